@@ -1,7 +1,7 @@
 """The containers' health check: exit code 0 when the process is well.
 
-FLEXDT_HEALTH is the address of its page, FLEXDT_HEALTH_WANTS what that has to say beside `status`,
-as words KEY=VALUE.
+FLEXDT_HEALTH is the address of its page, FLEXDT_HEALTH_WANTS what that has to say beside
+`status`, as words KEY=VALUE.
 """
 
 import json

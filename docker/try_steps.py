@@ -4,10 +4,10 @@
     debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm ROOT
     python docker/try_steps.py --root ROOT            # as root: the steps run inside ROOT
 
-Reads the Dockerfile, copies what it copies (and nothing else of the repository), runs its install
-steps (in a scratch folder, or changed into ROOT), starts each image's entry point as the image's
-user where it may, and waits for its health check. What it cannot tell: whether the base image is
-there and what else the engine does. Exit code 0 when all are healthy.
+Reads the Dockerfile, copies what it copies (and nothing else of the repository), runs its
+install steps (in a scratch folder, or changed into ROOT), starts each image's entry point as
+the image's user where it may, and waits for its health check. What it cannot tell: whether the
+base image is there and what else the engine does. Exit code 0 when all are healthy.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ STATE = "/var/lib/flexdt"
 
 @dataclass(frozen=True)
 class Place:
-    """Where the steps are tried: `folder` stands for the image's /, truly so if it is a root."""
+    """Where the steps are tried: `folder` stands for the image's /, truly so if it is a
+    root."""
 
     folder: Path
     is_root: bool
@@ -99,20 +100,29 @@ def build(steps: list[tuple[str, str]], place: Place) -> None:
                 else:
                     shutil.copy(ROOT / item, target)
         elif word == "RUN":
-            command = rest if place.is_root else rest.replace("/opt/", f"{place.folder}/opt/")
+            command = (
+                rest if place.is_root else rest.replace("/opt/", f"{place.folder}/opt/")
+            )
             if place.is_root:
                 command = re.sub(r"^python ", "python3 ", command)  # Debian's name for it
             print(f"+ {command}", flush=True)
-            done = place.run(command.split(), "/src", False, stdout=subprocess.DEVNULL).wait()
+            done = place.run(
+                command.split(), "/src", False, stdout=subprocess.DEVNULL
+            ).wait()
             if done:
                 raise SystemExit(f"{command!r} ended with code {done}")
 
 
 def _as_user() -> dict[str, Any]:
-    """Another user, where this one may become it and the interpreter can be reached by others."""
+    """Another user, where this one may become it and the interpreter can be reached by
+    others."""
     python = Path(sys.executable).resolve()
     reached = all(folder.stat().st_mode & 0o001 for folder in python.parents)
-    return {"user": UID, "group": UID, "extra_groups": []} if os.getuid() == 0 and reached else {}
+    return (
+        {"user": UID, "group": UID, "extra_groups": []}
+        if os.getuid() == 0 and reached
+        else {}
+    )
 
 
 def start(name: str, stages: dict[str, list[tuple[str, str]]], place: Place, more: list[str],
@@ -178,9 +188,13 @@ def prepared(root: Path | None) -> Iterator[Place]:
 
 def main() -> int:
     """Build, start, check, stop."""
-    options = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    options = argparse.ArgumentParser(
+        description=__doc__.split("\n")[0] if __doc__ else None
+    )
     options.add_argument("images", nargs="*", default=[])
-    options.add_argument("--root", type=Path, help="a debootstrap root to run the steps in")
+    options.add_argument(
+        "--root", type=Path, help="a debootstrap root to run the steps in"
+    )
     chosen = options.parse_args()
     stages = instructions()
     with prepared(chosen.root) as place:
@@ -203,7 +217,11 @@ def main() -> int:
                 health = f"http://127.0.0.1:{port}/healthz"
                 process, took = start(name, stages, place, more, health)
                 running.append((name, process))
-                who = "as the image's user" if place.is_root or _as_user() else "as this user"
+                who = (
+                    "as the image's user"
+                    if place.is_root or _as_user()
+                    else "as this user"
+                )
                 print(f"{name}: healthy after {took:.1f} s, {who}", flush=True)
         finally:
             for name, process in reversed(running):

@@ -14,7 +14,9 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
 # Notebooks call `flexdt` and `python` as a user would: those of this environment.
-os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ["PATH"] = os.pathsep.join(
+    [str(Path(sys.executable).parent), os.environ["PATH"]]
+)
 os.environ.setdefault("MPLBACKEND", "module://matplotlib_inline.backend_inline")
 
 # Imported before autodoc does: its models cannot be built under autodoc's eyes.
@@ -35,7 +37,14 @@ extensions = [
     "links_outside",
     "redirects",
 ]
-exclude_patterns = ["_build", "_ext", "_static", "history", "tools", "**/.ipynb_checkpoints"]
+exclude_patterns = [
+    "_build",
+    "_ext",
+    "_static",
+    "history",
+    "tools",
+    "**/.ipynb_checkpoints",
+]
 source_suffix = {".md": "myst-nb", ".rst": "restructuredtext"}
 master_doc = "index"
 nitpicky = True
@@ -72,7 +81,11 @@ html_theme_options = {
     "logo": {"text": "flexdt"},
     "show_toc_level": 2,
     "navigation_with_keys": False,
-    "secondary_sidebar_items": {"**": ["page-toc"], "_generated/evidence/peers": [], "index": []},
+    "secondary_sidebar_items": {
+        "**": ["page-toc"],
+        "_generated/evidence/peers": [],
+        "index": [],
+    },
     "footer_start": ["copyright"],
     "footer_end": [],
     "header_links_before_dropdown": 6,

@@ -3,8 +3,8 @@
     flexdt up --gateway-port 50000 --data data
     python examples/acquila_client.py [HOST] [PORT_OUT] [PORT_IN]
 
-Needs pyzmq and nothing of flexdt: the same program drives the real scanner. Takes a dark, a flat
-and a short scan in motion.
+Needs pyzmq and nothing of flexdt: the same program drives the real scanner. Takes a dark, a
+flat and a short scan in motion.
 """
 
 import itertools
@@ -18,7 +18,9 @@ import zmq
 class Acquila:
     """Commands out, replies in: RCV at once, FDB while it takes, then ACK or ERR."""
 
-    def __init__(self, host: str = "127.0.0.1", out: int = 50000, into: int = 50001) -> None:
+    def __init__(
+        self, host: str = "127.0.0.1", out: int = 50000, into: int = 50001
+    ) -> None:
         context = zmq.Context.instance()
         self.replies = context.socket(zmq.SUB)
         self.replies.subscribe(b"")
@@ -28,7 +30,9 @@ class Acquila:
         self.numbers = itertools.count(time.time_ns() % 2**48)
         time.sleep(0.5)  # ZeroMQ drops what is sent before both sides know each other
 
-    def send(self, component: str, command: str, arg1: object = "", arg2: object = "") -> int:
+    def send(
+        self, component: str, command: str, arg1: object = "", arg2: object = ""
+    ) -> int:
         """Send a command; returns its UUID."""
         uuid = next(self.numbers)
         event = {
@@ -49,7 +53,9 @@ class Acquila:
             if event["reply type"] == "FDB":
                 print("   ", event["command"], event["reply"])
             if event["reply type"] == "ERR":
-                raise RuntimeError(f"{event['component']} {event['command']}: {event['reply']}")
+                raise RuntimeError(
+                    f"{event['component']} {event['command']}: {event['reply']}"
+                )
             if event["reply type"] == "ACK":
                 return str(event["reply"])
         raise TimeoutError(f"no reply to {uuid}")

@@ -1,10 +1,10 @@
 """Does a sweep ever miss a contact, and how long does it take? Random aimed sweeps, measured.
 
-Two convex bodies are sent at each other on random motors: translations, rotations, both, several
-motors of both bodies at once, with walls of 0.1 mm and samples of up to 400 mm. Every sweep is
-compared with dense sampling along the same trajectories (a step of at most 0.25 mm; distances by
-fcl without any of the sweep's code, and for boxes the separating axis test written here). Then
-random motions of the whole FleX-ray and checks of whole scripts are timed.
+Two convex bodies are sent at each other on random motors: translations, rotations, both,
+several motors of both bodies at once, with walls of 0.1 mm and samples of up to 400 mm. Every
+sweep is compared with dense sampling along the same trajectories (a step of at most 0.25 mm;
+distances by fcl without any of the sweep's code, and for boxes the separating axis test written
+here). Then random motions of the whole FleX-ray and checks of whole scripts are timed.
 
     python examples/collision_study.py --sweeps 10000 --moves 2000 --json study.json
 """
@@ -28,7 +28,13 @@ from scipy.spatial.transform import Rotation
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
 from flexdt.twin.collision.convex_pieces import convex_pieces
-from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
+from flexdt.twin.collision.convex_solids import (
+    ConvexSolid,
+    Polytope,
+    UprightCylinder,
+    box,
+    hull,
+)
 from flexdt.twin.collision.first_contact import PathSearch, SweepResult
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.plan_report import collision_check
@@ -107,7 +113,9 @@ def random_trajectory(rng: np.random.Generator, span: float) -> Trajectory:
         return first
     at = start + rng.uniform(0.1, 0.9) * first.duration
     target = rng.uniform(-0.3, 1.3) * span
-    new = motion.move(first.position(at), first.velocity(at), target, speed, acceleration, at)
+    new = motion.move(
+        first.position(at), first.velocity(at), target, speed, acceleration, at
+    )
     before = tuple(p for p in first.pieces if p.start < at)
     return Trajectory(before + new.pieces, new.end, new.target)
 
@@ -122,7 +130,9 @@ def random_case(rng: np.random.Generator, kind: str) -> Case:
         "several axes": [n for n in AXES if rng.random() < 0.7] or ["ax"],
     }[kind]
     trajectories = {
-        n: random_trajectory(rng, rng.uniform(20, 720) if "turn" in n else rng.uniform(50, 600))
+        n: random_trajectory(
+            rng, rng.uniform(20, 720) if "turn" in n else rng.uniform(50, 600)
+        )
         for n in moving
     }
     end = max(t.end for t in trajectories.values())
@@ -142,8 +152,11 @@ def random_case(rng: np.random.Generator, kind: str) -> Case:
         for i, (n, s) in enumerate((("a", a), ("b", b)))
     ]
     at = rng.uniform(0.1, 1.0) * end
-    q = np.array([trajectories[n].position(at) if n in trajectories else 0.0 for n in AXES])
-    # At that time a plane across `normal` leaves this much room between them (less than none: hit).
+    q = np.array(
+        [trajectories[n].position(at) if n in trajectories else 0.0 for n in AXES]
+    )
+    # At that time a plane across `normal` leaves this much room between them (less than none:
+    # hit).
     normal = _unit(rng)
     room = rng.choice([rng.uniform(-30, 0), rng.uniform(0, 3), rng.uniform(0, 30)])
     (turn_a, origin_a), (turn_b, origin_b) = (pose_at(body, q) for body in bodies)
@@ -179,7 +192,10 @@ def _tip(solid: ConvexSolid, direction: np.ndarray) -> np.ndarray:
         return solid.vertices[np.argmax(solid.vertices @ direction)]
     assert isinstance(solid, UprightCylinder)
     across = direction[:2] / max(np.linalg.norm(direction[:2]), 1e-12) * solid.radius
-    return np.array(solid.center) + [*across, math.copysign(0.5 * solid.height, direction[2])]
+    return np.array(solid.center) + [
+        *across,
+        math.copysign(0.5 * solid.height, direction[2]),
+    ]
 
 
 def reference(case: Case, times: np.ndarray) -> np.ndarray:
@@ -191,7 +207,9 @@ def reference(case: Case, times: np.ndarray) -> np.ndarray:
     q = np.stack(columns, axis=1)
     objects, poses = [], []
     for body in case.scene.bodies:
-        turns = Rotation.from_rotvec((q @ body.turns)[:, None] * body.spin_axis).as_matrix()
+        turns = Rotation.from_rotvec(
+            (q @ body.turns)[:, None] * body.spin_axis
+        ).as_matrix()
         origins = body.origin + q @ body.slides
         solid = body.solid
         if isinstance(solid, UprightCylinder):
@@ -199,7 +217,9 @@ def reference(case: Case, times: np.ndarray) -> np.ndarray:
             origins = origins + turns @ np.array(solid.center)
         else:
             assert isinstance(solid, Polytope)
-            faces = np.concatenate([np.full((len(solid.faces), 1), 3), solid.faces], axis=1)
+            faces = np.concatenate(
+                [np.full((len(solid.faces), 1), 3), solid.faces], axis=1
+            )
             shape = fcl.Convex(np.array(solid.vertices), len(solid.faces), faces.ravel())
         objects.append(fcl.CollisionObject(shape))
         poses.append((turns, origins))
@@ -220,12 +240,15 @@ def separated(
 ) -> np.ndarray:
     """Separating axis test of two boxes (8 corners each) at many poses: (n,) bool."""
     corners = [
-        v @ np.swapaxes(r, 1, 2) + o[:, None] for v, (r, o) in zip(vertices, poses, strict=True)
+        v @ np.swapaxes(r, 1, 2) + o[:, None]
+        for v, (r, o) in zip(vertices, poses, strict=True)
     ]
     edges = [c[:, [1, 2, 4]] - c[:, [0]] for c in corners]
     edges = [e / np.linalg.norm(e, axis=2, keepdims=True) for e in edges]
     axes = [edges[0][:, i] for i in range(3)] + [edges[1][:, i] for i in range(3)]
-    axes += [np.cross(edges[0][:, i], edges[1][:, j]) for i, j in product(range(3), range(3))]
+    axes += [
+        np.cross(edges[0][:, i], edges[1][:, j]) for i, j in product(range(3), range(3))
+    ]
     apart = np.zeros(len(corners[0]), dtype=bool)
     for axis in axes:
         usable = np.linalg.norm(axis, axis=1) > 1e-6
@@ -247,11 +270,16 @@ def sample_times(case: Case) -> np.ndarray:
         way += np.abs(np.diff(t.positions(fine))) * per_unit
     total = np.concatenate([[0.0], np.cumsum(way)])
     count = int(np.clip(total[-1] / STEP_MM, 2001, 12001))
-    return np.union1d(np.interp(np.linspace(0, total[-1], count), total, fine), [0.0, case.end])
+    return np.union1d(
+        np.interp(np.linspace(0, total[-1], count), total, fine), [0.0, case.end]
+    )
 
 
-def swept(scene: CollisionScene, trajectories: Mapping[str, Trajectory], end: float) -> SweepResult:
-    """The first contact from 0 s to `end` [s]; without one the least clearance, as `check` does."""
+def swept(
+    scene: CollisionScene, trajectories: Mapping[str, Trajectory], end: float
+) -> SweepResult:
+    """The first contact from 0 s to `end` [s]; without one the least clearance, as `check`
+    does."""
     search = PathSearch(scene, scene.path(trajectories, 0.0, end))
     found = search.first_contact()
     return search.refined(found) if found.contact is None else found
@@ -261,7 +289,9 @@ def judge(case: Case) -> Outcome | None:
     """Sweep and compare; None where the bodies begin within 0.1 mm of the margin."""
     if reference(case, np.zeros(1))[0] < MARGIN + 0.1:
         return None
-    swept(case.scene, case.trajectories, case.end)  # a scene is made once, swept many times
+    swept(
+        case.scene, case.trajectories, case.end
+    )  # a scene is made once, swept many times
     seconds = math.inf
     for _ in range(3):  # the least of three: others use this machine too
         begin = time.perf_counter()
@@ -316,8 +346,12 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
         "false_stops": sum(o.stop_clearance > MARGIN + TOLERANCE + NOISE for o in stops),
         "stops_short_of_touching": sum(not o.touches for o in stops),
         "stops_where_reference_keeps_margin": sum(o.least >= MARGIN for o in stops),
-        "least_clearance_at_stops_mm": min((o.stop_clearance for o in stops), default=None),
-        "greatest_clearance_at_stops_mm": max((o.stop_clearance for o in stops), default=None),
+        "least_clearance_at_stops_mm": min(
+            (o.stop_clearance for o in stops), default=None
+        ),
+        "greatest_clearance_at_stops_mm": max(
+            (o.stop_clearance for o in stops), default=None
+        ),
         "least_clearance_error_mm": [min(over), max(over)] if over else None,
         "least_clearance_beyond_accuracy": sum(
             o.reported > o.least + max(0.1, 0.02 * o.reported) + NOISE
@@ -336,7 +370,9 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
 def study_machine(moves: int, seed: int) -> dict[str, object]:
     """Times of sweeps of the whole FleX-ray with a LEGO-sized sample: 1 to 8 motors at once."""
     machine = builtin_machine()
-    scene = build_scene(machine, builtin_profile(machine.default_profile), [box((24, 16, 49.8))])
+    scene = build_scene(
+        machine, builtin_profile(machine.default_profile), [box((24, 16, 49.8))]
+    )
     guard = SceneGuard(scene)
     rng = np.random.default_rng([seed, 1])
     full, only_contacts, stops = [], [], 0
@@ -347,7 +383,9 @@ def study_machine(moves: int, seed: int) -> dict[str, object]:
         for name, a in machine.axes.items():
             low, high = (-720.0, 720.0) if a.kind == "rotation" else (a.lower, a.upper)
             target = rng.uniform(low, high) if name in chosen else a.home
-            trajectories[name] = motion.move(a.home, 0.0, target, a.speed, a.acceleration, 0.0)
+            trajectories[name] = motion.move(
+                a.home, 0.0, target, a.speed, a.acceleration, 0.0
+            )
         end = max(t.end for t in trajectories.values())
         begin = time.perf_counter()
         result = swept(scene, trajectories, end)
@@ -374,10 +412,14 @@ def study_scripts() -> dict[str, object]:
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
     lego = convex_pieces(load_phantom("lego").mesh())
-    close = [box((300, 20, 40))]  # a bar that sweeps past the panel with a few mm to spare
+    close = [
+        box((300, 20, 40))
+    ]  # a bar that sweeps past the panel with a few mm to spare
     fly = compose_script(ScanRequest("fly", frames=1440), machine, profile)
     step = compose_script(ScanRequest("step", frames=1440), machine, profile)
-    near = compose_script(ScanRequest("step", frames=1440, sdd_mm=757.0), machine, profile)
+    near = compose_script(
+        ScanRequest("step", frames=1440, sdd_mm=757.0), machine, profile
+    )
     shipped = [f.read_bytes() for f in (Path(__file__).parent / "scripts").glob("*.txt")]
     hundred = [text for _, text in zip(range(100), cycle(shipped), strict=False)]
     cases = {
@@ -392,7 +434,9 @@ def study_scripts() -> dict[str, object]:
         for _ in range(5):
             begin = time.perf_counter()
             for text in texts:
-                report = check_script(text, machine, profile, collision=collision_check(sample))
+                report = check_script(
+                    text, machine, profile, collision=collision_check(sample)
+                )
             best = min(best, time.perf_counter() - begin)
         assert report is not None
         assert report.clearance is not None

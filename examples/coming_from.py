@@ -2,11 +2,11 @@
 
     python examples/coming_from.py [astra cil five-tasks gvxr tigre]
 
-Takes the code blocks of docs/coming-from/ as they stand, makes panel, views and volume small, runs
-ours, then runs each peer's line by line. A line that fails (nothing installed, no CUDA device) is
-reported and the others go on, so that a peer's geometry is compared even where it cannot project.
-Prints JSON: for each block its lines, the peer's version, how many statements ran, the first error,
-and how far its result is from ours.
+Takes the code blocks of docs/coming-from/ as they stand, makes panel, views and volume small,
+runs ours, then runs each peer's line by line. A line that fails (nothing installed, no CUDA
+device) is reported and the others go on, so that a peer's geometry is compared even where it
+cannot project. Prints JSON: for each block its lines, the peer's version, how many statements
+ran, the first error, and how far its result is from ours.
 
 gvxr needs Mesa's software OpenGL where there is no graphics card: see examples/compare_gvxr.py.
 """
@@ -34,8 +34,14 @@ PAGES = Path(__file__).resolve().parents[1] / "docs" / "coming-from"
 BLOCK = re.compile(r":caption: ([^\n]+)\n\n(.*?)```", re.DOTALL)
 SMALLER = {"360": "40", "760": "38", "956": "48", "0.1496": "2.0", "256": "24", "0.2": "1.0",
            "51.2": "24.0", "25.6": "12.0"}  # fmt: skip
-"""Numbers of the pages -> numbers of the runs: a panel of 38 x 48, 40 views, 24 voxels a side."""
-PACKAGES = {"ASTRA": "astra-toolbox", "gVXR": "gvxr", "TIGRE": "pytigre", "diffdrr": "diffdrr"}
+"""Numbers of the pages -> numbers of the runs: a panel of 38 x 48, 40 views, 24 voxels a
+side."""
+PACKAGES = {
+    "ASTRA": "astra-toolbox",
+    "gVXR": "gvxr",
+    "TIGRE": "pytigre",
+    "diffdrr": "diffdrr",
+}
 MONO_KEV = 60.0
 """One energy, so that the two sides differ by geometry alone."""
 ON_THE_CARD = re.compile(
@@ -48,7 +54,9 @@ ON_THE_CARD = re.compile(
 def blocks(page: str) -> dict[str, str]:
     """Caption -> code of a page, made smaller."""
     text = (PAGES / f"{page}.md").read_text(encoding="utf-8")
-    numbers = re.compile(r"(?<![\w.])(" + "|".join(map(re.escape, SMALLER)) + r")(?![\w.])")
+    numbers = re.compile(
+        r"(?<![\w.])(" + "|".join(map(re.escape, SMALLER)) + r")(?![\w.])"
+    )
     return {
         caption: numbers.sub(lambda found: SMALLER[found[0]], code)
         for caption, code in BLOCK.findall(text)
@@ -56,7 +64,8 @@ def blocks(page: str) -> dict[str, str]:
 
 
 def given() -> dict[str, Any]:
-    """What the blocks take for granted: an array, a spectrum, files in the working directory."""
+    """What the blocks take for granted: an array, a spectrum, files in the working
+    directory."""
     array = np.zeros((24, 24, 24), np.float32)
     array[6:18, 6:18, 6:18] = 0.05
     array[8:11, 13:16, 15:18] = 0.0
@@ -124,7 +133,10 @@ def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
     scans = theirs.get("scans", ())
     if caption == "tomosipo, task 5" and len(scans) == 100:
         pairs = zip(scans, fifth_task(), strict=True)
-        rest = [spread_mm(fx.ConeVec.from_tomosipo(a).rows, b, upwards=False) for a, b in pairs]
+        rest = [
+            spread_mm(fx.ConeVec.from_tomosipo(a).rows, b, upwards=False)
+            for a, b in pairs
+        ]
         return {"geometry_mm": max(rest)}
     images = theirs.get("images", ())
     if caption == "diffdrr, task 5" and len(images) == 100:
@@ -132,7 +144,9 @@ def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
         volume = fx.Volume(theirs["array"], 1.0)
         ours = np.stack([fx.project(volume, g) for g in fifth_task()[::10]])
         theirs_now = np.stack([np.asarray(i) for i in images[::10]]) * volume.data.max()
-        return {"mean_difference_part": float(np.abs(theirs_now - ours).mean() / ours.mean())}
+        return {
+            "mean_difference_part": float(np.abs(theirs_now - ours).mean() / ours.mean())
+        }
     return {}
 
 
@@ -140,9 +154,9 @@ def cil_rows(theirs: dict[str, Any]) -> np.ndarray:
     """The geometry of CIL's `scan`, as CIL gives it to ASTRA."""
     from cil.plugins.astra.utilities import convert_geometry_to_astra_vec_3D
 
-    rows: np.ndarray = convert_geometry_to_astra_vec_3D(theirs["volume"], theirs["scan"])[1][
-        "Vectors"
-    ]
+    rows: np.ndarray = convert_geometry_to_astra_vec_3D(theirs["volume"], theirs["scan"])[
+        1
+    ]["Vectors"]
     return rows
 
 
@@ -152,9 +166,13 @@ def compared(peer: str, theirs: dict[str, Any], ours: dict[str, Any]) -> dict[st
     turn, scan = ours.get("turn"), theirs.get("scan")
     if scan is not None and turn is not None:
         if peer == "ASTRA":
-            out["geometry_mm"] = spread_mm(fx.ConeVec.from_astra(scan).rows, turn, upwards=True)
+            out["geometry_mm"] = spread_mm(
+                fx.ConeVec.from_astra(scan).rows, turn, upwards=True
+            )
         elif peer == "tomosipo":
-            out["geometry_mm"] = spread_mm(fx.ConeVec.from_tomosipo(scan).rows, turn, upwards=True)
+            out["geometry_mm"] = spread_mm(
+                fx.ConeVec.from_tomosipo(scan).rows, turn, upwards=True
+            )
             again = fx.ConeVec.from_tomosipo(turn.to_tomosipo())
             out["there_and_back_mm"] = spread_mm(again.rows, turn, upwards=False)
         elif peer == "CIL":
@@ -190,7 +208,9 @@ def page(name: str) -> dict[str, object]:
         os.chdir(folder)
         try:
             ours, out = given(), {}
-            for caption, code in sorted(blocks(name).items(), key=lambda b: b[0] != "flexdt"):
+            for caption, code in sorted(
+                blocks(name).items(), key=lambda b: b[0] != "flexdt"
+            ):
                 peer = caption.split(",")[0]
                 lines = sum(bool(line.strip()) for line in code.splitlines())
                 start = ours if peer in ("flexdt", "CIL with flexdt") else given()
@@ -205,7 +225,9 @@ def page(name: str) -> dict[str, object]:
 
 def main() -> None:
     every = sorted(path.stem for path in PAGES.glob("*.md"))
-    parser = argparse.ArgumentParser(description="the pages for users of other programs, run")
+    parser = argparse.ArgumentParser(
+        description="the pages for users of other programs, run"
+    )
     parser.add_argument("pages", nargs="*", default=every, choices=every)
     print(json.dumps({name: page(name) for name in parser.parse_args().pages}, indent=1))
 

@@ -1,7 +1,7 @@
 """FDK beside itk-rtk's on the same data: a ball and a box, exact projections, one machine.
 
-Needs `pip install itk-rtk`. Prints both times, the mean of each inside the ball over the truth, and
-the largest and the root mean square difference of the two volumes [1/mm].
+Needs `pip install itk-rtk`. Prints both times, the mean of each inside the ball over the truth,
+and the largest and the root mean square difference of the two volumes [1/mm].
 
     python examples/compare_fdk.py --views 360 --voxels 256
 """
@@ -27,10 +27,14 @@ def circle(views: int) -> ConeVec:
     angle = 2 * np.pi * np.arange(views) / views
     c, s, zero = np.cos(angle), np.sin(angle), np.zeros(views)
     across, away = np.stack([c, s, zero], 1), np.stack([-s, c, zero], 1)
-    return ConeVec.from_vectors(-SOD * away, (SDD - SOD) * away, PIXEL * across, (0, 0, -PIXEL))
+    return ConeVec.from_vectors(
+        -SOD * away, (SDD - SOD) * away, PIXEL * across, (0, 0, -PIXEL)
+    )
 
 
-def by_rtk(data: np.ndarray, views: int, voxels: int, size: float) -> tuple[np.ndarray, float]:
+def by_rtk(
+    data: np.ndarray, views: int, voxels: int, size: float
+) -> tuple[np.ndarray, float]:
     """RTK's (x, y, z) is our (x, z, -y), and its detector rows grow upwards."""
     import itk  # here, so that --help needs no peer
     from itk import RTK as rtk
@@ -75,7 +79,10 @@ def main() -> None:
     data = project_scene(scene, scan, SHAPE)
     like = Grid((n, n, n), size).blank()
     fdk(
-        data[:16], scan[:: options.views // 16][:16], Grid((16, 16, 16), 1.0).blank(), errors=False
+        data[:16],
+        scan[:: options.views // 16][:16],
+        Grid((16, 16, 16), 1.0).blank(),
+        errors=False,
     )  # compile
     ours, theirs = [], []
     for _ in range(options.repeat):

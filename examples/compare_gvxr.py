@@ -1,12 +1,12 @@
 """A polychromatic radiograph beside gVirtualXRay's: a plastic box with five steel beads.
 
-Needs `pip install gvxr` and, without a graphics card, Mesa's software OpenGL (`apt install libegl1
-libgl1 libxcb-res0 libxcb-ewmh2 libxcb-icccm4 libxcb-composite0 libxcb-xinerama0 libxcb-keysyms1`).
-Both get the same spectrum and the same geometry and see the signal of a detector that measures
-energy. gVirtualXRay uses meshes and its own attenuation tables. Which way its rows and columns run
-is asked of it with one ball whose shadow is worked out by hand, so an image of ours that were
-mirrored would not pass. Prints the differences of the transmissions of all pixels and of those off
-the edges.
+Needs `pip install gvxr` and, without a graphics card, Mesa's software OpenGL (`apt install
+libegl1 libgl1 libxcb-res0 libxcb-ewmh2 libxcb-icccm4 libxcb-composite0 libxcb-xinerama0
+libxcb-keysyms1`). Both get the same spectrum and the same geometry and see the signal of a
+detector that measures energy. gVirtualXRay uses meshes and its own attenuation tables. Which
+way its rows and columns run is asked of it with one ball whose shadow is worked out by hand, so
+an image of ours that were mirrored would not pass. Prints the differences of the transmissions
+of all pixels and of those off the edges.
 
     python examples/compare_gvxr.py
 """
@@ -39,7 +39,9 @@ STEADY = 0.2
 
 def ours() -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Transmission by this package, and the path through each material."""
-    scan = ConeVec.from_vectors((0, -SOD, 0), (0, SDD - SOD, 0), (PIXEL, 0, 0), (0, 0, -PIXEL))
+    scan = ConeVec.from_vectors(
+        (0, -SOD, 0), (0, SDD - SOD, 0), (PIXEL, 0, 0), (0, 0, -PIXEL)
+    )
     parts = channels(bead_phantom("normal", 5))
     paths = {c.material.name: project_scene(c.body, scan, SHAPE)[0] for c in parts}
     spectrum = tube_spectrum(KV)
@@ -73,7 +75,9 @@ def theirs(folder: Path) -> np.ndarray:
     way = ways(folder)
     box = trimesh.creation.box(extents=phantom.size_mm)
     bodies = {"box": box}
-    for i, (at, radius) in enumerate(zip(phantom.beads, phantom.bead_radius_mm, strict=True)):
+    for i, (at, radius) in enumerate(
+        zip(phantom.beads, phantom.bead_radius_mm, strict=True)
+    ):
         bead = trimesh.creation.icosphere(subdivisions=6, radius=float(radius))
         bead.apply_translation(at)
         bodies[f"bead{i}"] = bead
@@ -118,10 +122,17 @@ def ways(folder: Path) -> tuple[slice, slice]:
     gvxr.removePolygonMeshesFromXRayRenderer()
     right, up = at[[0, 2]] * SDD / SOD / PIXEL
     rows, cols = (np.arange(n) - (n - 1) / 2 for n in SHAPE)
-    row, col = (weight * rows[:, None]).sum() / weight.sum(), (weight * cols).sum() / weight.sum()
+    row, col = (
+        (weight * rows[:, None]).sum() / weight.sum(),
+        (weight * cols).sum() / weight.sum(),
+    )
     if not (abs(abs(col) - right) < 1.0 and abs(abs(row) - up) < 1.0):
-        raise SystemExit(f"the ball's shadow is at {col:.1f}, {row:.1f}, not {right:.1f}, {up:.1f}")
-    return slice(None, None, -1 if row > 0 else 1), slice(None, None, -1 if col < 0 else 1)
+        raise SystemExit(
+            f"the ball's shadow is at {col:.1f}, {row:.1f}, not {right:.1f}, {up:.1f}"
+        )
+    return slice(None, None, -1 if row > 0 else 1), slice(
+        None, None, -1 if col < 0 else 1
+    )
 
 
 def main() -> None:

@@ -1,4 +1,5 @@
-"""Drive the scanner from Python: move two axes, take a projection, see where its geometry stands.
+"""Drive the scanner from Python: move two axes, take a projection, see where its geometry
+stands.
 
 Start `flexdt up` in another terminal, then run `python examples/drive_from_python.py`.
 """
@@ -18,13 +19,19 @@ def main(host: str = "127.0.0.1", port: int = 55000) -> None:
         print(f"arrived after {moved.duration_s:.2f} s of the twin's clock")
 
         g = client.state().geometry
-        print(f"SOD {g.SOD_mm:.3f} mm, SDD {g.SDD_mm:.3f} mm, magnification {g.magnification:.4f}")
+        print(
+            f"SOD {g.SOD_mm:.3f} mm, SDD {g.SDD_mm:.3f} mm, magnification {g.magnification:.4f}"
+        )
 
         taken = client.projection(kind="line_integral")
-        print(f"projection {taken.image.shape}, largest line integral {taken.image.max():.3f}")
+        print(
+            f"projection {taken.image.shape}, largest line integral {taken.image.max():.3f}"
+        )
 
         # The geometry that came with the image says where every point of the sample falls.
-        column, row = ConeVec(taken.cone_vec).project_points([[0, 0, 0]], taken.image.shape)[0, 0]
+        column, row = ConeVec(taken.cone_vec).project_points(
+            [[0, 0, 0]], taken.image.shape
+        )[0, 0]
         print(f"the sample's centre is at column {column:.2f}, row {row:.2f}")
 
 

@@ -31,7 +31,9 @@ def main(argv: list[str]) -> None:
     ticks = np.linspace(-20.0, 20.0, 5)
     points = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
     pixels = ours.cone_vec.project_points(points, data.shape)
-    print(f"{data.name}: {len(data)} projections of {data.shape[1]} x {data.shape[0]} pixels")
+    print(
+        f"{data.name}: {len(data)} projections of {data.shape[1]} x {data.shape[0]} pixels"
+    )
     for name, format in FORMATS.items():
         if format.read is None:
             continue
@@ -45,7 +47,9 @@ def main(argv: list[str]) -> None:
             back = import_geometry(file, name, given)
             mm = np.abs(back.cone_vec.rows - ours.cone_vec.rows).max()
             px = np.abs(back.cone_vec.project_points(points, data.shape) - pixels).max()
-            print(f"{name:9} {file.name}: {file.stat().st_size} bytes, {mm:.1e} mm, {px:.1e} px")
+            print(
+                f"{name:9} {file.name}: {file.stat().st_size} bytes, {mm:.1e} mm, {px:.1e} px"
+            )
 
 
 if __name__ == "__main__":

@@ -3,10 +3,10 @@
     python examples/faulty_scanner.py 50123 &
     flexdt follow tcp://127.0.0.1:50123 --for 12
 
-It needs pyzmq and nothing of flexdt. Every message has a tick of its own, as in the last pages of
-the interface's description; `flexdt follow` goes by the UUID. The first move is sound; the second
-is of a motor of half the speed; the third ends 0.4 mm from its target, and its reply states another
-limit.
+It needs pyzmq and nothing of flexdt. Every message has a tick of its own, as in the last pages
+of the interface's description; `flexdt follow` goes by the UUID. The first move is sound; the
+second is of a motor of half the speed; the third ends 0.4 mm from its target, and its reply
+states another limit.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def main(port: int) -> None:
                 gone = abs(target - start) - 0.5 * ACCELERATION * left**2
             else:
                 gone = speed * (t - ramp / 2)
-            socket.send_string(event(axis, target, uuid, "FDB", f"{start + way * gone:.10f}"))
+            socket.send_string(
+                event(axis, target, uuid, "FDB", f"{start + way * gone:.10f}")
+            )
         time.sleep(max(0.0, begun + duration - time.monotonic()))
         head = (ends_at, target, 50.0, 0, 50.0, upper, LOWER[axis], 0, 50.0, 0, 125.0)
         cluster = struct.pack(">17d", *head, *[0.0] * 6) + bytes(7)

@@ -1,15 +1,16 @@
 """A misalignment learnt back from images by gradients, and what the gradients cost.
 
-    python examples/learn_geometry.py [--trials 10] [--views 32] [--voxels 80] [--sharp] [--peer]
-    python examples/learn_geometry.py --cost 256
+    python examples/learn_geometry.py [--trials 10] [--views 32] [--voxels 80] [--sharp]
+    [--peer] python examples/learn_geometry.py --cost 256
 
-Images of random ellipsoids come from a renderer of its own below (closed form, double precision;
---sharp for a jump at the surface, which voxels can only approximate), seen by a scanner whose
-detector is shifted and rolled and whose rotation axis is off. The ellipsoids as voxels are the
-model. From starts drawn at random, Gauss-Newton finds shift, roll and axis: each alone, then all
-three. Errors are in pixels: of the roll at the end of a row, of the axis as it moves the image.
-With all three free, the distance between images of points by the found and by the true geometry is
-what counts; the singular values of the Jacobian name the direction that the images say least about.
+Images of random ellipsoids come from a renderer of its own below (closed form, double
+precision; --sharp for a jump at the surface, which voxels can only approximate), seen by a
+scanner whose detector is shifted and rolled and whose rotation axis is off. The ellipsoids as
+voxels are the model. From starts drawn at random, Gauss-Newton finds shift, roll and axis: each
+alone, then all three. Errors are in pixels: of the roll at the end of a row, of the axis as it
+moves the image. With all three free, the distance between images of points by the found and by
+the true geometry is what counts; the singular values of the Jacobian name the direction that
+the images say least about.
 
 With --peer the same task, by the same optimiser (L-BFGS on loss and gradient), for diffdrr
 (pip install diffdrr) beside flexdt. Prints JSON.
@@ -52,15 +53,24 @@ class Task:
         """The geometry (n, 12) with a shift, a roll and an axis [px]."""
         shift, roll, axis = values
         width = self.nominal.shape[2]
-        source, centre, u, v = (self.nominal.rows[:, i : i + 3].copy() for i in (0, 3, 6, 9))
+        source, centre, u, v = (
+            self.nominal.rows[:, i : i + 3].copy() for i in (0, 3, 6, 9)
+        )
         angle = roll / (0.5 * width)  # a px at the end of a row
         aside = axis * SOD_MM / SDD_MM * u  # what moves the image by a px
-        turned = np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u
-        return np.concatenate([source - aside, centre - aside + shift * u, *turned], axis=1)
+        turned = (
+            np.cos(angle) * u + np.sin(angle) * v,
+            np.cos(angle) * v - np.sin(angle) * u,
+        )
+        return np.concatenate(
+            [source - aside, centre - aside + shift * u, *turned], axis=1
+        )
 
     def operator(self, values: np.ndarray) -> fx.Operator:
         """The projector with a misalignment."""
-        return fx.Operator(fx.ConeVec(self.rows(values), self.nominal.detector_shape), self.volume)
+        return fx.Operator(
+            fx.ConeVec(self.rows(values), self.nominal.detector_shape), self.volume
+        )
 
     def residual(self, values: np.ndarray) -> np.ndarray:
         """Model minus images."""
@@ -69,8 +79,9 @@ class Task:
     def jacobian(self, values: np.ndarray, free: list[int]) -> np.ndarray:
         """(pixels, free parameters): the chain from parameters to the twelve numbers to images.
 
-        The mean of points NEAR_PX to both sides. The images of voxels have kinks at every hundredth
-        of a pixel; a derivative in one point, right as it is, holds for less than that.
+        The mean of points NEAR_PX to both sides. The images of voxels have kinks at every
+        hundredth of a pixel; a derivative in one point, right as it is, holds for less than
+        that.
         """
         columns = []
         for near in (*NEAR_PX, *(-px for px in NEAR_PX)):
@@ -85,12 +96,14 @@ class Task:
         return np.asarray(near_by.mean(axis=0).T)
 
     def reprojection(self, values: np.ndarray) -> float:
-        """Root mean square distance between images of points by this and by the true geometry."""
+        """Root mean square distance between images of points by this and by the true
+        geometry."""
         reach = 0.3 * self.volume.size_mm[0]
         points = np.random.default_rng(0).uniform(-reach, reach, (100, 3))
         shape = self.nominal.detector_shape
         found, true = (
-            fx.ConeVec(self.rows(v), shape).project_points(points) for v in (values, self.truth)
+            fx.ConeVec(self.rows(v), shape).project_points(points)
+            for v in (values, self.truth)
         )
         return float(np.sqrt(np.mean(np.sum((found - true) ** 2, axis=-1))))
 
@@ -100,7 +113,8 @@ def render(
 ) -> np.ndarray:
     """Line integrals (n, rows, cols) of ellipsoids (centre, matrix to the unit ball, value).
 
-    A sharp one has its value everywhere inside, another value * (1 - rho^2) at rho of the way to
+    A sharp one has its value everywhere inside, another value * (1 - rho^2) at rho of the way
+    to
     the surface. With rho^2 = a t^2 + 2 b t + c along a ray the chord is |t - t0| < w, and the
     integrals are 2 w and 4/3 a w^3.
     """
@@ -145,19 +159,28 @@ def make(seed: int, views: int, count: int, sharp: bool = False) -> Task:
     for _ in range(12):
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         to_ball = np.diag(1.0 / rng.uniform(0.08, 0.2, 3) / size) @ turn
-        ellipsoids.append((rng.uniform(-0.27, 0.27, 3) * size, to_ball, rng.uniform(0.01, 0.04)))
+        ellipsoids.append(
+            (rng.uniform(-0.27, 0.27, 3) * size, to_ball, rng.uniform(0.01, 0.04))
+        )
     pixels = 2 * count // 3
     nominal = fx.ConeVec.circular(
-        sod=SOD_MM, sdd=SDD_MM, angles=views, shape=(pixels, pixels), pixel=2.2 * size / pixels
+        sod=SOD_MM,
+        sdd=SDD_MM,
+        angles=views,
+        shape=(pixels, pixels),
+        pixel=2.2 * size / pixels,
     )
     truth = rng.uniform(-2.0, 2.0, 3)
     volume = voxels(ellipsoids, fx.Grid((count,) * 3, size / count), sharp)
     task = Task(nominal, volume, np.zeros(0), truth)
-    return replace(task, images=render(ellipsoids, task.rows(truth), (pixels, pixels), sharp))
+    return replace(
+        task, images=render(ellipsoids, task.rows(truth), (pixels, pixels), sharp)
+    )
 
 
 def learn(task: Task, free: list[int], start: np.ndarray) -> np.ndarray:
-    """Gauss-Newton with trust region: shift, roll and axis [px], the others kept at the truth."""
+    """Gauss-Newton with trust region: shift, roll and axis [px], the others kept at the
+    truth."""
 
     def all_of(values: np.ndarray) -> np.ndarray:
         full = task.truth.copy()
@@ -187,7 +210,9 @@ def trial(seed: int, views: int, count: int, sharp: bool = False) -> dict[str, o
     result["start_px"] = task.reprojection(start)
     result["joint_px"] = task.reprojection(found)
     result["joint_errors"] = np.abs(found - task.truth).tolist()
-    _, sizes, directions = np.linalg.svd(task.jacobian(found, [0, 1, 2]), full_matrices=False)
+    _, sizes, directions = np.linalg.svd(
+        task.jacobian(found, [0, 1, 2]), full_matrices=False
+    )
     result["weakest"] = (sizes[-1] / sizes[0]).item()
     weak = directions[-1] * np.sign(directions[-1][0])
     result["weak_direction"] = dict(zip(NAMES, weak.round(3).tolist(), strict=True))
@@ -205,7 +230,10 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
     density = torch.from_numpy(np.ascontiguousarray(task.volume.data.transpose(2, 1, 0)))
     low = -torch.tensor(task.volume.size_mm) / 2
     edge = task.volume.voxel_xyz[0]
-    measured, siddon = torch.from_numpy(task.images.astype(np.float32)), Siddon(voxel_shift=0.0)
+    measured, siddon = (
+        torch.from_numpy(task.images.astype(np.float32)),
+        Siddon(voxel_shift=0.0),
+    )
 
     def chain(values: np.ndarray, by_rows: np.ndarray) -> np.ndarray:
         steps = 1e-4 * np.eye(3)
@@ -242,7 +270,9 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
         value, slope = function(start)
         once = time.perf_counter() - begun
         begun = time.perf_counter()
-        found = minimize(function, start, jac=True, method="L-BFGS-B", options={"maxiter": 40})
+        found = minimize(
+            function, start, jac=True, method="L-BFGS-B", options={"maxiter": 40}
+        )
         result[name] = {
             "seconds_loss_and_gradient": once,
             "loss_at_start": value,
@@ -255,12 +285,14 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
 
 
 def cost(count: int, repeat: int = 3) -> dict[str, float]:
-    """Milliseconds a view for count^3 random voxels on a panel of 380 x 478: the best of some runs,
-    taken in turns.
+    """Milliseconds a view for count^3 random voxels on a panel of 380 x 478: the best of some
+    runs, taken in turns.
     """
     data = np.random.default_rng(0).uniform(0, 0.02, (count,) * 3).astype(np.float32)
     volume = fx.Volume(data, 76.8 / count)
-    scan = fx.ConeVec.circular(sod=600, sdd=1059, angles=6, shape=(380, 478), pixel=0.2992)
+    scan = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=6, shape=(380, 478), pixel=0.2992
+    )
     operator = fx.Operator(scan, volume)
     images, change = operator @ volume, np.ones((6, 12))
     jobs = {
@@ -274,18 +306,26 @@ def cost(count: int, repeat: int = 3) -> dict[str, float]:
         for name, job in jobs.items():
             begun = time.perf_counter()
             job()
-            best[name] = min(best[name], (time.perf_counter() - begun) / len(images) * 1e3)
+            best[name] = min(
+                best[name], (time.perf_counter() - begun) / len(images) * 1e3
+            )
     return best
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="a misalignment learnt back by gradients")
+    parser = argparse.ArgumentParser(
+        description="a misalignment learnt back by gradients"
+    )
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--views", type=int, default=32)
     parser.add_argument("--voxels", type=int, default=80)
     parser.add_argument("--peer", action="store_true", help="diffdrr on the same task")
-    parser.add_argument("--sharp", action="store_true", help="ellipsoids of one value each")
-    parser.add_argument("--cost", type=int, metavar="VOXELS", help="only ms a view, for VOXELS^3")
+    parser.add_argument(
+        "--sharp", action="store_true", help="ellipsoids of one value each"
+    )
+    parser.add_argument(
+        "--cost", type=int, metavar="VOXELS", help="only ms a view, for VOXELS^3"
+    )
     options = parser.parse_args()
     if options.cost is not None:
         print(json.dumps(cost(options.cost), indent=2))

@@ -1,6 +1,8 @@
-"""Read a data set: normalised projections, the geometry of each, and what the scanner wrote down.
+"""Read a data set: normalised projections, the geometry of each, and what the scanner wrote
+down.
 
-Run `flexdt demo --no-viewer`, then `python examples/read_a_dataset.py flexdt-demo/data/lego-...`.
+Run `flexdt demo --no-viewer`, then `python examples/read_a_dataset.py
+flexdt-demo/data/lego-...`.
 """
 
 from __future__ import annotations

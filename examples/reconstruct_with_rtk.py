@@ -3,8 +3,8 @@
     flexdt export DATASET --format rtk --out geometry.xml
     python examples/reconstruct_with_rtk.py DATASET geometry.xml OUT.npy [VOXEL_MM] [VOXELS]
 
-Needs itk-rtk. The images go in as they are, row 0 on top. The volume comes out in the order z, y,
-x, layers from the lowest up, so it lies on what `flexdt reconstruct` gives.
+Needs itk-rtk. The images go in as they are, row 0 on top. The volume comes out in the order z,
+y, x, layers from the lowest up, so it lies on what `flexdt reconstruct` gives.
 """
 
 import sys
@@ -52,7 +52,9 @@ def main(argv: list[str]) -> None:
     # RTK's (x, y, z) is our (x, z, -y).
     volume = itk.array_from_image(fdk.GetOutput())[::-1].transpose(1, 0, 2)
     np.save(argv[2], np.ascontiguousarray(volume))
-    print(f"{argv[2]}: {count} voxels of {voxel:g} mm a side, largest {volume.max():.4g} /mm")
+    print(
+        f"{argv[2]}: {count} voxels of {voxel:g} mm a side, largest {volume.max():.4g} /mm"
+    )
 
 
 if __name__ == "__main__":

@@ -2,9 +2,10 @@
 
 Starts the servers, scans 1434 projections over a turn, reconstructs 160 x 240 x 498 voxels of
 0.1 mm (the phantom's short side along y here), finds the five beads in the volume and compares
-them with where the phantom has them; then the same from the scanner's two texts alone. Prints times
-and peak memory: of the largest process, and of all together (sampled twice a second, pages that
-processes share counted once). About 4 GB of disk; `--frames 240 --voxel 0.2` is a quick one.
+them with where the phantom has them; then the same from the scanner's two texts alone. Prints
+times and peak memory: of the largest process, and of all together (sampled twice a second,
+pages that processes share counted once). About 4 GB of disk; `--frames 240 --voxel 0.2` is a
+quick one.
 
     python examples/reference_scan.py --out /tmp/reference --physics poly
 """
@@ -60,7 +61,8 @@ def bead_centres(volume: Volume, beads: np.ndarray, radius: float) -> np.ndarray
 
 
 def sharpness(volume: Volume) -> float:
-    """Steepest slope across a voxel relative to the brightest value: the sharpest edge there is."""
+    """Steepest slope across a voxel relative to the brightest value: the sharpest edge there
+    is."""
     data = np.asarray(volume.data[::2])
     steep = np.abs(np.diff(data, axis=1))
     return float(np.quantile(steep, 0.9999) / np.quantile(data, 0.9999))
@@ -153,7 +155,9 @@ def main() -> None:
     print(json.dumps(figures, indent=1))
 
 
-def _measure(options: argparse.Namespace, script: str, figures: dict[str, object]) -> None:
+def _measure(
+    options: argparse.Namespace, script: str, figures: dict[str, object]
+) -> None:
     """Scan, reconstruct and compare; what comes out goes into `figures`."""
     out: Path = options.out
     folder = out / "data" / "reference"

@@ -3,10 +3,10 @@
     python examples/several_projectors.py [--projectors N] [--frames N]
 
 Starts N projectors of one thread and a twin on free ports of this machine, scans with the first
-alone, with all, and with `flexdt up`, whose own projector is one more, and compares the images byte
-for byte. On other machines start `flexdt projector
---host ADDRESS --token-file FILE` on each, and here `flexdt twin --projectors HOST:PORT,HOST:PORT
---projector-token-file FILE`.
+alone, with all, and with `flexdt up`, whose own projector is one more, and compares the images
+byte for byte. On other machines start `flexdt projector
+--host ADDRESS --token-file FILE` on each, and here `flexdt twin --projectors
+HOST:PORT,HOST:PORT --projector-token-file FILE`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,21 @@ from flexdt.clients import TwinClient
 def start(*words: str) -> tuple[subprocess.Popen[str], int]:
     """A `flexdt` process and its port."""
     command = [sys.executable, "-m", "flexdt.clients.cli", *words, "--port", "0"]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    child = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     assert child.stdout is not None
     return child, int(json.loads(child.stdout.readline())["port"])
 
 
-def scan(ports: list[int], data: Path, frames: int, *how: str) -> tuple[dict[str, str], float]:
+def scan(
+    ports: list[int], data: Path, frames: int, *how: str
+) -> tuple[dict[str, str], float]:
     """Digests of a scan's frames, and seconds; `how` is the command and its own options."""
     pool = ",".join(f"127.0.0.1:{port}" for port in ports)
-    twin, port = start(*how, "--projectors", pool, "--data", str(data), "--speed-up", "max")
+    twin, port = start(
+        *how, "--projectors", pool, "--data", str(data), "--speed-up", "max"
+    )
     try:
         poses = [{"rot_obj": 360.0 * i / frames} for i in range(frames)]
         with TwinClient(port=port) as client:
@@ -64,7 +70,13 @@ def main() -> int:
             one, alone_s = scan(ports[:1], Path(name) / "one", o.frames, "twin")
             many, took = scan(ports, Path(name) / "many", o.frames, "twin")
             up, up_s = scan(
-                ports, Path(name) / "up", o.frames, "up", "--no-viewer", "--projector-port", "0"
+                ports,
+                Path(name) / "up",
+                o.frames,
+                "up",
+                "--no-viewer",
+                "--projector-port",
+                "0",
             )
     finally:
         for child, _ in projectors:

@@ -1,4 +1,5 @@
-"""Submit a scan script and watch it: progress events while it runs, the data set's name at the end.
+"""Submit a scan script and watch it: progress events while it runs, the data set's name at the
+end.
 
 Start `flexdt up` in another terminal, then run `python examples/submit_a_script.py SCRIPT`.
 """

@@ -3,8 +3,8 @@
     python examples/tv_weights.py [--voxels 48]
 
 An ellipsoid with a hole and two inclusions: line integrals of the analytic solids, with noise.
-Prints one line a case: views, noise, and the rms error [1/mm] of FDK, SIRT and TV with each weight.
-docs/evidence/reconstruction.json has the table.
+Prints one line a case: views, noise, and the rms error [1/mm] of FDK, SIRT and TV with each
+weight. docs/evidence/reconstruction.json has the table.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ def truth(count: int, fine: int = 3) -> np.ndarray:
     full += 0.03 * (((x - 5) / 5) ** 2 + ((y - 3) / 4) ** 2 + ((z - 2) / 6) ** 2 < 1)
     full -= 0.03 * ((abs(x + 7) < 3) & (abs(y + 2) < 3.5) & (abs(z) < 4.5))
     full += 0.05 * ((x - 2) ** 2 + (y + 7) ** 2 + (z + 4) ** 2 < 9)
-    return np.asarray(full.reshape(count, fine, count, fine, count, fine).mean(axis=(1, 3, 5)))
+    return np.asarray(
+        full.reshape(count, fine, count, fine, count, fine).mean(axis=(1, 3, 5))
+    )
 
 
 def errors(views: int, noise: float, count: int) -> list[float]:
@@ -60,7 +62,9 @@ def main() -> None:
     parser.add_argument("--voxels", type=int, default=48)
     count = parser.parse_args().voxels
     for views, noise in CASES:
-        print(views, noise, *(f"{e:.4f}" for e in errors(views, noise, count)), flush=True)
+        print(
+            views, noise, *(f"{e:.4f}" for e in errors(views, noise, count)), flush=True
+        )
 
 
 if __name__ == "__main__":

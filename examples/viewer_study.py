@@ -3,8 +3,8 @@
     python examples/viewer_study.py                   # rates and latency, about a minute
     python examples/viewer_study.py --minutes 30      # and memory under half an hour of motion
 
-Starts its own servers on free ports. The browser parts need Debian's chromium and playwright and
-are left out, with a word, where either is missing.
+Starts its own servers on free ports. The browser parts need Debian's chromium and playwright
+and are left out, with a word, where either is missing.
 """
 
 from __future__ import annotations
@@ -37,7 +37,16 @@ PAGES = 3
 def servers() -> Iterator[dict[str, Any]]:
     """`flexdt up` on free ports; its ready line."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["--port", "0", "--projector-port", "0", "--viewer-port", "0", "--data", folder]
+        words = [
+            "--port",
+            "0",
+            "--projector-port",
+            "0",
+            "--viewer-port",
+            "0",
+            "--data",
+            folder,
+        ]
         process = subprocess.Popen(
             [sys.executable, "-m", "flexdt.clients.launch.up", *words],
             stdout=subprocess.PIPE,
@@ -77,13 +86,21 @@ async def rates(viewer: str) -> list[dict[str, float]]:
         pages = [
             Page(
                 await stack.enter_async_context(
-                    connect(f"ws://{viewer}/ws/{os.urandom(8).hex()}", max_size=None, proxy=None)
+                    connect(
+                        f"ws://{viewer}/ws/{os.urandom(8).hex()}",
+                        max_size=None,
+                        proxy=None,
+                    )
                 )
             )
             for _ in range(PAGES)
         ]
         await asyncio.gather(*(p.listen(2.0) for p in pages))
-        move = {"id": 1, "method": "axes.move", "params": {"targets": {"rot_obj": 1000.0}}}
+        move = {
+            "id": 1,
+            "method": "axes.move",
+            "params": {"targets": {"rot_obj": 1000.0}},
+        }
         await pages[0].socket.send(json.dumps(move))
         await asyncio.gather(*(p.listen(2.0) for p in pages))
         for page in pages:
@@ -120,7 +137,9 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        chromium = playwright.chromium.launch(
+            executable_path=CHROMIUM, headless=True, args=FLAGS
+        )
         page = chromium.new_page(viewport={"width": 1280, "height": 800})
         page.goto(f"{url}?view={view}&theme=light")
         page.wait_for_function("window.flexdt?.store.image", timeout=120_000)
@@ -135,7 +154,9 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
         page.wait_for_timeout(int(SECONDS * 1000))
         after, took = page.evaluate(counts), time.monotonic() - begun
         used = cpu_s(pid) - used
-        shown, images, states = ((b - a) / took for a, b in zip(before, after, strict=True))
+        shown, images, states = (
+            (b - a) / took for a, b in zip(before, after, strict=True)
+        )
         result: dict[str, Any] = {
             "view": view,
             "latency_ms": {
@@ -168,13 +189,16 @@ def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
     while time.monotonic() < end:
         page.evaluate(
             "(() => { const a = flexdt.store.state.axes.rot_obj; if (!a.moving)"
-            " flexdt.call('axes.move', {targets: {rot_obj: a.position > 0 ? -7000 : 7000}}); })()"
+            " flexdt.call('axes.move', {targets: {rot_obj: a.position > 0 ? -7000 : "
+            "7000}}); })()"
         )
         page.wait_for_timeout(min(30_000, int(60_000 * minutes / 4)))
         resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf(
             "SC_PAGE_SIZE"
         )
-        session.send("HeapProfiler.collectGarbage")  # what is in use, not what is not yet swept
+        session.send(
+            "HeapProfiler.collectGarbage"
+        )  # what is in use, not what is not yet swept
         heap = session.send("Runtime.getHeapUsage")["usedSize"]
         samples.append(
             {
@@ -191,7 +215,11 @@ def viewer_pid(port: int) -> int:
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             words = (entry / "cmdline").read_bytes().split(b"\0")
-            if b"flexdt.clients.viewer.main" in words and int(entry.name) and _owns(entry, port):
+            if (
+                b"flexdt.clients.viewer.main" in words
+                and int(entry.name)
+                and _owns(entry, port)
+            ):
                 return int(entry.name)
     raise LookupError("the viewer's process is not to be found")
 
@@ -200,7 +228,10 @@ def _owns(entry: Path, port: int) -> bool:
     sockets = {os.readlink(f) for f in (entry / "fd").iterdir()}
     for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
         fields = line.split()
-        if int(fields[1].rsplit(":", 1)[1], 16) == port and f"socket:[{fields[9]}]" in sockets:
+        if (
+            int(fields[1].rsplit(":", 1)[1], 16) == port
+            and f"socket:[{fields[9]}]" in sockets
+        ):
             return True
     return False
 
@@ -208,8 +239,12 @@ def _owns(entry: Path, port: int) -> bool:
 def main() -> int:
     """Print one JSON document."""
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--minutes", type=float, default=0.0, help="of motion, for memory")
-    options.add_argument("--view", default="iso", help="what the page shows: iso, four, none, ...")
+    options.add_argument(
+        "--minutes", type=float, default=0.0, help="of motion, for memory"
+    )
+    options.add_argument(
+        "--view", default="iso", help="what the page shows: iso, four, none, ..."
+    )
     chosen = options.parse_args()
     with servers() as ready:
         at = ready["viewer"]

@@ -94,7 +94,8 @@ _HOMES: _typing.Final = {
     "sirt": "flexdt.twin.reconstruction.iterative",
     "tv": "flexdt.twin.reconstruction.tv",
 }
-"""Name -> module, or MODULE:ATTRIBUTE where the names differ; a module itself ends with a colon."""
+"""Name -> module, or MODULE:ATTRIBUTE where the names differ; a module itself ends with a
+colon."""
 
 __all__ = sorted(["__version__", *_HOMES])
 

@@ -1,8 +1,8 @@
 """Building blocks of commands and file formats in other distributions, such as flexdt's
 extensions.
 
-A command is a function whose parameters' defaults are its options; it yields lines for people and,
-once, the document of `--json`. The entry point group `flexdt.commands` gives it a name:
+A command is a function whose parameters' defaults are its options; it yields lines for people
+and, once, the document of `--json`. The entry point group `flexdt.commands` gives it a name:
 
     [project.entry-points."flexdt.commands"]
     study = "my_package.study_command:study"

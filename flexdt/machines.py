@@ -4,4 +4,6 @@ import warnings
 
 from flexdt.library.machines import *  # noqa: F403
 
-warnings.warn("flexdt.machines is now flexdt.library.machines", DeprecationWarning, stacklevel=2)
+warnings.warn(
+    "flexdt.machines is now flexdt.library.machines", DeprecationWarning, stacklevel=2
+)

@@ -12,7 +12,9 @@ from flexdt.twin.projection.kernels import siddon_kernels
 from flexdt.twin.projection.kernels.compiling import parallel
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt.twin.reconstruction.feldkamp.fdk_views import view_table
-from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as gpu_fdk_kernels
+from flexdt.twin.reconstruction.kernels import (
+    gpu_reconstruction_kernels as gpu_fdk_kernels,
+)
 
 __all__ = [
     "box_of",

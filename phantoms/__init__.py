@@ -22,7 +22,13 @@ from flexdt.phantoms.files.phantom_files import load_phantom_file
 from flexdt.phantoms.materials import Material, material, materials, stated_keV
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
-from flexdt.phantoms.samples import as_phantom, is_shipped, load_phantom, phantom_names, shepp_logan
+from flexdt.phantoms.samples import (
+    as_phantom,
+    is_shipped,
+    load_phantom,
+    phantom_names,
+    shepp_logan,
+)
 
 __all__ = [
     "Material",

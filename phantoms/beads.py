@@ -39,7 +39,9 @@ MAX_BEADS: Final = 10_000
 """Largest number of beads of a phantom."""
 
 
-def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> FloatArray:
+def spiral_positions(
+    size_mm: Sequence[float], beads: int, radius_mm: float
+) -> FloatArray:
     """Compute bead centres on the elliptic spiral that fits a cuboid.
 
     Unity's y_k = (k/(K-1) - 1/2)(H - 2r) at angle 2 pi k / K on semi-axes W/2 - r (x) and
@@ -66,18 +68,25 @@ def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> 
         raise LimitError.instead(f"{beads} beads asked", beads, f"1 to {MAX_BEADS}")
     if not 0.0 < min(width, breadth, height) <= max(width, breadth, height) < math.inf:
         message = f"a cuboid of {width:g} x {breadth:g} x {height:g} mm cannot be"
-        raise LimitError.instead(message, [width, breadth, height], "sides of more than 0 mm")
+        raise LimitError.instead(
+            message, [width, breadth, height], "sides of more than 0 mm"
+        )
     if not 0.0 < 2.0 * radius_mm <= min(width, breadth, height):
         raise LimitError(
             f"a bead of radius {radius_mm:g} mm does not fit into {width:g} x {breadth:g} x "
-            f"{height:g} mm; allowed: more than 0 and at most {min(width, breadth, height) / 2:g}",
+            f"{height:g} mm; allowed: more than 0 and at most "
+            f"{min(width, breadth, height) / 2:g}",
             {"asked": radius_mm, "allowed": [0.0, min(width, breadth, height) / 2]},
         )
     k = np.arange(beads, dtype=np.float64)
     y = (k / (beads - 1) - 0.5) * (height - 2.0 * radius_mm) if beads > 1 else np.zeros(1)
     angle = 2.0 * math.pi * k / beads
     unity = np.stack(
-        [(width / 2 - radius_mm) * np.cos(angle), y, (breadth / 2 - radius_mm) * np.sin(angle)],
+        [
+            (width / 2 - radius_mm) * np.cos(angle),
+            y,
+            (breadth / 2 - radius_mm) * np.sin(angle),
+        ],
         axis=1,
     )
     return from_unity(unity)
@@ -180,7 +189,8 @@ def bead_phantom(
     overlap = worst_overlap(centers, radii)
     if overlap is not None:
         assumed += (
-            f"the spiral makes beads {overlap[0]} and {overlap[1]} overlap by {overlap[2]:.3g} mm; "
+            f"the spiral makes beads {overlap[0]} and {overlap[1]} overlap by "
+            f"{overlap[2]:.3g} mm; "
             "attenuation adds up there",
         )
     return cuboid_with_beads(
@@ -235,7 +245,9 @@ def cuboid_with_beads(
         mu = material(bead_material).mu_per_mm - surrounding
         x, y, z = (float(c) for c in center)
         solids.append(Solid(Sphere((x, y, z), float(radius)), bead_material, mu))
-    return Phantom(name, description, Scene(tuple(solids)), size_mm, centers, radii, assumed)
+    return Phantom(
+        name, description, Scene(tuple(solids)), size_mm, centers, radii, assumed
+    )
 
 
 def chiral_phantom() -> Phantom:
@@ -249,7 +261,9 @@ def chiral_phantom() -> Phantom:
         >>> chiral_phantom().beads.shape
         (4, 3)
     """
-    centers = np.array([[14.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 18.0], [-6.0, 2.0, -9.0]])
+    centers = np.array(
+        [[14.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 18.0], [-6.0, 2.0, -9.0]]
+    )
     return cuboid_with_beads(
         "chiral",
         (40.0, 34.0, 46.0),
@@ -277,11 +291,17 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
         )
 
 
-def worst_overlap(centers: FloatArray, radii: FloatArray) -> tuple[int, int, float] | None:
+def worst_overlap(
+    centers: FloatArray, radii: FloatArray
+) -> tuple[int, int, float] | None:
     """Find the two beads that overlap most and by how much [mm], or None."""
     worst: tuple[int, int, float] | None = None
     for i in range(len(centers) - 1):
-        gap = np.linalg.norm(centers[i + 1 :] - centers[i], axis=1) - radii[i + 1 :] - radii[i]
+        gap = (
+            np.linalg.norm(centers[i + 1 :] - centers[i], axis=1)
+            - radii[i + 1 :]
+            - radii[i]
+        )
         j = int(np.argmin(gap))
         if gap[j] < -1e-9 and (worst is None or -gap[j] > worst[2]):
             worst = (i, i + 1 + j, float(-gap[j]))

@@ -67,7 +67,12 @@ def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
     angle = 2.0 * math.pi * v["spiral_turns"] * k / stack.bricks
     z = -height / 2.0 + k * v["brick_height_mm"] + v["bead_height_in_brick_mm"]
     return np.stack(
-        [(width / 2.0 - inset) * np.cos(angle), (breadth / 2.0 - inset) * np.sin(angle), z], axis=1
+        [
+            (width / 2.0 - inset) * np.cos(angle),
+            (breadth / 2.0 - inset) * np.sin(angle),
+            z,
+        ],
+        axis=1,
     )
 
 
@@ -114,8 +119,12 @@ def brick_shapes(
             x = (i - (studs[0] - 2) / 2) * pitch
             y = (j - (studs[1] - 2) / 2) * pitch
             foot = at(x, y, floor + depth / 2)
-            out.append((analytic.Cylinder(foot, v["tube_outer_diameter_mm"] / 2, depth), 1.0))
-            out.append((analytic.Cylinder(foot, v["tube_inner_diameter_mm"] / 2, depth), -1.0))
+            out.append(
+                (analytic.Cylinder(foot, v["tube_outer_diameter_mm"] / 2, depth), 1.0)
+            )
+            out.append(
+                (analytic.Cylinder(foot, v["tube_inner_diameter_mm"] / 2, depth), -1.0)
+            )
     return out
 
 
@@ -175,7 +184,9 @@ class Brickwork:
         ]
         # In the cavities, touching no plastic: nothing to subtract.
         solids += [
-            analytic.Solid(analytic.Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm)
+            analytic.Solid(
+                analytic.Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm
+            )
             for x, y, z in beads.tolist()
         ]
         return analytic.Scene(tuple(solids))

@@ -86,7 +86,9 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
             material(name),
             Scene(tuple(solids)),
             longest * max(1.0, *(abs(s.mu_per_mm) for s in solids)),
-            "materials without composition are taken as water" if name in stand_ins else "",
+            "materials without composition are taken as water"
+            if name in stand_ins
+            else "",
         )
         for name, solids in amounts.items()
     ]
@@ -102,13 +104,20 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
         made_of = material(phantom.voxels.material or STAND_IN)
         density = _scaled(as_volume(phantom.voxels), made_of)
         thick = longest * max(1.0, float(np.abs(density.data).max()))
-        known_as = "" if phantom.voxels.material else "voxels are taken as water of varying density"
+        known_as = (
+            ""
+            if phantom.voxels.material
+            else "voxels are taken as water of varying density"
+        )
         out.append(Channel(made_of, density, thick, known_as))
     return tuple(out)
 
 
 def chain_through(
-    parts: Sequence[Channel], panel: Detector, tube: TubeModel, mono_keV: float | None = None
+    parts: Sequence[Channel],
+    panel: Detector,
+    tube: TubeModel,
+    mono_keV: float | None = None,
 ) -> Chain:
     """Make the chain from the paths through these materials to
     counts, see `flexdt.twin.physics`.
@@ -143,14 +152,18 @@ def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
         if mesh is not None:
             out.append((mesh, surface.mu_per_mm))
         else:
-            grid = voxelise(Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2)
+            grid = voxelise(
+                Scene(()), (surface,), phantom.size_mm, phantom.default_voxel_mm, 2
+            )
             out.append((grid, 1.0))
     if phantom.voxels is not None:
         out.append((as_volume(phantom.voxels), 1.0))
     return tuple(out)
 
 
-def line_integrals(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+def line_integrals(
+    phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]
+) -> Float32Array:
     """Compute the attenuation along every ray at the energy at which phantoms state it.
 
     Args:
@@ -226,7 +239,8 @@ def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]
         difference = made_of.mu_per_mm - other.mu_per_mm
         if (
             other is not made_of
-            and abs(solid.mu_per_mm - difference) <= ATTENUATION_TOLERANCE * made_of.mu_per_mm
+            and abs(solid.mu_per_mm - difference)
+            <= ATTENUATION_TOLERANCE * made_of.mu_per_mm
         ):
             return [(made_of.name, 1.0), (other.name, -1.0)]
     return [(made_of.name, amount)]
@@ -260,8 +274,14 @@ def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Ob
     box = (max(size_mm[0], least), max(size_mm[1], least), max(size_mm[2], least))
     edge = (math.prod(box) / voxels) ** (1.0 / 3.0)
     empty = voxelise(Scene(()), (), box, edge, 1)
-    amounts = [np.maximum(_fractions_filled(part.body, empty, box), 0.0) for part in parts]
-    data = np.stack(amounts, axis=-1) if amounts else np.zeros((*empty.data.shape, 0), np.float32)
+    amounts = [
+        np.maximum(_fractions_filled(part.body, empty, box), 0.0) for part in parts
+    ]
+    data = (
+        np.stack(amounts, axis=-1)
+        if amounts
+        else np.zeros((*empty.data.shape, 0), np.float32)
+    )
     return Object(
         np.ascontiguousarray(data, dtype=np.float32),
         empty.voxel_xyz,
@@ -282,7 +302,9 @@ def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
     x, y, z = (_overlaps(body, grid, axis) for axis in range(3))
     coarse = np.einsum("cz,zyx->cyx", z, body.data, optimize=True)
     coarse = np.einsum("cy,zyx->zcx", y, coarse, optimize=True)
-    return np.asarray(np.einsum("cx,zyx->zyc", x, coarse, optimize=True), dtype=np.float32)
+    return np.asarray(
+        np.einsum("cx,zyx->zyc", x, coarse, optimize=True), dtype=np.float32
+    )
 
 
 def _overlaps(fine: Volume, coarse: Volume, axis: int) -> FloatArray:

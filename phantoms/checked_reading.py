@@ -42,7 +42,9 @@ _KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
     "ellipsoid": analytic.Ellipsoid,
     "convex": analytic.ConvexPolyhedron,
 }
-_KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
+_KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {
+    cls: kind for kind, cls in _KINDS.items()
+}
 _OPTIONAL_FIELDS: Final = ("axis", "axes")
 
 
@@ -94,7 +96,9 @@ def fields(
         if key not in readers:
             message = f"{where}: unknown key {key!r}"
             raise PhantomError.instead(message, key, list(readers), path=f"{where}.{key}")
-    given = {name: get(value, name, where) for name in needed} | dict(mapping(value, where))
+    given = {name: get(value, name, where) for name in needed} | dict(
+        mapping(value, where)
+    )
     return {name: readers[name](one, f"{where}.{name}") for name, one in given.items()}
 
 
@@ -152,7 +156,9 @@ def unit(value: object, where: str) -> analytic.Vector:
 def axes(value: object, where: str) -> analytic.Matrix:
     """Check that `value` is three orthogonal unit vectors."""
     rows = each(value, where, unit)
-    if len(rows) != 3 or not np.allclose(np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6):
+    if len(rows) != 3 or not np.allclose(
+        np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6
+    ):
         raise wrong(value, where, "three orthogonal unit vectors")
     return (rows[0], rows[1], rows[2])
 
@@ -160,7 +166,9 @@ def axes(value: object, where: str) -> analytic.Matrix:
 Text = Annotated[str, BeforeValidator(partial(string, where=NAMED_ALREADY))]
 Number = Annotated[float, BeforeValidator(partial(number, where=NAMED_ALREADY))]
 Place = Annotated[analytic.Vector, BeforeValidator(partial(vector, where=NAMED_ALREADY))]
-Lengths = Annotated[analytic.Vector, BeforeValidator(partial(lengths, where=NAMED_ALREADY))]
+Lengths = Annotated[
+    analytic.Vector, BeforeValidator(partial(lengths, where=NAMED_ALREADY))
+]
 
 
 def packed(dtype: str) -> PlainValidator:
@@ -211,7 +219,9 @@ def _count(value: object, where: str) -> int:
     return value
 
 
-def _three(value: object, where: str, read: Callable[[object, str], float]) -> analytic.Vector:
+def _three(
+    value: object, where: str, read: Callable[[object, str], float]
+) -> analytic.Vector:
     """Read three numbers, each by `read`."""
     numbers = each(value, where, read)
     if len(numbers) != 3:

@@ -27,7 +27,11 @@ from flexdt.twin.machine.description import Machine, Profile, builtin_machine, p
 from flexdt.twin.physics.chain import Chain, flux_of, radiographs
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
-from flexdt.twin.physics.image_quality import air_kerma_mGy, contrast_to_noise, pixel_reading
+from flexdt.twin.physics.image_quality import (
+    air_kerma_mGy,
+    contrast_to_noise,
+    pixel_reading,
+)
 from flexdt.twin.physics.predicted_beam import BRIGHTEST_FILL, CountShares
 from flexdt.twin.physics.readout import expected_counts, saturating_counts
 from flexdt.twin.physics.tube import Filter, tube_of, voltages
@@ -52,13 +56,21 @@ from flexdt.twin.signatures import public
 
 SIMULATED_VIEWS: Final = 8
 """Number of views of a turn that are simulated."""
-TRANSMISSION_EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
+TRANSMISSION_EDGES: Final = np.concatenate(
+    [[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]]
+)
 """Edges of the bins of transmission: ten a decade, the open beam amid the last,
 and the rest."""
 FILTERS: Final = (
-    "", "aluminium:0.5", "aluminium:1", "aluminium:2", "copper:0.1", "copper:0.25", "copper:0.5",
+    "",
+    "aluminium:0.5",
+    "aluminium:1",
+    "aluminium:2",
+    "copper:0.1",
+    "copper:0.25",
+    "copper:0.5",
     "copper:1",
-)  # fmt: skip
+)
 """Filters that are proposed, in addition to the tube's own."""
 VOID: Final = "void"
 
@@ -88,7 +100,12 @@ class Transmission:
         p1, p5, median = np.quantile(flat, (0.01, 0.05, 0.5)).tolist()
         shares = (counts / flat.size).tolist()
         return cls(
-            float(flat.min()), p1, p5, median, tuple(TRANSMISSION_EDGES.tolist()), tuple(shares)
+            float(flat.min()),
+            p1,
+            p5,
+            median,
+            tuple(TRANSMISSION_EDGES.tolist()),
+            tuple(shares),
         )
 
 
@@ -143,7 +160,8 @@ class Forecast:
         """One line."""
         return (
             f"<Forecast: {self.images} images in {self.seconds:.0f} s, "
-            f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} saturated, "
+            f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} "
+            "saturated, "
             f"{self.starved:.1%} starved, best at {self.best[0].kV:g} kV>"
         )
 
@@ -247,7 +265,9 @@ def expose(
         seconds = plan.duration_s
         total = plan.bytes
     elif start is None:  # else the distances of a scanner at its start
-        distances = ScanRequest("step", sod, sdd, frames=2, exposure_ms=camera.exposure_ms)
+        distances = ScanRequest(
+            "step", sod, sdd, frames=2, exposure_ms=camera.exposure_ms
+        )
         plan = _plan_of(distances, scanner, profile, start)
     if plan is not None:
         source_mm, panel_mm = _distances(plan)
@@ -263,20 +283,28 @@ def expose(
         pixel=camera.pixel_mm(spec.pixels),
     )
     layers = _Layers(parts, scanner, filter)
-    paths, through, saturated, starved = _views(parts, layers.chains[filter], camera, cone, lit)
+    paths, through, saturated, starved = _views(
+        parts, layers.chains[filter], camera, cone, lit
+    )
     view, row, col = np.unravel_index(int(through.argmin()), through.shape)
     flux = flux_of(cone.rows[0], camera.shape)
-    ray = _Ray(tuple(paths[:, view, row, col].tolist()), float(flux[row, col]), float(flux.max()))
+    ray = _Ray(
+        tuple(paths[:, view, row, col].tolist()), float(flux[row, col]), float(flux.max())
+    )
     other = ray.with_detail(wanted, [part.material.substance for part in parts])
     seen = _SeenDetail(layers, camera, ray, other, sod, images)
     low, high = _voltages(scanner)
-    kVs = tried if len(tried) > 1 else np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
+    kVs = (
+        tried if len(tried) > 1 else np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
+    )
     found = [
         seen.setting(layer, seen.unsaturated(layer, replace(lit, kV=float(one))))
         for layer in FILTERS
         for one in kVs
     ]
-    best = [s for s in found if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms]
+    best = [
+        s for s in found if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms
+    ]
     return Forecast(
         Transmission.of(through),
         saturated,
@@ -338,14 +366,18 @@ def _check_settings(
             if not low_end <= value <= high_end or (counted and value != int(value)):
                 integers = "whole numbers from " if counted else ""
                 raise LimitError(
-                    f"{what} is {value:g}; allowed with {machine.name}: {integers}{low_end:g} to "
+                    f"{what} is {value:g}; allowed with {machine.name}: "
+                    f"{integers}{low_end:g} to "
                     f"{high_end:g}",
                     {"asked": value, "allowed": [low_end, high_end]},
                 )
 
 
 def _plan_of(
-    request: ScanRequest, machine: Machine, profile: Profile | None, start: StartState | None
+    request: ScanRequest,
+    machine: Machine,
+    profile: Profile | None,
+    start: StartState | None,
 ) -> ScanPlan:
     """Compose a script for a request and plan it.
 
@@ -517,7 +549,8 @@ class _Ray:
         if substance is not None:
             return replace(self, added=(substance, thickness))
         weights = [
-            s.attenuation().mean() * d for s, d in zip(substances, self.paths_mm, strict=True)
+            s.attenuation().mean() * d
+            for s, d in zip(substances, self.paths_mm, strict=True)
         ]
         most = int(np.argmax(weights))
         if thickness > self.paths_mm[most]:

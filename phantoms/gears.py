@@ -1,7 +1,7 @@
 """A printed gear with its pinion: a sample without metal, for a first scan.
 
-Both have teeth that slant one way and back, so that no slice is like the next one, and the rim has
-pores that only a volume shows. Its measures are this project's own, not a real part's.
+Both have teeth that slant one way and back, so that no slice is like the next one, and the rim
+has pores that only a volume shows. Its measures are this project's own, not a real part's.
 """
 
 from __future__ import annotations
@@ -56,14 +56,17 @@ def gear_phantom() -> Phantom:
     (40.0, 40.0, 30.0)
     """
     plastic = material(MATERIAL)
-    rings = [*_teeth(GEAR_TEETH, GEAR_RADII_MM, LEVELS_MM[:2], SLANT_DEG[0]),
-             *_teeth(PINION_TEETH, PINION_RADII_MM, LEVELS_MM[1:], SLANT_DEG[1])]  # fmt: skip
+    rings = [
+        *_teeth(GEAR_TEETH, GEAR_RADII_MM, LEVELS_MM[:2], SLANT_DEG[0]),
+        *_teeth(PINION_TEETH, PINION_RADII_MM, LEVELS_MM[1:], SLANT_DEG[1]),
+    ]
     inner = [_circle(level) for level in (LEVELS_MM[2], LEVELS_MM[0])]
     vertices, faces = _closed([*rings, *inner])
     body = Surface(vertices, faces, plastic.name, plastic.mu_per_mm)
     return Phantom(
         "gear",
-        f"gear of {GEAR_TEETH} teeth with a pinion of {PINION_TEETH}, printed of {plastic.name}, "
+        f"gear of {GEAR_TEETH} teeth with a pinion of {PINION_TEETH}, printed of "
+        f"{plastic.name}, "
         f"with {len(PORES_MM)} pores",
         Scene(tuple(_holes(plastic))),
         size_about_origin(Scene(()), [body]),
@@ -104,11 +107,16 @@ def _circle(level_mm: float) -> Ring:
     """A ring of the bore (n, 3)."""
     angle = _angles()
     flat = np.full(len(angle), level_mm)
-    return np.stack([BORE_RADIUS_MM * np.cos(angle), BORE_RADIUS_MM * np.sin(angle), flat], axis=1)
+    return np.stack(
+        [BORE_RADIUS_MM * np.cos(angle), BORE_RADIUS_MM * np.sin(angle), flat], axis=1
+    )
 
 
 def _teeth(
-    teeth: int, radii_mm: tuple[float, float], levels_mm: tuple[float, ...], slant_deg: float
+    teeth: int,
+    radii_mm: tuple[float, float],
+    levels_mm: tuple[float, ...],
+    slant_deg: float,
 ) -> list[Ring]:
     """Rings (n, 3) of a gear from its bottom to its top."""
     foot, tip = radii_mm

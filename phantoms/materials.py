@@ -15,7 +15,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 
-from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula, tables
+from flexdt.twin.attenuation.substances import (
+    Substance,
+    mass_fractions,
+    parse_formula,
+    tables,
+)
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 
@@ -62,12 +67,17 @@ class Material:
         Raises:
             LimitError: the energy is outside the table.
         """
-        ends = tables().energy_keV if not self.points else [energy for energy, _ in self.points]
+        ends = (
+            tables().energy_keV
+            if not self.points
+            else [energy for energy, _ in self.points]
+        )
         low = float(ends[0])
         high = float(ends[-1])
         if not low <= energy_keV <= high:
             raise LimitError(
-                f"{self.name}: {energy_keV:g} keV is outside the table's [{low:g}, {high:g}] keV",
+                f"{self.name}: {energy_keV:g} keV is outside the table's [{low:g}, "
+                f"{high:g}] keV",
                 {"asked": energy_keV, "allowed": [low, high], "unit": "keV"},
             )
         if not self.points:
@@ -84,7 +94,9 @@ class Material:
 @lru_cache
 def materials() -> Mapping[str, Material]:
     """Load all bundled materials by name."""
-    text = (resources.files("flexdt.phantoms") / "data" / "materials.toml").read_text("utf-8")
+    text = (resources.files("flexdt.phantoms") / "data" / "materials.toml").read_text(
+        "utf-8"
+    )
     document = tomllib.loads(text)
     return {
         name: Material(
@@ -122,7 +134,8 @@ def material(name: str) -> Material:
     if "@" in name:
         return _by_formula(name)
     raise UnknownNameError(
-        f"unknown material {name!r}; there are: {', '.join(table)}, and FORMULA@DENSITY such as "
+        f"unknown material {name!r}; there are: {', '.join(table)}, and FORMULA@DENSITY "
+        "such as "
         "C8H8@1.05 (g/cm3)",
         {"asked": name, "allowed": [*table, "FORMULA@DENSITY"]},
     )

@@ -83,7 +83,9 @@ def cut(
             for (other, its), (bottom, top) in zip(pieces, boxes, strict=True)
             if its > rank and (low < top).all() and (bottom < high).all()
         ]
-        rest = _outside(_filled(one), [_filled(other) for other in above]) if above else one
+        rest = (
+            _outside(_filled(one), [_filled(other) for other in above]) if above else one
+        )
         left += [] if rest is None else [rest]
     return (
         analytic.Scene(tuple(one for one in left if isinstance(one, analytic.Solid))),
@@ -106,10 +108,14 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
     """
     if isinstance(one, Surface):
         return one
-    if not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron) or one.mu_per_mm < 0.0:
+    if (
+        not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron)
+        or one.mu_per_mm < 0.0
+    ):
         what = type(one.shape).__name__.lower() if one.mu_per_mm > 0.0 else "hole"
         raise PhantomError(
-            f"a {what} of {one.material} overlaps something of another priority; allowed: meshes, "
+            f"a {what} of {one.material} overlaps something of another priority; "
+            "allowed: meshes, "
             "boxes and convex solids. A round solid names what it replaces instead",
             {"asked": what, "allowed": ["mesh", "box", "convex"]},
         )
@@ -128,14 +134,18 @@ def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
 
     solids = [
         _solid(mesh, _bodies(mesh))
-        for mesh in (TriangleMesh(s.vertices, s.faces.astype(np.int64)) for s in (surface, *others))
+        for mesh in (
+            TriangleMesh(s.vertices, s.faces.astype(np.int64)) for s in (surface, *others)
+        )
     ]
     left = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Subtract)
     if left.is_empty():
         return None
     mesh64 = left.to_mesh64()
     return replace(
-        surface, vertices=mesh64.vert_properties[:, :3], faces=mesh64.tri_verts.astype(np.int32)
+        surface,
+        vertices=mesh64.vert_properties[:, :3],
+        faces=mesh64.tri_verts.astype(np.int32),
     )
 
 
@@ -164,7 +174,9 @@ def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
     return bool((meet & meet.T & ~np.eye(len(bodies), dtype=bool)).any())
 
 
-def _solid(mesh: TriangleMesh, bodies: Sequence[npt.NDArray[np.int64]]) -> manifold3d.Manifold:
+def _solid(
+    mesh: TriangleMesh, bodies: Sequence[npt.NDArray[np.int64]]
+) -> manifold3d.Manifold:
     """Unite the bodies, each without the cavities in it.
 
     Args:
@@ -181,17 +193,26 @@ def _solid(mesh: TriangleMesh, bodies: Sequence[npt.NDArray[np.int64]]) -> manif
     boxes = [(three.min(axis=(0, 1)), three.max(axis=(0, 1))) for three in corners]
     shells = {i: [bodies[i]] for i, volume in enumerate(volumes) if volume > 0}
     for i, (low, high) in enumerate(boxes):
-        around = [j for j in shells if (boxes[j][0] <= low).all() and (high <= boxes[j][1]).all()]
+        around = [
+            j
+            for j in shells
+            if (boxes[j][0] <= low).all() and (high <= boxes[j][1]).all()
+        ]
         if volumes[i] <= 0 and around:
             shells[min(around, key=volumes.__getitem__)].append(bodies[i])
     solids = []
     for faces in shells.values():
-        used, triangles = np.unique(mesh.faces[np.concatenate(faces)], return_inverse=True)
-        given = manifold3d.Mesh64(mesh.vertices[used], triangles.reshape(-1, 3).astype(np.uint64))
+        used, triangles = np.unique(
+            mesh.faces[np.concatenate(faces)], return_inverse=True
+        )
+        given = manifold3d.Mesh64(
+            mesh.vertices[used], triangles.reshape(-1, 3).astype(np.uint64)
+        )
         solids.append(manifold3d.Manifold(given))
         if solids[-1].status() != manifold3d.Error.NoError:
             raise PhantomError(
-                f"a mesh's surface meets itself ({solids[-1].status().name}); it cannot be united "
+                f"a mesh's surface meets itself ({solids[-1].status().name}); it cannot "
+                "be united "
                 "with or cut out of another"
             )
     return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)

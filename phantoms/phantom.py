@@ -46,7 +46,9 @@ _Scene = Annotated[
     PlainSerializer(scene_to_dict, when_used="json"),
 ]
 _LIST = PlainSerializer(np.ndarray.tolist, when_used="json")
-_PLACES = PlainValidator(partial(reading.each, where="phantom.beads", read=reading.vector))
+_PLACES = PlainValidator(
+    partial(reading.each, where="phantom.beads", read=reading.vector)
+)
 _RADII = PlainValidator(
     partial(reading.each, where="phantom.bead_radius_mm", read=reading.positive)
 )
@@ -72,7 +74,9 @@ class Phantom(ArrayValue):
     description: reading.Text
     scene: _Scene
     size_mm: reading.Lengths
-    beads: Annotated[FloatArray, _PLACES, _LIST] = field(default_factory=lambda: np.zeros((0, 3)))
+    beads: Annotated[FloatArray, _PLACES, _LIST] = field(
+        default_factory=lambda: np.zeros((0, 3))
+    )
     bead_radius_mm: Annotated[FloatArray, _RADII, _LIST] = field(
         default_factory=lambda: np.zeros(0)
     )
@@ -151,7 +155,9 @@ class Phantom(ArrayValue):
         """
         if self.voxels is not None:
             if not self.is_voxels:
-                raise PhantomError(f"{self.name}: voxels cannot be put together with other parts")
+                raise PhantomError(
+                    f"{self.name}: voxels cannot be put together with other parts"
+                )
             return as_volume(self.voxels)
         voxel = self.default_voxel_mm if voxel_mm is None else voxel_mm
         return voxelise(self.scene, self.surfaces, self.size_mm, voxel, oversample)
@@ -159,7 +165,10 @@ class Phantom(ArrayValue):
     def to_dict(self) -> dict[str, object]:
         """Convert to a JSON-able document; `from_dict` makes an equal phantom of it."""
         document = adapter_of(Phantom).dump_python(self, mode="json", exclude_none=True)
-        for place, name in ((document, "surfaces"), (document.get("voxels", {}), "materials")):
+        for place, name in (
+            (document, "surfaces"),
+            (document.get("voxels", {}), "materials"),
+        ):
             if not place.get(name):  # left out where there are none
                 place.pop(name, None)
         return {"schema": SCHEMA, **document}
@@ -184,7 +193,10 @@ class Phantom(ArrayValue):
 
 
 def assemble(
-    name: str, parts: Sequence[Phantom], description: str = "", priority: Sequence[float] = ()
+    name: str,
+    parts: Sequence[Phantom],
+    description: str = "",
+    priority: Sequence[float] = (),
 ) -> Phantom:
     """Join several phantoms; attenuation adds up where they overlap.
 
@@ -205,9 +217,13 @@ def assemble(
             {"asked": len(priority), "allowed": len(parts)},
         )
     if not parts:
-        raise PhantomError(f"{name}: there is nothing in it", {"asked": 0, "allowed": "1 or more"})
+        raise PhantomError(
+            f"{name}: there is nothing in it", {"asked": 0, "allowed": "1 or more"}
+        )
     if len(parts) == 1:
-        return replace(parts[0], name=name, description=description or parts[0].description)
+        return replace(
+            parts[0], name=name, description=description or parts[0].description
+        )
     grids = [p.name for p in parts if p.voxels is not None]
     if grids:
         raise PhantomError(

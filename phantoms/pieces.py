@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.checked_reading import PACK, Lengths, Number, PhantomError, Place, Text, packed
+from flexdt.phantoms.checked_reading import (
+    PACK,
+    Lengths,
+    Number,
+    PhantomError,
+    Place,
+    Text,
+    packed,
+)
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import analytic_solids as analytic
 from flexdt.twin.projection.analytic_solids import as_convex
@@ -81,7 +89,8 @@ class Voxels(ArrayValue):
             labels = np.array(self.labels, dtype=np.uint8)
             if labels.shape != data.shape or int(labels.max()) > len(self.materials):
                 raise PhantomError(
-                    f"labels have shape {labels.shape} and end at {labels.max()}; allowed: shape "
+                    f"labels have shape {labels.shape} and end at {labels.max()}; "
+                    "allowed: shape "
                     f"{data.shape}, 0 to {len(self.materials)}"
                 )
             freeze(self, labels=labels)
@@ -102,11 +111,15 @@ def boxes(
     found += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]
     if voxels is not None:
         half = np.array(voxels.voxel_mm) * voxels.data.shape[::-1] / 2.0
-        found.append((np.array(voxels.center_mm) - half, np.array(voxels.center_mm) + half))
+        found.append(
+            (np.array(voxels.center_mm) - half, np.array(voxels.center_mm) + half)
+        )
     return found
 
 
-def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -> analytic.Vector:
+def size_about_origin(
+    scene: analytic.Scene, surfaces: Sequence[Surface] = ()
+) -> analytic.Vector:
     """Compute the full extent along x, y, z [mm] of the box about the origin
     that contains everything.
 

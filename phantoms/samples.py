@@ -24,7 +24,12 @@ from flexdt.phantoms.beads import CUBOIDS_MM, DEFAULT_BEADS, bead_phantom, chira
 from flexdt.phantoms.bricks import lego_phantom
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.files import phantom_files as files
-from flexdt.phantoms.files.mesh_files import FORMATS, filled_mesh, mesh_phantom, voxel_phantom
+from flexdt.phantoms.files.mesh_files import (
+    FORMATS,
+    filled_mesh,
+    mesh_phantom,
+    voxel_phantom,
+)
 from flexdt.phantoms.gears import gear_phantom
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
@@ -56,8 +61,11 @@ FILLED_TOLERANCE: Final = 1e-3
 TEXT_SUFFIXES: Final = (".toml", ".json")
 """Suffixes of phantom and scene files."""
 ALLOWED_FORMS: Final = (
-    "a phantom or its name, the path of a file (TOML, JSON, " + ", ".join(FORMATS).upper() + "), a "
-    "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene or Solid, a "
+    "a phantom or its name, the path of a file (TOML, JSON, "
+    + ", ".join(FORMATS).upper()
+    + "), a "
+    "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene "
+    "or Solid, a "
     "dictionary as in a scene file, (any of these, material), or a list of them"
 )
 """Kinds of samples, for error messages."""
@@ -82,11 +90,14 @@ def shepp_logan(size_mm: float = 50.0) -> Phantom:
         a, b, c = (half * s for s in semi_axes)
         x, y, z = (half * p for p in center)
         axes = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
-        solids.append(Solid(Ellipsoid((x, y, z), (a, b, c), axes), "water", contrast * water))
+        solids.append(
+            Solid(Ellipsoid((x, y, z), (a, b, c), axes), "water", contrast * water)
+        )
     skull = _ELLIPSOIDS[0][1]
     return Phantom(
         "shepp-logan",
-        f"Shepp-Logan head phantom of ten ellipsoids in a {size_mm:g} mm cube, contrast times the "
+        f"Shepp-Logan head phantom of ten ellipsoids in a {size_mm:g} mm cube, contrast "
+        "times the "
         "attenuation of water",
         Scene(tuple(solids)),
         (size_mm * skull[0], size_mm * skull[1], size_mm * skull[2]),
@@ -217,7 +228,11 @@ def _one(
         return _array(sample, material, voxel_mm)
     if hasattr(sample, "vertices") and hasattr(sample, "faces"):
         return _mesh(given, material, keep)
-    if isinstance(sample, tuple) and len(sample) == 2 and isinstance(sample[1], str | Mapping):
+    if (
+        isinstance(sample, tuple)
+        and len(sample) == 2
+        and isinstance(sample[1], str | Mapping)
+    ):
         return _one(sample[0], sample[1], voxel_mm, keep)
     _require_none(material, f"a {type(sample).__name__}")
     if isinstance(sample, Phantom):
@@ -265,7 +280,8 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
     if kind in TEXT_SUFFIXES or path.is_file():
         return files.read_phantom_file(path)
     raise UnknownNameError(
-        f"no sample {word!r}: neither a phantom that ships ({', '.join(phantom_names())}) nor a "
+        f"no sample {word!r}: neither a phantom that ships "
+        f"({', '.join(phantom_names())}) nor a "
         f"file ending with {', '.join(TEXT_SUFFIXES)}, {', '.join('.' + f for f in FORMATS)}",
         {"asked": word, "allowed": list(phantom_names())},
     )
@@ -298,8 +314,10 @@ def _array(
         high = float(data.max())
         if low < -FILLED_TOLERANCE or high > 1.0 + FILLED_TOLERANCE:
             raise PhantomError(
-                f"with material={material!r} an array holds the part of each voxel that it fills, "
-                f"0 to 1, and this one goes from {low:g} to {high:g}; for an array of labels give "
+                f"with material={material!r} an array holds the part of each voxel that "
+                "it fills, "
+                f"0 to 1, and this one goes from {low:g} to {high:g}; for an array of "
+                "labels give "
                 "material={1: ...}",
                 {"asked": [low, high], "allowed": [0, 1]},
             )
@@ -307,7 +325,9 @@ def _array(
     return voxel_phantom(data, voxel_mm, material=material)
 
 
-def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None) -> Phantom:
+def _labelled(
+    sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None
+) -> Phantom:
     """Make voxels of several materials from an array of labels or a Volume that holds them.
 
     Args:
@@ -334,11 +354,14 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
     unknown = np.unique(labels[~known]).tolist()
     if unknown or 0 in names or len(order) > 256:
         raise PhantomError(
-            f"labels {unknown or list(names)}: allowed are 0 for nothing and the at most 255 that "
+            f"labels {unknown or list(names)}: allowed are 0 for nothing and the at most "
+            "255 that "
             f"have a material ({', '.join(map(str, order[1:]))})",
             {"asked": unknown or list(names), "allowed": order},
         )
-    mu = np.array([0.0, *(material_of(names[key]).mu_per_mm for key in order[1:])], np.float32)
+    mu = np.array(
+        [0.0, *(material_of(names[key]).mu_per_mm for key in order[1:])], np.float32
+    )
     if isinstance(sample, Volume):
         phantom = voxel_phantom(mu[index], sample.voxel_xyz, center_mm=sample.center_mm)
     else:
@@ -362,7 +385,9 @@ def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
 
 def _solids(scene: Scene) -> Phantom:
     """Make the phantom of a scene."""
-    return Phantom("scene", f"{len(scene.solids)} solids", scene, size_about_origin(scene))
+    return Phantom(
+        "scene", f"{len(scene.solids)} solids", scene, size_about_origin(scene)
+    )
 
 
 def _shown(sample: object) -> str:

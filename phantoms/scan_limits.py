@@ -22,7 +22,11 @@ from flexdt.twin.script.scan_request import ScanRequest
 
 __all__ = ["check_distances", "check_placement", "check_tube", "open_beam_doubts"]
 
-USELESS_PLACEMENTS: Final = ("source in the sample", "panel in the sample", "sample not seen")
+USELESS_PLACEMENTS: Final = (
+    "source in the sample",
+    "panel in the sample",
+    "sample not seen",
+)
 """Findings about placements whose images are useless."""
 
 
@@ -82,7 +86,11 @@ def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int])
     half = np.array(phantom.size_mm) / 2.0
     found = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
     settled(
-        [replace(one, severity=Severity.REFUSAL) for one in found if one.kind in USELESS_PLACEMENTS]
+        [
+            replace(one, severity=Severity.REFUSAL)
+            for one in found
+            if one.kind in USELESS_PLACEMENTS
+        ]
     )
 
 

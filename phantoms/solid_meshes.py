@@ -115,7 +115,9 @@ def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
     """
     mesh = _mesh(solid.shape)
     if around and isinstance(solid.shape, analytic.Sphere | analytic.Ellipsoid):
-        mesh.vertices = solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()
+        mesh.vertices = (
+            solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()
+        )
     elif around and isinstance(solid.shape, analytic.Cylinder):
         axis = np.asarray(solid.shape.axis)
         out = mesh.vertices - solid.shape.center
@@ -154,7 +156,9 @@ def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
     match shape:
         case analytic.Sphere(center, radius):
             ball = _unit_ball()
-            mesh = trimesh.Trimesh(ball.vertices * radius + center, ball.faces, process=False)
+            mesh = trimesh.Trimesh(
+                ball.vertices * radius + center, ball.faces, process=False
+            )
         case analytic.Ellipsoid(center, semi_axes, axes):
             mesh = _unit_ball().copy()
             mesh.apply_transform(_placed(np.asarray(axes).T * semi_axes, center))
@@ -163,7 +167,9 @@ def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
         case analytic.Cylinder(center, radius, height, axis):
             half = np.asarray(axis) * height / 2.0
             ends = np.stack([center - half, center + half])
-            mesh = trimesh.creation.cylinder(radius, sections=CYLINDER_SECTIONS, segment=ends)
+            mesh = trimesh.creation.cylinder(
+                radius, sections=CYLINDER_SECTIONS, segment=ends
+            )
         case analytic.ConvexPolyhedron():
             mesh = trimesh.convex.convex_hull(polyhedron_corners(shape))
     return mesh

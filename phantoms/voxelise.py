@@ -29,7 +29,11 @@ _Interval = tuple[FloatArray, FloatArray]
 
 
 def voxelise(
-    scene: Scene, surfaces: Sequence[Surface], size_mm: Vector, voxel_mm: float, oversample: int
+    scene: Scene,
+    surfaces: Sequence[Surface],
+    size_mm: Vector,
+    voxel_mm: float,
+    oversample: int,
 ) -> Volume:
     """Sample the attenuation [1/mm] of a scene and of meshes on a grid about the origin.
 
@@ -69,7 +73,11 @@ def as_volume(voxels: Voxels) -> Volume:
 
 
 def _add_solid(
-    data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
+    data: npt.NDArray[np.float32],
+    shape: Shape,
+    mu: float,
+    voxel_mm: float,
+    oversample: int,
 ) -> None:
     """Add a convex solid to `data` [z, y, x], with `oversample` columns per voxel
     along x and y.
@@ -132,12 +140,19 @@ def _add_surface(
     signs = np.empty(total, dtype=np.int8)
     kernels.cross(triangles, starts, np.zeros_like(counts), heights, signs)
     leaks = kernels.add_surface(
-        data, starts, counts, heights, signs, oversample, surface.mu_per_mm / oversample**2
+        data,
+        starts,
+        counts,
+        heights,
+        signs,
+        oversample,
+        surface.mu_per_mm / oversample**2,
     )
     hit = int(np.count_nonzero(counts))
     if leaks > MAX_LEAK_SHARE * hit:
         raise PhantomError(
-            f"the mesh is not closed: {leaks} of {hit} columns through it do not end; repair it "
+            f"the mesh is not closed: {leaks} of {hit} columns through it do not end; "
+            "repair it "
             "(close holes, orient faces) and try again",
             {"asked": leaks, "allowed": int(MAX_LEAK_SHARE * hit)},
         )
@@ -163,7 +178,9 @@ def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
     return bottom, top
 
 
-def _quadric(to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
+def _quadric(
+    to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray
+) -> _Interval:
     """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded
     in an upright cylinder.
 

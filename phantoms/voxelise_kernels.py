@@ -52,7 +52,12 @@ def add_convex(data, low, high, x0, y0, oversample, value):
         for i in range(low.shape[1]):
             if high[j, i] > low[j, i]:
                 _add_interval(
-                    data, y0 + j // oversample, x0 + i // oversample, low[j, i], high[j, i], value
+                    data,
+                    y0 + j // oversample,
+                    x0 + i // oversample,
+                    low[j, i],
+                    high[j, i],
+                    value,
                 )
 
 
@@ -117,10 +122,16 @@ def cross(triangles, starts, counts, heights, signs):
     listing = heights.size > 0
     for f in range(triangles.shape[0]):
         t = triangles[f]
-        i0, i1 = _span(min(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 0], t[1, 0], t[2, 0]),
-                       counts.shape[1])  # fmt: skip
-        j0, j1 = _span(min(t[0, 1], t[1, 1], t[2, 1]), max(t[0, 1], t[1, 1], t[2, 1]),
-                       counts.shape[0])  # fmt: skip
+        i0, i1 = _span(
+            min(t[0, 0], t[1, 0], t[2, 0]),
+            max(t[0, 0], t[1, 0], t[2, 0]),
+            counts.shape[1],
+        )
+        j0, j1 = _span(
+            min(t[0, 1], t[1, 1], t[2, 1]),
+            max(t[0, 1], t[1, 1], t[2, 1]),
+            counts.shape[0],
+        )
         for j in range(j0, j1):
             for i in range(i0, i1):
                 w = _winding(t, i + 0.5, j + 0.5)
@@ -151,9 +162,13 @@ def add_surface(data, starts, counts, heights, signs, oversample, value):
                 here = a + order[k]
                 if winding != 0:
                     _add_interval(
-                        data, j // oversample, i // oversample,
-                        heights[a + order[k - 1]], heights[here], value,
-                    )  # fmt: skip
+                        data,
+                        j // oversample,
+                        i // oversample,
+                        heights[a + order[k - 1]],
+                        heights[here],
+                        value,
+                    )
                 winding += signs[here]
             if winding != 0:
                 leaks += 1

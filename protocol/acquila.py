@@ -23,9 +23,16 @@ FEEDBACK_S: Final = 0.8
 MAX_BYTES: Final = 1 << 20
 """Longest event that is read, and longest argument 1 (a script) [bytes]."""
 MAX_CHARS: Final[Mapping[str, int]] = {
-    "component": 100, "comp_phys": 1000, "command": 1000, "arg1": MAX_BYTES, "arg2": 4096,
-    "reply": 1 << 16, "reply type": 20, "comp_type": 100, "UUID": 200,
-}  # fmt: skip
+    "component": 100,
+    "comp_phys": 1000,
+    "command": 1000,
+    "arg1": MAX_BYTES,
+    "arg2": 4096,
+    "reply": 1 << 16,
+    "reply type": 20,
+    "comp_type": 100,
+    "UUID": 200,
+}
 """Longest text of each field; the names of most are given by the scanner and far shorter."""
 MAX_UUID: Final = 1e200
 """Greatest absolute value of a numeric UUID."""
@@ -33,8 +40,18 @@ BINARY_FIELDS: Final = ("arg1", "arg2", "reply")
 """Fields that may hold control characters: arguments may be binary."""
 _SURROGATE = re.compile(r"[\ud800-\udfff]")
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-FIELDS: Final = ("component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type",
-                 "comp_type", "tick count", "UUID")  # fmt: skip
+FIELDS: Final = (
+    "component",
+    "comp_phys",
+    "command",
+    "arg1",
+    "arg2",
+    "reply",
+    "reply type",
+    "comp_type",
+    "tick count",
+    "UUID",
+)
 """Names of all fields, in the order in which an event has them."""
 
 
@@ -68,8 +85,8 @@ class AcquilaError(ValueError):
 class AcquilaEvent:
     """One event; texts may be empty, `uuid` is as it came (a number, or some clients' text).
 
-    The interface's UUIDs are unsigned 64-bit numbers, but programs send negative and greater ones,
-    and those whose JSON has no other numbers send floats.
+    The interface's UUIDs are unsigned 64-bit numbers, but programs send negative and greater
+    ones, and those whose JSON has no other numbers send floats.
     """
 
     component: str
@@ -111,7 +128,9 @@ class AcquilaEvent:
             return self.uuid
         return float(self.uuid)
 
-    def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> AcquilaEvent:
+    def answer(
+        self, reply_type: ReplyType, reply: str = "", comp_type: str = ""
+    ) -> AcquilaEvent:
         """Make the event that replies to this one: same UUID, same tick count.
 
         Args:
@@ -120,7 +139,10 @@ class AcquilaEvent:
             comp_type: of the component that replies; left empty, that of this event.
         """
         return replace(
-            self, reply_type=reply_type, reply=reply, comp_type=comp_type or self.comp_type
+            self,
+            reply_type=reply_type,
+            reply=reply,
+            comp_type=comp_type or self.comp_type,
         )
 
 
@@ -177,7 +199,9 @@ class Exchange:
         now: real time [s].
     """
 
-    def __init__(self, command: AcquilaEvent, comp_type: ComponentType, now: float) -> None:
+    def __init__(
+        self, command: AcquilaEvent, comp_type: ComponentType, now: float
+    ) -> None:
         self.command = command
         self._type = comp_type
         self._last = now
@@ -237,11 +261,18 @@ def _plain(name: str, text: str) -> str:
         AcquilaError: too long, or characters that no event can carry.
     """
     if len(text) > MAX_CHARS[name]:
-        raise AcquilaError(f"{name} of {len(text)} characters; allowed: {MAX_CHARS[name]}")
-    if (found := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)) is not None:
-        but = "surrogates" if name in BINARY_FIELDS else "surrogates and control characters"
         raise AcquilaError(
-            f"{name} holds U+{ord(found[0]):04X} at {found.start()}; allowed: anything but {but}"
+            f"{name} of {len(text)} characters; allowed: {MAX_CHARS[name]}"
+        )
+    if (
+        found := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)
+    ) is not None:
+        but = (
+            "surrogates" if name in BINARY_FIELDS else "surrogates and control characters"
+        )
+        raise AcquilaError(
+            f"{name} holds U+{ord(found[0]):04X} at {found.start()}; allowed: anything "
+            f"but {but}"
         )
     return text
 
@@ -260,6 +291,10 @@ def _uuid(value: object) -> int | float | str:
         return _plain("UUID", value)
     if value is None:
         return 0
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_UUID:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not abs(value) < MAX_UUID
+    ):
         raise AcquilaError(f"UUID must be a number below {MAX_UUID:g} or a text")
     return value

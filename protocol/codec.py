@@ -62,7 +62,9 @@ def _unique(pairs: list[tuple[str, object]]) -> None:
 
 
 # The fast parser silently keeps the last of equal names. Numbers are not parsed a second time.
-_UNIQUE_NAME_DECODER = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
+_UNIQUE_NAME_DECODER = json.JSONDecoder(
+    object_pairs_hook=_unique, parse_int=str, parse_float=str
+)
 
 
 def write_json(document: object) -> bytes:

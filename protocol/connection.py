@@ -27,8 +27,21 @@ from typing import Any, Final, TypeGuard
 
 from flexdt.protocol import codec as codecs
 from flexdt.protocol.codec import Codec
-from flexdt.protocol.messages import Encoded, Malformed, Message, Response, from_plain, to_plain
-from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, parse_error, too_large
+from flexdt.protocol.messages import (
+    Encoded,
+    Malformed,
+    Message,
+    Response,
+    from_plain,
+    to_plain,
+)
+from flexdt.protocol.rpc_errors import (
+    Code,
+    ProtocolError,
+    RpcError,
+    parse_error,
+    too_large,
+)
 
 MAX_FRAME: Final = 2**24 - 1
 """Largest MessagePack frame [bytes]: its length's first byte must be zero."""
@@ -49,7 +62,9 @@ _HEAD_WINDOWS_BYTES: Final = (4096, 2**20)
 _MAX_SPLIT_ATTEMPTS: Final = 4
 
 _size = struct.Struct(">I").unpack_from
-_HTTP: Final = re.compile(rb"[!#$%&'*+.^_`|~0-9A-Za-z-]+ [^ ]* HTTP/|host[ \t]*:", re.IGNORECASE)
+_HTTP: Final = re.compile(
+    rb"[!#$%&'*+.^_`|~0-9A-Za-z-]+ [^ ]* HTTP/|host[ \t]*:", re.IGNORECASE
+)
 """Start of a line of an HTTP request: TOKEN SP TARGET SP HTTP/, or the field `Host`.
 
 RFC 9112, 3 and 3.2. A browser sends methods of any name, and always a Host; no JSON
@@ -85,7 +100,11 @@ class Connection:
     """
 
     def __init__(
-        self, codec: Codec | None = None, *, max_message: int = MAX_FRAME, max_batch: int = 1000
+        self,
+        codec: Codec | None = None,
+        *,
+        max_message: int = MAX_FRAME,
+        max_batch: int = 1000,
     ) -> None:
         self.codec = codec
         self.max_message = max_message
@@ -104,7 +123,8 @@ class Connection:
         self._begun = bytearray()
         """The received part of an incomplete message."""
         self._skip = 0
-        """Bytes of a rejected frame still to be skipped, or 1 for the rest of a rejected line."""
+        """Bytes of a rejected frame still to be skipped, or 1 for the rest of a rejected
+        line."""
         self._broken = False
         """Whether a fatal error waits in the queue, so that further bytes are ignored."""
 
@@ -147,7 +167,9 @@ class Connection:
         held = self.pending
         self._end()
         if inside:
-            raise ProtocolError(f"the stream ended inside a message, of which {held} bytes came")
+            raise ProtocolError(
+                f"the stream ended inside a message, of which {held} bytes came"
+            )
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Receive bytes without decoding them; `next_raw` returns the complete messages."""
@@ -391,7 +413,11 @@ def _body(codec: Codec, message: Message) -> list[bytes]:
     """Encode a message without framing; an `Encoded` result is inserted as it is."""
     match message:
         case Response(id, Encoded(pieces)) if codec is Codec.JSON:
-            return [b'{"jsonrpc":"2.0","id":%b,"result":' % codecs.write_json(id), *pieces, b"}"]
+            return [
+                b'{"jsonrpc":"2.0","id":%b,"result":' % codecs.write_json(id),
+                *pieces,
+                b"}",
+            ]
         case Response(id, Encoded(pieces)):
             head = {"jsonrpc": "2.0", "id": id, "result": None}
             return [codecs.write_msgpack(head)[:-1], *pieces]  # nil is one byte
@@ -495,7 +521,9 @@ def _split(body: memoryview) -> object | None:
     for window in _HEAD_WINDOWS_BYTES:
         head = bytes(body[:window])
         at = head.find(_DATA_BIN32)
-        while 0 <= at <= len(head) - len(_DATA_BIN32) - 4 and attempts < _MAX_SPLIT_ATTEMPTS:
+        while (
+            0 <= at <= len(head) - len(_DATA_BIN32) - 4 and attempts < _MAX_SPLIT_ATTEMPTS
+        ):
             start = at + len(_DATA_BIN32) + 4
             if start + int.from_bytes(head[start - 4 : start], "big") == len(body):
                 attempts += 1

@@ -37,7 +37,9 @@ from flexdt.protocol.image import Dtype
 MAX_UNKNOWN = 50
 """Largest number of members beyond the declared fields before an object is rejected unread."""
 
-_MODEL = ConfigDict(frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+_MODEL = ConfigDict(
+    frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+)
 """Configuration of all models; the text below a field is its description in OpenRPC."""
 Payload = Annotated[
     bytes,
@@ -135,12 +137,15 @@ class Params(BaseModel):
         """Reject an object with far more members than fields before they are validated."""
         fields = cls.model_fields
         if isinstance(value, Mapping) and len(value) > len(fields) + MAX_UNKNOWN:
-            raise ValueError(f"{len(value)} members; allowed: {', '.join(fields) or 'none'}")
+            raise ValueError(
+                f"{len(value)} members; allowed: {', '.join(fields) or 'none'}"
+            )
         return value
 
 
 class Result(BaseModel):
-    """A result: frozen, finite numbers only; unknown members are kept (the protocol may grow)."""
+    """A result: frozen, finite numbers only; unknown members are kept (the protocol may
+    grow)."""
 
     model_config = ConfigDict(**_MODEL, extra="allow")
 

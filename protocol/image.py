@@ -53,7 +53,9 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
     except (KeyError, TypeError):
         raise invalid_params("an image is {dtype, shape, data}") from None
     if dtype not in DTYPES or not isinstance(dtype, str):
-        raise invalid_params(f"image dtype {clip(dtype)} is not one of {', '.join(DTYPES)}")
+        raise invalid_params(
+            f"image dtype {clip(dtype)} is not one of {', '.join(DTYPES)}"
+        )
     return from_bytes(payload(data), dtype, _shape(shape))
 
 
@@ -70,7 +72,8 @@ def from_bytes(
     size = memoryview(data).nbytes
     if size != expected:
         raise invalid_params(
-            f"an image of shape {list(shape)} and dtype {dtype} has {expected} bytes, not {size}",
+            f"an image of shape {list(shape)} and dtype {dtype} has {expected} bytes, "
+            f"not {size}",
             [problem("data", "wrong size", size)],
             {"bytes": expected},
         )
@@ -114,5 +117,7 @@ def _shape(value: object) -> tuple[int, ...]:
         or len(value) > 4
         or not all(type(n) is int and 0 <= n <= 2**31 for n in value)
     ):
-        raise invalid_params(f"image shape {clip(value)} is not a list of up to four sizes")
+        raise invalid_params(
+            f"image shape {clip(value)} is not a list of up to four sizes"
+        )
     return tuple(value)

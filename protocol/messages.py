@@ -42,9 +42,15 @@ Id = str | int | float | None
 
 Params = Mapping[str, object] | list[object] | None
 _JSON_TYPE_NAMES: Mapping[type, str] = {
-    dict: "an object", list: "a list", str: "text", bool: "a truth value",
-    int: "a number", float: "a number", type(None): "null", bytes: "bytes",
-}  # fmt: skip
+    dict: "an object",
+    list: "a list",
+    str: "text",
+    bool: "a truth value",
+    int: "a number",
+    float: "a number",
+    type(None): "null",
+    bytes: "bytes",
+}
 _W = TypeVar("_W")
 
 
@@ -67,7 +73,8 @@ class Notification:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A result that is already encoded, in the codec of the requesting connection, in pieces."""
+    """A result that is already encoded, in the codec of the requesting connection, in
+    pieces."""
 
     pieces: tuple[bytes, ...]
 
@@ -199,14 +206,18 @@ def _single(document: object) -> Single:
     if document.get("jsonrpc") != "2.0":
         return Malformed(invalid_request('"jsonrpc" must be "2.0"'), answer_to)
     if not known:
-        return Malformed(invalid_request(f'"id" must be text or a finite number, not {_kind(id)}'))
+        return Malformed(
+            invalid_request(f'"id" must be text or a finite number, not {_kind(id)}')
+        )
     if "method" in document:
         return _request(document, answer_to)
     if "result" in document and "error" not in document and "id" in document:
         return Response(answer_to, document["result"])
     if "error" in document and "result" not in document and "id" in document:
         return _failure(answer_to, document["error"])
-    return Malformed(invalid_request('neither "method" nor "result" nor "error"'), answer_to)
+    return Malformed(
+        invalid_request('neither "method" nor "result" nor "error"'), answer_to
+    )
 
 
 def _request(document: dict[object, object], id: Id) -> Single:
@@ -221,11 +232,15 @@ def _request(document: dict[object, object], id: Id) -> Single:
     """
     method = document["method"]
     params = document.get("params")
-    extra = [clip(k, 40) for k in document if k not in ("jsonrpc", "id", "method", "params")]
+    extra = [
+        clip(k, 40) for k in document if k not in ("jsonrpc", "id", "method", "params")
+    ]
     if extra:
         return Malformed(invalid_request(f"unknown member {', '.join(extra[:5])}"), id)
     if not isinstance(method, str):
-        return Malformed(invalid_request(f'"method" must be text, not {_kind(method)}'), id)
+        return Malformed(
+            invalid_request(f'"method" must be text, not {_kind(method)}'), id
+        )
     if not isinstance(params, (dict, list)) and "params" in document:
         return Malformed(invalid_request('"params" must be an object or a list'), id)
     if isinstance(params, dict) and not all(isinstance(key, str) for key in params):
@@ -243,7 +258,9 @@ def _failure(id: Id, error: object) -> Single:
         message = error.get("message")
         if type(code) is int and isinstance(message, str):
             return Failure(id, RpcError(code, message, error.get("data")))
-    return Malformed(RpcError(Code.INVALID_REQUEST, "invalid response: no code or message"), id)
+    return Malformed(
+        RpcError(Code.INVALID_REQUEST, "invalid response: no code or message"), id
+    )
 
 
 def _valid_id(id: object) -> bool:
@@ -424,7 +441,9 @@ class Correlation(Generic[_W]):
             case Failure(None, RpcError(code=Code.PARSE)):
                 # The server could not read one of our requests, not even its id. Which request
                 # failed is unknown, so all of them fail.
-                waiting = [(id, w) for id, w in self._open_requests.items() if w is not None]
+                waiting = [
+                    (id, w) for id, w in self._open_requests.items() if w is not None
+                ]
                 self._open_requests.update((id, None) for id, _ in waiting)
                 return [Answered(waiter, message) for _, waiter in waiting]
             case Failure(None, error) | Malformed(error, None):
@@ -442,7 +461,9 @@ class Correlation(Generic[_W]):
         """Record that the peer's bytes break the protocol (see `Connection.receive_end`)."""
         self.violation = violation
 
-    def _settle(self, answer: Response | Failure) -> list[Answered[_W] | Request | Notification]:
+    def _settle(
+        self, answer: Response | Failure
+    ) -> list[Answered[_W] | Request | Notification]:
         """Match an answer to its request and close the request.
 
         Raises:
@@ -457,7 +478,9 @@ class Correlation(Generic[_W]):
             return []
         return [Answered(waiter, answer)]
 
-    def _receive_call(self, message: Message) -> list[Answered[_W] | Request | Notification]:
+    def _receive_call(
+        self, message: Message
+    ) -> list[Answered[_W] | Request | Notification]:
         """Register a client's call as open.
 
         Raises:

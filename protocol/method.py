@@ -16,7 +16,8 @@ from flexdt.protocol.fields import Params, Result
 from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_params, problem
 
 PROTOCOL: Final = "1.0"
-"""Version of the wire: a server serves every client of the same major number (before the dot)."""
+"""Version of the wire: a server serves every client of the same major number (before the
+dot)."""
 
 _M = TypeVar("_M", bound=BaseModel)
 _P = TypeVar("_P", bound=Params, covariant=True)
@@ -31,7 +32,8 @@ class Method(Generic[_P, _R]):
         name: as on the wire.
         params, result: their models.
         summary: one line for people.
-        control: only the controller may call it (a client becomes the controller if there is none).
+        control: only the controller may call it (a client becomes the controller if there is
+            none).
         safe: reads only, so a client may repeat it after a lost connection.
         urgent: handled on arrival, ahead of the connection's earlier requests.
         by_hand: an error while a job runs, and allowed while it is paused.
@@ -131,10 +133,14 @@ def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcErro
             "message": e["msg"].removeprefix("Value error, "),
             "asked": clip(e["input"], 80),
         }
-        limits = {k: v for k, v in e.get("ctx", {}).items() if isinstance(v, (int, float, str))}
+        limits = {
+            k: v for k, v in e.get("ctx", {}).items() if isinstance(v, (int, float, str))
+        }
         if limits:
             problem["allowed"] = limits
         problems.append(problem)
     first = problems[0]
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    return invalid_params(f"{method}: {first['path']}: {first['message']}{more}", problems, allowed)
+    return invalid_params(
+        f"{method}: {first['path']}: {first['message']}{more}", problems, allowed
+    )

@@ -48,7 +48,9 @@ def _rows(value: object) -> object:
     except (TypeError, ValueError, OverflowError):
         raise ValueError("cone_vec must be rows of twelve numbers") from None
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != 12:
-        raise ValueError(f"cone_vec has shape {list(array.shape)}; allowed: [n, 12] numbers")
+        raise ValueError(
+            f"cone_vec has shape {list(array.shape)}; allowed: [n, 12] numbers"
+        )
     if isinstance(value, list) and any(type(x) is bool for row in value for x in row):
         raise ValueError("cone_vec holds a truth value; allowed: [n, 12] numbers")
     if not 0 < len(array) <= MAX_VIEWS:
@@ -87,7 +89,9 @@ ConeVecs = Annotated[
 ]
 """(n, 12) float64 [mm], object frame."""
 
-Stack = Annotated[InstanceOf[np.ndarray], BeforeValidator(_stack), WithJsonSchema(_IMAGE_SCHEMA)]
+Stack = Annotated[
+    InstanceOf[np.ndarray], BeforeValidator(_stack), WithJsonSchema(_IMAGE_SCHEMA)
+]
 """(n, rows, cols) float32."""
 
 Buffer = Annotated[
@@ -134,10 +138,11 @@ class MeshSize(f.Params):
 
 
 class VolumePut(f.Params):
-    """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]) or of a mesh, or an analytic scene.
+    """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]) or of a mesh, or an analytic
+    scene.
 
-    The first chunk has start 0 and begins afresh; the volume replaces its namesake when all bytes
-    have come. Projections of a mesh are path lengths [mm].
+    The first chunk has start 0 and begins afresh; the volume replaces its namesake when all
+    bytes have come. Projections of a mesh are path lengths [mm].
     """
 
     name: f.VolumeName
@@ -179,7 +184,8 @@ class Project(f.Params):
 
 
 class Backproject(f.Params):
-    """The adjoint of `project`; with `into` it is added to a named volume instead of answered."""
+    """The adjoint of `project`; with `into` it is added to a named volume instead of
+    answered."""
 
     cone_vec: ConeVecs
     grid: VoxelGrid
@@ -271,13 +277,17 @@ class Health(f.Result):
 PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
     m.name: m
     for m in (
-        read("session.hello", Hello, HelloResult, "introduce the client; bring the token"),
+        read(
+            "session.hello", Hello, HelloResult, "introduce the client; bring the token"
+        ),
         read("volume.put", VolumePut, PutResult, "store a named volume or scene"),
         read("volume.get", VolumeRef, Array, "read a named volume of voxels back"),
         read("volume.list", f.Empty, VolumeList, "the volumes there are"),
         read("volume.remove", VolumeRef, Removed, "forget a volume"),
         read("project", Project, Array, "line integrals, float32 (n, rows, cols)"),
-        Method("backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"),
+        Method(
+            "backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"
+        ),
         read("health", f.Empty, Health, "how the server is"),
         read("cancel", Cancel, Cancelled, "give up a request of this connection"),
         read("rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document"),

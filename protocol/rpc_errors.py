@@ -14,7 +14,8 @@ from itertools import islice
 
 
 class Code(IntEnum):
-    """Every error code that may appear on the wire, with the line that `rpc.discover` publishes."""
+    """Every error code that may appear on the wire, with the line that `rpc.discover`
+    publishes."""
 
     meaning: str
 
@@ -120,7 +121,9 @@ def not_authorised() -> RpcError:
     return RpcError(Code.NOT_AUTHORISED, message, data)
 
 
-def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes") -> RpcError:
+def too_large(
+    what: str, asked: float | str, allowed: float, unit: str = "bytes"
+) -> RpcError:
     """Make the error for something above its allowed size.
 
     Args:
@@ -138,7 +141,9 @@ def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes"
 
 def superseded(key: str) -> RpcError:
     """Make the error for a request that a newer one with the same key replaced."""
-    return RpcError(Code.SUPERSEDED, f"superseded by a newer request for {key!r}", {"key": key})
+    return RpcError(
+        Code.SUPERSEDED, f"superseded by a newer request for {key!r}", {"key": key}
+    )
 
 
 def link_down(why: str) -> RpcError:
@@ -175,7 +180,9 @@ def _brief(value: object, limit: int) -> str:
             return f"a whole number of {value.bit_length()} bits"
         case Mapping():
             pairs = islice(value.items(), some)
-            inner = ", ".join(f"{_brief(k, limit)}: {_brief(v, limit // 4)}" for k, v in pairs)
+            inner = ", ".join(
+                f"{_brief(k, limit)}: {_brief(v, limit // 4)}" for k, v in pairs
+            )
             return "{" + inner + (", ...}" if len(value) > some else "}")
         case list() | tuple():
             inner = ", ".join(_brief(v, limit // 4) for v in value[:some])

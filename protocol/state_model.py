@@ -9,7 +9,16 @@ from typing import Literal
 
 from pydantic import Field
 
-from flexdt.protocol.fields import NonNegative, Pair, Positive, Result, Roi, Shape2, SpeedUp, Triple
+from flexdt.protocol.fields import (
+    NonNegative,
+    Pair,
+    Positive,
+    Result,
+    Roi,
+    Shape2,
+    SpeedUp,
+    Triple,
+)
 
 EndedPhase = Literal["done", "failed", "aborted", "incomplete"]
 JobPhase = Literal["queued", "running", "paused", EndedPhase]
@@ -216,11 +225,11 @@ class State(Result):
     image: ImageFlags | None = None
     """the image made last, by anyone's request or by a scan"""
     unsaved: str | None = None
-    """why this state is not on the server's disk, as after an E-stop on a disk that fails: a server
-    that is killed now comes back without it; null where it is, or is being written"""
+    """why this state is not on the server's disk, as after an E-stop on a disk that fails: a
+    server that is killed now comes back without it; null where it is, or is being written"""
     projector: str | None = None
-    """why no image can be computed now, as where no projector answers; null where nothing is wrong,
-    or nobody looks"""
+    """why no image can be computed now, as where no projector answers; null where nothing is
+    wrong, or nobody looks"""
 
 
 class Stopping(Result):

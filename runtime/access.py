@@ -180,7 +180,9 @@ def check_bind(host: str, token: str | None) -> None:
         AccessError: no token for a non-loopback address, or a token too short to be one.
     """
     if token is not None and len(token) < 16:
-        raise AccessError(f"the token has {len(token)} characters; at least 16 are needed")
+        raise AccessError(
+            f"the token has {len(token)} characters; at least 16 are needed"
+        )
     if token is None and not is_loopback(host):
         raise AccessError(
             f"listening on {host!r}, which others can reach, needs a token (--token-file); "
@@ -208,11 +210,15 @@ def read_token(file: Path | None) -> str | None:
         raise AccessFileError(f"token file {file}: {why}") from None
     token = text.split("\n", 1)[0].strip()
     if not token:
-        raise AccessFileError(f"token file {file} is empty; its first line must be the token")
+        raise AccessFileError(
+            f"token file {file} is empty; its first line must be the token"
+        )
     return token
 
 
-def client_tls(authority: Path | None, *, any_name: bool = False) -> ssl.SSLContext | None:
+def client_tls(
+    authority: Path | None, *, any_name: bool = False
+) -> ssl.SSLContext | None:
     """Make a client's TLS context that trusts the certificates of a PEM file alone;
     None without one.
 

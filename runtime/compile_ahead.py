@@ -38,14 +38,20 @@ def _detection() -> None:
     one = np.ones(3)
     result = np.zeros(spot_kernels.RESULTS)
     spot_kernels.measure(image, at, at, at, 1.0, at, result)
-    spot_kernels.fit_ball(image, mask, at, at, at, one, at, 0.5, 0.0, np.bool_(True), True, result)
+    spot_kernels.fit_ball(
+        image, mask, at, at, at, one, at, 0.5, 0.0, np.bool_(True), True, result
+    )
 
 
 def _fit() -> None:
     """Compile the kernels of calibration, on no views."""
     from flexdt.twin.calibration.fit import fit_kernels
 
-    ints, floats, views = np.zeros(1, np.int64), np.zeros(1), np.zeros((0, 1))  # of no view
+    ints, floats, views = (
+        np.zeros(1, np.int64),
+        np.zeros(1),
+        np.zeros((0, 1)),
+    )  # of no view
     sets = np.zeros((1, fit_kernels.PARAMETERS))
     radii = np.zeros(1)
     radii.flags.writeable = False  # as a phantom's
@@ -86,7 +92,9 @@ def _reconstruction() -> None:
 
     scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
     images = np.ones((8, 4, 6), np.float32)
-    fdk(images, scan, Grid((2, 3, 4), 0.5).blank())  # which go on beyond the panel's edges
+    fdk(
+        images, scan, Grid((2, 3, 4), 0.5).blank()
+    )  # which go on beyond the panel's edges
     layout_kernels.unfit_parts(images.reshape(-1).view(np.uint32))
     one = np.ones((1, 1))
     six = np.zeros(truncation_kernels.PARAMETERS)
@@ -137,7 +145,9 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
             now = [left.pop(each) for each in done] or ["still"]
             compiled = len(missing) - len(left)
             seconds = time.monotonic() - begun
-            note(f"compiled {compiled} of {len(missing)} ({', '.join(now)}, {seconds:.0f} s)")
+            note(
+                f"compiled {compiled} of {len(missing)} ({', '.join(now)}, {seconds:.0f} s)"
+            )
 
 
 def elsewhere(group: str) -> None:
@@ -160,7 +170,9 @@ def main() -> None:
         case ["--here", group]:
             GROUPS[group][0]()
         case groups:
-            compile_ahead(groups or list(GROUPS), lambda line: print(f"flexdt: {line}", flush=True))
+            compile_ahead(
+                groups or list(GROUPS), lambda line: print(f"flexdt: {line}", flush=True)
+            )
 
 
 if __name__ == "__main__":

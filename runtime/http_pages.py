@@ -192,7 +192,10 @@ class _Handler(WSGIRequestHandler):
 
     def get_environ(self) -> dict[str, Any]:
         """Add the function that admits the request to the environment."""
-        return {**super().get_environ(), ADMIT: partial(self.server.admit, self.connection)}
+        return {
+            **super().get_environ(),
+            ADMIT: partial(self.server.admit, self.connection),
+        }
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing."""
@@ -206,7 +209,9 @@ def _foreign(host: str) -> bool:
         return True
 
 
-def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable[..., list[bytes]]:
+def _application(
+    pages: Pages, token: str | None, *, loopback: bool
+) -> Callable[..., list[bytes]]:
     """Make the pages a WSGI application of the running event loop.
 
     Args:
@@ -234,7 +239,11 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
         if path not in pages:
             return HttpResponse("{}", HTTPStatus.NOT_FOUND)
         bearer = given.removeprefix("Bearer ")
-        if token is not None and path not in OPEN_PAGES and not token_matches(bearer, token):
+        if (
+            token is not None
+            and path not in OPEN_PAGES
+            and not token_matches(bearer, token)
+        ):
             return HttpResponse("{}", HTTPStatus.UNAUTHORIZED)
         asked[ADMIT]()
         page: Future[HttpResponse] = Future()
@@ -270,7 +279,9 @@ def _application(pages: Pages, token: str | None, *, loopback: bool) -> Callable
 
 
 @contextlib.asynccontextmanager
-async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[dict[str, object]]:
+async def served_pages(
+    pages: Pages, settings: ServerSettings
+) -> AsyncIterator[dict[str, object]]:
     """Serve `pages`, in daemon threads, as long as the context lasts.
 
     Without a port for them in the settings nothing is served.
@@ -299,7 +310,9 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
     loopback = is_loopback(host)
     application = _application(pages, None if loopback else token, loopback=loopback)
     port = settings.http_port
-    server = await asyncio.to_thread(make_server, host, port, application, Server, _Handler)
+    server = await asyncio.to_thread(
+        make_server, host, port, application, Server, _Handler
+    )
     Thread(target=server.serve_forever, name="http pages", daemon=True).start()
     try:
         yield {"http_port": server.server_port}
@@ -335,13 +348,17 @@ def watching_pages(
         """Make `/metrics`: requests, figures, lost log lines and turns of the loop."""
         page = [*(requests or Requests()).figures(), *figures()]
         page.append(
-            counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
+            counter(
+                "flexdt_log_dropped_total", "Log lines nobody took in time.", dropped()
+            )
         )
         loop = asyncio.get_running_loop()
         if isinstance(loop, ServerLoop):
             page += loop.holds.turns.collect()
             worst = "The longest turn since the last scrape."
-            page.append(gauge("flexdt_loop_hold_worst_seconds", worst, loop.holds.worst()))
+            page.append(
+                gauge("flexdt_loop_hold_worst_seconds", worst, loop.holds.worst())
+            )
         return HttpResponse(render(page), content_type=CONTENT_TYPE)
 
     return {"/healthz": healthz, "/metrics": metrics}

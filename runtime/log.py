@@ -68,7 +68,9 @@ class JsonLines(logging.Formatter):
             "event": record.getMessage(),
         }
         line.update(getattr(record, "facts", {}))
-        if record.exc_info and record.exc_info[0] is not None:  # False where there is none
+        if (
+            record.exc_info and record.exc_info[0] is not None
+        ):  # False where there is none
             line["traceback"] = record.exc_text or self.formatException(record.exc_info)
         return json.dumps(line, default=str)
 
@@ -127,7 +129,9 @@ def dropped() -> int:
     return sum(h.dropped for h in LOGGER.handlers if isinstance(h, Apart))
 
 
-def log(event: str, level: int = logging.INFO, *, error: bool = False, **facts: object) -> None:
+def log(
+    event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
+) -> None:
     """Write one line; `error` adds the traceback of the exception being handled."""
     trace = current()
     if trace:
@@ -146,10 +150,14 @@ class Sparing:
         clock: returns the time [s].
     """
 
-    def __init__(self, burst: int = BURST, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, burst: int = BURST, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._burst = burst
         self._clock = clock
-        self._kinds: dict[str, tuple[float, float, int]] = {}  # when, lines allowed, left out
+        self._kinds: dict[
+            str, tuple[float, float, int]
+        ] = {}  # when, lines allowed, left out
 
     def log(
         self,
@@ -177,14 +185,18 @@ class Sparing:
         if allowed < 1.0:
             self._kinds[kind] = (now, allowed, left_out + 1)
             return
-        self._kinds = {k: v for k, v in self._kinds.items() if v[2] or now - v[0] < EVERY_S * burst}
+        self._kinds = {
+            k: v for k, v in self._kinds.items() if v[2] or now - v[0] < EVERY_S * burst
+        }
         self._kinds[kind] = (now, allowed - 1.0, 0)
         if left_out:
             facts["left_out"] = left_out
         log(event, level, error=error, **facts)
 
 
-def set_up(stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False) -> None:
+def set_up(
+    stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False
+) -> None:
     """Send this program's log to `stream` as JSON lines (for a process's main).
 
     Args:

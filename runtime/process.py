@@ -126,12 +126,20 @@ class ServerLoop(asyncio.SelectorEventLoop):
             error = context.get("exception")
             kind = f"{what} {type(error).__name__}"
             if error is None or isinstance(error, OSError):
-                lines.log("event loop", logging.WARNING, kind=kind, message=what, reason=str(error))
+                lines.log(
+                    "event loop",
+                    logging.WARNING,
+                    kind=kind,
+                    message=what,
+                    reason=str(error),
+                )
                 return
             try:
                 raise error
             except BaseException:
-                lines.log("event loop", logging.ERROR, kind=kind, error=True, message=what)
+                lines.log(
+                    "event loop", logging.ERROR, kind=kind, error=True, message=what
+                )
 
         self.set_exception_handler(complain)
 
@@ -268,7 +276,9 @@ def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None
         gc.collect()
         gc.freeze()
         loop.holds.begin()  # no client has waited for it yet
-    print(json.dumps({"ready": server, **facts, "pid": os.getpid()}), file=out, flush=True)
+    print(
+        json.dumps({"ready": server, **facts, "pid": os.getpid()}), file=out, flush=True
+    )
 
 
 def announce_bound(server: str, host: str, port: int) -> None:
@@ -299,7 +309,9 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
         code = INVALID
     except OSError as error:
         if error.filename is None:
-            problem = f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
+            problem = (
+                f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
+            )
             code = REFUSED
         else:
             problem = f"{error.filename}: {error.strerror}"
@@ -315,7 +327,9 @@ def _allow_descriptors() -> None:
     except ImportError:  # Windows has no such limit
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    limit = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
+    limit = (
+        MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
+    )
     with contextlib.suppress(OSError, ValueError):  # macOS allows fewer than it reports
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, limit), hard))
 

@@ -53,9 +53,13 @@ def address(text: str) -> Address:
     host, _, port = text.strip().rpartition(":")
     closed = host.startswith("[") == host.endswith("]")
     if not host or not closed or not (port.isascii() and port.isdigit()):
-        raise typer.BadParameter(f"{text!r} is not HOST:PORT, such as {LOOPBACK}:{TWIN_PORT}")
+        raise typer.BadParameter(
+            f"{text!r} is not HOST:PORT, such as {LOOPBACK}:{TWIN_PORT}"
+        )
     if not 1 <= int(port) <= MAX_PORT:
-        raise typer.BadParameter(f"{text!r}: the port must be a number from 1 to {MAX_PORT}")
+        raise typer.BadParameter(
+            f"{text!r}: the port must be a number from 1 to {MAX_PORT}"
+        )
     return Address(host.strip("[]"), int(port))
 
 
@@ -115,11 +119,15 @@ def scatter_method(text: str) -> str:
     """
     if text not in get_args(Scatter):
         removed = "; 'first' has been removed, use 'mc'" if text == "first" else ""
-        raise typer.BadParameter(f"{text!r} is not one of {', '.join(get_args(Scatter))}{removed}")
+        raise typer.BadParameter(
+            f"{text!r} is not one of {', '.join(get_args(Scatter))}{removed}"
+        )
     return text
 
 
-def tcp_port(default: int | None, *flags: str, most: int = MAX_PORT, public: bool = True) -> Any:
+def tcp_port(
+    default: int | None, *flags: str, most: int = MAX_PORT, public: bool = True
+) -> Any:
     """Declare a field for a TCP port."""
     return option(default, *flags, public=public, min=0, max=most)
 
@@ -214,7 +222,9 @@ class FarProjectorSettings(Settings):
         projector_token_file: Show this file's token to the projectors.
     """
 
-    projectors: str | None = option(None, public=False, metavar="HOST:PORT,...", parser=several)
+    projectors: str | None = option(
+        None, public=False, metavar="HOST:PORT,...", parser=several
+    )
     projector_token_file: Path | None = option(None, public=False, metavar="FILE")
 
 
@@ -239,12 +249,18 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
     projector_port: int | None = tcp_port(None)
     projector_tls_ca: Path | None = option(None, metavar="FILE")
     no_noise: bool = option(False, public=False)
-    memory_limit: int | None = option(None, public=False, metavar="SIZE", parser=memory_size)
+    memory_limit: int | None = option(
+        None, public=False, metavar="SIZE", parser=memory_size
+    )
 
     @property
     def places(self) -> tuple[Address, ...]:
         """Addresses of the projectors, each once."""
-        port = None if self.projector_port is None else Address(LOOPBACK, self.projector_port)
+        port = (
+            None
+            if self.projector_port is None
+            else Address(LOOPBACK, self.projector_port)
+        )
         named = [place for place in (self.projector or port,) if place is not None]
         found = tuple(dict.fromkeys((*named, *addresses(self.projectors))))
         return found or (Address(LOOPBACK, PROJECTOR_PORT),)
@@ -281,7 +297,9 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
 
     command = "viewer"
     port: int = tcp_port(VIEWER_PORT, "--port", "--viewer-port")
-    twin: Address = option(Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address)
+    twin: Address = option(
+        Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address
+    )
     token_file: Path | None = option(None, metavar="FILE")
 
 
@@ -301,7 +319,9 @@ class GatewaySettings(TwinClientSettings):
     host: str = option(LOOPBACK, "--bind", "--host", metavar="HOST")
     port: int = tcp_port(GATEWAY_PORT)
     inbound_port: int | None = tcp_port(None)
-    server: Address = option(Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address)
+    server: Address = option(
+        Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address
+    )
     data: Path = option(Path("data"), metavar="DIR")
 
 

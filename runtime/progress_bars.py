@@ -33,7 +33,8 @@ class Shown(Protocol):
 
 
 def shown_on(log: logging.Logger) -> Shown:
-    """Choose where work is shown: the handlers of a log, a notebook, a terminal, standard error.
+    """Choose where work is shown: the handlers of a log, a notebook, a terminal, standard
+    error.
 
     Args:
         log: whose handlers a program may have set.
@@ -130,7 +131,9 @@ class NotebookBar:
         """Draw over what was drawn before."""
         value = "" if done is None else f' value="{done:.3f}"'
         text = f"{html.escape(what)} {told_time(done, seconds)}"
-        self._draw(f'<progress max="1"{value} aria-label="{html.escape(what)}"></progress> {text}')
+        self._draw(
+            f'<progress max="1"{value} aria-label="{html.escape(what)}"></progress> {text}'
+        )
 
     def close(self) -> None:
         """Leave an empty place."""

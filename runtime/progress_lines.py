@@ -1,8 +1,10 @@
-"""Show work that takes seconds: a bar on terminals and in notebooks, lines of the log elsewhere.
+"""Show work that takes seconds: a bar on terminals and in notebooks, lines of the log
+elsewhere.
 
-`told` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends within
-`SILENT_S` shows nothing. Work within other work of the same thread lends it its name only: there is
-one bar. Where a program handles the records of the logger `flexdt`, it gets lines, not a bar; a
+`told` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends
+within `SILENT_S` shows nothing. Work within other work of the same thread lends it its name
+only: there is one bar. Where a program handles the records of the logger `flexdt`, it gets
+    lines, not a bar; a
 level above WARNING of the logger `flexdt.progress` silences both.
 """
 
@@ -162,8 +164,8 @@ class _Threads(threading.local):
 _teller = _Teller()
 _threads = _Threads()
 _last: dict[str, tuple[float, float]] = {}
-"""First word of a work -> when the first of those that follow each other began and the last ended:
-one kernel compiles after another."""
+"""First word of a work -> when the first of those that follow each other began and the last
+ended: one kernel compiles after another."""
 
 
 def _forget() -> None:

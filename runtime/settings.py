@@ -42,7 +42,9 @@ def option(default: object, *flags: str, public: bool = True, **details: Any) ->
         public: whether `flexdt up` lists it in its help.
         details: of `typer.Option`, such as metavar, min, max and parser.
     """
-    return field(default=default, metadata={"public": public, "flags": flags, "details": details})
+    return field(
+        default=default, metadata={"public": public, "flags": flags, "details": details}
+    )
 
 
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
@@ -56,7 +58,9 @@ def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
     """
     hints = get_type_hints(settings)
     found = {}
-    helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}
+    helps = {
+        n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()
+    }
     for f in fields(settings):
         flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
         default = str(f.default) if _is_read(f) else f.default
@@ -83,7 +87,9 @@ def described(thing: object) -> tuple[str, dict[str, str]]:
     return text, {name: " ".join(about.split()) for name, about in items}
 
 
-def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Parameter]) -> None:
+def has_parameters(
+    command: Callable[..., Any], shown: Iterable[inspect.Parameter]
+) -> None:
     """Set the signature of a command to these parameters, for typer."""
     named = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]
     command.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
@@ -104,7 +110,9 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
 
     def take(**given: Any) -> None:
         """Store the values that typer has read."""
-        found.update({n: tuple(v) if isinstance(v, list) else v for n, v in given.items()})
+        found.update(
+            {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
+        )
 
     has_parameters(take, parameters(settings).values())
     app = typer.Typer(add_completion=False, rich_markup_mode=None)

@@ -183,10 +183,14 @@ class Supervisor:
             pause = ends.after(0.0 if begun is None else clock() - begun)
             if ends.told:
                 times = (
-                    f" for the {ends.row}th time in a row" if ends.row > MAX_SINGLE_REPORTS else ""
+                    f" for the {ends.row}th time in a row"
+                    if ends.row > MAX_SINGLE_REPORTS
+                    else ""
                 )
                 later = f" in {pause:g} s" if pause else ""
-                self.note(f"the {service.name} ended ({how}){times}; starting it again{later}")
+                self.note(
+                    f"the {service.name} ended ({how}){times}; starting it again{later}"
+                )
             await asyncio.sleep(pause)
 
     async def _spawn(self, service: Service) -> Process:
@@ -240,7 +244,8 @@ class Supervisor:
                     raise _Ended(f"it did nothing for {STALLED_S:g} s")
                 if clock() >= note_at and (note or used_s is not None):
                     work = (
-                        f"the {service.name} is still starting: {used_s or 0:.0f} s of work so far"
+                        f"the {service.name} is still starting: {used_s or 0:.0f} s of "
+                        "work so far"
                     )
                     self.note(note or work)
                     note = ""
@@ -271,10 +276,14 @@ class Supervisor:
                 ValueError, KeyError, TypeError, AttributeError, RecursionError
             ):
                 if not (line := await process.stdout.readline()):
-                    await asyncio.Event().wait()  # it prints no more, and may live: others look
+                    await (
+                        asyncio.Event().wait()
+                    )  # it prints no more, and may live: others look
                 message = json.loads(line)
                 if name in (message.get("bound"), message.get("ready")):
-                    self.addresses[name] = Address(str(message["host"]), int(message["port"]))
+                    self.addresses[name] = Address(
+                        str(message["host"]), int(message["port"])
+                    )
                     start.bound.set()
                     if "ready" in message:
                         return
@@ -322,7 +331,9 @@ class _Start:
     ready: asyncio.Event = field(default_factory=asyncio.Event)
 
 
-async def _unless_one_ends(event: asyncio.Event, keepers: Sequence[asyncio.Task[None]]) -> None:
+async def _unless_one_ends(
+    event: asyncio.Event, keepers: Sequence[asyncio.Task[None]]
+) -> None:
     """Wait for an event; a keeper's error ends the waiting and is raised."""
     waiting = asyncio.create_task(event.wait())
     await asyncio.wait({waiting, *keepers}, return_when=FIRST_COMPLETED)

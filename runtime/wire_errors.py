@@ -60,7 +60,9 @@ def explain(error: Exception, root: Path | None = None) -> RpcError:
             return RpcError(code, error.message, error.data)
         case ProjectorUnavailable():
             return RpcError(
-                Code.PROJECTOR_UNAVAILABLE, str(error), {"allowed": "a running projector server"}
+                Code.PROJECTOR_UNAVAILABLE,
+                str(error),
+                {"allowed": "a running projector server"},
             )
     return internal()
 
@@ -75,7 +77,9 @@ def from_root(said: object, root: Path) -> object:
     match said:
         case str():
             below = said.replace(str(root) + os.sep, "")
-            return re.sub(rf"{re.escape(str(root))}(?![\w-]|\.\w)", "the data directory", below)
+            return re.sub(
+                rf"{re.escape(str(root))}(?![\w-]|\.\w)", "the data directory", below
+            )
         case Mapping():
             return {name: from_root(value, root) for name, value in said.items()}
         case list() | tuple():

@@ -76,7 +76,9 @@ def peak_bytes() -> int:
     """
     try:
         with open("/proc/self/status", encoding="ascii") as status:
-            return 1024 * int(next(x for x in status if x.startswith("VmHWM:")).split()[1])
+            return 1024 * int(
+                next(x for x in status if x.startswith("VmHWM:")).split()[1]
+            )
     except (OSError, StopIteration):
         return 1024 * int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
@@ -104,7 +106,10 @@ def answer(request: Sequence[bytes]) -> list[bytes]:
 
         if is_user_error(error):
             e = explain(error)
-            return [b"refused", json.dumps([e.code, e.message, e.data], default=repr).encode()]
+            return [
+                b"refused",
+                json.dumps([e.code, e.message, e.data], default=repr).encode(),
+            ]
         return [b"failed", traceback.format_exc().encode("utf-8", "replace")]
 
 
@@ -125,7 +130,9 @@ def main() -> int:
     limit("RLIMIT_CORE", 0)
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
-    threading.Thread(target=_end_with_parent, args=[channel.fileno()], daemon=True).start()
+    threading.Thread(
+        target=_end_with_parent, args=[channel.fileno()], daemon=True
+    ).start()
     with suppress(EOFError, ConnectionError):
         while True:
             out = answer(receive_parts(channel))

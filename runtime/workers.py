@@ -30,7 +30,11 @@ MAX_IDLE_S = 120.0
 """Time for which a process without work is kept [s]."""
 CHECK_INTERVAL_S = 0.2
 """Interval at which the processor time of a working process is checked [s]."""
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+ENVIRONMENT = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
 """Environment that restricts numerical libraries to one thread."""
 
 
@@ -101,7 +105,9 @@ class Worker:
             how, peak, *answer = receive_parts(self._channel)
             sound = how in (b"done", b"refused") and int(peak) <= MAX_KEPT_BYTES
         except TimeoutError:
-            raise too_large(_label(work), f"more than {seconds:g}", seconds, "s") from None
+            raise too_large(
+                _label(work), f"more than {seconds:g}", seconds, "s"
+            ) from None
         except (OSError, EOFError, ValueError):
             raise self._died(work, seconds) from None
         finally:
@@ -114,7 +120,9 @@ class Worker:
                 raise RpcError(*json.loads(answer[0]))
             case b"memory":
                 limit_mib = self._memory >> 20
-                raise too_large(_label(work), f"more than {limit_mib}", limit_mib, "MiB of memory")
+                raise too_large(
+                    _label(work), f"more than {limit_mib}", limit_mib, "MiB of memory"
+                )
         raise RuntimeError(answer[0].decode("utf-8", "replace"))
 
     def _wait(self, seconds: float) -> None:
@@ -142,7 +150,10 @@ class Worker:
         return RpcError(
             Code.TOO_LARGE,
             f"the process of {_label(work)} ended with code {self._process.returncode}",
-            {"asked": _label(work), "allowed": {"seconds": seconds, "memory_bytes": self._memory}},
+            {
+                "asked": _label(work),
+                "allowed": {"seconds": seconds, "memory_bytes": self._memory},
+            },
         )
 
     def stop(self) -> None:

@@ -1,1 +1,2 @@
-"""The shell: twin server, projector server, viewer, data set writer. Only here wire meets twin."""
+"""The shell: twin server, projector server, viewer, data set writer. Only here wire meets
+twin."""

@@ -1,4 +1,5 @@
-"""Continuous integration: what the workflows run, and what `.ci/run` says of a test that fails."""
+"""Continuous integration: what the workflows run, and what `.ci/run` says of a test that
+fails."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def commands(job: dict[str, Any]) -> list[str]:
 
 
 def targets() -> set[str]:
-    return set(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    return set(
+        re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    )
 
 
 def test_each_part_of_ci_is_a_job() -> None:
@@ -48,7 +51,9 @@ def test_browsers_run_where_debian_has_chromium() -> None:
         for name, job in workflow(path.name)["jobs"].items():
             text = json.dumps(job)
             if "chromium" in text or "page" in json.dumps(job.get("strategy")):
-                assert re.fullmatch(r"python:3\.\d+-bookworm", job.get("container", "")), name
+                assert re.fullmatch(
+                    r"python:3\.\d+-bookworm", job.get("container", "")
+                ), name
 
 
 def test_campaigns_and_resolutions_run_weekly() -> None:
@@ -61,7 +66,9 @@ def test_campaigns_and_resolutions_run_weekly() -> None:
     assert weekday in "0123456"
     jobs = loaded["jobs"]
     assert 'make campaigns CAMPAIGNS="${{ matrix.tests }}"' in commands(jobs["campaigns"])
-    kinds = {row["resolution"] for row in jobs["resolutions"]["strategy"]["matrix"]["include"]}
+    kinds = {
+        row["resolution"] for row in jobs["resolutions"]["strategy"]["matrix"]["include"]
+    }
     assert kinds == {"lowest", "newest"}
     assert "make ${{ matrix.resolution }} PYTHON=python" in commands(jobs["resolutions"])
 
@@ -90,13 +97,16 @@ DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 
 
 def others_commands() -> list[tuple[str, str, str]]:
-    """Each such command of the documentation: page, command, and the row or paragraph around it."""
+    """Each such command of the documentation: page, command, and the row or paragraph around
+    it."""
     found = []
     for page, whole in pages().items():
         text = re.sub(r"^```.*?^```", "", whole, flags=re.MULTILINE | re.DOTALL)
         for block in re.split(r"\n\n|\n(?=\|)", text):
             for command in NEEDS.findall(block):
-                found.append((page.relative_to(ROOT).as_posix(), command.strip("`"), block))
+                found.append(
+                    (page.relative_to(ROOT).as_posix(), command.strip("`"), block)
+                )
     return found
 
 
@@ -123,7 +133,11 @@ esac
 
 
 def run_ci(
-    folder: Path, *parts: str, failing: str = "", second: int = 0, failed: tuple[str, ...] = ()
+    folder: Path,
+    *parts: str,
+    failing: str = "",
+    second: int = 0,
+    failed: tuple[str, ...] = (),
 ) -> tuple[subprocess.CompletedProcess[str], list[str]]:
     """Run a copy of `.ci/run` with a make of our own; its outcome, and the calls of make."""
     (folder / ".ci").mkdir()
@@ -162,7 +176,9 @@ def test_a_run_without_failures_makes_each_part_once(tmp_path: Path) -> None:
     assert "FLAKY" not in done.stdout
 
 
-def test_tests_that_pass_at_the_second_run_are_named_before_and_after_it(tmp_path: Path) -> None:
+def test_tests_that_pass_at_the_second_run_are_named_before_and_after_it(
+    tmp_path: Path,
+) -> None:
     done, calls = run_ci(tmp_path, "test", "studies", failing="test", failed=FAILED)
     assert done.returncode == 0
     assert calls == ["make -j2 test", "make failed", "make -j2 studies"]
@@ -175,7 +191,9 @@ def test_tests_that_pass_at_the_second_run_are_named_before_and_after_it(tmp_pat
 
 
 def test_tests_that_fail_twice_end_the_run(tmp_path: Path) -> None:
-    done, calls = run_ci(tmp_path, "test", "studies", failing="test", second=1, failed=FAILED)
+    done, calls = run_ci(
+        tmp_path, "test", "studies", failing="test", second=1, failed=FAILED
+    )
     assert done.returncode == 1
     assert calls == ["make -j2 test", "make failed"]
     assert FAILED[1] in done.stdout
@@ -190,7 +208,9 @@ def test_a_failure_that_is_no_tests_is_not_repeated(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["slow", "tes", "--help"])
-def test_an_unknown_part_is_refused_with_those_there_are(part: str, tmp_path: Path) -> None:
+def test_an_unknown_part_is_refused_with_those_there_are(
+    part: str, tmp_path: Path
+) -> None:
     done, calls = run_ci(tmp_path, part)
     assert (done.returncode, calls) == (2, [])
     assert all(name in done.stderr for name in (*PARTS, part))

@@ -1,4 +1,5 @@
-"""The distribution: every package is listed, and a built wheel works far from the repository."""
+"""The distribution: every package is listed, and a built wheel works far from the
+repository."""
 
 from __future__ import annotations
 
@@ -28,13 +29,16 @@ TEXTS = ("pyproject.toml", "README.md", "LICENSE")
 
 
 def present() -> set[str]:
-    inits = (init.parent for folder in FOLDERS for init in (ROOT / folder).rglob("__init__.py"))
+    inits = (
+        init.parent for folder in FOLDERS for init in (ROOT / folder).rglob("__init__.py")
+    )
     inside = (init.relative_to(ROOT).parts for init in inits)
     return {".".join(p if p[0] == "flexdt" else ("flexdt", *p)) for p in inside}
 
 
 def test_the_package_is_seen_whole_through_its_links() -> None:
-    """setuptools, type checkers and import-linter walk `src/`, and must find what lies on top."""
+    """setuptools, type checkers and import-linter walk `src/`, and must find what lies on
+    top."""
     walked = find_packages(str(ROOT / "src"))
     assert sorted(walked) == sorted(present())
     for folder in CODE:
@@ -86,7 +90,10 @@ def built(out: Path, place: str) -> Path:
         cwd=ROOT, capture_output=True, check=True,
     ).stdout.decode().split("\0")  # fmt: skip
     for name in filter(None, tracked):
-        if name.split("/")[0] in (*FOLDERS, "src", "extensions", *TEXTS) and (ROOT / name).exists():
+        if (
+            name.split("/")[0] in (*FOLDERS, "src", "extensions", *TEXTS)
+            and (ROOT / name).exists()
+        ):
             target = source / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target, follow_symlinks=False)
@@ -114,7 +121,9 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def outside(installed: Path, tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def outside(
+    installed: Path, tmp_path: Path, *words: str
+) -> subprocess.CompletedProcess[str]:
     """Run Python so that flexdt can only come from the installed wheel.
 
     -S leaves out the editable install's path; the dependencies' folder is named instead.
@@ -133,7 +142,9 @@ def environment_with(folder: Path, *more: Path) -> Path:
     venv.create(folder, with_pip=False)
     (site,) = folder.glob("lib/python*/site-packages")
     dependencies = [p for p in sys.path if p.endswith("site-packages")]
-    (site / "dependencies.pth").write_text("\n".join([*map(str, more), *dependencies]) + "\n")
+    (site / "dependencies.pth").write_text(
+        "\n".join([*map(str, more), *dependencies]) + "\n"
+    )
     return folder / "bin" / "python"
 
 
@@ -145,14 +156,18 @@ def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
         "flexdt_command.py",  # the console script's first module
         next(n.split("/")[0] for n in names if n.endswith(".dist-info/METADATA")),
     }
-    assert not [n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc", ".ts"))]
+    assert not [
+        n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc", ".ts"))
+    ]
 
 
 @pytest.mark.slow
 def test_the_wheel_of_the_extensions_holds_only_them(tmp_path: Path) -> None:
     files = zipfile.ZipFile(built(tmp_path, "extensions"))
     names = files.namelist()
-    (about,) = (name.split("/")[0] for name in names if name.endswith(".dist-info/METADATA"))
+    (about,) = (
+        name.split("/")[0] for name in names if name.endswith(".dist-info/METADATA")
+    )
     assert {name.split("/")[0] for name in names} == {"flexdt_extensions", about}
     package = ROOT / "extensions" / "flexdt_extensions"
     modules = {p.relative_to(package.parent).as_posix() for p in package.rglob("*.py")}
@@ -163,7 +178,9 @@ def test_the_wheel_of_the_extensions_holds_only_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_wheel_imports_as_flexdt_and_nothing_else(installed: Path, tmp_path: Path) -> None:
+def test_the_wheel_imports_as_flexdt_and_nothing_else(
+    installed: Path, tmp_path: Path
+) -> None:
     program = (
         "import importlib, importlib.util, json, pkgutil, sys\n"
         f"folders = {list(CODE)!r}\n"
@@ -198,10 +215,13 @@ def test_the_installed_command_answers(installed: Path, tmp_path: Path) -> None:
 def test_a_folder_of_its_name_does_not_stand_in_an_installed_flexdts_way(
     installed: Path, tmp_path: Path
 ) -> None:
-    """Who installs without `-e` goes on in the clone, whose folder `flexdt/` Python finds first."""
+    """Who installs without `-e` goes on in the clone, whose folder `flexdt/` Python finds
+    first."""
     python = environment_with(tmp_path / "venv", installed)
     (tmp_path / "flexdt").mkdir()
-    (tmp_path / "flexdt" / "__init__.py").write_text("raise SystemExit('the wrong one')\n")
+    (tmp_path / "flexdt" / "__init__.py").write_text(
+        "raise SystemExit('the wrong one')\n"
+    )
     program = tmp_path / "programs" / "program.py"
     program.parent.mkdir()
     program.write_text(
@@ -223,7 +243,9 @@ def test_an_editable_install_is_found_from_everywhere(place: str, tmp_path: Path
     (tmp_path / "beside").mkdir()
     (tmp_path / "beside" / "flexdt").symlink_to(ROOT, target_is_directory=True)
     (tmp_path / "far").mkdir()
-    where = {"inside": ROOT, "beside": tmp_path / "beside", "far": tmp_path / "far"}[place]
+    where = {"inside": ROOT, "beside": tmp_path / "beside", "far": tmp_path / "far"}[
+        place
+    ]
     words = [
         python,
         "-c",
@@ -353,7 +375,10 @@ def test_bounds_are_no_tighter_than_those_of_our_dependencies() -> None:
     from packaging.requirements import Requirement
 
     with (ROOT / "pyproject.toml").open("rb") as file:
-        ours = {r.name: r for r in map(Requirement, tomllib.load(file)["project"]["dependencies"])}
+        ours = {
+            r.name: r
+            for r in map(Requirement, tomllib.load(file)["project"]["dependencies"])
+        }
     theirs = {r.name: r for r in map(Requirement, requires("viser") or [])}
     for name in ("rich", "websockets", "trimesh", "numpy"):
         upper = {
@@ -380,9 +405,7 @@ def test_the_development_container_can_be_read() -> None:
 
 def test_code_lines_are_counted_without_blanks_comments_and_docstrings() -> None:
     count = load(ROOT / "tests" / "studies" / "code_lines.py").code_lines
-    source = (
-        '"""What\nfor."""\n\n# why\nx = [\n    1,\n]\n\ndef f():\n    """Says."""\n    return x\n'
-    )
+    source = '"""What\nfor."""\n\n# why\nx = [\n    1,\n]\n\ndef f():\n    """Says."""\n    return x\n'  # noqa: E501
     assert count(source) == len(["x = [", "1,", "]", "def f():", "return x"])
 
 
@@ -392,7 +415,8 @@ def test_a_module_that_is_a_program_begins_below_all_that_it_needs() -> None:
         path
         for folder in CODE
         for path in (ROOT / folder).rglob("*.py")
-        if "node_modules" not in path.parts and "\nif __name__ ==" in path.read_text("utf-8")
+        if "node_modules" not in path.parts
+        and "\nif __name__ ==" in path.read_text("utf-8")
     ]
     assert len(programs) >= 5
     for path in programs:

@@ -1,7 +1,7 @@
 """The algorithms that reconstruct, and the windows of the ramp filter: the only list of either.
 
-`flexdt reconstruct`, its help and completion, the library and the table of `docs/reconstruction.md`
-iterate it. Names are there without an import of what computes.
+`flexdt reconstruct`, its help and completion, the library and the table of
+`docs/reconstruction.md` iterate it. Names are there without an import of what computes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ class Algorithm:
     Attributes:
         name: as users write it.
         home: its module.
-        function: its name there. An iterative one is called with line integrals (n, rows, cols),
-            their geometry, a volume like the result, `watch` and those of its options that are
-            given.
+        function: its name there. An iterative one is called with line integrals (n, rows,
+            cols), their geometry, a volume like the result, `watch` and those of its options
+            that are given.
         kind: direct (goes through the views once, in parts and slab by slab), or iterative (all
             views and the whole volume in memory).
         options: those of iterations, weight, window, materials that it has.
-        stacks, grids: arrays as large as all images, and as the volume, that it holds at a time.
+        stacks, grids: arrays as large as all images, and as the volume, that it holds at a
+            time.
     """
 
     name: str
@@ -58,16 +59,27 @@ DEFAULT: Final = "fdk"
 ALGORITHMS: Final[dict[str, Algorithm]] = {
     one.name: one
     for one in (
-        Algorithm(DEFAULT, "flexdt.twin.reconstruction.checked_fdk", "fdk", "direct",
-                  frozenset({"window"})),
+        Algorithm(
+            DEFAULT,
+            "flexdt.twin.reconstruction.checked_fdk",
+            "fdk",
+            "direct",
+            frozenset({"window"}),
+        ),
         Algorithm("sirt", _ITERATIVE, "sirt", options=_SEVERAL),
         Algorithm("sart", _ITERATIVE, "sart", options=_SEVERAL),
         Algorithm("cgls", _ITERATIVE, "cgls"),
         Algorithm("em", _ITERATIVE, "em"),
-        Algorithm("tv", "flexdt.twin.reconstruction.tv", "tv",
-                  options=frozenset({"iterations", "weight"}), stacks=6, grids=13),
+        Algorithm(
+            "tv",
+            "flexdt.twin.reconstruction.tv",
+            "tv",
+            options=frozenset({"iterations", "weight"}),
+            stacks=6,
+            grids=13,
+        ),
     )
-}  # fmt: skip
+}
 """Name -> algorithm, in the order in which users see them."""
 
 

@@ -1,8 +1,9 @@
 """Methods of core values that need files, figures or other programs.
 
-`ConeVec.load`, `Volume.save` and `ScanPlan.check` belong to their values for the reader's sake, but
-the core reads no files, draws no figures and imports nothing above it. Such a method finds the
-module of the library that does the work in `BACKENDS`, the only place where the core names it.
+`ConeVec.load`, `Volume.save` and `ScanPlan.check` belong to their values for the reader's sake,
+but the core reads no files, draws no figures and imports nothing above it. Such a method finds
+the module of the library that does the work in `BACKENDS`, the only place where the core names
+it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ BACKENDS: Final = {
     "volume files": "flexdt.library.reconstruction.volume_files",
     "xarray": "flexdt.library.xarray_forms",
 }
-"""Subject -> module of the library or of the phantoms, imported when a method first needs it."""
+"""Subject -> module of the library or of the phantoms, imported when a method first needs
+it."""
 
 
 def backend(subject: str) -> Any:

@@ -2,10 +2,10 @@
 
 `align` tells the column in which the rotation axis is seen, and texts where the motors stood. A
 sideways shift of the axis moves the column in proportion to the magnification, one of the panel
-does not: axs_tan, det_tan and axs_tan's drift follow from one weighted least squares, into which
-det_tan enters as the texts have it, with its prior. Roll gets a weighted line, and either drift a
-prior. Where residuals are larger than their sigmas say, all sigmas grow in proportion (Birge 1932,
-doi:10.1103/PhysRev.40.207).
+does not: axs_tan, det_tan and axs_tan's drift follow from one weighted least squares, into
+which det_tan enters as the texts have it, with its prior. Roll gets a weighted line, and either
+drift a prior. Where residuals are larger than their sigmas say, all sigmas grow in proportion
+(Birge 1932, doi:10.1103/PhysRev.40.207).
 """
 
 from __future__ import annotations
@@ -49,8 +49,13 @@ their exposures. Motors and offsets may differ by `rebuild.MATCH_MM`."""
 ALIKE: Final = 3
 """Motors whose limits are a shipped machine's, from which on an executed script is of it."""
 OFFSETS: Final = ("det_tan", "src_ort", "axs_tan", "c_obj", "c_det", "det_roll_deg")
-TELLS: Final = {"axs_tan": "ordinary", "det_roll_deg": "ordinary", "src_ort": "beads",
-                "c_obj": "beads", "c_det": "beads"}  # fmt: skip
+TELLS: Final = {
+    "axs_tan": "ordinary",
+    "det_roll_deg": "ordinary",
+    "src_ort": "beads",
+    "c_obj": "beads",
+    "c_det": "beads",
+}
 """Offset -> the kind of scan that tells it."""
 
 
@@ -120,7 +125,12 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
     """
     s = None if scan.settings is None else rebuild.physical(scan.settings, scan.name)[0]
     f = None if s is None else s.figures
-    if s is None or s.roi is None or s.mode is None or not set(s.motors) & set(machine.axes):
+    if (
+        s is None
+        or s.roi is None
+        or s.mode is None
+        or not set(s.motors) & set(machine.axes)
+    ):
         raise TwinError("no settings text states its motors, camera mode and ROI")
     if f is None or not 0.0 < f.sod_mm < f.sdd_mm:
         raise TwinError("its text does not state SOD, SDD, HC, VC, COR and pixel")
@@ -142,8 +152,8 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 
 
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
-    """What its script asks for: axis -> target when the settings file is written, and settings of
-    camera and tube, by the names of `ScanSettings`, at the first projection.
+    """What its script asks for: axis -> target when the settings file is written, and settings
+    of camera and tube, by the names of `ScanSettings`, at the first projection.
 
     `projections` counts all that it saves: those of sequences, and single images.
     """
@@ -162,22 +172,28 @@ def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
             count = _projections(k, now.get("frames"))
             taken += count
             if count and first is None:
-                first = {n: v for n, v in now.items() if n not in machine.axes and n != "frames"}
+                first = {
+                    n: v
+                    for n, v in now.items()
+                    if n not in machine.axes and n != "frames"
+                }
     return moved if first is None else first | {"projections": taken} | moved
 
 
 def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> int:
     """Projections that a command saves; a sequence without a number of frames has one."""
     if isinstance(command, c.TakeSequence):
-        names: Sequence[str | None] = sequence_names(command.prefix, command.first, frames or 1)
+        names: Sequence[str | None] = sequence_names(
+            command.prefix, command.first, frames or 1
+        )
     else:
         names = (image_name(command.path),)
     return sum(name is not None and kind_of(name) == "projection" for name in names)
 
 
 class Scanner(NamedTuple):
-    """Which scanner a scan says it is of: the machine that ships, the serial number, and by what
-    the machine is known; each "" where nothing says it."""
+    """Which scanner a scan says it is of: the machine that ships, the serial number, and by
+    what the machine is known; each "" where nothing says it."""
 
     machine: str = ""
     serial: str = ""
@@ -206,7 +222,8 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
     """How many motors have the limits that a machine file has for them."""
     own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
-        axis is not None and bool(np.allclose(limits[name], (axis.lower, axis.upper), AGREE, 0.0))
+        axis is not None
+        and bool(np.allclose(limits[name], (axis.lower, axis.upper), AGREE, 0.0))
         for name, axis in own.items()
     )
 
@@ -224,7 +241,11 @@ def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
     words = []
     for one, names in groups.items():
         serial = f"serial number {one.serial}" if one.serial else "no serial number"
-        machine = f"{one.machine} (by {one.by})" if one.machine else "a scanner that nothing names"
+        machine = (
+            f"{one.machine} (by {one.by})"
+            if one.machine
+            else "a scanner that nothing names"
+        )
         words.append(f"{machine}, {serial}: {', '.join(names)}")
     return "; ".join(words)
 
@@ -236,16 +257,27 @@ def contradictions(
     differently; `fitted` has the signs and limits that the scans show."""
     said: dict[str, list[tuple[Any, list[str]]]] = {}
     lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
-    every = [(f"{name} in {scan.name}", value, who, name) for scan in scans
-             for name, value, who in _within(scan, fitted)]  # fmt: skip
-    every += [(name, value, scan.name, name) for scan in scans
-              for name, value in _alike(scan, fitted)]  # fmt: skip
+    every = [
+        (f"{name} in {scan.name}", value, who, name)
+        for scan in scans
+        for name, value, who in _within(scan, fitted)
+    ]
+    every += [
+        (name, value, scan.name, name)
+        for scan in scans
+        for name, value in _alike(scan, fitted)
+    ]
     known = {about for about, *_ in every}
-    every += [(name, value, f"machine {shipped.name}", name)
-              for name, value in _of_machine(shipped) if name in known]  # fmt: skip
-    every += [(f"sign of {name}", axis.settings_sign, who, name) for m, who in
-              ((fitted, "the scans' texts"), (shipped, f"machine {shipped.name}"))
-              for name, axis in m.axes.items()]  # fmt: skip
+    every += [
+        (name, value, f"machine {shipped.name}", name)
+        for name, value in _of_machine(shipped)
+        if name in known
+    ]
+    every += [
+        (f"sign of {name}", axis.settings_sign, who, name)
+        for m, who in ((fitted, "the scans' texts"), (shipped, f"machine {shipped.name}"))
+        for name, axis in m.axes.items()
+    ]
     for about, value, who, name in every:
         slack = (0.0, rebuild.MATCH_MM) if name in lengths else (AGREE, 0.0)
         told = said.setdefault(about, [])
@@ -264,7 +296,9 @@ def contradictions(
             if scan.camera is not None:
                 check_roi(scan.camera.roi, shipped.detector.pixels, scan.camera.binning)
         except TwinError as error:
-            yield Finding(f"camera in {scan.name}", f"machine {shipped.name}: {error.message}")
+            yield Finding(
+                f"camera in {scan.name}", f"machine {shipped.name}: {error.message}"
+            )
 
 
 def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
@@ -276,19 +310,29 @@ def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
     read = {n: signs[n] * m.value for n, m in s.motors.items() if n in signs}
     asked = scripted(scan, machine)
     for name in asked.keys() & signs.keys():
-        asked[name] = min(max(asked[name], machine.axes[name].lower), machine.axes[name].upper)
-    sources: dict[str, Mapping[str, Any]] = {"the text": {**vars(s), **read}, "the script": asked}
+        asked[name] = min(
+            max(asked[name], machine.axes[name].lower), machine.axes[name].upper
+        )
+    sources: dict[str, Mapping[str, Any]] = {
+        "the text": {**vars(s), **read},
+        "the script": asked,
+    }
     sources["the images"] = {"projections": scan.images or None, "shape": scan.shape}
     if scan.second is not None:
         sources["the XRE text"] = vars(scan.second)
     if s.figures is not None:
         f = s.figures
-        sources["its figures"] = {"magnification": f.magnification, "voxel_um": f.voxel_um}
+        sources["its figures"] = {
+            "magnification": f.magnification,
+            "voxel_um": f.voxel_um,
+        }
     if camera is not None:
         pixel = camera.pixel_mm(machine.detector.pixels)
         sources["mode and ROI"] = {
-            "shape": camera.shape, "binning": camera.binning, "binned_pixel_mm": pixel,
-        }  # fmt: skip
+            "shape": camera.shape,
+            "binning": camera.binning,
+            "binned_pixel_mm": pixel,
+        }
     for who, told in sources.items():
         for name in (*scan_settings.ENTRIES, "shape", *read):
             if told.get(name) not in (None, ""):
@@ -307,7 +351,10 @@ def _alike(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
             yield f"rates of {name}", (motor.speed, motor.acceleration)
     for x in scan.log:
         if x.motor is not None and isinstance(x.command, c.MotorCommand):
-            yield f"limits of {own_name(x.command.component, machine.axes)}", _limits(x.motor)
+            yield (
+                f"limits of {own_name(x.command.component, machine.axes)}",
+                _limits(x.motor),
+            )
     for name in OFFSETS[:-1] if scan.profile is not None else ():
         yield f"{name} of the texts", getattr(scan.profile, name)
 
@@ -335,15 +382,17 @@ def _plain(value: Any) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return ", ".join(names[:3]) + (
+        f" and {len(names) - 3} more" if len(names) > 3 else ""
+    )
 
 
 class ZeroOffsets(NamedTuple):
     """The profile that past scans give, at the last date.
 
-    `lines` are each offset's value and drift, `columns` of each scan the axis's (measured, fitted,
-    sigma of the fitted) column [px], `findings` the scans that contradict the others, and
-    `questions` what the scans leave open.
+    `lines` are each offset's value and drift, `columns` of each scan the axis's (measured,
+    fitted, sigma of the fitted) column [px], `findings` the scans that contradict the others,
+    and `questions` what the scans leave open.
     """
 
     profile: Profile
@@ -353,7 +402,9 @@ class ZeroOffsets(NamedTuple):
     questions: Sequence[Question]
 
 
-def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) -> ZeroOffsets:
+def zero_offsets(
+    scans: Sequence[PastScan], machine: Machine, usual: Profile
+) -> ZeroOffsets:
     """Zero offsets and drift.
 
     Args:
@@ -361,11 +412,15 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
         machine: whose.
         usual: offsets where no text states any.
     """
-    base = next((scan.profile for scan in reversed(scans) if scan.profile is not None), usual)
+    base = next(
+        (scan.profile for scan in reversed(scans) if scan.profile is not None), usual
+    )
     lines = {name: Line(getattr(base, name)) for name in OFFSETS}
     findings, columns = list[Finding](), dict[str, tuple[float, float, float]]()
     last = max((scan.date for scan in scans if scan.date is not None), default=None)
-    told = [s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters]
+    told = [
+        s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters
+    ]
     drifts = len({s.date for s in told if s.date is not None}) >= FOR_A_LINE
     told = [s for s in told if s.date is not None or not drifts]
     width = prior_widths(machine, usual)["dD_x"]
@@ -373,8 +428,8 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
     def fitted(
         sides: FloatArray, rest: list[float], sigmas: list[float], *names: str
     ) -> tuple[FloatArray, FloatArray]:
-        """Put the first name's line and the other's value into `lines`; the rows beyond those of
-        the scans are priors, of the drift first."""
+        """Put the first name's line and the other's value into `lines`; the rows beyond those
+        of the scans are priors, of the drift first."""
         at, covariance, pulls = _fit(sides, np.array(rest), np.array(sigmas), len(told))
         widths = np.sqrt(np.diag(covariance)).tolist()
         for name, i in zip(names, (0, 2), strict=False):
@@ -389,8 +444,12 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
         return at, covariance
 
     if told:
-        years = np.array([(s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0
-                          for s in told])  # fmt: skip
+        years = np.array(
+            [
+                (s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0
+                for s in told
+            ]
+        )
         found = [s.aligned.parameters for s in told if s.aligned]
         rolls = [p["det_roll"] for p in found]
         sides = np.vstack([np.column_stack([np.ones(len(told)), years]), [0.0, 1.0]])
@@ -401,19 +460,37 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
         )
         sides = np.column_stack([seen[:, 1], seen[:, 1] * years, seen[:, 2]])
         measured = [p["axis_column_px"] for p in found]
-        rest = [*(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)), 0.0, 0.0]
+        rest = [
+            *(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)),
+            0.0,
+            0.0,
+        ]
         sigmas = [*(m.sigma for m in measured), DRIFT, width]
         known = np.vstack([sides, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         at, covariance = fitted(known, rest, sigmas, "axs_tan", "det_tan")
         spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, covariance, sides))
-        for s, m, *more in zip(told, measured, seen[:, 0] + sides @ at, spread, strict=True):
+        for s, m, *more in zip(
+            told, measured, seen[:, 0] + sides @ at, spread, strict=True
+        ):
             columns[s.name] = (m.value, float(more[0]), float(more[1]))
     day = "undated" if last is None else f"{last:%Y-%m-%d}"
-    source = "; ".join(f"{n}: {x.scans or 'texts of the'} scans" for n, x in lines.items())
-    head = {"name": f"commissioned-{day}", "machine": machine.name, "date": day, "source": source}
-    profile = Profile.model_validate(head | {n: round(x.value, 6) for n, x in lines.items()})
-    questions = [Question(n, "no scan's images tell it; it is the texts'", by)
-                 for n, by in TELLS.items() if not lines[n].scans]  # fmt: skip
+    source = "; ".join(
+        f"{n}: {x.scans or 'texts of the'} scans" for n, x in lines.items()
+    )
+    head = {
+        "name": f"commissioned-{day}",
+        "machine": machine.name,
+        "date": day,
+        "source": source,
+    }
+    profile = Profile.model_validate(
+        head | {n: round(x.value, 6) for n, x in lines.items()}
+    )
+    questions = [
+        Question(n, "no scan's images tell it; it is the texts'", by)
+        for n, by in TELLS.items()
+        if not lines[n].scans
+    ]
     if (lines["det_tan"].sigma or math.inf) > TOLD * width:
         why = "no scans of different magnification tell the axis"
         questions.append(Question("det_tan apart from axs_tan", why, "magnified"))
@@ -423,14 +500,20 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
     return ZeroOffsets(profile, lines, columns, findings, questions)
 
 
-def _axis(machine: Machine, scan: PastScan, base: Profile, roll: float) -> tuple[float, ...]:
-    """The axis's column [px] with the offsets of `base`, and its slopes [px/mm] with axs_tan and
-    det_tan, in which it is linear."""
+def _axis(
+    machine: Machine, scan: PastScan, base: Profile, roll: float
+) -> tuple[float, ...]:
+    """The axis's column [px] with the offsets of `base`, and its slopes [px/mm] with axs_tan
+    and det_tan, in which it is linear."""
     own, camera = scan.profile or base, scan.camera or machine.detector.camera
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     column = []
     for axs, det in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-        moved = {"axs_tan": base.axs_tan + axs, "det_tan": base.det_tan + det, "det_roll_deg": roll}
+        moved = {
+            "axs_tan": base.axs_tan + axs,
+            "det_tan": base.det_tan + det,
+            "det_roll_deg": roll,
+        }
         poses = motor_poses(machine, own.model_copy(update=moved), camera, scan.positions)
         column.append(float(axis_in_image(poses, NOMINAL, middle)[0]))
     return column[0], column[1] - column[0], column[2] - column[0]
@@ -441,8 +524,8 @@ def _fit(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weighted least squares of rows, of which the first `scans` belong to a scan each.
 
-    The scan that contradicts the others most is left out while it does so by `FAR_OFF` sigmas and
-    enough remain.
+    The scan that contradicts the others most is left out while it does so by `FAR_OFF` sigmas
+    and enough remain.
 
     Returns:
         Values, covariance, and the residuals of all scans in sigmas.
@@ -457,5 +540,9 @@ def _fit(
         pulls, freedom = (rest / spread)[:scans], int(kept.sum()) - a.shape[1]
         far = np.where(kept[:scans], np.abs(pulls), 0.0)
         if freedom < FOR_A_LINE or far.max() <= FAR_OFF:
-            return at, max(1.0, float(rest[kept] @ rest[kept]) / max(freedom, 1)) * inverse, pulls
+            return (
+                at,
+                max(1.0, float(rest[kept] @ rest[kept]) / max(freedom, 1)) * inverse,
+                pulls,
+            )
         kept[int(far.argmax())] = False

@@ -1,7 +1,7 @@
 """The errors of the pure core, one type for each thing a caller may want to handle differently.
 
-Every error names the value asked for, what is allowed and where; `data` carries the same facts for
-a program. The server maps the types to wire codes.
+Every error names the value asked for, what is allowed and where; `data` carries the same facts
+for a program. The server maps the types to wire codes.
 """
 
 from __future__ import annotations
@@ -38,16 +38,23 @@ class TwinError(ValueError):
             >>> print(error, error.data)
             no unit 'mile'; allowed: mm, m {'asked': 'mile', 'allowed': ['mm', 'm']}
         """
-        several = list(map(str, allowed)) if isinstance(allowed, list | tuple | dict) else None
+        several = (
+            list(map(str, allowed)) if isinstance(allowed, list | tuple | dict) else None
+        )
         words = allowed if several is None else ", ".join(several)
-        data = {**where, "asked": asked, "allowed": allowed if several is None else several}
+        data = {
+            **where,
+            "asked": asked,
+            "allowed": allowed if several is None else several,
+        }
         return cls(f"{said}; allowed: {words}", data)
 
     @classmethod
     def of_shape(
         cls, what: str, got: Sequence[int], allowed: Sequence[int | str], more: str = ""
     ) -> Self:
-        """The error whose message is `what`, the shape it has and the one it must have, and `more`.
+        """The error whose message is `what`, the shape it has and the one it must have, and
+        `more`.
 
         Example:
             >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
@@ -72,12 +79,16 @@ class LimitError(TwinError):
     """A target, speed or setting outside what the machine allows."""
 
     @classmethod
-    def of_axis(cls, said: str, axis: str, asked: object, allowed: object, unit: str) -> Self:
+    def of_axis(
+        cls, said: str, axis: str, asked: object, allowed: object, unit: str
+    ) -> Self:
         """Make the error whose message is `said`, about what an axis allows."""
         return cls(said, {"axis": axis, "asked": asked, "allowed": allowed, "unit": unit})
 
 
-def require_within(what: str, value: float, low: float, high: float, unit: str = "") -> None:
+def require_within(
+    what: str, value: float, low: float, high: float, unit: str = ""
+) -> None:
     """Check that a number is finite and from `low` to `high`.
 
     Raises:
@@ -144,13 +155,21 @@ class UnknownNameError(TwinError):
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
         facts = dict(data or {})
         asked, allowed = facts.get("asked"), facts.get("allowed")
-        if isinstance(asked, str) and isinstance(allowed, Sequence) and MEANT not in message:
-            near = nearest_name(asked, [name for name in allowed if isinstance(name, str)])
+        if (
+            isinstance(asked, str)
+            and isinstance(allowed, Sequence)
+            and MEANT not in message
+        ):
+            near = nearest_name(
+                asked, [name for name in allowed if isinstance(name, str)]
+            )
             message += "" if near is None else f"; {MEANT} {near!r}?"
         super().__init__(message, facts)
 
     @classmethod
-    def among(cls, problem: str, asked: str, allowed: Iterable[str], more: str = "") -> Self:
+    def among(
+        cls, problem: str, asked: str, allowed: Iterable[str], more: str = ""
+    ) -> Self:
         """The error whose message is `problem`, a colon, the names there are, and `more`.
 
         Example:
@@ -158,7 +177,9 @@ class UnknownNameError(TwinError):
             no axis 'w'; there are: x, y
         """
         names = list(allowed)
-        return cls(f"{problem}: {', '.join(names)}{more}", {"asked": asked, "allowed": names})
+        return cls(
+            f"{problem}: {', '.join(names)}{more}", {"asked": asked, "allowed": names}
+        )
 
 
 class NotIdentifiableError(TwinError):

@@ -16,7 +16,8 @@ def parse_json(text: str, kind: type[dict[str, Any]] = dict) -> Any:
         kind: of its objects.
 
     Raises:
-        ValueError: it is none, nests too deep, or holds a number of thousands of digits; says so.
+        ValueError: it is none, nests too deep, or holds a number of thousands of digits; says
+            so.
 
     Example:
         >>> parse_json("\ufeff[1]")

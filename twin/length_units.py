@@ -12,4 +12,5 @@ UNITS_MM: Final[Mapping[str, float]] = {
     "m": 1000.0,
     "inch": 25.4,
 }
-"""Name of a unit -> its length [mm]. The wire has the same names (`LengthUnit` of the protocol)."""
+"""Name of a unit -> its length [mm]. The wire has the same names (`LengthUnit` of the
+protocol)."""

@@ -1,4 +1,5 @@
-"""Name work that takes seconds, so that whoever has a clock and a screen can show how far it is."""
+"""Name work that takes seconds, so that whoever has a clock and a screen can show how far it
+is."""
 
 from __future__ import annotations
 
@@ -10,15 +11,18 @@ Part = TypeVar("Part")
 Advance: TypeAlias = Callable[[float], None]
 """Takes the fraction of the work that is done, 0 to 1."""
 Progress: TypeAlias = bool | Advance | None
-"""What callers choose: None or True for a bar after two seconds, False for silence, or a function
-that is called with the fraction done and shows it in its own way."""
+"""What callers choose: None or True for a bar after two seconds, False for silence, or a
+function that is called with the fraction done and shows it in its own way."""
 
 
 class Announcer(Protocol):
     """Shows work while it goes on."""
 
-    def __call__(self, what: str, progress: Progress = None) -> AbstractContextManager[Advance]:
-        """Enter with the work's name and the caller's choice; yields what takes the fraction."""
+    def __call__(
+        self, what: str, progress: Progress = None
+    ) -> AbstractContextManager[Advance]:
+        """Enter with the work's name and the caller's choice; yields what takes the
+        fraction."""
 
 
 @contextmanager
@@ -32,7 +36,8 @@ def ignore(done: float) -> None:
 
 
 class Passes:
-    """Tell the fraction done of work that passes over all of its parts an unknown number of times.
+    """Tell the fraction done of work that passes over all of its parts an unknown number of
+    times.
 
     After n passes n / (n + 1) of it is taken as done.
 

@@ -1,8 +1,8 @@
 """Public functions and classes: what their signatures say, said to the caller.
 
-`public` compares the arguments of a call with the annotations of the signature, so that a misspelt
-keyword, two arguments in the wrong order or a value of another type is one sentence that says what
-was given and what is allowed. Values are checked by what is called, as before.
+`public` compares the arguments of a call with the annotations of the signature, so that a
+misspelt keyword, two arguments in the wrong order or a value of another type is one sentence
+that says what was given and what is allowed. Values are checked by what is called, as before.
 """
 
 from __future__ import annotations
@@ -16,7 +16,16 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, wraps
 from numbers import Real
-from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+)
 
 from flexdt.twin.errors import GeometryError, LimitError, nearest_name
 
@@ -25,7 +34,8 @@ Result = TypeVar("Result")
 Thing = TypeVar("Thing", bound=Callable[..., Any])
 
 NAMES: Final = (("voxel", "voxel_mm"), ("center", "center_mm"), ("geometry", "cone_vec"))
-"""Names of one thing (docs/conventions.md): where a signature has one, the other is deprecated."""
+"""Names of one thing (docs/conventions.md): where a signature has one, the other is
+deprecated."""
 SHOWN: Final = 60
 """Characters of a value that a message repeats."""
 LOOKED_AT: Final = 100
@@ -67,7 +77,8 @@ class Kind(NamedTuple):
 def with_arguments_of(
     other: Callable[P, object],
 ) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
-    """A decorator that gives a function the parameters of `other`, for `help` and type checkers."""
+    """A decorator that gives a function the parameters of `other`, for `help` and type
+    checkers."""
 
     def typed(function: Callable[..., Result]) -> Callable[P, Result]:
         result = inspect.signature(function).return_annotation
@@ -79,7 +90,8 @@ def with_arguments_of(
 
 
 def with_options_of(declared: type) -> Callable[[Thing], Thing]:
-    """A decorator: the `**options` of a function are the keys of a TypedDict, each None by default.
+    """A decorator: the `**options` of a function are the keys of a TypedDict, each None by
+    default.
 
     They stand in its signature, and their descriptions in its docstring, in place of the line
     `options: OPTIONS` of its arguments.
@@ -90,7 +102,10 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
     told = inspect.cleandoc(declared.__doc__ or "").partition("Args:\n")[2]
     hints = typing.get_type_hints(declared)
     keyword = inspect.Parameter.KEYWORD_ONLY
-    more = [inspect.Parameter(n, keyword, default=None, annotation=h) for n, h in hints.items()]
+    more = [
+        inspect.Parameter(n, keyword, default=None, annotation=h)
+        for n, h in hints.items()
+    ]
 
     def declaring(function: Thing) -> Thing:
         said = inspect.signature(function)
@@ -128,7 +143,11 @@ def public(thing: Thing) -> Thing:
         if name == "__init__" or not name.startswith("_"):
             if isinstance(member, classmethod | staticmethod):
                 inside = member.__func__
-                setattr(thing, name, type(member)(_checked(inside, inspect.getdoc(inside) or "")))
+                setattr(
+                    thing,
+                    name,
+                    type(member)(_checked(inside, inspect.getdoc(inside) or "")),
+                )
             elif inspect.isfunction(member):
                 said = text if name == "__init__" else inspect.getdoc(member) or ""
                 setattr(thing, name, _checked(member, said))
@@ -183,12 +202,15 @@ class Known:
     def kinds(self) -> dict[str, Kind]:
         """What is allowed for each argument whose annotation says it."""
         names = Names(
-            self.function.__globals__, npt=types.SimpleNamespace(ArrayLike=Array, NDArray=Array)
+            self.function.__globals__,
+            npt=types.SimpleNamespace(ArrayLike=Array, NDArray=Array),
         )
         found = {}
         for name, parameter in self.signature.parameters.items():
             said = parameter.annotation
-            found[name] = kind_of(eval(said, {}, names) if isinstance(said, str) else said)
+            found[name] = kind_of(
+                eval(said, {}, names) if isinstance(said, str) else said
+            )
         return {name: kind for name, kind in found.items() if kind is not None}
 
     def checked(self, given: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
@@ -218,7 +240,11 @@ class Known:
     def _name_for(self, given: tuple[Any, ...]) -> str:
         """Name the function as the caller does: a method by the class that it was called on."""
         owner, dot, method = self.qualname.rpartition(".")
-        called = given[0] if given and isinstance(given[0], type) else type(next(iter(given), None))
+        called = (
+            given[0]
+            if given and isinstance(given[0], type)
+            else type(next(iter(given), None))
+        )
         known = any(base.__name__ == owner for base in called.__mro__)
         name = f"{called.__name__ if known else owner}{dot}{method}"
         return name.removesuffix(".__init__")
@@ -232,7 +258,9 @@ class Known:
             return named
         found = {}
         for name, value in named.items():
-            other = next((b for pair in NAMES for a, b in (pair, pair[::-1]) if a == name), "")
+            other = next(
+                (b for pair in NAMES for a, b in (pair, pair[::-1]) if a == name), ""
+            )
             if name in takes:
                 found[name] = value
             elif other in takes and other not in named:
@@ -252,7 +280,9 @@ class Known:
         *first, last = self.kinds[name].words
         words = f"{', '.join(first)} or {last}" if first else last
         takes = self.signature.parameters
-        places = [n for n in self._names() if takes[n].kind is takes[n].POSITIONAL_OR_KEYWORD]
+        places = [
+            n for n in self._names() if takes[n].kind is takes[n].POSITIONAL_OR_KEYWORD
+        ]
         swapped = [
             other
             for other in places
@@ -261,10 +291,16 @@ class Known:
             and (other not in self.kinds or self.kinds[other].holds(value))
         ]
         hint = f"; are {label} and {swapped[-1]} in the wrong order?" if swapped else ""
-        told = re.search(rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M)
-        more = f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})" if told else ""
+        told = re.search(
+            rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M
+        )
+        more = (
+            f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})" if told else ""
+        )
         said = f"{where}: {label} is {_shown(value)}"
-        return ArgumentError.instead(said, repr(value)[:100], words + more + hint, argument=label)
+        return ArgumentError.instead(
+            said, repr(value)[:100], words + more + hint, argument=label
+        )
 
 
 class Names(dict[str, Any]):
@@ -291,28 +327,43 @@ def kind_of(annotation: Any) -> Kind | None:
     if origin in (typing.Union, types.UnionType):
         kinds = [kind for kind in inner if kind is not None]
         words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))
-        return Kind(words, lambda v: any(k.holds(v) for k in kinds)) if None not in inner else None
+        return (
+            Kind(words, lambda v: any(k.holds(v) for k in kinds))
+            if None not in inner
+            else None
+        )
     if origin is Literal:
         return Kind(
-            tuple(map(repr, parts)), lambda v: v in [p for p in parts if type(p) is type(v)]
+            tuple(map(repr, parts)),
+            lambda v: v in [p for p in parts if type(p) is type(v)],
         )
     if annotation is Array or getattr(origin, "__name__", "") == "ndarray":
         return Kind(("an array of numbers",), _is_numbers)
     if origin is tuple and ... not in parts:
-        members = ["anything" if kind is None else " or ".join(kind.words) for kind in inner]
+        members = [
+            "anything" if kind is None else " or ".join(kind.words) for kind in inner
+        ]
         return Kind((f"({', '.join(members)})",), lambda v: _is_list(v, inner))
     if origin in (tuple, list, Sequence):
         member = "anything" if inner[0] is None else " or ".join(inner[0].words)
-        return Kind((f"a list ({member}, ...)",), lambda v: _is_list(v, inner, several=True))
+        return Kind(
+            (f"a list ({member}, ...)",), lambda v: _is_list(v, inner, several=True)
+        )
     if origin is Mapping:
         return Kind(("a dictionary",), lambda v: isinstance(v, Mapping))
     if origin is Callable:
         return Kind(("a function",), callable)
     wanted = origin or annotation
-    if wanted in (*PLAIN, Any, object, inspect.Parameter.empty) or not isinstance(wanted, type):
+    if wanted in (*PLAIN, Any, object, inspect.Parameter.empty) or not isinstance(
+        wanted, type
+    ):
         return PLAIN.get(wanted)
     if getattr(wanted, "_is_protocol", False):
-        methods = [n for n, m in vars(wanted).items() if inspect.isfunction(m) and n != "__init__"]
+        methods = [
+            n
+            for n, m in vars(wanted).items()
+            if inspect.isfunction(m) and n != "__init__"
+        ]
         return Kind((_named(wanted),), lambda v: all(hasattr(v, n) for n in methods))
     return Kind((_named(wanted),), lambda v: isinstance(v, wanted))
 
@@ -333,14 +384,25 @@ def _is_numbers(value: Any) -> bool:
     """
     import numpy as np
 
-    kind = "O" if isinstance(value, bool) else getattr(getattr(value, "dtype", None), "kind", None)
-    if kind is None and isinstance(value, Real | str | bytes | list | tuple | Mapping | None):
+    kind = (
+        "O"
+        if isinstance(value, bool)
+        else getattr(getattr(value, "dtype", None), "kind", None)
+    )
+    if kind is None and isinstance(
+        value, Real | str | bytes | list | tuple | Mapping | None
+    ):
         try:
             kind = np.asarray(value).dtype.kind
         except ValueError:  # lists of different lengths
             kind = "O"
     if kind is None:
-        forms = ("__array__", "__array_interface__", "__cuda_array_interface__", "__dlpack__")
+        forms = (
+            "__array__",
+            "__array_interface__",
+            "__cuda_array_interface__",
+            "__dlpack__",
+        )
         return any(hasattr(value, form) for form in (*forms, "__getitem__"))
     return kind in "biufc"
 
@@ -351,10 +413,14 @@ def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False)
         return False
     alone = isinstance(value, str | bytes | Mapping) or getattr(value, "ndim", 1) == 0
     kinds = kinds if alone or not several else [*kinds] * len(value)
-    return not alone and len(value) == len(kinds) and all(
-        kind is None or kind.holds(one)
-        for kind, one in zip(kinds[:LOOKED_AT], value, strict=False)
-    )  # fmt: skip
+    return (
+        not alone
+        and len(value) == len(kinds)
+        and all(
+            kind is None or kind.holds(one)
+            for kind, one in zip(kinds[:LOOKED_AT], value, strict=False)
+        )
+    )
 
 
 def _named(kind: type) -> str:

@@ -1,8 +1,9 @@
-"""Frozen dataclasses that hold arrays, as values: compared by content, written to JSON and back.
+"""Frozen dataclasses that hold arrays, as values: compared by content, written to JSON and
+back.
 
-A dataclass compares its fields as a tuple, which NumPy arrays do not support, and pydantic, which
-does the conversion, has no schema for arrays. `ArrayValue` supplies the comparison, `Array` and
-`Table` the schema.
+A dataclass compares its fields as a tuple, which NumPy arrays do not support, and pydantic,
+which does the conversion, has no schema for arrays. `ArrayValue` supplies the comparison,
+`Array` and `Table` the schema.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class ArrayValue:
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
             return NotImplemented
-        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return all(
+            _same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)
+        )
 
 
 class JsonValue:

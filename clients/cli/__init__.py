@@ -1,7 +1,7 @@
 """The `flexdt` command: arguments in, client calls, readable text or one JSON document out.
 
-Importing this package imports nothing heavy, so that `flexdt --help` answers at once. Each command
-only hands over to a client, a pure function or a process.
+Importing this package imports nothing heavy, so that `flexdt --help` answers at once. Each
+command only hands over to a client, a pure function or a process.
 """
 
 from __future__ import annotations

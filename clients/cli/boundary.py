@@ -1,9 +1,9 @@
 """The single error boundary of the command line: every error becomes lines and an exit code.
 
 Exit codes: 0 done, 1 invalid input, 2 usage, 3 collision or limit, 4 no connection or refused,
-5 not identifiable; 130 after Ctrl-C, as shells have it. Never a traceback, unless FLEXDT_TRACEBACK
-is set in the environment, which is for developers. Types are looked up only once something has
-gone wrong, so the boundary costs no imports.
+5 not identifiable; 130 after Ctrl-C, as shells have it. Never a traceback, unless
+FLEXDT_TRACEBACK is set in the environment, which is for developers. Types are looked up only
+once something has gone wrong, so the boundary costs no imports.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     from flexdt.protocol.rpc_errors import RpcError
     from flexdt.twin import errors as twin
 
-    if callable(getattr(error, "format_message", None)):  # typer's usage errors, any version
+    if callable(
+        getattr(error, "format_message", None)
+    ):  # typer's usage errors, any version
         return _usage(error), USAGE
     if isinstance(error, RpcError):
         return _wire_error(error), wire_code(error)
@@ -107,7 +109,9 @@ def _wire_error(error: RpcError) -> tuple[str, ...]:
     """Return the lines of a server's error reply: `code`, `message` and `data` of
     JSON-RPC."""
     lines = [error.message]
-    if isinstance(error.data, Mapping):  # the message states the first parameter's problem
+    if isinstance(
+        error.data, Mapping
+    ):  # the message states the first parameter's problem
         found = error.data.get("problems", ())
         lines += [f"{p['path']}: {p['message']}" for p in found[1:] if "path" in p]
     return (*(f"flexdt: {line}" for line in lines), *positions(error.data))

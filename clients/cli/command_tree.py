@@ -97,26 +97,62 @@ NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 PROCESS_COMMANDS: Final = ("twin", "projector", "viewer", "gateway")
 """Commands that pass their words on to a process, `--help` among them."""
 SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
-    "Scanner": ("state", "move", "jog", "stop", "estop", "reset", "tube", "camera", "clock",
-                "sample", "delete", "snap"),
+    "Scanner": (
+        "state",
+        "move",
+        "jog",
+        "stop",
+        "estop",
+        "reset",
+        "tube",
+        "camera",
+        "clock",
+        "sample",
+        "delete",
+        "snap",
+    ),
     "Scans": ("script", "check", "expose", "run", "job", "follow"),
-    "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
-    "Analysis": ("phantom", "machine", "commission", "study", "batch", "bench", "evidence"),
+    "Data": (
+        "calibrate",
+        "align",
+        "compare",
+        "reconstruct",
+        "export",
+        "import",
+        "simulate",
+    ),
+    "Analysis": (
+        "phantom",
+        "machine",
+        "commission",
+        "study",
+        "batch",
+        "bench",
+        "evidence",
+    ),
     "Processes": ("up", *PROCESS_COMMANDS, "demo", "doctor"),
-}  # fmt: skip
+}
 """Sections of the help page; commands in none of them are listed under Extensions."""
 
 
 COMMON: Final[Mapping[str, str]] = {
-    "--json": "--json", "--server": "--server HOST:PORT", "--token-file": "--token-file FILE",
-    "--quiet": "--quiet", "-q": "-q", "--verbose": "--verbose", "-v": "-v",
-}  # fmt: skip
-"""Options of `flexdt` itself that may also follow the command's name, as help pages show them."""
+    "--json": "--json",
+    "--server": "--server HOST:PORT",
+    "--token-file": "--token-file FILE",
+    "--quiet": "--quiet",
+    "-q": "-q",
+    "--verbose": "--verbose",
+    "-v": "-v",
+}
+"""Options of `flexdt` itself that may also follow the command's name, as help pages show
+them."""
 OPTIONS_WITH_VALUE: Final = ("--server", "--token-file")
 """Options of `COMMON` that a value follows."""
 
 
-def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], list[str]]:
+def own_first(
+    words: Sequence[str], flags: Collection[str]
+) -> tuple[list[str], list[str]]:
     """Split words into these options of `COMMON`, with their values, and the other words."""
     first, rest = list[str](), list[str]()
     more = iter(words)
@@ -145,7 +181,9 @@ class InSections(TyperGroup):
         if first and first[-1] in OPTIONS_WITH_VALUE:
             ctx.fail(f"Option '{first[-1]}' requires an argument.")
         if command not in (None, self) and rest[0].partition("=")[0] in COMMON:
-            ctx.fail(f"{rest[0].partition('=')[0]} is no option of `flexdt {command.name}`")
+            ctx.fail(
+                f"{rest[0].partition('=')[0]} is no option of `flexdt {command.name}`"
+            )
         return list(super().parse_args(ctx, [*first, *rest]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -155,8 +193,11 @@ class InSections(TyperGroup):
         others = tuple(name for name in found if name not in named)
         room = formatter.width - 6 - max(map(len, found))
         for title, names in {**SECTIONS, "Extensions": others}.items():
-            rows = [(name, command.get_short_help_str(room))
-                    for name in names if (command := found.get(name)) is not None]  # fmt: skip
+            rows = [
+                (name, command.get_short_help_str(room))
+                for name in names
+                if (command := found.get(name)) is not None
+            ]
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
@@ -182,7 +223,11 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
     @app.callback()
     def root(
         version: bool = option(
-            False, "Print the version and exit.", "--version", callback=_version, is_eager=True
+            False,
+            "Print the version and exit.",
+            "--version",
+            callback=_version,
+            is_eager=True,
         ),
         json: Json = False,
         server: Server = None,
@@ -248,8 +293,13 @@ def _add_others(
     else:
         first, second = [*own_first(words, COMMON)[1], "", ""][:2]
         asked = [f"{first} {second}" if first in GROUPS else first]
-    ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
-    asked = [name for name in asked if name not in ours and name and name.split()[-1][0] != "-"]
+    ours = {
+        *COMMANDS,
+        *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more),
+    }
+    asked = [
+        name for name in asked if name not in ours and name and name.split()[-1][0] != "-"
+    ]
     for name in dict.fromkeys([*KNOWN, *asked]):
         command = found(name) if name in asked else None
         group, _, one = name.rpartition(" ")
@@ -262,11 +312,17 @@ def _add_others(
             place.command(one, context_settings=bare)(listed(name))
 
 
-def _add(app: typer.Typer, name: str, command: Callable[..., Any], context: Any = None) -> None:
+def _add(
+    app: typer.Typer, name: str, command: Callable[..., Any], context: Any = None
+) -> None:
     """Add a command; its help page ends with the options of `flexdt` that it heeds."""
     complete, heeds = completed(command)
     complete.heeds = heeds  # type: ignore[attr-defined]
-    also = f"Also, of flexdt itself: {', '.join(COMMON[flag] for flag in heeds)}" if heeds else None
+    also = (
+        f"Also, of flexdt itself: {', '.join(COMMON[flag] for flag in heeds)}"
+        if heeds
+        else None
+    )
     app.command(name, context_settings=context, epilog=also)(complete)
 
 
@@ -311,7 +367,8 @@ def _run(argv: Sequence[str]) -> int:
     if argv and argv[0] in REMOVED_COMMANDS:
         note(
             f"flexdt {argv[0]}: has been removed; the data directory of a stopped twin is an "
-            "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` unpacks it"
+            "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` "
+            "unpacks it"
         )
         return USAGE
     completing = COMPLETION_VARIABLE in os.environ  # a shell requests completions
@@ -327,7 +384,9 @@ def _run(argv: Sequence[str]) -> int:
         raise
     except typer.Exit as leave:
         return leave.exit_code
-    except BrokenPipeError:  # a closed pipe at the help page; `say` handles that of results
+    except (
+        BrokenPipeError
+    ):  # a closed pipe at the help page; `say` handles that of results
         hush()
         return DONE
     except Exception as error:

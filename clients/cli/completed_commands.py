@@ -69,8 +69,12 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
                 emit(part)
 
     complete.__doc__ = about
-    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-    offered = (_with_choices(p) for name, p in own.items() if name not in FILLED_PARAMETERS)
+    context = inspect.Parameter(
+        "context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context
+    )
+    offered = (
+        _with_choices(p) for name, p in own.items() if name not in FILLED_PARAMETERS
+    )
     has_parameters(complete, [context, *offered])
     heeds = ("--json",) if yields or "json" in own else ()
     reaches = ("--server", "--token-file") if "twin" in own else ()

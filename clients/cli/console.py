@@ -39,7 +39,9 @@ def speak(quiet: bool, verbose: bool) -> None:
     if quiet or verbose:
         import logging
 
-        logging.getLogger("flexdt.progress").setLevel(logging.ERROR if quiet else logging.INFO)
+        logging.getLogger("flexdt.progress").setLevel(
+            logging.ERROR if quiet else logging.INFO
+        )
         if verbose:
             logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
 
@@ -89,7 +91,9 @@ def as_json(document: object) -> str:
     def plain(value: Any) -> object:
         return value.tolist() if hasattr(value, "tolist") else str(value)
 
-    known = to_jsonable_python(document, by_alias=False, inf_nan_mode="null", fallback=plain)
+    known = to_jsonable_python(
+        document, by_alias=False, inf_nan_mode="null", fallback=plain
+    )
     return json.dumps(known, indent=2, allow_nan=False)
 
 
@@ -100,7 +104,9 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
         return ""
     widths = [max(len(row[i]) for row in every) for i in range(len(every[0]))]
     lines = (
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        "  ".join(
+            cell.ljust(width) for cell, width in zip(row, widths, strict=True)
+        ).rstrip()
         for row in every
     )
     return "\n".join(lines)
@@ -166,7 +172,9 @@ class ProgressBar:
             from rich.console import Console
             from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
-            usual = Progress.get_default_columns()  # description, bar, percentage, time left
+            usual = (
+                Progress.get_default_columns()
+            )  # description, bar, percentage, time left
             counted = MofNCompleteColumn(), TextColumn(self._unit)
             self._bar = Progress(*usual, *counted, console=Console(stderr=True))
             self._bar.start()
@@ -195,7 +203,9 @@ class ProgressBar:
     def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:
         if not total:
             return f"{text}: {done:g} {self._unit}"
-        counted = f"{done:g} of {total:g} {self._unit} " if float(done).is_integer() else ""
+        counted = (
+            f"{done:g} of {total:g} {self._unit} " if float(done).is_integer() else ""
+        )
         line = f"{text}: {counted}({100 * done / total:.0f} %)"
         if 0 < done < total:
             line += f", about {duration(elapsed * (total - done) / done)} left"

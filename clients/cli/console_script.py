@@ -63,7 +63,9 @@ def _watch() -> None:
     heard_of, arrives = os.pipe()
     os.set_blocking(arrives, False)
     signal.set_wakeup_fd(arrives, warn_on_full_buffer=False)
-    threading.Thread(target=_end_if_stuck, args=(heard_of,), name="interrupts", daemon=True).start()
+    threading.Thread(
+        target=_end_if_stuck, args=(heard_of,), name="interrupts", daemon=True
+    ).start()
 
 
 def _end_if_stuck(arrivals: int) -> None:
@@ -86,14 +88,16 @@ def _not_lost(unraisable: object) -> None:
 
 def main() -> None:
     """Run the command line of this process."""
-    if signal.getsignal(signal.SIGINT) != signal.default_int_handler:  # a shell's `&` ignores it
+    if (
+        signal.getsignal(signal.SIGINT) != signal.default_int_handler
+    ):  # a shell's `&` ignores it
         _command()
         return
     signal.signal(signal.SIGINT, _interrupt)
     import atexit
 
-    # Registered first it is called last, when all is done: Python itself takes its handlers away
-    # before it has ended, and the signal would kill it.
+    # Registered first it is called last, when all is done: Python itself takes its handlers
+    # away before it has ended, and the signal would kill it.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
         if sys.platform != "win32":

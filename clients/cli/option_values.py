@@ -42,7 +42,9 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
         name, equals, value = word.partition("=")
         name = name.strip()
         if not equals or not name or not value.strip():
-            raise typer.BadParameter(f"{word!r} is not of the form AXIS=VALUE, e.g. tra_obj=-12.5")
+            raise typer.BadParameter(
+                f"{word!r} is not of the form AXIS=VALUE, e.g. tra_obj=-12.5"
+            )
         if name in out:
             raise typer.BadParameter(f"{name} is given twice")
         out[name] = number(value, f"the value of {name}")
@@ -57,7 +59,9 @@ def span(word: str, what: str) -> tuple[float, float]:
     """
     ends = [number(part, what) for part in word.split(":")]
     if len(ends) > 2 or ends[0] > ends[-1]:
-        raise typer.BadParameter(f"{what}: {word!r} is not of the form VALUE or LOWER:UPPER")
+        raise typer.BadParameter(
+            f"{what}: {word!r} is not of the form VALUE or LOWER:UPPER"
+        )
     return ends[0], ends[-1]
 
 
@@ -78,7 +82,9 @@ def numbers(
         typer.BadParameter: another count, or a part that is no such number.
     """
     parts = [part.strip() for part in word.lower().split(by)]
-    if len(parts) not in counts or (whole and not all(p.isdecimal() and int(p) for p in parts)):
+    if len(parts) not in counts or (
+        whole and not all(p.isdecimal() and int(p) for p in parts)
+    ):
         raise typer.BadParameter(f"{what} {word!r} is not {form}")
     return [number(part, what) for part in parts]
 
@@ -114,7 +120,9 @@ def require_ending(file: Path, *allowed: str) -> None:
         typer.BadParameter: another one.
     """
     if file.suffix.lower() not in allowed:
-        raise typer.BadParameter(f"{file.name}: the ending must be {' or '.join(allowed)}")
+        raise typer.BadParameter(
+            f"{file.name}: the ending must be {' or '.join(allowed)}"
+        )
 
 
 def require_folder(*files: Path | None) -> None:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 Answer = Iterator[object]
 """Answer of most commands: texts, which are lines for people, and one object that is
 no text, the document of `--json`."""
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document and nothing else.")
+]
 Verbose = Annotated[
     bool | None,
     typer.Option(
@@ -60,11 +62,15 @@ ProfileName = Annotated[
 ]
 Free = Annotated[
     str | None,
-    typer.Option("--free", metavar="P,P,...", help="Estimate these parameters; default: six."),
+    typer.Option(
+        "--free", metavar="P,P,...", help="Estimate these parameters; default: six."
+    ),
 ]
 Roi = Annotated[
     tuple[int, int, int, int] | None,
-    typer.Option("--roi", metavar="L T R B", help="Read these unbinned pixels, bounds included."),
+    typer.Option(
+        "--roi", metavar="L T R B", help="Read these unbinned pixels, bounds included."
+    ),
 ]
 Geometry = Annotated[
     Path | None,
@@ -76,18 +82,25 @@ Geometry = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option("--jobs", min=1, help="Use so many processes; default: one for each core."),
+    typer.Option(
+        "--jobs", min=1, help="Use so many processes; default: one for each core."
+    ),
 ]
 Scheduler = Annotated[
     str | None,
     typer.Option(
-        "--scheduler", metavar="ADDRESS", help="Let the workers of this Dask scheduler do the work."
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Let the workers of this Dask scheduler do the work.",
     ),
 ]
 Texts = Annotated[
-    bool, typer.Option("--texts", help="Take the geometry from the scanner's two texts alone.")
+    bool,
+    typer.Option("--texts", help="Take the geometry from the scanner's two texts alone."),
 ]
-Push = Annotated[bool, typer.Option("--push", help="Put the correction in force on the twin.")]
+Push = Annotated[
+    bool, typer.Option("--push", help="Put the correction in force on the twin.")
+]
 
 
 def option(
@@ -103,9 +116,10 @@ def option(
 
     Args:
         default: where the option is left out; `...` for one that must be given.
-        words: flags as typed, and one line of help. Flags follow from the parameter's name, but a
-            switch that is only ever on has to name its flag, or typer adds one that switches it
-            off. The help is that of the command's docstring (`Args:`) if it is not given here.
+        words: flags as typed, and one line of help. Flags follow from the parameter's name, but
+            a switch that is only ever on has to name its flag, or typer adds one that switches
+            it off. The help is that of the command's docstring (`Args:`) if it is not given
+            here.
         among: gives the words that are allowed. It is called when the command line is built, so
             that each list has one home, and imports nothing heavy.
         proposes: gives the values that a shell completes, see `value_completion`.
@@ -131,4 +145,6 @@ def argument(
         help: one line; default: that of the command's docstring.
         proposes: gives the values that a shell completes, see `value_completion`.
     """
-    return typer.Argument(default, metavar=metavar, help=help or None, autocompletion=proposes)
+    return typer.Argument(
+        default, metavar=metavar, help=help or None, autocompletion=proposes
+    )

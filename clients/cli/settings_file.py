@@ -74,11 +74,18 @@ class Configuration(Settings):
 TABLES: Final[Mapping[str, type[Settings]]] = {
     kind.command.replace(" ", "_"): kind
     for kind in (
-        UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings,
-        CalibrateSettings, MachineNewSettings, PhantomMakeSettings,
-        ReconstructSettings, ScriptNewSettings,
+        UpSettings,
+        TwinSettings,
+        ProjectorSettings,
+        ViewerSettings,
+        GatewaySettings,
+        CalibrateSettings,
+        MachineNewSettings,
+        PhantomMakeSettings,
+        ReconstructSettings,
+        ScriptNewSettings,
     )
-}  # fmt: skip
+}
 """Tables of the file, and the settings of their keys."""
 SHARED_TABLES: Final[Mapping[str, str]] = {"doctor": "up"}
 """Commands that read the table of another one."""
@@ -94,7 +101,11 @@ def config_file(environ: Mapping[str, str]) -> Path:
     if named:
         return Path(named).expanduser()
     base = environ.get("XDG_CONFIG_HOME")
-    return (Path(base) if base else Path("~/.config").expanduser()) / "flexdt" / "config.toml"
+    return (
+        (Path(base) if base else Path("~/.config").expanduser())
+        / "flexdt"
+        / "config.toml"
+    )
 
 
 def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
@@ -115,12 +126,18 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
         found.pop("token_file", None)
     found |= own
     if "token" in found and "token_file" in found:
-        where = "FLEXDT_TOKEN and FLEXDT_TOKEN_FILE" if own else f"{path}: token and token_file"
+        where = (
+            "FLEXDT_TOKEN and FLEXDT_TOKEN_FILE"
+            if own
+            else f"{path}: token and token_file"
+        )
         raise CommandError(f"{where} are both set; allowed: one of them")
     tables = {name: found.pop(name) for name in TABLES if name in found}
     given = {key: value for key, value in found.items() if value}
     paths = {
-        key: str(Path(value).expanduser()) for key, value in given.items() if KEYS[key] in PATHS
+        key: str(Path(value).expanduser())
+        for key, value in given.items()
+        if KEYS[key] in PATHS
     }
     return Configuration(**given | paths, tables=tables)
 
@@ -152,12 +169,16 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     tables = {key: value for key, value in document.items() if key in TABLES}
     for key, table in tables.items():
         if isinstance(table, dict):
-            _require_known(f"{path}: [{key}]", table, [f.name for f in fields(TABLES[key])])
+            _require_known(
+                f"{path}: [{key}]", table, [f.name for f in fields(TABLES[key])]
+            )
     plain = {k: v for k, v in document.items() if not isinstance(tables.get(k), dict)}
     _require_known(f"{path}:", plain, KEYS, [f"[{name}]" for name in TABLES])
     for key, value in plain.items():
         if not isinstance(value, str) or not value:
-            raise CommandError(f"{path}: {key} is {value!r}; allowed: a text that is not empty")
+            raise CommandError(
+                f"{path}: {key} is {value!r}; allowed: a text that is not empty"
+            )
     return dict(document)
 
 

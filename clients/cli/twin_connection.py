@@ -1,4 +1,5 @@
-"""The twin that the command line, the environment or the settings file names, and its client."""
+"""The twin that the command line, the environment or the settings file names, and its
+client."""
 
 from __future__ import annotations
 

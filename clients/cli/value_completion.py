@@ -1,7 +1,7 @@
 """Propose values of options and arguments to a shell that completes a word.
 
-Each function takes the part of the word that was typed and returns the values that begin with it.
-An empty list leaves the word to the shell, which proposes files.
+Each function takes the part of the word that was typed and returns the values that begin with
+it. An empty list leaves the word to the shell, which proposes files.
 """
 
 from __future__ import annotations

@@ -139,8 +139,8 @@ class Core:
         """Send `listener` its topics' events, also after reconnects.
 
         Raises:
-            ValueError: another listener follows one of the topics with other options; the server
-                keeps one set of options for each topic of a connection.
+            ValueError: another listener follows one of the topics with other options; the
+                server keeps one set of options for each topic of a connection.
         """
         params = {
             "topics": list(listener.topics),
@@ -172,7 +172,9 @@ class Core:
         if gone and self.link is not None and self.link.alive:
             # If this fails, the connection has ended and the subscriptions with it.
             with contextlib.suppress(ConnectionLost, TimeoutError, RpcError):
-                await self.link.request("state.unsubscribe", {"topics": gone}, self.timeout_s)
+                await self.link.request(
+                    "state.unsubscribe", {"topics": gone}, self.timeout_s
+                )
 
     async def close(self) -> None:
         """End the connection and all subscriptions."""
@@ -256,7 +258,9 @@ class Core:
         return link
 
 
-def _require_same(topic: str, asked: Mapping[str, object], known: Mapping[str, object]) -> None:
+def _require_same(
+    topic: str, asked: Mapping[str, object], known: Mapping[str, object]
+) -> None:
     view = ("projection_kind", "projection_binning") if topic == "projection" else ()
     for name in ("max_rate_hz", *view):
         if asked.get(name) != known.get(name):
@@ -273,8 +277,8 @@ SHOWN: Final = ("Progress", "ScanProgress")
 class ClientMethod(Generic[_P, _R]):
     """A method made of a function that makes a flow, with its signature and docstring.
 
-    It runs the flow by its client's `run`: so it blocks on a `TwinClient`, and is a coroutine on an
-    `AsyncTwinClient`.
+    It runs the flow by its client's `run`: so it blocks on a `TwinClient`, and is a coroutine
+    on an `AsyncTwinClient`.
     """
 
     def __init__(self, make: Callable[_P, Flow[_R]]) -> None:
@@ -285,14 +289,19 @@ class ClientMethod(Generic[_P, _R]):
             make: returns the flow of a call; see `twin_methods`.
         """
         made = inspect.signature(make)
-        shows = "progress" in made.parameters and made.parameters["progress"].annotation in SHOWN
+        shows = (
+            "progress" in made.parameters
+            and made.parameters["progress"].annotation in SHOWN
+        )
 
         @functools.wraps(make)
         def blocking(self: TwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
             return self.run(make(*args, **kwargs))
 
         @functools.wraps(make)
-        async def awaited(self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        async def awaited(
+            self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs
+        ) -> _R:
             # Other coroutines run in this thread meanwhile: a bar would mix with their output.
             if shows and "progress" not in made.bind_partial(*args, **kwargs).arguments:
                 kwargs["progress"] = False
@@ -304,7 +313,9 @@ class ClientMethod(Generic[_P, _R]):
         returns = str(made.return_annotation).removeprefix("Flow[").removesuffix("]")
         parameters = [own, *made.parameters.values()]
         for method in self._methods.values():
-            method.__signature__ = made.replace(parameters=parameters, return_annotation=returns)
+            method.__signature__ = made.replace(
+                parameters=parameters, return_annotation=returns
+            )
 
     @overload
     def __get__(self, client: TwinClient, kind: type[TwinClient]) -> Callable[_P, _R]: ...
@@ -312,7 +323,9 @@ class ClientMethod(Generic[_P, _R]):
     def __get__(
         self, client: AsyncTwinClient, kind: type[AsyncTwinClient]
     ) -> Callable[_P, Coroutine[Any, Any, _R]]: ...
-    def __get__(self, client: TwinClient | AsyncTwinClient | None, kind: type[Any]) -> Any:
+    def __get__(
+        self, client: TwinClient | AsyncTwinClient | None, kind: type[Any]
+    ) -> Any:
         return self._methods[inspect.iscoroutinefunction(kind.run)].__get__(client, kind)
 
 
@@ -473,9 +486,12 @@ class AsyncTwinClient(SharedMethods):
             "projection_binning": projection_binning,
         }
         return AsyncSubscription(
-            topics or ("state",), max_queue,
-            lambda made: core.subscribe(made, options), core.connected, core.unsubscribe,
-        )  # fmt: skip
+            topics or ("state",),
+            max_queue,
+            lambda made: core.subscribe(made, options),
+            core.connected,
+            core.unsubscribe,
+        )
 
 
 @functools.cache
@@ -553,9 +569,16 @@ class TwinClient(SharedMethods):
         ssl: tls.SSLContext | None = None,
     ) -> None:
         self._client = AsyncTwinClient(
-            host, port, token, transport,
-            name=name, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s, ssl=ssl,
-        )  # fmt: skip
+            host,
+            port,
+            token,
+            transport,
+            name=name,
+            timeout_s=timeout_s,
+            reconnect_s=reconnect_s,
+            wait_s=wait_s,
+            ssl=ssl,
+        )
         self._wait(self._client.connect())
 
     def __repr__(self) -> str:
@@ -601,14 +624,19 @@ class TwinClient(SharedMethods):
             ValueError: this client already follows one of the topics with other options.
         """
         events = self._client.subscribe(
-            *topics, max_rate_hz=max_rate_hz, projection_kind=projection_kind,
-            projection_binning=projection_binning, max_queue=max_queue,
-        )  # fmt: skip
+            *topics,
+            max_rate_hz=max_rate_hz,
+            projection_kind=projection_kind,
+            projection_binning=projection_binning,
+            max_queue=max_queue,
+        )
         self._wait(events.__aenter__())
         return Subscription(events, self._wait)
 
     def _perform(self, effect: Effect) -> object:
-        if isinstance(effect, Tell):  # in the thread that calls, where it may call the client
+        if isinstance(
+            effect, Tell
+        ):  # in the thread that calls, where it may call the client
             return effect.function(*effect.args)
         return self._wait(perform(effect, self._client.core.call))
 

@@ -1,6 +1,7 @@
 """Events as typed values, and subscriptions to iterate over, blocking and asynchronous.
 
-A subscription whose queue is full drops its oldest event, as the server would for a slow client.
+A subscription whose queue is full drops its oldest event, as the server would for a slow
+client.
 """
 
 from __future__ import annotations
@@ -87,7 +88,9 @@ class Projection:
         marks in colour."""
         from flexdt.library.datasets.pictures import png
 
-        return png(self.image, dark_is_dense=self.kind == "line_integral", marks=self.marks)
+        return png(
+            self.image, dark_is_dense=self.kind == "line_integral", marks=self.marks
+        )
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,9 @@ class Event:
             or not isinstance(seq, int)
             or not isinstance(time, (int, float))
         ):
-            raise RpcError(-32603, f"the server sent an event that is none: topic {topic!r}")
+            raise RpcError(
+                -32603, f"the server sent an event that is none: topic {topic!r}"
+            )
         data = parse_result(MODELS[topic], params.get("data"))
         if isinstance(data, WireProjection):
             return cls(topic, seq, float(time), Projection.from_wire(data))

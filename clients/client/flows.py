@@ -1,6 +1,8 @@
-"""A client's methods as generators without I/O: a flow yields effects, and a client performs them.
+"""A client's methods as generators without I/O: a flow yields effects, and a client performs
+them.
 
-The blocking and the asynchronous client drive the same flows; they differ only in how they wait.
+The blocking and the asynchronous client drive the same flows; they differ only in how they
+wait.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ class Ask:
 
     Attributes:
         method, params: of the request.
-        patience_s: timeout for the answer [s]; None waits for ever, negative is the client's own.
+        patience_s: timeout for the answer [s]; None waits for ever, negative is the client's
+            own.
     """
 
     method: str
@@ -57,7 +60,10 @@ Flow: TypeAlias = Generator[Effect, Any, _R]
 
 
 def ask(
-    method: Method[Params, _M], patience_s: float | None = OWN_PATIENCE, /, **params: object
+    method: Method[Params, _M],
+    patience_s: float | None = OWN_PATIENCE,
+    /,
+    **params: object,
 ) -> Flow[_M]:
     """Call `method` and validate its result; params that are None are not sent.
 
@@ -70,7 +76,9 @@ def ask(
         RpcError: the server's answer is an error, or is not the method's result.
     """
     given = {k: v for k, v in params.items() if v is not None}
-    answer = yield Ask(method.name, given, None if "seconds" in method.limits else patience_s)
+    answer = yield Ask(
+        method.name, given, None if "seconds" in method.limits else patience_s
+    )
     return parse_result(method.result, answer)
 
 
@@ -81,7 +89,11 @@ def sample_shape() -> Flow[scanner.SampleMeshResult]:
         while first is None or len(content) < first.total:
             part = yield from ask(scanner.SAMPLE_MESH, start=len(content))
             first = part if first is None else first
-            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
+            if (part.name, part.revision, part.total) != (
+                first.name,
+                first.revision,
+                first.total,
+            ):
                 break  # another sample is on the stage by now: start again
             content += part.data
         else:

@@ -81,9 +81,14 @@ class KeptConnection:
         self.problem = "not connected yet"
         self._on_event, self._on_change = on_event, on_change
         self._client = AsyncTwinClient(
-            address.host, address.port, address.token,
-            name=name, timeout_s=HELLO_S, reconnect_s=0.0, ssl=address.ssl,
-        )  # fmt: skip
+            address.host,
+            address.port,
+            address.token,
+            name=name,
+            timeout_s=HELLO_S,
+            reconnect_s=0.0,
+            ssl=address.ssl,
+        )
         self.topics: tuple[str, ...] = ()
         if subscription is not None:
             self.topics = tuple(cast(list[str], subscription["topics"]))
@@ -111,7 +116,9 @@ class KeptConnection:
                 except OSError as error:  # ConnectionLost and TimeoutError are ones
                     self._change(str(error))
                 except RpcError as error:
-                    self._change(f"the twin on {self.address} refuses {self.name}: {error}")
+                    self._change(
+                        f"the twin on {self.address} refuses {self.name}: {error}"
+                    )
                 else:
                     self._change("")
                     await link.ended()
@@ -121,11 +128,14 @@ class KeptConnection:
         finally:
             await core.disconnect()
 
-    async def request(self, method: str, params: Mapping[str, object] | None = None) -> object:
+    async def request(
+        self, method: str, params: Mapping[str, object] | None = None
+    ) -> object:
         """Send a request over the present connection and wait for its result, however long.
 
         Raises:
-            RpcError: the twin's answer is an error; `Unsendable`: the parameters cannot be sent.
+            RpcError: the twin's answer is an error; `Unsendable`: the parameters cannot be
+                sent.
             ConnectionLost: there is no connection, or it was lost before the answer came.
         """
         link = self._client.core.link

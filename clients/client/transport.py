@@ -54,7 +54,8 @@ class ConnectionLost(ConnectionError):
 
 
 class Transport(Protocol):
-    """A connection to a server. `open` may be called again after the connection has been lost."""
+    """A connection to a server. `open` may be called again after the connection has been
+    lost."""
 
     async def open(self) -> None:
         """Connect, or raise `ConnectionLost`."""
@@ -117,16 +118,24 @@ class TcpTransport:
             async with asyncio.timeout(self.timeout_s):
                 name = None if self.ssl is None else self.host
                 self._streams = await asyncio.open_connection(
-                    self.host, self.port, ssl=self.ssl, server_hostname=name, limit=MAX_FRAME
+                    self.host,
+                    self.port,
+                    ssl=self.ssl,
+                    server_hostname=name,
+                    limit=MAX_FRAME,
                 )
         except OSError as error:  # TimeoutError is one
             why, number = error.strerror or str(error) or "no answer in time", error.errno
             if number is None and f"[Errno {errno.ECONNREFUSED}]" in why:
                 number = errno.ECONNREFUSED  # of each of the addresses that a name has
-            if number == errno.ECONNREFUSED or (isinstance(error, ConnectionError) and number):
+            if number == errno.ECONNREFUSED or (
+                isinstance(error, ConnectionError) and number
+            ):
                 why = os.strerror(number)  # asyncio has put the address there
             hint = ": start one with `flexdt up`" if number == errno.ECONNREFUSED else ""
-            raise ConnectionLost(f"no server at {self.host}:{self.port} ({why}){hint}") from error
+            raise ConnectionLost(
+                f"no server at {self.host}:{self.port} ({why}){hint}"
+            ) from error
         self._wire = Connection(self.codec)
 
     async def send(self, message: Message) -> None:
@@ -165,7 +174,9 @@ class TcpTransport:
             except OSError:
                 return []
             if not data:
-                if self._streams is not None:  # the server's end of the stream, not our `close`
+                if (
+                    self._streams is not None
+                ):  # the server's end of the stream, not our `close`
                     self._wire.receive_end()
                 return []
             messages = self._wire.receive_data(data)
@@ -189,7 +200,8 @@ class Link:
 
     Attributes:
         alive: until the connection has ended.
-        calls: its open requests; `calls.reason` is what the server reported about the connection.
+        calls: its open requests; `calls.reason` is what the server reported about the
+            connection.
     """
 
     def __init__(
@@ -215,14 +227,16 @@ class Link:
 
         Raises:
             RpcError: the server's answer is an error.
-            ConnectionLost: the connection ended; `.sent` says whether the request had been sent.
+            ConnectionLost: the connection ended; `.sent` says whether the request had been
+                sent.
             TimeoutError: no answer in time.
         """
         if not self.alive:
             raise ConnectionLost.of(self.calls, sent=False)
         waiter: asyncio.Future[Answered[Any]] = asyncio.get_running_loop().create_future()
         request = self.calls.request(method, params, waiter)
-        # A call cancelled while it sends may have handed its bytes over, so its answer may come.
+        # A call cancelled while it sends may have handed its bytes over, so its answer may
+        # come.
         sent = True
         try:
             async with asyncio.timeout(timeout_s) as limit:

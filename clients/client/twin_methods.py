@@ -1,7 +1,7 @@
 """The server's methods as flows, once for both clients.
 
-One function per method of the wire, with the protocol's own models as results and NumPy arrays as
-images. The clients of `client` decide how to wait for an answer. In the examples `twin` is a
+One function per method of the wire, with the protocol's own models as results and NumPy arrays
+as images. The clients of `client` decide how to wait for an answer. In the examples `twin` is a
 `TwinClient`; with `AsyncTwinClient` the same calls are awaited.
 """
 
@@ -124,9 +124,14 @@ def move(
     """
     with long_work.during("moving", progress if wait else False):
         moved = yield from ask(
-            scanner.AXES_MOVE, None if wait else OWN_PATIENCE, targets=dict(targets),
-            relative=relative, wait=wait, plan=plan, shortest=shortest,
-        )  # fmt: skip
+            scanner.AXES_MOVE,
+            None if wait else OWN_PATIENCE,
+            targets=dict(targets),
+            relative=relative,
+            wait=wait,
+            plan=plan,
+            shortest=shortest,
+        )
         return moved
 
 
@@ -231,9 +236,13 @@ def set_camera(
         200.0
     """
     return ask(
-        scanner.CAMERA_SET, exposure_ms=exposure_ms, mode=mode,
-        roi=None if roi is None else list(roi), averages=averages, frames=frames,
-    )  # fmt: skip
+        scanner.CAMERA_SET,
+        exposure_ms=exposure_ms,
+        mode=mode,
+        roi=None if roi is None else list(roi),
+        averages=averages,
+        frames=frames,
+    )
 
 
 # -- samples -----------------------------------------------------------------------------
@@ -341,7 +350,13 @@ def upload_mesh(
             f"a mesh needs a name and a format of {', '.join(MESH_FORMATS)}; "
             f"got name {name!r}, format {format!r}"
         )
-    head = {"name": name, "kind": "mesh", "format": format, "unit": unit, "material": material}
+    head = {
+        "name": name,
+        "kind": "mesh",
+        "format": format,
+        "unit": unit,
+        "material": material,
+    }
     return _upload(head, data, progress)
 
 
@@ -404,9 +419,13 @@ def upload_voxels(
     size = (voxel_mm,) * 3 if isinstance(voxel_mm, (int, float)) else voxel_mm
     raw = np.ascontiguousarray(data, dtype="<f4")
     head = {
-        "name": name, "kind": "voxels", "format": "raw", "material": material,
-        "shape": list(raw.shape), "voxel_mm": [float(v) for v in size],
-    }  # fmt: skip
+        "name": name,
+        "kind": "voxels",
+        "format": "raw",
+        "material": material,
+        "shape": list(raw.shape),
+        "voxel_mm": [float(v) for v in size],
+    }
     return _upload(head, raw.tobytes(), progress)
 
 
@@ -416,7 +435,9 @@ def _upload(
     total, done = len(data), None
     for start in range(0, total, CHUNK):
         part = data[start : start + CHUNK]
-        done = yield from ask(scanner.SAMPLE_UPLOAD, **head, total=total, start=start, data=part)
+        done = yield from ask(
+            scanner.SAMPLE_UPLOAD, **head, total=total, start=start, data=part
+        )
         if progress is not None:
             yield Tell(progress, (done.received, total))
     if done is None:
@@ -438,8 +459,8 @@ def projection(
 ) -> Flow[Projection]:
     """Take an X-ray image at the current pose, or predict the one at another.
 
-    Where `positions`, `tube` or `camera` is given nothing moves: the image is predicted, from the
-    geometry of `geometry`, without noise.
+    Where `positions`, `tube` or `camera` is given nothing moves: the image is predicted, from
+    the geometry of `geometry`, without noise.
 
     Args:
         kind: line_integral (float32) or counts (uint16).
@@ -455,9 +476,14 @@ def projection(
         ((95, 119), 'line_integral')
     """
     answer = yield from ask(
-        images.PROJECTION_GET, kind=kind, binning=binning, marks=marks or None,
-        positions=positions, tube=tube, camera=camera,
-    )  # fmt: skip
+        images.PROJECTION_GET,
+        kind=kind,
+        binning=binning,
+        marks=marks or None,
+        positions=positions,
+        tube=tube,
+        camera=camera,
+    )
     return Projection.from_wire(answer)
 
 
@@ -531,10 +557,21 @@ def predict_exposure(
         (True, 60.0)
     """
     return ask(
-        images.EXPOSURE_PREDICT, sample=sample, kV=kV, power_W=power_W, filter=filter,
-        exposure_ms=exposure_ms, averages=averages, frames=frames, kind=kind, detail=detail,
-        mode=mode, roi=None if roi is None else list(roi), sod_mm=sod_mm, sdd_mm=sdd_mm,
-    )  # fmt: skip
+        images.EXPOSURE_PREDICT,
+        sample=sample,
+        kV=kV,
+        power_W=power_W,
+        filter=filter,
+        exposure_ms=exposure_ms,
+        averages=averages,
+        frames=frames,
+        kind=kind,
+        detail=detail,
+        mode=mode,
+        roi=None if roi is None else list(roi),
+        sod_mm=sod_mm,
+        sdd_mm=sdd_mm,
+    )
 
 
 def check_script(script: str | bytes, name: str | None = None) -> Flow[scans.CheckResult]:
@@ -575,9 +612,13 @@ def submit_script(
         'done'
     """
     return ask(
-        scans.SCRIPT_SUBMIT, **_script(script), name=name, speed_up=speed_up,
-        seed=seed, motion_samples=motion_samples,
-    )  # fmt: skip
+        scans.SCRIPT_SUBMIT,
+        **_script(script),
+        name=name,
+        speed_up=speed_up,
+        seed=seed,
+        motion_samples=motion_samples,
+    )
 
 
 def check_trajectory(
@@ -594,9 +635,11 @@ def check_trajectory(
         2
     """
     return ask(
-        scans.TRAJECTORY_CHECK, poses=[dict(p) for p in poses], exposure_ms=exposure_ms,
+        scans.TRAJECTORY_CHECK,
+        poses=[dict(p) for p in poses],
+        exposure_ms=exposure_ms,
         flat=flat if isinstance(flat, bool) else dict(flat),
-    )  # fmt: skip
+    )
 
 
 def submit_trajectory(
@@ -627,10 +670,14 @@ def submit_trajectory(
         2
     """
     return ask(
-        scans.TRAJECTORY_SUBMIT, poses=[dict(p) for p in poses],
-        exposure_ms=exposure_ms, name=name, speed_up=speed_up, seed=seed,
+        scans.TRAJECTORY_SUBMIT,
+        poses=[dict(p) for p in poses],
+        exposure_ms=exposure_ms,
+        name=name,
+        speed_up=speed_up,
+        seed=seed,
         flat=flat if isinstance(flat, bool) else dict(flat),
-    )  # fmt: skip
+    )
 
 
 def jobs() -> Flow[scans.JobListResult]:
@@ -721,7 +768,9 @@ def abort_job(job: Job | None = None, reason: str | None = None) -> Flow[s.JobSt
     return ask(scans.JOB_ABORT, job=_name_of(job), reason=reason)
 
 
-def forget_job(job: Job | None = None, *, days: float | None = None) -> Flow[scans.JobForgetResult]:
+def forget_job(
+    job: Job | None = None, *, days: float | None = None
+) -> Flow[scans.JobForgetResult]:
     """Forget an ended job, or all that ended at least `days` ago; data sets stay.
 
     Example:
@@ -744,8 +793,8 @@ def wait_job(
     """Wait until a job has ended, also across a lost connection.
 
     Args:
-        job: which one, by name or as `submit_script` and its kin returned it; the current one if
-            left out.
+        job: which one, by name or as `submit_script` and its kin returned it; the current one
+            if left out.
         progress: a bar of frames after two seconds; False for none, or what is called with each
             status.
         poll_s: time between two requests for the status [s].
@@ -774,7 +823,9 @@ def wait_job(
             if status.state in FINAL_STATES:
                 return status
             if deadline is not None and time.monotonic() > deadline:
-                raise TimeoutError(f"job {status.job} is {status.state} after {timeout_s:g} s")
+                raise TimeoutError(
+                    f"job {status.job} is {status.state} after {timeout_s:g} s"
+                )
             yield Sleep(poll_s)
 
 
@@ -824,7 +875,9 @@ def dataset(
         >>> twin.dataset("looked-at").positions["rot_obj"]
         [0.0, 0.0, 0.0, 90.0]
     """
-    return ask(corrections.DATASET_GET, name=name, points=points, measure=measure, script=script)
+    return ask(
+        corrections.DATASET_GET, name=name, points=points, measure=measure, script=script
+    )
 
 
 def dataset_frame(
@@ -878,9 +931,12 @@ def apply_calibration(
         True
     """
     return ask(
-        corrections.CALIBRATION_APPLY, parameters=dict(parameters), name=name,
-        comment=comment, source=source,
-    )  # fmt: skip
+        corrections.CALIBRATION_APPLY,
+        parameters=dict(parameters),
+        name=name,
+        comment=comment,
+        source=source,
+    )
 
 
 def calibration(name: str | None = None) -> Flow[s.Correction | None]:
@@ -948,8 +1004,8 @@ def fit_calibration(
 
     Args:
         datasets: their names.
-        phantom: one that ships, a TOML or JSON file among the data sets, or "unknown": markers of
-            which nobody knows where they are.
+        phantom: one that ships, a TOML or JSON file among the data sets, or "unknown": markers
+            of which nobody knows where they are.
         free: parameters to estimate; default: the six of a phantom on a stage, dO_x of unknown
             markers.
         priors: name -> standard deviation [mm, deg]; 0 is exactly known.
@@ -957,8 +1013,8 @@ def fit_calibration(
         steps: include the covariance after so many parts of the frames.
         residuals: include those of every bead in every frame.
         tracks: include the beads' places, seen, before and after the fit.
-        markers: where beads were seen, (frame, bead, column, row, sigma) [px], sigma None where it
-            is not known; default: they are detected in the images.
+        markers: where beads were seen, (frame, bead, column, row, sigma) [px], sigma None where
+            it is not known; default: they are detected in the images.
         scale: distance of two unknown markers [mm], "A-B=MM" or "A-B=MM+-SIGMA".
 
     Raises:
@@ -975,14 +1031,24 @@ def fit_calibration(
     for i, row in enumerate(markers or ()):
         if len(row) != len(fields):
             raise ValueError(f"mark {i} is {row!r}; allowed: ({', '.join(fields)})")
-    marks = None if markers is None else [
-        dict(zip(fields, row, strict=True)) for row in markers
-    ]  # fmt: skip
+    marks = (
+        None
+        if markers is None
+        else [dict(zip(fields, row, strict=True)) for row in markers]
+    )
     return ask(
-        corrections.CALIBRATION_FIT, datasets=list(datasets), phantom=phantom,
-        free=free and list(free), priors=dict(priors or {}), per_frame=list(per_frame),
-        steps=steps, residuals=residuals, tracks=tracks, markers=marks, scale=scale,
-    )  # fmt: skip
+        corrections.CALIBRATION_FIT,
+        datasets=list(datasets),
+        phantom=phantom,
+        free=free and list(free),
+        priors=dict(priors or {}),
+        per_frame=list(per_frame),
+        steps=steps,
+        residuals=residuals,
+        tracks=tracks,
+        markers=marks,
+        scale=scale,
+    )
 
 
 def align_dataset(

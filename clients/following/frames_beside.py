@@ -88,7 +88,10 @@ class FramesBeside:
         }
         picture = png(np.concatenate([real, virtual], axis=1), dark_is_dense=True)
         self.out.mkdir(parents=True, exist_ok=True)
-        for name, data in (("png", picture), ("json", json.dumps(told, indent=2).encode())):
+        for name, data in (
+            ("png", picture),
+            ("json", json.dumps(told, indent=2).encode()),
+        ):
             write_whole(self.out / f"beside.{name}", data)
         return told
 
@@ -126,5 +129,7 @@ def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
         >>> round(columns, 1), round(rows, 1)
         (-3.0, 2.0)
     """
-    (columns, rows), _ = cv2.phaseCorrelate(virtual.astype(np.float64), real.astype(np.float64))
+    (columns, rows), _ = cv2.phaseCorrelate(
+        virtual.astype(np.float64), real.astype(np.float64)
+    )
     return float(columns), float(rows)

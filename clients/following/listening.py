@@ -32,7 +32,9 @@ SILENT_MS: Final = 500
 RETRY_MS: Final = 100
 MAX_RETRY_MS: Final = 1000
 MAX_HELD: Final = 10_000
-_ADDRESS: Final = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+)(?::(\d{1,5}))?/?")
+_ADDRESS: Final = re.compile(
+    r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+)(?::(\d{1,5}))?/?"
+)
 
 
 def endpoint(address: str) -> str:
@@ -48,7 +50,9 @@ def endpoint(address: str) -> str:
     match = _ADDRESS.fullmatch(address.strip())
     port = PORT if match is None or match[2] is None else int(match[2])
     if match is None or not 0 < port < 65536:
-        raise ValueError(f"{address!r} is no address; allowed: tcp://HOST[:PORT], PORT 1 to 65535")
+        raise ValueError(
+            f"{address!r} is no address; allowed: tcp://HOST[:PORT], PORT 1 to 65535"
+        )
     return f"tcp://{match[1]}:{port}"
 
 
@@ -104,11 +108,15 @@ async def listen(
         """Open the SUB socket and its monitor, read until the end, and close both."""
         with zmq.Context() as context, context.socket(zmq.SUB) as socket:
             for option, value in (
-                (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),
-                (zmq.HEARTBEAT_IVL, HEARTBEAT_MS), (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
-                (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MAX_RETRY_MS),
+                (zmq.LINGER, 0),
+                (zmq.RCVHWM, MAX_HELD),
+                (zmq.MAXMSGSIZE, MAX_BYTES),
+                (zmq.HEARTBEAT_IVL, HEARTBEAT_MS),
+                (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
+                (zmq.RECONNECT_IVL, RETRY_MS),
+                (zmq.RECONNECT_IVL_MAX, MAX_RETRY_MS),
                 (zmq.IPV6, int("[" in address)),
-            ):  # fmt: skip
+            ):
                 socket.setsockopt(option, value)
             socket.subscribe(b"")
             events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED

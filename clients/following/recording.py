@@ -1,9 +1,10 @@
 """Raw messages of a scanner with the times of day at which they came: written and read.
 
-One message after the other, each behind its time: `[hh:mm:ss.ffffff LATE] MESSAGE`, where LATE is
-how many seconds earlier it may have come. Messages are kept byte for byte and may hold line ends;
-that the link came up or was lost is a message that begins with `--`. The form is that of the public
-`monitor_zmq.py`, whose times are whole seconds without LATE: they may be anywhere in their second.
+One message after the other, each behind its time: `[hh:mm:ss.ffffff LATE] MESSAGE`, where LATE
+is how many seconds earlier it may have come. Messages are kept byte for byte and may hold line
+ends; that the link came up or was lost is a message that begins with `--`. The form is that of
+the public `monitor_zmq.py`, whose times are whole seconds without LATE: they may be anywhere in
+their second.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-STAMP: Final = re.compile(rb"^\[(\d\d):(\d\d):(\d\d(?:\.\d+)?)(?: (\d+\.\d+))?\] ", re.MULTILINE)
+STAMP: Final = re.compile(
+    rb"^\[(\d\d):(\d\d):(\d\d(?:\.\d+)?)(?: (\d+\.\d+))?\] ", re.MULTILINE
+)
 LINK: Final = b"-- "
 UP: Final = b"-- connected"
 DAY_S: Final = 86400.0
@@ -62,7 +65,9 @@ def read_recording(data: bytes) -> Iterator[Recorded]:
         [(86400.0, 1.0), (86401.5, 0.002)]
     """
     stamps, last = list(STAMP.finditer(data)), 0.0
-    for stamp, end in zip(stamps, [*(s.start() for s in stamps[1:]), len(data)], strict=True):
+    for stamp, end in zip(
+        stamps, [*(s.start() for s in stamps[1:]), len(data)], strict=True
+    ):
         hour, minute, second = (float(x) for x in stamp.groups()[:3])
         late = float(stamp[4] or (0.0 if b"." in stamp[3] else 1.0))
         at = 3600.0 * hour + 60.0 * minute + second + (0.0 if b"." in stamp[3] else 1.0)

@@ -86,7 +86,9 @@ class FollowSession:
             said = heard(data, self._axes, self.time_of_day(at), late_s)
         except AcquilaError as error:
             self.unread += 1
-            self.unread_example = self.unread_example or f"{error}: {data[:200].decode('latin-1')}"
+            self.unread_example = (
+                self.unread_example or f"{error}: {data[:200].decode('latin-1')}"
+            )
             return
         self._take(self.follower.hear(self.mirror, said, at))
         for line in self.mirror.lines:
@@ -108,7 +110,9 @@ class FollowSession:
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
         if self.record is not None:
-            self.record.write(format_recorded(Recorded(at - self._midnight, late_s, data)))
+            self.record.write(
+                format_recorded(Recorded(at - self._midnight, late_s, data))
+            )
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
@@ -151,7 +155,9 @@ class FollowSession:
             else:
                 self.message(message.data, message.at_s, message.late_s)
             if ahead and self._is_new():
-                self._take(self.follower.told(self.mirror, self.follower.ahead(self.mirror, now)))
+                self._take(
+                    self.follower.told(self.mirror, self.follower.ahead(self.mirror, now))
+                )
 
     async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
         """Write each new frame of a folder with its radiograph, until cancelled.
@@ -172,7 +178,9 @@ class FollowSession:
                 await asyncio.to_thread(beside.write, path, mirror, time.time() - written)
                 self.mirror = self.mirror.cleared("frames")
             except (TwinError, OSError) as error:
-                alarm = Alarm(self.clock(), "warning", "frame", "frames", f"{path.name}: {error}")
+                alarm = Alarm(
+                    self.clock(), "warning", "frame", "frames", f"{path.name}: {error}"
+                )
                 self._take(self.mirror.alarmed(alarm))
 
     async def _look_ahead(self) -> None:
@@ -181,13 +189,18 @@ class FollowSession:
         while True:
             await asyncio.sleep(TICK_S)
             if self._is_new():
-                found = await asyncio.to_thread(self.follower.ahead, self.mirror, self.clock())
+                found = await asyncio.to_thread(
+                    self.follower.ahead, self.mirror, self.clock()
+                )
                 self._take(self.follower.told(self.mirror, found))
 
     def _is_new(self) -> bool:
         """Determine whether targets or the next line have changed since the last call."""
         key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
-        before, self._looked = self._looked, key if self.mirror.heard_s is not None else None
+        before, self._looked = (
+            self._looked,
+            key if self.mirror.heard_s is not None else None,
+        )
         return self._looked not in (None, before)
 
 
@@ -195,6 +208,8 @@ def executed_script(recording: bytes, machine: Machine) -> bytes:
     """Return the executed script in a recording of raw messages, as the scanner would
     write it."""
     lines: list[bytes] = []
-    follower = Follower(machine, Profile(name=ZERO, machine=machine.name, source="no offsets"))
+    follower = Follower(
+        machine, Profile(name=ZERO, machine=machine.name, source="no offsets")
+    )
     FollowSession(follower, executed=lines.append).replay(recording, ahead=False)
     return b"".join(lines)

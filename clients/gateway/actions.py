@@ -59,7 +59,9 @@ async def output_path(
     return command.path
 
 
-async def remember(twin: ConnectedTwin, command: c.Command, progress: CommandProgress) -> str:
+async def remember(
+    twin: ConnectedTwin, command: c.Command, progress: CommandProgress
+) -> str:
     """Keep the command in the transcript; the twin does nothing with it."""
     return ""
 
@@ -86,7 +88,9 @@ def setting(
         reply: the text of ACK, from the command.
     """
 
-    async def send(twin: ConnectedTwin, command: c.Command, progress: CommandProgress) -> str:
+    async def send(
+        twin: ConnectedTwin, command: c.Command, progress: CommandProgress
+    ) -> str:
         await twin.ask(method, params(command))
         return reply(command)
 
@@ -111,7 +115,9 @@ async def wait_ready(
     return "TRUE"
 
 
-async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: CommandProgress) -> str:
+async def take_image(
+    twin: ConnectedTwin, command: c.TakeImage, progress: CommandProgress
+) -> str:
     """Take an image at the present pose and settings and keep it in the camera."""
     state = await twin.state()
     counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
@@ -122,7 +128,9 @@ async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: Comman
     return f"{cols} x {rows}, mean {counts.mean():.1f}"
 
 
-async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: CommandProgress) -> str:
+async def save_image(
+    twin: ConnectedTwin, command: c.SaveImage, progress: CommandProgress
+) -> str:
     """Save the last image under the bare name of the path."""
     if twin.image is None:
         raise Refusal("no image has been taken; camera take image first")
@@ -137,7 +145,9 @@ async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: Comman
         raise Refusal(str(error)) from None
 
 
-async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandProgress) -> str:
+async def move(
+    twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandProgress
+) -> str:
     """Move to a position and wait for arrival.
 
     Args:
@@ -166,7 +176,9 @@ async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandPr
     return await asyncio.shield(armed.ended)
 
 
-async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandProgress) -> str:
+async def _go(
+    twin: ConnectedTwin, axis: str, target: float, progress: CommandProgress
+) -> str:
     """Move an axis, report its position while it moves, and check that it arrived.
 
     Args:
@@ -181,7 +193,9 @@ async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandPr
     Raises:
         Refusal: the axis was stopped or sent elsewhere.
     """
-    await twin.ask("axes.move", {"targets": {axis: await _at_limit_switch(twin, axis, target)}})
+    await twin.ask(
+        "axes.move", {"targets": {axis: await _at_limit_switch(twin, axis, target)}}
+    )
     state = await twin.state()
     bound = state.axes[axis].target
     while state.axes[axis].moving and state.axes[axis].target == bound:
@@ -191,7 +205,8 @@ async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandPr
     at = state.axes[axis]
     if at.target != bound or abs(at.position - bound) > 1e-9:
         raise Refusal(
-            f"{axis} was bound for {bound:g} {at.unit} and is at {at.position:g}: it was stopped "
+            f"{axis} was bound for {bound:g} {at.unit} and is at {at.position:g}: it was "
+            "stopped "
             f"or sent elsewhere{_why(state)}"
         )
     return twin.motor_text(axis, at)
@@ -222,7 +237,9 @@ def rate_setting(what: Rate, digits: int) -> Action:
             found = rate(machine, axis, what, value)
             shares = machine.moves(axis)
             if found.told and found.is_clamped(machine):
-                value = min(found.motors[motor] / abs(share) for motor, share in shares.items())
+                value = min(
+                    found.motors[motor] / abs(share) for motor, share in shares.items()
+                )
         await twin.ask("axes.set", {"axis": axis, what: value})
         return f"{value:.{digits}f}"
 
@@ -234,7 +251,9 @@ def _why(state: State) -> str:
     return f" ({safety.message or safety.state})" if safety.state != "ok" else ""
 
 
-async def question(twin: ConnectedTwin, command: Question, progress: CommandProgress) -> str:
+async def question(
+    twin: ConnectedTwin, command: Question, progress: CommandProgress
+) -> str:
     """Answer with a part of the twin's state as text."""
     value: object = (await twin.state()).model_dump(mode="json")
     for key in command.path:
@@ -244,7 +263,9 @@ async def question(twin: ConnectedTwin, command: Question, progress: CommandProg
     return f"{value:.{10 if command.path[-1] == 'position' else 6}f}"
 
 
-async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: CommandProgress) -> str:
+async def sequence(
+    twin: ConnectedTwin, command: c.TakeSequence, progress: CommandProgress
+) -> str:
     """Take an image sequence as a job of the twin, at rest or during the armed move.
 
     Returns:
@@ -261,7 +282,9 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Comma
         state = await twin.state()
         text = _sequence_script(state, command, armed)
         twin.record().suggest(command.prefix)
-        name = f"{twin.record().name}-{bare_name(command.prefix).strip('_') or 'sequence'}"
+        name = (
+            f"{twin.record().name}-{bare_name(command.prefix).strip('_') or 'sequence'}"
+        )
         twin.sequence = text.encode()
         folder = await _run(twin, twin.sequence, name, progress)
         state = await twin.state()
@@ -269,7 +292,9 @@ async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Comma
     except BaseException as error:
         if armed is not None and armed.ended is not None:
             armed.ended.set_exception(
-                error if isinstance(error, Refusal) else Refusal("the sequence was cut short")
+                error
+                if isinstance(error, Refusal)
+                else Refusal("the sequence was cut short")
             )
             # The sequence reports the same error: mark the move's as retrieved, so asyncio
             # logs nothing.
@@ -315,7 +340,9 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
     return "".join("\t".join((*line, "", "")) + "\r\n" for line in lines)
 
 
-async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: CommandProgress) -> str:
+async def abort_script(
+    twin: ConnectedTwin, command: AbortScript, progress: CommandProgress
+) -> str:
     """Abort the job that this gateway started."""
     if twin.job is None:
         raise Refusal("no script or sequence of this gateway is running")
@@ -323,7 +350,9 @@ async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: Comm
     return twin.job
 
 
-async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: CommandProgress) -> str:
+async def _run(
+    twin: ConnectedTwin, script: bytes, name: str, progress: CommandProgress
+) -> str:
     """Submit a script and wait for the end of its job.
 
     Args:
@@ -391,17 +420,25 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
     c.XrayOn: setting("tube.set", lambda k: {"on": True}, lambda k: ""),
     c.XrayOff: setting("tube.set", lambda k: {"on": False}, lambda k: ""),
     c.SetVoltage: setting("tube.set", lambda k: {"kV": k.kV}, lambda k: f"{k.kV:.6f}"),
-    c.SetPower: setting("tube.set", lambda k: {"power_W": k.power_W}, lambda k: f"{k.power_W:.6f}"),
+    c.SetPower: setting(
+        "tube.set", lambda k: {"power_W": k.power_W}, lambda k: f"{k.power_W:.6f}"
+    ),
     c.WaitXrayReady: wait_ready,
     c.SetMode: setting("camera.set", lambda k: {"mode": k.mode}, lambda k: k.mode),
     c.SetExposure: setting(
-        "camera.set", lambda k: {"exposure_ms": k.exposure_ms}, lambda k: f"{k.exposure_ms:.6f}"
+        "camera.set",
+        lambda k: {"exposure_ms": k.exposure_ms},
+        lambda k: f"{k.exposure_ms:.6f}",
     ),
-    c.SetFrames: setting("camera.set", lambda k: {"frames": k.frames}, lambda k: str(k.frames)),
+    c.SetFrames: setting(
+        "camera.set", lambda k: {"frames": k.frames}, lambda k: str(k.frames)
+    ),
     c.SetAverages: setting(
         "camera.set", lambda k: {"averages": k.averages}, lambda k: str(k.averages)
     ),
-    c.SetRoi: setting("camera.set", lambda k: {"roi": list(k.roi.edges)}, lambda k: str(k.roi)),
+    c.SetRoi: setting(
+        "camera.set", lambda k: {"roi": list(k.roi.edges)}, lambda k: str(k.roi)
+    ),
     c.TakeImage: take_image,
     c.SaveImage: save_image,
     c.TakeSequence: sequence,

@@ -133,7 +133,9 @@ class ConnectedTwin:
         script = path.read_bytes()
         return None if script == self.sequence else script
 
-    async def ask(self, method: str, params: Mapping[str, object] | None = None) -> object:
+    async def ask(
+        self, method: str, params: Mapping[str, object] | None = None
+    ) -> object:
         """Send a request to the twin and return its result.
 
         Raises:
@@ -172,7 +174,12 @@ class ConnectedTwin:
         if self.recording is None:
             machine, profile = self._scanner()
             self.recording = Recording(
-                self.root, self.path, machine, profile, datetime.now(UTC), version("flexdt")
+                self.root,
+                self.path,
+                machine,
+                profile,
+                datetime.now(UTC),
+                version("flexdt"),
             )
         return self.recording
 
@@ -190,17 +197,22 @@ class ConnectedTwin:
     def motor_text(self, axis: str, at: AxisState) -> str:
         """Format the reply to a completed move: a motor's cluster, one character a byte.
 
-        A virtual axis, which has no motor, and a motor of a machine that the gateway does not know
-        reply with their position.
+        A virtual axis, which has no motor, and a motor of a machine that the gateway does not
+        know reply with their position.
         """
         machine = self.machine
         known = None if machine is None else machine.axes.get(axis)
         if known is None or at.speed is None or at.acceleration is None:
             return f"{at.position:.10f}"
         motor = MotorReply(
-            at.position, at.target, at.speed, at.acceleration, *at.limits,
-            known.max_speed, known.max_acceleration,
-        )  # fmt: skip
+            at.position,
+            at.target,
+            at.speed,
+            at.acceleration,
+            *at.limits,
+            known.max_speed,
+            known.max_acceleration,
+        )
         return motor_cluster(motor).decode("latin-1")
 
     @property
@@ -215,7 +227,9 @@ class ConnectedTwin:
                 machine = builtin_machine(hello.machine)
             if machine is None:
                 return None, None
-            return machine, self._profile or profile_of(machine, hello.profile if hello else None)
+            return machine, self._profile or profile_of(
+                machine, hello.profile if hello else None
+            )
         except TwinError:  # neither of them need ship
             return machine, None
 
@@ -229,6 +243,8 @@ def _one_line(error: RpcError) -> str:
     lines = [
         f"line {p.get('line')}: {p['message']}"
         for p in (data if isinstance(data, list) else [])
-        if isinstance(p, Mapping) and "message" in p and p.get("severity", "error") == "error"
+        if isinstance(p, Mapping)
+        and "message" in p
+        and p.get("severity", "error") == "error"
     ]
     return "; ".join([error.message, *lines[:5]])

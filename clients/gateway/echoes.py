@@ -81,7 +81,9 @@ class Echoes:
         not echoed."""
         self._known |= {k: v for k, v in told(state).items() if k[0] == component}
 
-    def see(self, state: State, own: Collection[str], now: float) -> Iterator[AcquilaEvent]:
+    def see(
+        self, state: State, own: Collection[str], now: float
+    ) -> Iterator[AcquilaEvent]:
         """Yield the events for changes of the state.
 
         Args:
@@ -98,7 +100,11 @@ class Echoes:
             component, command = key
             if component in self._moves:
                 yield self._moves.pop(component).failed("stopped or sent elsewhere")
-            words = (component, value, "") if command == "xrays" else (component, command, value)
+            words = (
+                (component, value, "")
+                if command == "xrays"
+                else (component, command, value)
+            )
             exchange, *begun = self._begin((*words, "")[:4], state, now)
             yield from begun
             if command == MOVE:
@@ -179,7 +185,10 @@ class Echoes:
         if reply is None:
             axis = state.axes.get(line.command.component)
             moved = axis is not None and line.command.command == MOVE
-            echoed = line.command.command.startswith("set ") and line.command.component != "scanner"
+            echoed = (
+                line.command.command.startswith("set ")
+                and line.command.component != "scanner"
+            )
             reply = line.command.arg1 if echoed else ""
             reply = "TRUE" if line.command.command.startswith("REPEAT UNTIL") else reply
             reply = self.reply(line.command.component, axis) if moved and axis else reply
@@ -206,7 +215,10 @@ def told(state: State) -> Mapping[Key, str]:
     for name, axis in state.axes.items():
         if axis.virtual:
             continue
-        for command, value in (("set speed", axis.speed), ("set acceleration", axis.acceleration)):
+        for command, value in (
+            ("set speed", axis.speed),
+            ("set acceleration", axis.acceleration),
+        ):
             if value is not None:
                 made[name, command] = f"{value:.{10 if command == 'set speed' else 6}f}"
         made[name, MOVE] = f"{axis.target:.10f}"

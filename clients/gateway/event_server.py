@@ -1,10 +1,10 @@
 """The gateway's sockets: events in, replies out, one task for each running command.
 
-Binds a PUB socket (outgoing events) and a SUB socket (incoming events), as the scanner's software
-does; clients connect to both. Commands are forwarded to every subscriber, so that a component that
-a user runs elsewhere receives its own; if none answers, the reply is ERR. No event ends the
-gateway: one that cannot be served is answered with ERR and logged. The gateway listens on the
-loopback address only, because the interface cannot authenticate a client.
+Binds a PUB socket (outgoing events) and a SUB socket (incoming events), as the scanner's
+software does; clients connect to both. Commands are forwarded to every subscriber, so that a
+component that a user runs elsewhere receives its own; if none answers, the reply is ERR. No
+event ends the gateway: one that cannot be served is answered with ERR and logged. The gateway
+listens on the loopback address only, because the interface cannot authenticate a client.
 """
 
 from __future__ import annotations
@@ -106,7 +106,9 @@ class Gateway:
                     self._receive(await self._in.recv_multipart())
                 except Exception:
                     self._log_failure("an event")
-                    await asyncio.sleep(PAUSE_S)  # a socket that fails at once fails again at once
+                    await asyncio.sleep(
+                        PAUSE_S
+                    )  # a socket that fails at once fails again at once
         finally:
             for task in list(self._tasks):
                 task.cancel()
@@ -168,7 +170,9 @@ class Gateway:
                 state, now = await self.twin.state(), clock()
                 own = [name for name, count in self._busy.items() if count]
                 for status in self.twin.told_jobs(state):
-                    for event in self._echoes.follow(status, self.twin.script_of, state, now):
+                    for event in self._echoes.follow(
+                        status, self.twin.script_of, state, now
+                    ):
                         self._send(event)
                 for event in self._echoes.see(state, own, now):
                     self._send(event)
@@ -180,7 +184,9 @@ class Gateway:
                 self._log_failure("echo")
                 await asyncio.sleep(PAUSE_S)
 
-    async def _guarded(self, work: Coroutine[Any, Any, None], event: AcquilaEvent) -> None:
+    async def _guarded(
+        self, work: Coroutine[Any, Any, None], event: AcquilaEvent
+    ) -> None:
         try:
             await work
         except Exception:
@@ -204,7 +210,9 @@ class Gateway:
         task = asyncio.ensure_future(self._do(event, progress))
         try:
             while not task.done():
-                await asyncio.wait({task}, timeout=max(0.0, exchange.next_feedback - clock()))
+                await asyncio.wait(
+                    {task}, timeout=max(0.0, exchange.next_feedback - clock())
+                )
                 if not task.done():
                     self._send(exchange.feedback(progress.text, clock()))
             end = exchange.done(task.result())
@@ -232,7 +240,9 @@ class Gateway:
         async with lock:
             return await self._act(event, command, progress)
 
-    async def _act(self, event: AcquilaEvent, command: c.Command, progress: CommandProgress) -> str:
+    async def _act(
+        self, event: AcquilaEvent, command: c.Command, progress: CommandProgress
+    ) -> str:
         line = transcript_line(event, command)
         lines = self.twin.record().transcript
         if line is not None:
@@ -311,7 +321,9 @@ class Gateway:
             log("gateway event refused", logging.WARNING, reason=why)
         fields = ", ".join(FIELDS)
         reply = f"{why}; an event is a JSON object with {fields}"
-        self._send(AcquilaEvent("gateway", "receive", reply=reply, reply_type=ReplyType.ERR))
+        self._send(
+            AcquilaEvent("gateway", "receive", reply=reply, reply_type=ReplyType.ERR)
+        )
 
     def _log_failure(self, command: str) -> None:
         """Write the exception being handled to the log, up to `MAX_LOGGED` times."""
@@ -350,7 +362,9 @@ class Gateway:
             into.setsockopt(zmq.RCVHWM, MAX_HELD)
             into.subscribe(b"")
             try:
-                into.bind(bind_endpoint(self.host, here + 1 if inbound is None else inbound))
+                into.bind(
+                    bind_endpoint(self.host, here + 1 if inbound is None else inbound)
+                )
             except zmq.ZMQError:
                 out.close(linger=0)
                 into.close(linger=0)
@@ -398,6 +412,10 @@ def transcript_line(event: AcquilaEvent, command: c.Command) -> str | None:
     """Write the command as a line of a script; None if it cannot occur in one."""
     if type(command).__module__ != c.__name__:
         return None
-    wait = "POS" if isinstance(command, c.MoveAbsolute) and command.trigger is not None else "ACK"
+    wait = (
+        "POS"
+        if isinstance(command, c.MoveAbsolute) and command.trigger is not None
+        else "ACK"
+    )
     words = (event.component, event.command, event.arg1, event.arg2, wait, "", "")
     return "\t".join(" ".join(word.split()) for word in words)

@@ -1,7 +1,8 @@
-"""`python -m flexdt.clients.gateway.main`: the scanner software's socket interface as a process.
+"""`python -m flexdt.clients.gateway.main`: the scanner software's socket interface as a
+process.
 
-Prints one JSON `ready` line on standard output once programs may connect; the twin may come later
-or go and come back. SIGTERM and SIGINT end it cleanly. Nothing else is printed there.
+Prints one JSON `ready` line on standard output once programs may connect; the twin may come
+later or go and come back. SIGTERM and SIGINT end it cleanly. Nothing else is printed there.
 """
 
 from __future__ import annotations
@@ -67,11 +68,18 @@ async def run(options: GatewaySettings) -> int:
     except ZMQError as error:
         raise OSError(error.errno, error.strerror) from None
     stop = stop_signal()
-    tasks = [asyncio.create_task(work) for work in (link.run(), gateway.run(), stop.wait())]
-    announce("gateway", {
-        "host": options.host, "port": gateway.port, "inbound": gateway.inbound,
-        "twin": str(options.server),
-    })  # fmt: skip
+    tasks = [
+        asyncio.create_task(work) for work in (link.run(), gateway.run(), stop.wait())
+    ]
+    announce(
+        "gateway",
+        {
+            "host": options.host,
+            "port": gateway.port,
+            "inbound": gateway.inbound,
+            "twin": str(options.server),
+        },
+    )
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:

@@ -23,7 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.state_model import State
-from flexdt.runtime.files.dataset_folder import free_name, put_texts, read_document, tiff_bytes
+from flexdt.runtime.files.dataset_folder import (
+    free_name,
+    put_texts,
+    read_document,
+    tiff_bytes,
+)
 from flexdt.runtime.files.directory import Directory, open_data
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.file_names import SCRIPT
@@ -94,8 +99,8 @@ class Recording:
         """Write an image under a plain name.
 
         Raises:
-            DatasetError: the name is not plain or is taken, the file cannot be written, or another
-                output path has been set meanwhile.
+            DatasetError: the name is not plain or is taken, the file cannot be written, or
+                another output path has been set meanwhile.
         """
         with self._turn:
             files = self._files([file])
@@ -104,7 +109,12 @@ class Recording:
             positions = {n: np.array([v]) for n, v in _positions(state).items()}
             time = np.array([self._time(state.time)])
             block = FrameBlock(
-                kind_of_file(file), (file,), time, camera_of(state), positions, state.tube.ready
+                kind_of_file(file),
+                (file,),
+                time,
+                camera_of(state),
+                positions,
+                state.tube.ready,
             )
             self._add([block], state)
             return files.path / file
@@ -172,7 +182,8 @@ class Recording:
         taken = sorted(set(names) & self._folder.names())
         if taken:
             raise DatasetError(
-                f"{self._folder.path} has {taken[0]} already; allowed: another name, or another "
+                f"{self._folder.path} has {taken[0]} already; allowed: another name, or "
+                "another "
                 "output path",
                 {"asked": taken},
             )
@@ -264,7 +275,11 @@ def _positions(state: State) -> Mapping[str, float]:
 
 def _correction(state: State) -> NamedCorrection | None:
     c = state.correction
-    return None if c is None else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.comment)
+    return (
+        None
+        if c is None
+        else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.comment)
+    )
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
@@ -276,7 +291,9 @@ def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
 
     def block(run: Sequence[FrameEntry]) -> FrameBlock:
         first = run[0]
-        camera = CameraSettings(first.mode, Roi(*first.roi), first.exposure_ms, first.averages)
+        camera = CameraSettings(
+            first.mode, Roi(*first.roi), first.exposure_ms, first.averages
+        )
         positions = {n: np.array([f.positions[n] for f in run]) for n in first.positions}
         times = np.array([start + f.time_s for f in run])
         files = tuple(f.file for f in run)

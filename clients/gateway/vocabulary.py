@@ -53,13 +53,19 @@ _EXTRA: Final[Mapping[str, Mapping[str, Extra]]] = {
     },
     "": {
         "stop": lambda event: StopAll(),
-        "status_position_get": lambda event: Question(path=("axes", event.component, "position")),
+        "status_position_get": lambda event: Question(
+            path=("axes", event.component, "position")
+        ),
     },
 }
 """Commands in addition to the script's vocabulary; only status_XReady_get is in any
 public text."""
 
-_FIXED: Final[dict[str, ComponentType]] = {"tube": "tube", "camera": "camera", "scanner": "other"}
+_FIXED: Final[dict[str, ComponentType]] = {
+    "tube": "tube",
+    "camera": "camera",
+    "scanner": "other",
+}
 
 
 def component_type(component: str, axes: Collection[str]) -> ComponentType | None:
@@ -120,7 +126,9 @@ def _extra(event: AcquilaEvent, name: str) -> c.Command:
         if command.lower() == asked:
             return make(event)
     allowed = ", ".join(known_commands(name))
-    raise Refusal(f"{event.component} does not know {shown(event.command)}; it knows: {allowed}")
+    raise Refusal(
+        f"{event.component} does not know {shown(event.command)}; it knows: {allowed}"
+    )
 
 
 def shown(text: str) -> str:

@@ -1,7 +1,7 @@
 """Checks of an installation, one function for each.
 
-Compiled kernels are judged by their result (a sphere, whose shadow is known in closed form), not by
-their presence. The only thing written is a temporary file in the data directory.
+Compiled kernels are judged by their result (a sphere, whose shadow is known in closed form),
+not by their presence. The only thing written is a temporary file in the data directory.
 """
 
 from __future__ import annotations
@@ -51,20 +51,33 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
     Yields:
         One result for each check.
     """
-    checks: list[Callable[[], CheckOutcome]] = [python, packages, kernels, threads, memory, gpu]
+    checks: list[Callable[[], CheckOutcome]] = [
+        python,
+        packages,
+        kernels,
+        threads,
+        memory,
+        gpu,
+    ]
     checks += [lambda what=what, port=port: listening(what, port) for what, port in ports]  # type: ignore[misc]
     checks.append(lambda: disk(data))
     for check in checks:
         try:
             yield check()
-        except Exception as error:  # a check that fails is a finding, and the others go on
-            yield CheckOutcome(check.__name__, "error", f"{type(error).__name__}: {error}")
+        except (
+            Exception
+        ) as error:  # a check that fails is a finding, and the others go on
+            yield CheckOutcome(
+                check.__name__, "error", f"{type(error).__name__}: {error}"
+            )
 
 
 def python() -> CheckOutcome:
     """Report the interpreter, the platform and flexdt's version."""
     found = f"{platform.python_implementation()} {platform.python_version()}, {platform.system()}"
-    return CheckOutcome("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
+    return CheckOutcome(
+        "python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}"
+    )
 
 
 def packages() -> CheckOutcome:
@@ -105,7 +118,9 @@ def kernels() -> CheckOutcome:
     radius, mu, source, detector = 10.0, 0.02, -400.0, 600.0
     scene = Scene((Solid(Sphere((0.0, 0.0, 0.0), radius), "test", mu),))
     shape, pitch = (33, 47), 1.0
-    row = np.array([[0, source, 0, 0, detector, 0, pitch, 0, 0, 0, 0, -pitch]], dtype=np.float64)
+    row = np.array(
+        [[0, source, 0, 0, detector, 0, pitch, 0, 0, 0, 0, -pitch]], dtype=np.float64
+    )
     begun = time.perf_counter()
     image = project_scene(scene, row, shape)[0]
     first = time.perf_counter() - begun
@@ -118,7 +133,9 @@ def kernels() -> CheckOutcome:
     worst = float(np.abs(image - right).max() / right.max())
     found = f"a sphere's shadow is right to {worst:.1e}; first use took {first:.1f} s"
     if worst > WORST_ERROR:
-        return CheckOutcome("kernels", "error", found, "reinstall numba; see docs/performance.md")
+        return CheckOutcome(
+            "kernels", "error", found, "reinstall numba; see docs/performance.md"
+        )
     return CheckOutcome("kernels", "ok", found)
 
 
@@ -127,13 +144,19 @@ def threads() -> CheckOutcome:
     policy."""
     import numba
 
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    usable = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count()
+    )
     found = f"{usable} of {os.cpu_count()} cores usable, {numba.get_num_threads()} numba threads"
     found += f", threading layer {numba.threading_layer()}"
     if numba.threading_layer() == "omp":
         found += f", waiting {kernel_threads.waiting}"
     if usable is not None and numba.get_num_threads() < usable:
-        return CheckOutcome("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
+        return CheckOutcome(
+            "threads", "warning", found, "NUMBA_NUM_THREADS is below the cores"
+        )
     return CheckOutcome("threads", "ok", found)
 
 
@@ -149,7 +172,9 @@ def gpu() -> CheckOutcome:
     from flexdt.twin.projection.gpu import availability
 
     found = availability()
-    computes = f"{found.reason} computes" if found.present else f"the processor: {found.reason}"
+    computes = (
+        f"{found.reason} computes" if found.present else f"the processor: {found.reason}"
+    )
     return CheckOutcome("gpu", "warning" if "failed" in found.reason else "ok", computes)
 
 
@@ -198,9 +223,13 @@ def disk(data: Path) -> CheckOutcome:
     free = free_bytes(folder)
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
     if free < LITTLE_ROOM_BYTES:
-        return CheckOutcome("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
+        return CheckOutcome(
+            "disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB"
+        )
     if took > SLOW_SYNC_S:
-        return CheckOutcome("disk", "warning", found, "slow; scans at full speed will wait for it")
+        return CheckOutcome(
+            "disk", "warning", found, "slow; scans at full speed will wait for it"
+        )
     return CheckOutcome("disk", "ok", found)
 
 

@@ -50,7 +50,9 @@ class Servers:
         ready: the `ready` line's content, once entered.
     """
 
-    def __init__(self, options: Mapping[str, object], log: Path, *, viewer: bool = False) -> None:
+    def __init__(
+        self, options: Mapping[str, object], log: Path, *, viewer: bool = False
+    ) -> None:
         ports = {"port": 0, "projector-port": 0, "viewer-port": 0}
         self._words = words({**ports, **options, "no-viewer": not viewer})
         self._log_path = log
@@ -134,7 +136,9 @@ class Servers:
 
     def _wait_ready(self, process: subprocess.Popen[bytes]) -> dict[str, object]:
         assert process.stdout is not None
-        for line in process.stdout:  # however long: the supervisor ends a service that does nothing
+        for line in (
+            process.stdout
+        ):  # however long: the supervisor ends a service that does nothing
             with contextlib.suppress(ValueError, TypeError):
                 message = json.loads(line)
                 if isinstance(message, dict) and message.get("ready") == "up":
@@ -142,7 +146,8 @@ class Servers:
         code = process.wait(STOP_TIMEOUT_S)
         tail = "; ".join(self.log_tail(3))
         raise ServersError(
-            f"the servers did not start (exit code {code}): {tail}", code if 0 < code <= 5 else 1
+            f"the servers did not start (exit code {code}): {tail}",
+            code if 0 < code <= 5 else 1,
         )
 
 
@@ -150,9 +155,10 @@ class Servers:
 class LocalTwin:
     """Projector and twin server as processes of this machine, as a context manager.
 
-    Entering starts them on free ports and gives a connected `TwinClient`; leaving ends them, also
-    after an exception, and they end with this process however it ends. In a notebook, where a
-    `with` block cannot span cells, `start()` gives the client and `stop()` ends the servers.
+    Entering starts them on free ports and gives a connected `TwinClient`; leaving ends them,
+    also after an exception, and they end with this process however it ends. In a notebook,
+    where a `with` block cannot span cells, `start()` gives the client and `stop()` ends the
+    servers.
 
     Args:
         data: folder for all that the twin writes; None for a temporary one, deleted at the end.
@@ -190,10 +196,17 @@ class LocalTwin:
     ) -> None:
         self._progress = progress
         options = {
-            "sample": sample, "machine": machine, "profile": profile, "physics": physics,
-            "scatter": scatter, "speed-up": speed_up, "truth": truth,
-        }  # fmt: skip
-        self._options = {name: value for name, value in options.items() if value is not None}
+            "sample": sample,
+            "machine": machine,
+            "profile": profile,
+            "physics": physics,
+            "scatter": scatter,
+            "speed-up": speed_up,
+            "truth": truth,
+        }
+        self._options = {
+            name: value for name, value in options.items() if value is not None
+        }
         self._viewer, self._folder = viewer, None if data is None else Path(data)
         self._running: tuple[ExitStack, Servers, TwinClient, Path] | None = None
 
@@ -211,12 +224,16 @@ class LocalTwin:
         """
         if self._running is None:
             with ExitStack() as stack:
-                own = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexdt-twin-"))
+                own = stack.enter_context(
+                    tempfile.TemporaryDirectory(prefix="flexdt-twin-")
+                )
                 data = Path(own) / "data" if self._folder is None else self._folder
                 options = {**self._options, "data": data}
                 log = Path(own) / LOG
                 with long_work.during("starting the servers", self._progress):
-                    servers = stack.enter_context(Servers(options, log, viewer=self._viewer))
+                    servers = stack.enter_context(
+                        Servers(options, log, viewer=self._viewer)
+                    )
                 client = stack.enter_context(TwinClient(*servers.address))
                 atexit.register(self.stop)
                 self._running = stack.pop_all(), servers, client, data

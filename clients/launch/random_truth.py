@@ -1,7 +1,7 @@
 """The hidden misalignment of a demonstration: drawn at random, kept outside the data directory.
 
-The draw comes from the operating system's entropy, never from a seed, so nothing that a data set
-records can reveal it. Only the comparison after the calibration reads it.
+The draw comes from the operating system's entropy, never from a seed, so nothing that a data
+set records can reveal it. Only the comparison after the calibration reads it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,13 @@ from typing import Final
 from flexdt.library.failure import CommandError
 
 RANGES: Final[Mapping[str, float]] = {
-    "dO_x": 1.0, "dO_y": 1.0, "dO_z": 2.0, "alpha": 5.0, "tau_x": 0.5, "tau_z": 0.5,
-}  # fmt: skip
+    "dO_x": 1.0,
+    "dO_y": 1.0,
+    "dO_z": 2.0,
+    "alpha": 5.0,
+    "tau_x": 0.5,
+    "tau_z": 0.5,
+}
 """Parameter -> largest absolute value drawn [mm, deg]: errors of a careful operator."""
 
 
@@ -57,7 +62,9 @@ def read(path: Path) -> dict[str, float]:
     problems = []
     for name, value in content.items():
         if name not in NAMES:
-            problems.append(f"{path}: unknown parameter {name!r}; allowed: {', '.join(NAMES)}")
+            problems.append(
+                f"{path}: unknown parameter {name!r}; allowed: {', '.join(NAMES)}"
+            )
         elif type(value) not in (int, float):
             problems.append(f"{path}: {name} = {value!r} is not a number")
     if problems:

@@ -55,27 +55,52 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     for_twin = [x for x in options.limit if x not in for_viewer]
 
     def projector(known: Addresses) -> Sequence[str]:
-        given = {"host": LOOPBACK, "port": port_of("projector", options.projector_port, known),
-                 "memory_limit": options.projector_memory}  # fmt: skip
+        given = {
+            "host": LOOPBACK,
+            "port": port_of("projector", options.projector_port, known),
+            "memory_limit": options.projector_memory,
+        }
         return ("flexdt.server.projector.main", *words(given))
 
     def twin(known: Addresses) -> Sequence[str]:
-        own = {"port": port_of("twin", options.port, known), "projector": known["projector"],
-               "projector_port": None, "limit": for_twin}  # fmt: skip
+        own = {
+            "port": port_of("twin", options.port, known),
+            "projector": known["projector"],
+            "projector_port": None,
+            "limit": for_twin,
+        }
         # A restarted twin continues from its stored state, even if the first start was
         # `fresh`.
         again = {"fresh": False} if "twin" in known else {}
-        return ("flexdt.server.twin.main", *words(shared(options, TwinSettings) | own | again))
+        return (
+            "flexdt.server.twin.main",
+            *words(shared(options, TwinSettings) | own | again),
+        )
 
     def viewer(known: Addresses) -> Sequence[str]:
-        own = {"port": port_of("viewer", options.viewer_port, known), "twin": known["twin"],
-               "twin_cert": options.tls_cert, "limit": for_viewer, "http_port": None}  # fmt: skip
-        return ("flexdt.clients.viewer.main", *words(shared(options, ViewerSettings) | own))
+        own = {
+            "port": port_of("viewer", options.viewer_port, known),
+            "twin": known["twin"],
+            "twin_cert": options.tls_cert,
+            "limit": for_viewer,
+            "http_port": None,
+        }
+        return (
+            "flexdt.clients.viewer.main",
+            *words(shared(options, ViewerSettings) | own),
+        )
 
     def gateway(known: Addresses) -> Sequence[str]:
-        own = {"port": port_of("gateway", options.gateway_port or 0, known), "host": None,
-               "server": known["twin"], "twin_cert": options.tls_cert}  # fmt: skip
-        return ("flexdt.clients.gateway.main", *words(shared(options, GatewaySettings) | own))
+        own = {
+            "port": port_of("gateway", options.gateway_port or 0, known),
+            "host": None,
+            "server": known["twin"],
+            "twin_cert": options.tls_cert,
+        }
+        return (
+            "flexdt.clients.gateway.main",
+            *words(shared(options, GatewaySettings) | own),
+        )
 
     made = [Service("projector", projector, slow=COMPILING), Service("twin", twin)]
     if not options.no_viewer:
@@ -144,7 +169,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         pair = (options.gateway_port, options.gateway_port + 1)
         wanted += [("--gateway-port", LOOPBACK, port) for port in pair]
     # Checked before any start: a server would find it only after compiling, and end all.
-    missing = lacking("zmq", "pyzmq", "gateway") if options.gateway_port is not None else None
+    missing = (
+        lacking("zmq", "pyzmq", "gateway") if options.gateway_port is not None else None
+    )
     if missing is not None:
         print(f"flexdt up: --gateway-port: {missing}", file=sys.stderr)
         return INVALID

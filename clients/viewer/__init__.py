@@ -1,1 +1,2 @@
-"""The lab in the browser: a 3-D scene, the live radiograph and every control, over TCP alone."""
+"""The lab in the browser: a 3-D scene, the live radiograph and every control, over TCP
+alone."""

@@ -1,8 +1,8 @@
 """Exports of the viewer: pictures of a view, the current scene, and a scan as a replay.
 
-A replay is drawn in a viser server of its own without clients, so that recording does not disturb
-the live scene. Both file formats open without any server. The page saves what it receives;
-nothing is written here.
+A replay is drawn in a viser server of its own without clients, so that recording does not
+disturb the live scene. Both file formats open without any server. The page saves what it
+receives; nothing is written here.
 """
 
 from __future__ import annotations
@@ -43,16 +43,25 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
     Raises:
         RuntimeError, TimeoutError: the browser does not answer.
     """
-    rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(np.float32)
-    alpha = rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
+    rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(
+        np.float32
+    )
+    alpha = (
+        rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
+    )
     flat = rgba[:, :, :3] * alpha + np.array(DARK if dark else LIGHT) * (1.0 - alpha)
     return png_of(flat.astype(np.uint8))
 
 
 def scene_file(
-    server: viser.ViserServer, camera: Standpoint, nodes: Nodes, title: str, beside: str,
-    form: Form, dark: bool,
-) -> bytes:  # fmt: skip
+    server: viser.ViserServer,
+    camera: Standpoint,
+    nodes: Nodes,
+    title: str,
+    beside: str,
+    form: Form,
+    dark: bool,
+) -> bytes:
     """Export the live scene to a file: as the page shows it, with `beside` over it
     (HTML)."""
     serializer = server.get_scene_serializer()
@@ -103,10 +112,14 @@ def replay_file(
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
     if form != "html":
         return bytes(serializer.serialize())
-    page = re.sub(r"<title>.*?</title>", "", str(serializer.as_html(dark_mode=dark)), count=1)
+    page = re.sub(
+        r"<title>.*?</title>", "", str(serializer.as_html(dark_mode=dark)), count=1
+    )
     first = page_file(TRANSLUCENT).decode()
     head = f"<head><title>{html.escape(title)}</title><script>{first}</script>"
-    return page.replace("<head>", head, 1).replace("</body>", f"{beside}</body>", 1).encode()
+    return (
+        page.replace("<head>", head, 1).replace("</body>", f"{beside}</body>", 1).encode()
+    )
 
 
 def title_of(state: State | None, what: str) -> str:
@@ -126,14 +139,20 @@ def beside(state: State | None, image: ShownImage | None) -> str:
         return ""
     at = state.geometry
     rows = {
-        "source to sample": f"{at.SOD_mm:.2f} mm", "source to detector": f"{at.SDD_mm:.2f} mm",
-        "magnification": f"{at.magnification:.4f}", "voxel": f"{1000 * at.voxel_size_mm:.2f} µm",
+        "source to sample": f"{at.SOD_mm:.2f} mm",
+        "source to detector": f"{at.SDD_mm:.2f} mm",
+        "magnification": f"{at.magnification:.4f}",
+        "voxel": f"{1000 * at.voxel_size_mm:.2f} µm",
         "beam": f"{state.tube.kV:.0f} kV, {state.tube.power_W:.0f} W",
         "correction": "none" if state.correction is None else state.correction.name,
         "axes": "x right, y to the detector, z up",
-    }  # fmt: skip
+    }
     lines = "<br>".join(f"{name}: {html.escape(value)}" for name, value in rows.items())
-    film = "" if image is None else base64.b64encode(png_of(grey(image, window_of(image)))).decode()
+    film = (
+        ""
+        if image is None
+        else base64.b64encode(png_of(grey(image, window_of(image)))).decode()
+    )
     source = f"data:image/png;base64,{film}"
     return (
         '<aside style="position:fixed;left:8px;bottom:8px;width:230px;padding:8px;'
@@ -156,6 +175,7 @@ def standpoint(client: viser.ClientHandle) -> Standpoint:
     """Return the present camera of a client."""
     c = client.camera
     position, look_at, up = (
-        (float(v[0]), float(v[1]), float(v[2])) for v in (c.position, c.look_at, c.up_direction)
+        (float(v[0]), float(v[1]), float(v[2]))
+        for v in (c.position, c.look_at, c.up_direction)
     )
     return Standpoint(position, look_at, up, float(c.fov))

@@ -1,8 +1,8 @@
 """Images that come from the twin to the pages.
 
-There is one feed for each kind of image; it subscribes only while a page shows that kind. During
-motion pages get the mean over 2 x 2 pixels, and the full image at rest. Pixels are processed in a
-thread, and only the newest image is kept.
+There is one feed for each kind of image; it subscribes only while a page shows that kind.
+During motion pages get the mean over 2 x 2 pixels, and the full image at rest. Pixels are
+processed in a thread, and only the newest image is kept.
 """
 
 from __future__ import annotations
@@ -37,7 +37,11 @@ class ImageFeed:
     """
 
     def __init__(
-        self, address: TwinAddress, kind: str, take: Take, died: Callable[[], None] = lambda: None
+        self,
+        address: TwinAddress,
+        kind: str,
+        take: Take,
+        died: Callable[[], None] = lambda: None,
     ) -> None:
         self.kind = kind
         self.newest: ShownImage | None = None
@@ -53,12 +57,18 @@ class ImageFeed:
     def start(self) -> None:
         """Listen from now on."""
         if not self._tasks:
-            wish = {"topics": ["projection"], "max_rate_hz": IMAGE_HZ, "projection_kind": self.kind}
+            wish = {
+                "topics": ["projection"],
+                "max_rate_hz": IMAGE_HZ,
+                "projection_kind": self.kind,
+            }
             name = f"flexdt viewer ({self.kind})"
             link = KeptConnection(self._address, name, self._arrived, subscription=wish)
             what = f"the feed of {self.kind} images"
             self._link = link
-            self._tasks = [watched(w, what, self._died) for w in (link.run(), self._work())]
+            self._tasks = [
+                watched(w, what, self._died) for w in (link.run(), self._work())
+            ]
 
     def stop(self) -> asyncio.Future[Any]:
         """Listen no longer, from now on; done once the connection has ended."""
@@ -107,7 +117,12 @@ class ImageFeed:
                 sound = True
             except Exception:  # the next one may be better
                 if sound:  # once, not for each of twelve a second
-                    log("an image could not be shown", logging.ERROR, error=True, kind=self.kind)
+                    log(
+                        "an image could not be shown",
+                        logging.ERROR,
+                        error=True,
+                        kind=self.kind,
+                    )
                 sound = False
 
 

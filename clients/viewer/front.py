@@ -1,8 +1,8 @@
 """The viewer's HTTP and WebSocket front: one port for the page, its data, and viser's scenes.
 
-viser accepts any connection, so only this module can reach it (see `viser_gate`). Requests under
-`/scene/PAGE/VIEW` are relayed to viser after Host, Origin and (where there is one) the token have
-been checked. `/ws/PAGE` is the page's own connection.
+viser accepts any connection, so only this module can reach it (see `viser_gate`). Requests
+under `/scene/PAGE/VIEW` are relayed to viser after Host, Origin and (where there is one) the
+token have been checked. `/ws/PAGE` is the page's own connection.
 """
 
 from __future__ import annotations
@@ -63,14 +63,17 @@ FOR_GOOD: Final = "private, max-age=31536000, immutable"
 """Cache header of files whose name changes with their content."""
 NO_TOKEN: Final = "This viewer wants a token: open its first page, and type it there.\n"
 POLICY: Final = (
-    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: "
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' "
+    "data: blob: "
     "ws: wss:; frame-ancestors 'self'"
 )
 
 PageHandler = Callable[[str, ServerConnection], Awaitable[None]]
 """Serves a page's connection until it ends: the page's id, the connection."""
 Still = Callable[[Mapping[str, str]], Awaitable[bytes | None]]
-Connect = Callable[[str, Subprotocol | None], AbstractAsyncContextManager[ClientConnection]]
+Connect = Callable[
+    [str, Subprotocol | None], AbstractAsyncContextManager[ClientConnection]
+]
 """A connection to viser for a frame's path and subprotocol."""
 
 
@@ -133,7 +136,9 @@ class Front:
         )
         bare, self._program = parted(scene_html)
         self._program_path = f"/viser-{hashlib.sha256(self._program).hexdigest()[:16]}.js"
-        bare = bare.replace(MARK, b'<script src="%b"></script>' % self._program_path.encode(), 1)
+        bare = bare.replace(
+            MARK, b'<script src="%b"></script>' % self._program_path.encode(), 1
+        )
         self._scene_html = bare.replace(b"<head>", b"<head>" + more, 1)
         self._loopback, self._secure = True, False
         self._server: Server | None = None
@@ -144,7 +149,9 @@ class Front:
         assert self._server is not None
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
-    async def start(self, host: str, port: int, ssl: tls.SSLContext | None = None) -> None:
+    async def start(
+        self, host: str, port: int, ssl: tls.SSLContext | None = None
+    ) -> None:
         """Start to listen; port 0 is any free one.
 
         Args:
@@ -186,7 +193,9 @@ class Front:
 
     # -- plain requests ----------------------------------------------------------------------
 
-    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    async def _answer(
+        self, connection: ServerConnection, request: Request
+    ) -> Response | None:
         """Answer a request; None to go on with a WebSocket.
 
         Requests of other sites and without the token are rejected; a still picture is
@@ -198,8 +207,13 @@ class Front:
         """
         try:
             url = urlsplit(request.path)
-            denied = self._foreign(request) or await self._stranger(connection, request, url)
-        except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
+            denied = self._foreign(request) or await self._stranger(
+                connection, request, url
+            )
+        except (
+            ValueError,
+            LookupError,
+        ):  # brackets, bytes or headers that belong nowhere
             return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
         if denied is None:
             cast(BrowserConnection, connection).admit()
@@ -225,15 +239,21 @@ class Front:
         """
         if request.headers.get("Upgrade", "").lower() == "websocket":
             known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
-            return None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
+            return (
+                None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
+            )
         if SCENE_PATH.fullmatch(url.path):
             return _kept(request, self._scene_html, "text/html; charset=utf-8")
         if self._program and url.path == self._program_path:
-            return _kept(request, self._program, "text/javascript; charset=utf-8", FOR_GOOD)
+            return _kept(
+                request, self._program, "text/javascript; charset=utf-8", FOR_GOOD
+            )
         if (match := DOWNLOAD_PATH.fullmatch(url.path)) is not None:
             file = self._downloads.pop(match[1], None)
             if file is None:
-                return _plain(http.HTTPStatus.NOT_FOUND, "this file has been fetched already")
+                return _plain(
+                    http.HTTPStatus.NOT_FOUND, "this file has been fetched already"
+                )
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             disposition = f'attachment; filename="{file.name}"'
             return _response(file.content, kind, {"Content-Disposition": disposition})
@@ -257,7 +277,9 @@ class Front:
             return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {host}")
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
-            return _plain(http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served")
+            return _plain(
+                http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served"
+            )
         return None
 
     async def _stranger(
@@ -281,7 +303,9 @@ class Front:
         if given is not None and token_matches(given, self._token):
             secure = "; Secure" if self._secure else ""
             cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/{secure}"
-            headers = Headers({"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"})
+            headers = Headers(
+                {"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"}
+            )
             return Response(http.HTTPStatus.FOUND.value, "Found", headers, b"")
         if _same(_cookie(request), _pass(self._token)):
             return None
@@ -295,7 +319,9 @@ class Front:
         wrong = given is not None
         asked = token_form(wrong) if url.path == "/" else NO_TOKEN.encode()
         form = "text/html" if url.path == "/" else "text/plain"
-        return _response(asked, f"{form}; charset=utf-8", status=http.HTTPStatus.UNAUTHORIZED)
+        return _response(
+            asked, f"{form}; charset=utf-8", status=http.HTTPStatus.UNAUTHORIZED
+        )
 
     # -- WebSockets --------------------------------------------------------------------------
 
@@ -312,7 +338,9 @@ class Front:
             finally:
                 self._pages -= 1
         elif self.scenes >= self._max_scenes:
-            await connection.close(1013, f"{self._max_scenes} views are open, and no more may be")
+            await connection.close(
+                1013, f"{self._max_scenes} views are open, and no more may be"
+            )
         else:
             cast(BrowserConnection, connection).seat()
             self.scenes += 1
@@ -357,7 +385,9 @@ def _quiet() -> logging.Logger:
     front = logging.getLogger("websockets.front")
     for logger in (front, logging.getLogger("websockets.server")):
         if not logger.filters:
-            logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+            logger.addFilter(
+                lambda record: record.getMessage() != "opening handshake failed"
+            )
     return front
 
 
@@ -385,13 +415,22 @@ def _cookie(request: Request) -> str | None:
     return None
 
 
-def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:
+def _kept(
+    request: Request, body: bytes, kind: str, how_long: str = "no-cache"
+) -> Response:
     """Make a response that a browser may keep: sent again only where it has changed,
     and packed."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    more = {"ETag": tag, "Cache-Control": how_long, "Vary": "Accept-Encoding", **CLOSE_HEADER}
+    more = {
+        "ETag": tag,
+        "Cache-Control": how_long,
+        "Vary": "Accept-Encoding",
+        **CLOSE_HEADER,
+    }
     if tag in request.headers.get("If-None-Match", ""):
-        return Response(http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b"")
+        return Response(
+            http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b""
+        )
     if "gzip" in request.headers.get("Accept-Encoding", ""):
         body, more["Content-Encoding"] = _packed(body), "gzip"
     return _response(body, kind, more)

@@ -1,7 +1,7 @@
 """`python -m flexdt.clients.viewer.main`: the lab in the browser as a process.
 
-Prints one JSON `ready` line on standard output once browsers may come; the twin may come later or
-go and come back. SIGTERM and SIGINT end it cleanly. Nothing else is printed there.
+Prints one JSON `ready` line on standard output once browsers may come; the twin may come later
+or go and come back. SIGTERM and SIGINT end it cleanly. Nothing else is printed there.
 """
 
 from __future__ import annotations
@@ -66,8 +66,14 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     limits = with_limits(options.limit, ViewerLimits())
     machine = read_if_there(options.machine, machines.parsed)
     profile = read_if_there(options.profile, parse_profile)
-    looks = own_looks(machine, options.machine.parent) if machine and options.machine else None
-    viewer = Viewer(twin_address, ANSWERS, machine, profile, token, options.data, limits, looks)
+    looks = (
+        own_looks(machine, options.machine.parent)
+        if machine and options.machine
+        else None
+    )
+    viewer = Viewer(
+        twin_address, ANSWERS, machine, profile, token, options.data, limits, looks
+    )
     stop = stop_signal()
     context = server_tls(options.tls_cert, options.tls_key)
     try:
@@ -76,9 +82,17 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
         at = Address(options.host, viewer.front.port)
         url = f"{'http' if context is None else 'https'}://{at}/"
         async with served_pages(viewer_pages(viewer), options) as pages:
-            announce("viewer", {
-                "host": at.host, "port": at.port, "url": url, "twin": str(twin), **pages,
-            }, out)  # fmt: skip
+            announce(
+                "viewer",
+                {
+                    "host": at.host,
+                    "port": at.port,
+                    "url": url,
+                    "twin": str(twin),
+                    **pages,
+                },
+                out,
+            )
             await first_of(stop, viewer.failed)
     finally:
         await viewer.stop()
@@ -103,14 +117,24 @@ def viewer_pages(viewer: Viewer) -> Pages:
         return [
             gauge("flexdt_pages", "Pages open.", len(viewer.open_pages)),
             counter("flexdt_pages_total", "Pages that ever opened.", viewer.opened),
-            counter("flexdt_scene_messages_dropped_total", "Messages of pages kept from viser.",
-                    0 if front is None else front.doorkeeper.dropped),
+            counter(
+                "flexdt_scene_messages_dropped_total",
+                "Messages of pages kept from viser.",
+                0 if front is None else front.doorkeeper.dropped,
+            ),
             gauge("flexdt_scenes", "Views open.", 0 if front is None else front.scenes),
             counter("flexdt_states_drawn_total", "States drawn.", viewer.drawn),
-            gauge("flexdt_twin_connected", "Whether there is one.", float(viewer.link.connected)),
-            counter("flexdt_wrong_tokens_total", "Wrong tokens shown.",
-                    0 if front is None else front.wrong_tokens),
-        ]  # fmt: skip
+            gauge(
+                "flexdt_twin_connected",
+                "Whether there is one.",
+                float(viewer.link.connected),
+            ),
+            counter(
+                "flexdt_wrong_tokens_total",
+                "Wrong tokens shown.",
+                0 if front is None else front.wrong_tokens,
+            ),
+        ]
 
     return watching_pages(health, figures, failed=viewer.failed.is_set)
 

@@ -127,11 +127,19 @@ class Page:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
         if len(self._notes) > MAX_NOTES:
-            log("a page was closed", logging.WARNING, page=self.id, reason="it takes nothing")
+            log(
+                "a page was closed",
+                logging.WARNING,
+                page=self.id,
+                reason="it takes nothing",
+            )
             await self._connection.close(TRY_AGAIN, "this page took nothing for too long")
 
     def _start(
-        self, work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
+        self,
+        work: Coroutine[Any, Any, None],
+        what: str,
+        died: Callable[[], None] = lambda: None,
     ) -> asyncio.Task[None]:
         task = watched(work, what, died)
         self._tasks.add(task)
@@ -150,7 +158,8 @@ class Page:
         self._over.set()
 
     def say(self, kind: str, **content: object) -> None:
-        """Send something that must arrive, in order; a page that has not taken 1000 is closed."""
+        """Send something that must arrive, in order; a page that has not taken 1000 is
+        closed."""
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:
             self._over.set()
@@ -174,7 +183,9 @@ class Page:
             try:
                 await self.link.request("axes.move", {"targets": targets})
             except (RpcError, ConnectionLost) as error:
-                self.say("note", level="error", title="Cannot go there", body=_words(error))
+                self.say(
+                    "note", level="error", title="Cannot go there", body=_words(error)
+                )
             await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:
@@ -235,21 +246,33 @@ class Page:
             return
         known = METHODS.get(method)
         if self._busy >= MAX_ASKED and (known is None or not known.urgent):
-            self._fail(id, busy(f"{MAX_ASKED} requests of this page are under way already"))
+            self._fail(
+                id, busy(f"{MAX_ASKED} requests of this page are under way already")
+            )
             return
         self._asked += 1
         trace = f"page-{self.id[:8]}-{self._asked}"
         self._busy += 1
         with traced(trace):
             try:
-                self.say("answer", id=id, result=await self._ask(method, params), at=time.time())
+                self.say(
+                    "answer",
+                    id=id,
+                    result=await self._ask(method, params),
+                    at=time.time(),
+                )
             except RpcError as error:
                 self._fail(id, error)
             except ConnectionLost as error:
                 self._fail(id, link_down(str(error)))
             except Exception:
                 # Every failure is reported to the page; the process goes on for the others.
-                log("a page's request failed", logging.ERROR, error=True, method=clip(method, 100))
+                log(
+                    "a page's request failed",
+                    logging.ERROR,
+                    error=True,
+                    method=clip(method, 100),
+                )
                 self._fail(id, internal(trace))
             finally:
                 self._busy -= 1
@@ -263,13 +286,17 @@ class Page:
         try:
             return without_bytes(await self.link.request(method, params))
         except Unsendable:
-            parse_params(METHODS[method], params)  # names the field and the allowed values
+            parse_params(
+                METHODS[method], params
+            )  # names the field and the allowed values
             raise
 
     def _fail(self, id: object, error: RpcError) -> None:
         data = without_bytes(error.data)
         self.say(
-            "answer", id=id, error={"code": error.code, "message": _words(error), "data": data}
+            "answer",
+            id=id,
+            error={"code": error.code, "message": _words(error), "data": data},
         )
 
     def _link_changed(self) -> None:

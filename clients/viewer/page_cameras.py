@@ -1,7 +1,7 @@
 """Which of viser's clients shows which view of which page, and their cameras.
 
-Each view is a browser frame under `/scene/PAGE/VIEW`, so the path of a connection identifies it.
-But for the beam's eye, a view belongs to its user; only the page's buttons move its camera.
+Each view is a browser frame under `/scene/PAGE/VIEW`, so the path of a connection identifies
+it. But for the beam's eye, a view belongs to its user; only the page's buttons move its camera.
 """
 
 from __future__ import annotations
@@ -73,7 +73,11 @@ class SceneClients:
     def of(self, page: str, view: str | None = None) -> list[viser.ClientHandle]:
         """List the clients that show `view` (any, if None) of `page`."""
         with self._lock:
-            ids = [i for i, w in self._who.items() if w.page == page and view in (None, w.view)]
+            ids = [
+                i
+                for i, w in self._who.items()
+                if w.page == page and view in (None, w.view)
+            ]
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
@@ -99,7 +103,9 @@ class SceneClients:
                 continue
             when, stand = self._shown.get(id, (built, plain))
             known = (stand,) if when == built else (stand, plain)
-            changed = {n: s for n, s in nodes.items() if any(k.get(n) != s for k in known)}
+            changed = {
+                n: s for n, s in nodes.items() if any(k.get(n) != s for k in known)
+            }
             if changed:
                 set_nodes(client, changed)
             self._shown[id] = built, nodes
@@ -127,7 +133,9 @@ class SceneClients:
             for client in self._looking(view):
                 with contextlib.suppress(AssertionError):  # its width is not known yet
                     aspect = client.camera.aspect
-                    if anew or (self._untouched(client) and not preset.fits(_now(client), aspect)):
+                    if anew or (
+                        self._untouched(client) and not preset.fits(_now(client), aspect)
+                    ):
                         self._put(client, preset.at(aspect))
 
     def reset(self, page: str, view: str) -> None:
@@ -142,11 +150,20 @@ class SceneClients:
         for client in self.of(page, view):
             aspect = client.camera.aspect
             preset = self.cameras[view].at(aspect)
-            far = FAR_RATIO * radius_mm * MM / math.sin(preset.fov / 2) / min(1.0, max(aspect, 0.3))
+            far = (
+                FAR_RATIO
+                * radius_mm
+                * MM
+                / math.sin(preset.fov / 2)
+                / min(1.0, max(aspect, 0.3))
+            )
             way = np.subtract(preset.position, preset.look_at)
             middle = at * MM
             x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
-            aim(client, replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())))
+            aim(
+                client,
+                replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())),
+            )
 
     def theme(self, page: str, dark: bool, fine: bool) -> None:
         """Set light or dark, plain or fine light, for all frames of a page."""
@@ -212,7 +229,8 @@ def _now(client: viser.ClientHandle) -> Standpoint:
     """Return the present camera of a client."""
     c = client.camera
     position, look_at, up = (
-        (float(v[0]), float(v[1]), float(v[2])) for v in (c.position, c.look_at, c.up_direction)
+        (float(v[0]), float(v[1]), float(v[2]))
+        for v in (c.position, c.look_at, c.up_direction)
     )
     return Standpoint(position, look_at, up, float(c.fov))
 

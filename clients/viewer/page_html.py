@@ -25,7 +25,11 @@ def page_file(name: str) -> bytes:
         FileNotFoundError: there is none of this name.
     """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
-    return content.replace(BOXES.encode(), boxes(LAYERS).encode(), 1) if name == PAGE else content
+    return (
+        content.replace(BOXES.encode(), boxes(LAYERS).encode(), 1)
+        if name == PAGE
+        else content
+    )
 
 
 def token_form(wrong: bool) -> bytes:

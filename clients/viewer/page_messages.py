@@ -122,7 +122,11 @@ def _small_picture(data: bytes) -> bool:
     pass."""
     if not data:
         return True
-    if len(data) < 24 or not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
+    if (
+        len(data) < 24
+        or not data.startswith(b"\x89PNG\r\n\x1a\n")
+        or data[12:16] != b"IHDR"
+    ):
         return False
     return all(0 < side <= LARGEST_SIDE for side in struct.unpack(">II", data[16:24]))
 

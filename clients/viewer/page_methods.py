@@ -1,7 +1,7 @@
 """Methods that a page calls on its viewer: layers, views, plans, exports. One function each.
 
-Of the twin's commands only a correction passes through here, because it is inspected first; other
-requests go to the twin as they are (see `page`).
+Of the twin's commands only a correction passes through here, because it is inspected first;
+other requests go to the twin as they are (see `page`).
 
 Parameters are one model each, as strict and bounded as the wire's. Values that depend on the
 machine, the data directory or a plan are checked in the methods.
@@ -179,7 +179,9 @@ class Block(Live):
     """Kind of volume: the reconstructed one, its noise, a bound of its bias, its
     sample's truth, their difference, or the one with the other geometry."""
 
-    what: Literal["volume", "sigma", "bias_bound", "truth", "difference", "other"] = "volume"
+    what: Literal["volume", "sigma", "bias_bound", "truth", "difference", "other"] = (
+        "volume"
+    )
 
 
 class Voxel(Live):
@@ -255,7 +257,9 @@ async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
 async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
     """Put a view of this page back to its preset, or have it look at the sample."""
     if params.sample and viewer.world is not None:
-        viewer.clients.look(page.id, params.view, viewer.world.sample.shift, viewer.look.radius_mm)
+        viewer.clients.look(
+            page.id, params.view, viewer.world.sample.shift, viewer.look.radius_mm
+        )
     else:
         viewer.clients.reset(page.id, params.view)
     return {}
@@ -305,7 +309,10 @@ async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
     machine = _lab(viewer).machine
     tube, lit, panel = tube_of(machine.tube), machine.tube, machine.detector
     behind = tube_spectrum(params.kV, tube)
-    layers = [{"material": f.substance.name, "thickness_mm": f.thickness_mm} for f in tube.filters]
+    layers = [
+        {"material": f.substance.name, "thickness_mm": f.thickness_mm}
+        for f in tube.filters
+    ]
     return {
         "energy_keV": behind.energy_keV.tolist(),
         "photons": behind.fluence.tolist(),
@@ -385,7 +392,9 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     """
     lab, name = _lab(viewer), page.recorded
     if name is None:
-        raise RpcError(Code.INVALID_PARAMS, "open a data set first: there is nothing to show")
+        raise RpcError(
+            Code.INVALID_PARAMS, "open a data set first: there is nothing to show"
+        )
     asked = {"name": name, "index": params.index, "kind": params.kind}
     told: Any = await page.link.request("dataset.frame", asked)
     names = ("name", "index", "file", "image", "projection", "time_s", "positions")
@@ -400,7 +409,9 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     if page.recorded != name:
         raise RpcError(Code.SUPERSEDED, "another data set was opened meanwhile")
     if virtual is not None and virtual.shape != pixels.shape:
-        about["problem"] = f"the virtual image has {virtual.shape} pixels, not {pixels.shape}"
+        about["problem"] = (
+            f"the virtual image has {virtual.shape} pixels, not {pixels.shape}"
+        )
         virtual = None
     cone = tuple(told["cone_vec"] or ())
     about["geometry"] = _readout(cone, pixels.shape)
@@ -419,7 +430,9 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     return about
 
 
-def _readout(cone: Sequence[float], shape: tuple[int, ...]) -> Mapping[str, object] | None:
+def _readout(
+    cone: Sequence[float], shape: tuple[int, ...]
+) -> Mapping[str, object] | None:
     """Compute distances and sizes of a recorded image's nominal geometry; None: it is
     not known."""
     if not cone:
@@ -458,7 +471,10 @@ async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, by
     """Send a request to the volume's process; returns nothing where it has another
     volume by now."""
     folder = _data(viewer) / plain_name(params.name or "", "data set")
-    return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or ({}, b"")
+    return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or (
+        {},
+        b"",
+    )
 
 
 async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
@@ -482,7 +498,11 @@ async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
 async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
     """Compare the volume with the truth of its sample; its document brings the figures."""
     correction = None if viewer.state is None else viewer.state.correction
-    now = None if correction is None else correction.model_dump(include={"name", "parameters"})
+    now = (
+        None
+        if correction is None
+        else correction.model_dump(include={"name", "parameters"})
+    )
     return (await _of_volume(viewer, params, "compare", json.dumps(now)))[0]
 
 
@@ -493,7 +513,9 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
         `text`, and `moved`: axis -> its present position and the script's.
     """
     lab, state = _lab(viewer), viewer.state
-    request = ScanRequest(kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms)
+    request = ScanRequest(
+        kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms
+    )
     if state is not None:
         at = state.geometry
         sod = at.SOD_mm
@@ -547,7 +569,9 @@ async def datasets(viewer: Viewer, page: Page, params: Datasets) -> object:
     return told
 
 
-async def estimate(viewer: Viewer, page: Page, params: CalibrationFit | CalibrationAlign) -> object:
+async def estimate(
+    viewer: Viewer, page: Page, params: CalibrationFit | CalibrationAlign
+) -> object:
     """Fit a geometry to data sets; nothing is applied.
 
     Over a connection of its own: other requests of the page do not wait for this one.
@@ -563,7 +587,9 @@ async def estimate(viewer: Viewer, page: Page, params: CalibrationFit | Calibrat
 
 async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
     """Send a correction to the twin."""
-    return await page.link.request("calibration.apply", params.model_dump(exclude_none=True))
+    return await page.link.request(
+        "calibration.apply", params.model_dump(exclude_none=True)
+    )
 
 
 async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
@@ -573,7 +599,9 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
         lab.plan.unghost(viewer.clients.of(page.id))
         return {"positions": None}
     if page.plan is None:
-        raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
+        raise RpcError(
+            Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub"
+        )
     positions = plans.positions_at(page.plan, time_s)
     lab.plan.ghost(viewer.clients.of(page.id), positions)
     return {"positions": positions}
@@ -602,20 +630,33 @@ async def export(viewer: Viewer, page: Page, params: Export) -> object:
     """
     lab, form = _lab(viewer), params.format
     if not params.replay:
-        seen = next(iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None)
+        seen = next(
+            iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None
+        )
         camera = FREE if seen is None else exports.standpoint(seen)
         make = partial(
-            exports.scene_file, viewer.viser, camera, lab.nodes(page.shown, viewer.near),
+            exports.scene_file,
+            viewer.viser,
+            camera,
+            lab.nodes(page.shown, viewer.near),
             exports.title_of(viewer.state, "scene"),
             exports.beside(viewer.state, viewer.feeds["line_integral"].newest),
-        )  # fmt: skip
+        )
     elif page.plan is None or viewer.state is None:
-        raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
+        raise RpcError(
+            Code.INVALID_PARAMS, "plan a script first: there is nothing to replay"
+        )
     else:
         make = partial(
-            exports.replay_file, lab.machine, lab.profile, viewer.state, viewer.look, page.plan,
-            viewer.looks, exports.title_of(viewer.state, "replay"),
-        )  # fmt: skip
+            exports.replay_file,
+            lab.machine,
+            lab.profile,
+            viewer.state,
+            viewer.look,
+            page.plan,
+            viewer.looks,
+            exports.title_of(viewer.state, "replay"),
+        )
     with _room(viewer):
         content = await asyncio.to_thread(make, form, page.dark)
     what = "replay" if params.replay else "scene"
@@ -625,7 +666,9 @@ async def export(viewer: Viewer, page: Page, params: Export) -> object:
 @contextlib.contextmanager
 def _room(viewer: Viewer) -> Iterator[None]:
     if viewer.sharing >= MAX_SHARED:
-        raise busy(f"{MAX_SHARED} pictures or exports are being made; try again when they are done")
+        raise busy(
+            f"{MAX_SHARED} pictures or exports are being made; try again when they are done"
+        )
     viewer.sharing += 1
     try:
         yield
@@ -687,7 +730,9 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
 """Method -> its parameters, and its function."""
 
 
-async def serve(name: str, viewer: Viewer, page: Page, given: Mapping[str, Any]) -> object:
+async def serve(
+    name: str, viewer: Viewer, page: Page, given: Mapping[str, Any]
+) -> object:
     """Answer one request of a page.
 
     Raises:
@@ -695,7 +740,9 @@ async def serve(name: str, viewer: Viewer, page: Page, given: Mapping[str, Any])
     """
     model, answer = METHODS[name]
     try:
-        return await answer(viewer, page, parse_params(Method(name, model, Nothing, name), given))
+        return await answer(
+            viewer, page, parse_params(Method(name, model, Nothing, name), given)
+        )
     except TwinError as error:
         raise explain(error) from None
 

@@ -1,7 +1,7 @@
 """A planned script to scrub through: motor positions at any moment, and a time line of steps.
 
-The twin's own planner runs from the machine's present state; a long script is planned in a worker
-process. Collisions come from the twin's `script.check`. Of a data set its
+The twin's own planner runs from the machine's present state; a long script is planned in a
+worker process. Collisions come from the twin's `script.check`. Of a data set its
 images' poses are scrubbed.
 """
 
@@ -49,7 +49,9 @@ class RecordedPositions:
     def of(cls, told: Mapping[str, Any]) -> RecordedPositions | None:
         """Build from a result of `dataset.get`; None where poses are not known. Images
         without times are a second apart."""
-        motors = {n: np.array(values, dtype=float) for n, values in told["positions"].items()}
+        motors = {
+            n: np.array(values, dtype=float) for n, values in told["positions"].items()
+        }
         if not motors:
             return None
         times = np.array(told["times_s"] or told["indices"], dtype=float)
@@ -119,7 +121,9 @@ def _made(text: str, machine: Machine, profile: Profile, state: State | None) ->
     return Made(plan, path, document(plan))
 
 
-def plan_text(text: str, machine: Machine, profile: Profile, state: State | None) -> ScanPlan:
+def plan_text(
+    text: str, machine: Machine, profile: Profile, state: State | None
+) -> ScanPlan:
     """Plan a script.
 
     Raises:
@@ -149,7 +153,9 @@ def document(plan: ScanPlan) -> dict[str, Any]:
         for name, values in curves.items()
         if float(np.ptp(values)) > 1e-9
     }
-    frames = [[round(t, 4), group.kind] for group in plan.groups for t in group.starts.tolist()]
+    frames = [
+        [round(t, 4), group.kind] for group in plan.groups for t in group.starts.tolist()
+    ]
     keep = max(1, -(-len(frames) // MAX_STEPS))
     return {
         "duration_s": plan.duration_s,
@@ -159,7 +165,12 @@ def document(plan: ScanPlan) -> dict[str, Any]:
         "curves": moving,
         "images": frames[::keep],
         "steps": [
-            {"line": s.line, "start_s": s.start_s, "duration_s": s.duration_s, "what": s.what}
+            {
+                "line": s.line,
+                "start_s": s.start_s,
+                "duration_s": s.duration_s,
+                "what": s.what,
+            }
             for s in plan.steps[:MAX_STEPS]
         ],
         "problems": [p.to_dict() for p in plan.problems],

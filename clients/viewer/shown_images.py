@@ -1,7 +1,7 @@
 """Images as the panel and the pages get them.
 
-For the scene line integrals and counts become 8-bit grey by window and level. A page applies its
-own window: it gets 16-bit integers with a scale, deflated, or, while things move, a JPEG.
+For the scene line integrals and counts become 8-bit grey by window and level. A page applies
+its own window: it gets 16-bit integers with a scale, deflated, or, while things move, a JPEG.
 """
 
 from __future__ import annotations
@@ -100,7 +100,9 @@ def packed(
     full, pair = image.pixels.shape, image.virtual is not None
     if image.virtual is not None:
         image = replace(image, pixels=np.concatenate([image.pixels, image.virtual]))
-    values = np.asarray(binned_mean(image.pixels, 2) if coarse else image.pixels, dtype=np.float32)
+    values = np.asarray(
+        binned_mean(image.pixels, 2) if coarse else image.pixels, dtype=np.float32
+    )
     low, scale = 0.0, 1.0
     if image.kind == "line_integral" or coarse:
         low = float(values.min(initial=0.0))

@@ -74,7 +74,11 @@ def nearest(safety: SafetyState) -> dict[str, Any]:
     """Return the nearest parts that may not touch, for pages; `close` where a warning
     is due."""
     mm = safety.clearance_mm
-    return {"mm": mm, "pair": safety.pair or [], "close": mm is not None and mm < CLOSE_MM}
+    return {
+        "mm": mm,
+        "pair": safety.pair or [],
+        "close": mm is not None and mm < CLOSE_MM,
+    }
 
 
 class Viewer:
@@ -166,10 +170,15 @@ class Viewer:
         """
         self._loop = asyncio.get_running_loop()
         self.front = Front(
-            self._page, self.scenes.connect, self.scenes.html(), self.downloads, self._token,
-            max_scenes=SCENES_A_PAGE * self.limits.max_pages, max_pages=self.limits.max_pages,
+            self._page,
+            self.scenes.connect,
+            self.scenes.html(),
+            self.downloads,
+            self._token,
+            max_scenes=SCENES_A_PAGE * self.limits.max_pages,
+            max_pages=self.limits.max_pages,
             still=self.still,
-        )  # fmt: skip
+        )
         await self.front.start(host, port, ssl)
         self._tasks = [
             watched(self.link.run(), "the link to the twin", self.failed.set),
@@ -215,7 +224,9 @@ class Viewer:
             if not isinstance(seq, int) or seq <= self._told:
                 return
             self._told = seq
-            if "job" in (data.get("data") or {}):  # pages receive jobs under a topic of their own
+            if "job" in (
+                data.get("data") or {}
+            ):  # pages receive jobs under a topic of their own
                 return
         for page in self.pages.values():
             page.say(topic, data=without_bytes(data))
@@ -245,7 +256,9 @@ class Viewer:
         """Send the pages the age of the state: a hanging twin does not report it."""
         while True:
             now = time.monotonic()
-            beat = json.dumps({"type": "beat", "at": now, "silent_s": now - self._heard_at})
+            beat = json.dumps(
+                {"type": "beat", "at": now, "silent_s": now - self._heard_at}
+            )
             for page in self.pages.values():
                 page.show("beat", beat)
             await asyncio.sleep(BEAT_S)
@@ -268,7 +281,9 @@ class Viewer:
                 self.show_layers()
                 for client, id in self.clients.with_names():
                     named = lab.named(world, self._shown_by(id))
-                    with contextlib.suppress(AssertionError, KeyError):  # it has just come or gone
+                    with contextlib.suppress(
+                        AssertionError, KeyError
+                    ):  # it has just come or gone
                         await asyncio.to_thread(self.tags.draw, client, named)
 
     def show_layers(self) -> None:
@@ -375,7 +390,9 @@ class Viewer:
 
     async def _ready_lab(self) -> LabScene:
         hello = self.link.hello
-        machine = self._machine or builtin_machine("flexray" if hello is None else hello.machine)
+        machine = self._machine or builtin_machine(
+            "flexray" if hello is None else hello.machine
+        )
         named = None if hello is None else hello.profile
         profile = self._profile or profile_of(machine, named)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
@@ -402,7 +419,12 @@ class Viewer:
                 return
             await asyncio.to_thread(self.wardrobe.add, sample, stl)
         except (ConnectionLost, TwinError, ValueError) as error:
-            log("no shape of the sample", logging.WARNING, sample=sample.name, reason=str(error))
+            log(
+                "no shape of the sample",
+                logging.WARNING,
+                sample=sample.name,
+                reason=str(error),
+            )
             return
         if self.state is not None and self.state.sample == sample:
             await self._dress(lab, self.state)
@@ -480,12 +502,20 @@ class Viewer:
             connection: to its browser.
         """
         if len(self.open_pages) >= self.limits.max_pages:
-            reason = f"it serves {self.limits.max_pages} pages at most, and so many are open"
+            reason = (
+                f"it serves {self.limits.max_pages} pages at most, and so many are open"
+            )
             log("a page was refused", logging.WARNING, page=id, reason=reason)
             await connection.close(TRY_AGAIN, reason)
             return
-        asked = parse_qs(urlsplit(connection.request.path).query) if connection.request else {}
-        person = "".join(c for c in asked.get("person", [""])[0] if c.isprintable()).strip()[:40]
+        asked = (
+            parse_qs(urlsplit(connection.request.path).query)
+            if connection.request
+            else {}
+        )
+        person = "".join(
+            c for c in asked.get("person", [""])[0] if c.isprintable()
+        ).strip()[:40]
         page = Page(id, connection, self.twin_address, self._local, person or "a visitor")
         self.opened += 1
         self.open_pages.add(page)
@@ -508,7 +538,8 @@ class Viewer:
             self.refresh_feeds()
 
     def refresh_feeds(self) -> None:
-        """Subscribe to the images that pages show; the panel in the scenes shows line integrals."""
+        """Subscribe to the images that pages show; the panel in the scenes shows line
+        integrals."""
         wanted = {page.kind for page in self.pages.values()}
         if self.pages:
             wanted.add("line_integral")

@@ -1,9 +1,9 @@
 """A private viser server.
 
-viser accepts any connection and obeys any message, up to opening a public tunnel. So it listens on
-a Unix socket in a folder that only this user can open, and on no port: every byte has passed the
-front's checks, and `page_messages` filters what pages send. Everything that relies on viser's
-private parts is in this module (viser 1.1; the version is pinned), and
+viser accepts any connection and obeys any message, up to opening a public tunnel. So it listens
+on a Unix socket in a folder that only this user can open, and on no port: every byte has passed
+the front's checks, and `page_messages` filters what pages send. Everything that relies on
+viser's private parts is in this module (viser 1.1; the version is pinned), and
 `tests/viewer/test_viewer_gate.py` shows what a new version has changed.
 """
 
@@ -87,7 +87,9 @@ class Scenes:
 
     def html(self) -> bytes:
         """Read viser's page."""
-        return (Path(viser.__file__).parent / "client" / "build" / "index.html").read_bytes()
+        return (
+            Path(viser.__file__).parent / "client" / "build" / "index.html"
+        ).read_bytes()
 
     @asynccontextmanager
     async def connect(
@@ -119,7 +121,9 @@ class Scenes:
 
         Messages to it alone have a queue of their own, and could overtake those.
         """
-        at = self.server._websock_server._broadcast_buffer.generator_cursors.get(client_id, -1)
+        at = self.server._websock_server._broadcast_buffer.generator_cursors.get(
+            client_id, -1
+        )
         return at >= said - 1
 
     def stop(self) -> None:
@@ -173,11 +177,15 @@ def parted(html: bytes) -> tuple[bytes, bytes]:
     The program is nearly all of the page, and the same for every view: as a file under
     one name a browser fetches it once. A page that is built otherwise is not split.
     """
-    match = re.search(rb"<script((?: data-[a-z]+=\"[^\"]*\")+)>(.*?)</script>", html, re.DOTALL)
+    match = re.search(
+        rb"<script((?: data-[a-z]+=\"[^\"]*\")+)>(.*?)</script>", html, re.DOTALL
+    )
     if match is None:
         return html, b""
     facts = dict(re.findall(r'data-([a-z]+)="([^"]*)"', match[1].decode()))
-    script = b"Object.assign(document.currentScript.dataset, %b);" % json.dumps(facts).encode()
+    script = (
+        b"Object.assign(document.currentScript.dataset, %b);" % json.dumps(facts).encode()
+    )
     return html[: match.start()] + MARK + html[match.end() :], script + match[2]
 
 

@@ -33,5 +33,7 @@ def watched(
             died()
 
     task = asyncio.create_task(run())
-    task.add_done_callback(lambda _: work.close())  # where it was cancelled before it began
+    task.add_done_callback(
+        lambda _: work.close()
+    )  # where it was cancelled before it began
     return task

@@ -20,9 +20,9 @@ def rendered(document: Mapping[str, Any]) -> str:
     """Render one evidence document as Markdown.
 
     Args:
-        document: `title`, `about` and `sections`. A section has a `title`, `commands` (shell lines
-            that make its figures; none if its last column is `command`, or if it has `sources`
-            of what it cites), and may have `measured` (date, machine, load), `text`
+        document: `title`, `about` and `sections`. A section has a `title`, `commands` (shell
+            lines that make its figures; none if its last column is `command`, or if it has
+            `sources` of what it cites), and may have `measured` (date, machine, load), `text`
             (paragraphs), `columns` and `rows` (cells in Markdown).
 
     Returns:

@@ -39,11 +39,13 @@ def wire() -> str:
     out = [
         "# Methods of the wire",
         "",
-        f"From the OpenRPC document (version {document['openrpc']}) that `rpc.discover` answers "
+        f"From the OpenRPC document (version {document['openrpc']}) that `rpc.discover` "
+        "answers "
         "with. "
         f"Protocol {document['info']['version']}: {document['info']['description']}",
         "",
-        "**control**: needs the controller's role; **safe**: a client may repeat it after a lost "
+        "**control**: needs the controller's role; **safe**: a client may repeat it "
+        "after a lost "
         "connection; **urgent**: accepted in every state.",
         "",
     ]
@@ -125,7 +127,9 @@ def _option(parameter: Any) -> str:
     shown = f"`{default}`" if plain and str(default) else ""
     if getattr(parameter, "required", False):
         shown = "required"
-    return f"| {_code(name)} | {shown} | {_cell(getattr(parameter, 'help', None) or '')} |"
+    return (
+        f"| {_code(name)} | {shown} | {_cell(getattr(parameter, 'help', None) or '')} |"
+    )
 
 
 def _value(parameter: Any) -> str:
@@ -174,12 +178,16 @@ def _type(schema: Mapping[str, Any]) -> str:
 
 def _sentence(text: str) -> str:
     text = _cell(text)
-    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".") if text else ""
+    return (
+        text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".") if text else ""
+    )
 
 
 def _cell(text: str, paragraph: str = " ") -> str:
     parts = [" ".join(part.split()) for part in text.split("\n\n")]
-    return paragraph.join(parts).replace("|", "\\|").replace("<", "\\<").replace("*", "\\*")
+    return (
+        paragraph.join(parts).replace("|", "\\|").replace("<", "\\<").replace("*", "\\*")
+    )
 
 
 def _code(text: str) -> str:
@@ -199,8 +207,10 @@ def benchmark() -> str:
         "",
         "Commands: `flexdt bench --out out/bench`, `python examples/research/further_bench.py "
         "--out out/further`. Ratios are taken turn by turn in the same run; errors are of the "
-        "maximum; cases are those of [the projector's page](../../performance.md#measure). LEAP is "
-        "not on PyPI and was not run: its rows are derived from its times and itk-rtk's, measured "
+        "maximum; cases are those of [the projector's "
+        "page](../../performance.md#measure). LEAP is "
+        "not on PyPI and was not run: its rows are derived from its times and itk-rtk's, "
+        "measured "
         "together once on two Zen 4 cores of about 2.9 GHz.",
         "",
         bench_page.tables(document),
@@ -226,7 +236,9 @@ def module_pages(pages: Path) -> dict[str, str]:
     for page, folder in MODULE_LISTS.items():
         for name in MODULE.findall((pages / f"{page}.md").read_text("utf-8")):
             options = MODULE_OPTIONS.get(name, "")
-            text = f"# `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}\n{options}```\n"
+            text = (
+                f"# `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}\n{options}```\n"
+            )
             found[f"{folder}/{name}.md"] = text
     return found
 

@@ -1,8 +1,8 @@
 """Links from pages to files of the repository that are no pages.
 
-On a forge they open the file; on the site they become its path, since the site has no copy of it.
-A link to a document of `docs/evidence/` leads to the page that is rendered from it. A link to
-something that does not exist is a warning, so the build fails.
+On a forge they open the file; on the site they become its path, since the site has no copy of
+it. A link to a document of `docs/evidence/` leads to the page that is rendered from it. A link
+to something that does not exist is a warning, so the build fails.
 """
 
 from __future__ import annotations
@@ -50,10 +50,14 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
         inside = found.is_relative_to(pages) and found.suffix == ".md"
         if inside or not found.is_relative_to(pages.parent):
             return match[0]
-        name = found.relative_to(pages.parent).as_posix() + ("/" if found.is_dir() else "")
+        name = found.relative_to(pages.parent).as_posix() + (
+            "/" if found.is_dir() else ""
+        )
         plain = words.strip("`")
         return (
-            f"`{name}`" if name.rstrip("/").endswith(plain.rstrip("/")) else f"{words} (`{name}`)"
+            f"`{name}`"
+            if name.rstrip("/").endswith(plain.rstrip("/"))
+            else f"{words} (`{name}`)"
         )
 
     return LINK.sub(replace, text), lost

@@ -1,7 +1,9 @@
-"""Make the figures of `docs/tools/scan_figures.py` anew and show these in place of the kept copies.
+"""Make the figures of `docs/tools/scan_figures.py` anew and show these in place of the kept
+copies.
 
-Pages name `images/made/NAME.png`, which a forge shows. The site shows what the library makes during
-the build. Figures are kept in `_generated/figures/` until the script or flexdt's version changes.
+Pages name `images/made/NAME.png`, which a forge shows. The site shows what the library makes
+during the build. Figures are kept in `_generated/figures/` until the script or flexdt's version
+changes.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ def digest() -> str:
 
 
 def make(app: Any) -> None:
-    """Make the figures unless those of this script and version exist (hook `builder-inited`)."""
+    """Make the figures unless those of this script and version exist (hook
+    `builder-inited`)."""
     folder = Path(app.srcdir) / "_generated" / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     key = folder / "made-by.txt"

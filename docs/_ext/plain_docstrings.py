@@ -26,7 +26,9 @@ def plain(text: str) -> str:
     return "".join(parts)
 
 
-def rewrite(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+def rewrite(
+    app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
     """Sphinx's hook: `lines` are changed in place."""
     lines[:] = [plain(line) for line in lines]
 

@@ -1,15 +1,17 @@
 """The kept benchmark, from the document that `flexdt bench --out DIR` or
-`examples/research/further_bench.py` writes; the site renders it as a page of the evidence shelf.
+`examples/research/further_bench.py` writes; the site renders it as a page of the evidence
+shelf.
 
     flexdt bench --out out/bench
     python docs/tools/bench_page.py out/bench/bench.json
 
-What the benchmark did not run this time stays as it was, in docs/images/bench.json. `--page FILE`
-also puts the figures between a page's marks; `--out DIR` writes bench.md and bench.svg instead.
+What the benchmark did not run this time stays as it was, in docs/images/bench.json. `--page
+FILE` also puts the figures between a page's marks; `--out DIR` writes bench.md and bench.svg
+instead.
 
 Targets are ratios to itk-rtk's Joseph projector and FDK in the same run, shares of the maximum,
-milliseconds, or ratios of the adjoint to the forward. LEAP cannot be installed from PyPI, so its
-target is judged by a derived figure, and says so.
+milliseconds, or ratios of the adjoint to the forward. LEAP cannot be installed from PyPI, so
+its target is judged by a derived figure, and says so.
 """
 
 from __future__ import annotations
@@ -56,7 +58,10 @@ class Target:
 
     def verdict(self, value: float) -> str:
         """In words."""
-        for bar, words in ((self.wanted, "wanted: met"), (self.accepted, "accepted: met")):
+        for bar, words in (
+            (self.wanted, "wanted: met"),
+            (self.accepted, "accepted: met"),
+        ):
             if bar is not None and (value >= bar if self.more else value <= bar):
                 return words
         return "**missed**"
@@ -78,7 +83,9 @@ def target_table(document: Mapping[str, Any]) -> list[str]:
         else:
             value, where = found
             measured = target.form.format(value) + (f" ({where})" if where else "")
-            lines.append(f"| {target.what} | {bars} | {measured} | {target.verdict(value)} |")
+            lines.append(
+                f"| {target.what} | {bars} | {measured} | {target.verdict(value)} |"
+            )
     return [*lines, ""]
 
 
@@ -122,7 +129,10 @@ def _worst(key: str, chosen: Callable[[str], bool]) -> Callable[[Entries], Found
 
 
 def _of_peers(name: str) -> bool:
-    return name.removeprefix("adjoint-").startswith(("C1", "C2", "C3")) and "x1000" not in name
+    return (
+        name.removeprefix("adjoint-").startswith(("C1", "C2", "C3"))
+        and "x1000" not in name
+    )
 
 
 def _into_memory(name: str) -> bool:
@@ -139,27 +149,63 @@ TARGETS = (
     Target("C1, 36 views, against the best LEAP", 5, None, True, TIMES, _leap("C1x36")),
     Target("C2, 10 views, against the best LEAP", 5, None, True, TIMES, _leap("C2x10")),
     *(
-        Target(f"{name}, tilted, {kind}", accepted, wanted, True, TIMES, _ratio(f"{name}-tilt"))
+        Target(
+            f"{name}, tilted, {kind}",
+            accepted,
+            wanted,
+            True,
+            TIMES,
+            _ratio(f"{name}-tilt"),
+        )
         for kind, accepted, wanted in (("any processor", 2.5, 4), ("with AVX-512", 4, 8))
         for name in ("C1", "C2", "C3")
     ),
     Target("mean error, all cases", 1e-6, 3e-7, False, SHARE, _worst("mean_error", bool)),
-    Target("worst error, all cases", 1e-5, 3e-6, False, SHARE, _worst("worst_error", bool)),
-    Target("bead phantom on C1's detector", 5, 2, False, MS, _value("scene-C1", "ms_per_view")),
-    Target("bead phantom on C3's detector", 15, 6, False, MS, _value("scene-C3", "ms_per_view")),
+    Target(
+        "worst error, all cases", 1e-5, 3e-6, False, SHARE, _worst("worst_error", bool)
+    ),
+    Target(
+        "bead phantom on C1's detector",
+        5,
+        2,
+        False,
+        MS,
+        _value("scene-C1", "ms_per_view"),
+    ),
+    Target(
+        "bead phantom on C3's detector",
+        15,
+        6,
+        False,
+        MS,
+        _value("scene-C3", "ms_per_view"),
+    ),
     Target("FDK", 5, 10, True, TIMES, _ratio("FDK")),
     Target(
         "adjoint against forward, C1 to C3",
-        1.5, 1, False, "{:.2f} x",
+        1.5,
+        1,
+        False,
+        "{:.2f} x",
         _worst("times_forward", lambda n: _into_memory(n) and _of_peers(n)),
     ),
     Target(
         "adjoint against forward, cases nobody tuned for",
-        1.5, 1, False, "{:.2f} x",
+        1.5,
+        1,
+        False,
+        "{:.2f} x",
         _worst("times_forward", lambda n: _into_memory(n) and not _of_peers(n)),
     ),
-    Target("added by the projector server, C1", 5, 2, False, MS, _value("server-C1", "added_ms")),
-)  # fmt: skip
+    Target(
+        "added by the projector server, C1",
+        5,
+        2,
+        False,
+        MS,
+        _value("server-C1", "added_ms"),
+    ),
+)
 
 
 SHOWN = (
@@ -210,7 +256,8 @@ def _machine(machine: dict[str, Any]) -> list[str]:
     took_part = ", ".join(f"{name}: {what}" for name, what in machine["peers"].items())
     return [
         f"{machine['cpu']}, {machine['threads']} threads{memory}; load at start "
-        f"{machine['load_at_start']:.1f}; numba {machine['numba']}. Peers: {took_part or 'none'}.",
+        f"{machine['load_at_start']:.1f}; numba {machine['numba']}. Peers: "
+        f"{took_part or 'none'}.",
         "",
     ]
 
@@ -241,7 +288,8 @@ def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
             accuracy = " / ".join(f"{error:.1e}" for error in shown if error is not None)
         peers = ", ".join(f"{n} {p['ms_per_view']:.1f}" for n, p in case["peers"].items())
         ratio = ", ".join(
-            f"{value:.1f}" + (f" ({case['median_ratio'][n]:.1f})" if "median_ratio" in case else "")
+            f"{value:.1f}"
+            + (f" ({case['median_ratio'][n]:.1f})" if "median_ratio" in case else "")
             for n, value in case["ratio"].items()
         )
         load = "" if case.get("load") is None else f"{case['load']:.1f}"
@@ -258,7 +306,9 @@ def _growth(document: dict[str, Any]) -> list[str]:
     lines = []
     for key, points in document.get("growth", {}).items():
         for series in dict.fromkeys(p["series"] for p in points):
-            row = ", ".join(f"{p['x']:,}: {p['ms']:.2f}" for p in points if p["series"] == series)
+            row = ", ".join(
+                f"{p['x']:,}: {p['ms']:.2f}" for p in points if p["series"] == series
+            )
             lines.append(f"- ms against {key}, {series}: {row}")
     return lines
 
@@ -272,7 +322,10 @@ def merged(old: Document, new: Document) -> Document:
     kept = [fresh.pop(entry["name"], entry) for entry in old["cases"]]
     machine = {**old["machine"], **new["machine"]}
     return {
-        "machine": {**machine, "peers": {**old["machine"]["peers"], **new["machine"]["peers"]}},
+        "machine": {
+            **machine,
+            "peers": {**old["machine"]["peers"], **new["machine"]["peers"]},
+        },
         "cases": [*kept, *fresh.values()],
         "growth": {**old["growth"], **new["growth"]},
     }
@@ -292,7 +345,8 @@ def figure(document: dict[str, Any]) -> str:
             panels.append(_lines(points, label))
     height = PANEL * len(panels)
     body = "".join(
-        f'<g transform="translate(0 {i * PANEL})">{panel}</g>' for i, panel in enumerate(panels)
+        f'<g transform="translate(0 {i * PANEL})">{panel}</g>'
+        for i, panel in enumerate(panels)
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
@@ -329,7 +383,8 @@ def _bars(cases: Sequence[dict[str, Any]]) -> str:
 
 
 def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
-    """Milliseconds against the work, both logarithmic; figures above, below or beside a line."""
+    """Milliseconds against the work, both logarithmic; figures above, below or beside a
+    line."""
     xs = [math.log10(p["x"]) for p in points]
     ys = [math.log10(p["ms"]) for p in points]
     x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
@@ -356,7 +411,9 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
                 parts.append(_text(x + 8, y + 4, figure_of, "start"))
             if i == 0:
                 parts.append(_text(x, PANEL - 22, f"{p['x']:,}"))
-        parts.append(f'<text x="{MARGIN + 130 * i}" y="38" fill="{colour}">{escape(series)}</text>')
+        parts.append(
+            f'<text x="{MARGIN + 130 * i}" y="38" fill="{colour}">{escape(series)}</text>'
+        )
     return "".join(parts)
 
 
@@ -376,18 +433,26 @@ def renew(folder: Path, document: Document, page: Path | None = None) -> None:
     kept.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
     picture.write_text(figure(document), "utf-8")
     if page is not None:
-        page.write_text(into_page(page.read_text("utf-8"), document, "images/bench.svg"), "utf-8")
+        page.write_text(
+            into_page(page.read_text("utf-8"), document, "images/bench.svg"), "utf-8"
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Tables and figure of a benchmark.")
     parser.add_argument("document", type=Path, help="bench.json")
-    parser.add_argument("--page", type=Path, help="put the figures between this page's marks, too")
-    parser.add_argument("--out", type=Path, help="write bench.md and bench.svg here instead")
+    parser.add_argument(
+        "--page", type=Path, help="put the figures between this page's marks, too"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="write bench.md and bench.svg here instead"
+    )
     options = parser.parse_args()
     document = json.loads(options.document.read_text("utf-8"))
     if options.out is None:
-        renew(options.page.parent if options.page else Path("docs"), document, options.page)
+        renew(
+            options.page.parent if options.page else Path("docs"), document, options.page
+        )
     else:
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "bench.svg").write_text(figure(document), "utf-8")

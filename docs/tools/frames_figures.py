@@ -2,8 +2,8 @@
 
     python docs/tools/frames_figures.py [--out docs/images]
 
-Every arrow, angle and pixel is computed by `flexdt.twin`; nothing is drawn from memory, so a sign
-that changes in the code changes the drawing (`tests/docs` compares the two).
+Every arrow, angle and pixel is computed by `flexdt.twin`; nothing is drawn from memory, so a
+sign that changes in the code changes the drawing (`tests/docs` compares the two).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ FONT = 'font-family="DejaVu Sans, Verdana, sans-serif"'
 class Sheet:
     """An SVG in the making: points are mm of the drawing's own plane, x right, y up."""
 
-    def __init__(self, width: int, height: int, origin: tuple[float, float], scale: float) -> None:
+    def __init__(
+        self, width: int, height: int, origin: tuple[float, float], scale: float
+    ) -> None:
         self.width, self.height, self.origin, self.scale = width, height, origin, scale
         self.parts: list[str] = []
 
@@ -37,7 +39,12 @@ class Sheet:
         )
 
     def line(
-        self, a: np.ndarray, b: np.ndarray, colour: str, width: float = 1.5, more: str = ""
+        self,
+        a: np.ndarray,
+        b: np.ndarray,
+        colour: str,
+        width: float = 1.5,
+        more: str = "",
     ) -> None:
         (x0, y0), (x1, y1) = self.at(a), self.at(b)
         self.parts.append(
@@ -49,10 +56,21 @@ class Sheet:
         self.line(a, b, colour, 2.2, f'marker-end="url(#{colour[1:]})"')
         way = (b - a) / np.linalg.norm(b - a)
         where = "start" if way[0] > 0.8 else "middle"
-        self.text(b + way * (8 if where == "start" else 16) / self.scale, label, colour, 13, where)
+        self.text(
+            b + way * (8 if where == "start" else 16) / self.scale,
+            label,
+            colour,
+            13,
+            where,
+        )
 
     def text(
-        self, at: np.ndarray, words: str, colour: str = INK, size: int = 13, where: str = "middle"
+        self,
+        at: np.ndarray,
+        words: str,
+        colour: str = INK,
+        size: int = 13,
+        where: str = "middle",
     ) -> None:
         x, y = self.at(at)
         self.parts.append(
@@ -62,7 +80,9 @@ class Sheet:
 
     def dot(self, at: np.ndarray, colour: str, radius: float) -> None:
         x, y = self.at(at)
-        self.parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}"/>')
+        self.parts.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}"/>'
+        )
 
     def ring(self, at: np.ndarray, colour: str, radius: float) -> None:
         x, y = self.at(at)
@@ -119,7 +139,8 @@ def from_above() -> str:
         sheet.line(axis, before, SAMPLE, 1.0, 'stroke-dasharray="3 4"')
     # The way a point of the sample takes while rot_obj grows to 30 deg.
     way = [
-        axis + 160 * (stage_rotation(np.radians(a)) @ [0.0, 1.0, 0.0])[:2] for a in range(0, 31, 5)
+        axis + 160 * (stage_rotation(np.radians(a)) @ [0.0, 1.0, 0.0])[:2]
+        for a in range(0, 31, 5)
     ]
     for a, b in itertools.pairwise(way[:-1]):
         sheet.line(a, b, SAMPLE, 2.0)
@@ -129,12 +150,26 @@ def from_above() -> str:
     sheet.arrow(corner, corner + [120, 0], WORLD, "+x")
     sheet.arrow(corner, corner + [0, 120], WORLD, "+y")
     sheet.text(corner + [62, -42], "world (+z towards you)", WORLD)
-    sheet.line(source + [-210, 0], axis + [-210 - axis[0] + source[0], 0], INK, 1.0,
-               f'marker-end="url(#{INK[1:]})" marker-start="url(#{INK[1:]})"')  # fmt: skip
-    sheet.text((source + axis) / 2 + [-225, 0], f"SOD {pose.sod[0]:.0f}", INK, where="end")
-    sheet.line(source + [-420, 0], panel + [-420 - panel[0] + source[0], 0], INK, 1.0,
-               f'marker-end="url(#{INK[1:]})" marker-start="url(#{INK[1:]})"')  # fmt: skip
-    sheet.text((source + panel) / 2 + [-435, 0], f"SDD {pose.sdd[0]:.0f}", INK, where="end")
+    sheet.line(
+        source + [-210, 0],
+        axis + [-210 - axis[0] + source[0], 0],
+        INK,
+        1.0,
+        f'marker-end="url(#{INK[1:]})" marker-start="url(#{INK[1:]})"',
+    )
+    sheet.text(
+        (source + axis) / 2 + [-225, 0], f"SOD {pose.sod[0]:.0f}", INK, where="end"
+    )
+    sheet.line(
+        source + [-420, 0],
+        panel + [-420 - panel[0] + source[0], 0],
+        INK,
+        1.0,
+        f'marker-end="url(#{INK[1:]})" marker-start="url(#{INK[1:]})"',
+    )
+    sheet.text(
+        (source + panel) / 2 + [-435, 0], f"SDD {pose.sdd[0]:.0f}", INK, where="end"
+    )
     return sheet.svg("World and object frame from above at rot_obj = 30 deg")
 
 
@@ -184,12 +219,17 @@ def unity() -> str:
         base = np.array([i * 310.0, 0.0])
         for name, axis in zip("xyz", np.eye(3), strict=True):
             world = from_unity(axis) if convert else axis
-            meaning = ("traversal", "magnification", "height")[int(np.argmax(np.abs(world)))]
+            meaning = ("traversal", "magnification", "height")[
+                int(np.argmax(np.abs(world)))
+            ]
             colour = (PANEL, WORLD, SAMPLE)["xyz".index(name)]
             tip = base + 100 * flat(world)
             sheet.arrow(base, tip, colour, "")
             sheet.text(
-                tip + 100 * flat(world) * 0.1 + [6, 6], f"{name}: {meaning}", colour, where="start"
+                tip + 100 * flat(world) * 0.1 + [6, 6],
+                f"{name}: {meaning}",
+                colour,
+                where="start",
             )
         sheet.text(base + [40, -40], title, INK, 14)
     return sheet.svg("The thesis's axes beside ours")

@@ -1,10 +1,11 @@
-"""The pictures of the page in docs/images, from the page as it is: Chromium, software rendering.
+"""The pictures of the page in docs/images, from the page as it is: Chromium, software
+rendering.
 
     python docs/tools/page_pictures.py [--out docs/images] [--url http://127.0.0.1:8080/]
 
-Starts a lab of its own, unless it is given the address of one whose machine stands at home. Writes
-viewer-first.png, viewer-four-views.png, viewer-scan.png, viewer-design.png and viewer-virtual.png,
-in COLORS colours. Needs Debian's chromium, playwright and Pillow.
+Starts a lab of its own, unless it is given the address of one whose machine stands at home.
+Writes viewer-first.png, viewer-four-views.png, viewer-scan.png, viewer-design.png and
+viewer-virtual.png, in COLORS colours. Needs Debian's chromium, playwright and Pillow.
 """
 
 from __future__ import annotations
@@ -24,25 +25,42 @@ from typing import Any
 from PIL import Image
 
 CHROMIUM = "/usr/bin/chromium"
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
+FLAGS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+]
 SIZE = {"width": 1440, "height": 810}
 FADED_MS = 6000
 """A scene fades in once its parts have come."""
 COLORS = 256
 PATIENCE_MS = 300_000
 WRONG = "flexdt.call('calibration.apply', {parameters: {dO_x: 0.3, dO_z: -0.4}, comment: 'wrong'})"
-"""A correction by which the beads stand beside where they are seen, until a fit puts it right."""
+"""A correction by which the beads stand beside where they are seen, until a fit puts it
+right."""
 
 
 @contextmanager
 def lab() -> Iterator[str]:
     """`flexdt up` on free ports; the address of its page."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["--port", "0", "--projector-port", "0", "--viewer-port", "0", "--data", folder]
+        words = [
+            "--port",
+            "0",
+            "--projector-port",
+            "0",
+            "--viewer-port",
+            "0",
+            "--data",
+            folder,
+        ]
         process = subprocess.Popen(
             [sys.executable, "-m", "flexdt.clients.launch.up", *words],
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
         try:
             assert process.stdout is not None
             yield str(json.loads(process.stdout.readline())["viewer"]["url"])
@@ -68,7 +86,9 @@ def taken(page: Any, path: Path) -> None:
         page.locator("#veil").wait_for(state="hidden")
         last = now
     raw = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    few = raw.quantize(COLORS, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    few = raw.quantize(
+        COLORS, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+    )
     few.save(path, optimize=True)
 
 
@@ -131,7 +151,10 @@ def main() -> None:
     parser.add_argument("--url", help="of a page that is served already")
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
-    with nullcontext(chosen.url) if chosen.url else lab() as url, sync_playwright() as play:
+    with (
+        nullcontext(chosen.url) if chosen.url else lab() as url,
+        sync_playwright() as play,
+    ):
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         for picture in (first, four_views, scan, virtual):
             picture(browser, url, chosen.out)

@@ -2,9 +2,9 @@
 
     python docs/tools/page_words.py [--pages]
 
-A page's words are those of its Markdown, code and tables included. The evidence shelf's figures are
-data (`docs/evidence/*.json`) and are counted by themselves, as is the changelog's history. Pages
-that are generated from code are not counted.
+A page's words are those of its Markdown, code and tables included. The evidence shelf's figures
+are data (`docs/evidence/*.json`) and are counted by themselves, as is the changelog's history.
+Pages that are generated from code are not counted.
 """
 
 from __future__ import annotations
@@ -15,7 +15,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent.parent
-SHELVES = {"use": "use.md", "understand": "understand.md", "evidence": "evidence/index.md"}
+SHELVES = {
+    "use": "use.md",
+    "understand": "understand.md",
+    "evidence": "evidence/index.md",
+}
 """Shelf -> the page whose list of contents says what stands on it."""
 PICTURE = re.compile(r"!\[|\.imshow\(|\.plot\(|plt\.|\.show\(|^show\(", re.MULTILINE)
 """An image, or a line of a notebook that draws one."""
@@ -61,14 +65,18 @@ def pictures(path: Path) -> int:
 def main() -> None:
     """Print the counts."""
     arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("--pages", action="store_true", help="a line for each page, too")
+    arguments.add_argument(
+        "--pages", action="store_true", help="a line for each page, too"
+    )
     each_page = arguments.parse_args().pages
     total = 0
     for shelf, pages in shelves().items():
         count = sum(words(path) for path in pages)
         total += count
         bare = sum(not pictures(path) for path in pages)
-        print(f"{shelf:12s} {count:7d} words {len(pages):4d} pages, {bare} without a picture")
+        print(
+            f"{shelf:12s} {count:7d} words {len(pages):4d} pages, {bare} without a picture"
+        )
         if each_page:
             for path in pages:
                 name = path.relative_to(DOCS).as_posix()
@@ -77,7 +85,8 @@ def main() -> None:
     data = sum(words(path) for path in DOCS.glob("evidence/*.json"))
     history = sum(words(path) for path in DOCS.glob("history/*.md"))
     print(
-        f"{'besides':12s} {data:7d} words of evidence as JSON, {history} of the changelog's history"
+        f"{'besides':12s} {data:7d} words of evidence as JSON, {history} of the "
+        "changelog's history"
     )
 
 

@@ -1,8 +1,9 @@
-"""Writes the tables that flexdt.twin.physics ships, from spekpy and xraydb, with their provenance.
+"""Writes the tables that flexdt.twin.physics ships, from spekpy and xraydb, with their
+provenance.
 
 Run it only to renew the tables: `pip install spekpy xraydb`, then `python
-docs/tools/physics_tables.py twin/attenuation/data/tables.npz`. Every number in the file comes from
-these two packages; nothing is fitted or smoothed here.
+docs/tools/physics_tables.py twin/attenuation/data/tables.npz`. Every number in the file comes
+from these two packages; nothing is fitted or smoothed here.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ def main() -> None:
     names = [str(xraydb.atomic_symbol(z)) for z in elements]
     total = np.stack([xraydb.mu_elam(name, energy * 1000.0) for name in names])
     found = [
-        sorted(e.energy / 1e3 for e in xraydb.xray_edges(n).values() if e.energy > LOWEST_KEV * 1e3)
+        sorted(
+            e.energy / 1e3
+            for e in xraydb.xray_edges(n).values()
+            if e.energy > LOWEST_KEV * 1e3
+        )
         for n in names
     ]
     edges = np.full((len(names), max(map(len, found))), np.nan)

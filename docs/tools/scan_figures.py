@@ -39,7 +39,9 @@ Numbers = dict[str, float]
 Figure = Any
 
 
-def slices(images: Mapping[str, Image], low: float, high: float, unit: str = "1/mm") -> Figure:
+def slices(
+    images: Mapping[str, Image], low: float, high: float, unit: str = "1/mm"
+) -> Figure:
     """Draw images beside each other in one window.
 
     Args:
@@ -48,7 +50,11 @@ def slices(images: Mapping[str, Image], low: float, high: float, unit: str = "1/
         unit: of the values.
     """
     figure, axes = plt.subplots(
-        1, len(images), figsize=(WIDTH_INCH, HEIGHT_INCH), layout="constrained", squeeze=False
+        1,
+        len(images),
+        figsize=(WIDTH_INCH, HEIGHT_INCH),
+        layout="constrained",
+        squeeze=False,
     )
     for axis, (title, image) in zip(axes[0], images.items(), strict=True):
         drawn = axis.imshow(image, cmap="gray", vmin=low, vmax=high, origin="lower")
@@ -63,19 +69,32 @@ def correlation(one: Image, other: Image) -> float:
 
     A calibration leaves the object's place in its frame open by its sigmas.
     """
-    spectra = [np.fft.fft2((image - image.mean()) / image.std()) for image in (one, other)]
+    spectra = [
+        np.fft.fft2((image - image.mean()) / image.std()) for image in (one, other)
+    ]
     return float(np.fft.ifft2(spectra[0] * spectra[1].conj()).real.max() / one.size)
 
 
 def before_and_after(images: Mapping[str, Image], truth: Image) -> Numbers:
     """Return the correlations of two images, before and after, with the true one."""
     names = "correlation_before", "correlation_after"
-    return {name: correlation(one, truth) for name, one in zip(names, images.values(), strict=True)}
+    return {
+        name: correlation(one, truth)
+        for name, one in zip(names, images.values(), strict=True)
+    }
 
 
-def scan(angles: int = 120, shape: tuple[int, int] = (96, 120), **changes: Any) -> fx.ConeVec:
+def scan(
+    angles: int = 120, shape: tuple[int, int] = (96, 120), **changes: Any
+) -> fx.ConeVec:
     """Return a circular scan at the FleX-ray's usual distances, with coarse pixels."""
-    settings = {"sod": 600, "sdd": 1059, "angles": angles, "shape": shape, "pixel": 1.0} | changes
+    settings = {
+        "sod": 600,
+        "sdd": 1059,
+        "angles": angles,
+        "shape": shape,
+        "pixel": 1.0,
+    } | changes
     return fx.ConeVec.circular(**settings)
 
 
@@ -87,16 +106,27 @@ def as_seen(images: Image, believed: fx.ConeVec) -> fx.DataSet:
 def pieces() -> fx.phantoms.Phantom:
     """Return an unsymmetrical object of solids without a bead: a body with holes and pins."""
     solids: list[dict[str, Any]] = [
-        {"kind": "cylinder", "center": [2, -1, 0], "radius": 20, "height": 36, "material": "pmma"}
+        {
+            "kind": "cylinder",
+            "center": [2, -1, 0],
+            "radius": 20,
+            "height": 36,
+            "material": "pmma",
+        }
     ]
     rng = np.random.default_rng(SEED)
     for number in range(12):
         turn, out = 2 * np.pi * number / 12, (7.0, 14.5)[number % 2]
         place = [2 + out * np.cos(turn), -1 + out * np.sin(turn), 6.0 * (number % 3 - 1)]
-        solids.append({
-            "kind": "sphere", "center": place, "radius": rng.uniform(1.2, 2.9),
-            "material": ("air", "aluminium")[number % 5 == 0], "replaces": "pmma",
-        })  # fmt: skip
+        solids.append(
+            {
+                "kind": "sphere",
+                "center": place,
+                "radius": rng.uniform(1.2, 2.9),
+                "material": ("air", "aluminium")[number % 5 == 0],
+                "replaces": "pmma",
+            }
+        )
     return fx.phantoms.as_phantom(solids)
 
 
@@ -126,7 +156,10 @@ def calibrated() -> tuple[Figure, Numbers]:
         "as believed": data.reconstruct("fdk", **grid).data[:, 35],
         "calibrated": right.reconstruct("fdk", **grid).data[:, 35],
     }
-    return slices(images, 0.0, 0.06), {"miss_before_px": miss[0], "miss_after_px": miss[1]}
+    return slices(images, 0.0, 0.06), {
+        "miss_before_px": miss[0],
+        "miss_after_px": miss[1],
+    }
 
 
 def aligned() -> tuple[Figure, Numbers]:
@@ -145,16 +178,19 @@ def aligned() -> tuple[Figure, Numbers]:
 
 
 def gap() -> tuple[Figure, Numbers]:
-    """Show a panel of two tiles with a gap of 2 pixels, before and after a calibration finds it."""
+    """Show a panel of two tiles with a gap of 2 pixels, before and after a calibration finds
+    it."""
     fine = {"angles": 90, "pixel": 0.5984}
     wide = scan(shape=(190, 241), **fine)
     seen = fx.simulate("lego", wide, noise=SEED)
     kept = np.delete(np.arange(241), [90, 91])
     # The tile beyond the gap is taken to follow without one: it appears 1 pixel to either side.
     data = fx.DataSet.from_arrays(
-        seen.counts()[:, :, kept], scan(shape=(190, 239), **fine),
-        dark=seen.dark[:, kept], flat=seen.flat[:, kept],
-    )  # fmt: skip
+        seen.counts()[:, :, kept],
+        scan(shape=(190, 239), **fine),
+        dark=seen.dark[:, kept],
+        flat=seen.flat[:, kept],
+    )
     right = data.with_correction(data.calibrate("lego").correction)
     whole = fx.DataSet.from_arrays(seen.counts(), wide, dark=seen.dark, flat=seen.flat)
     grid = {"voxel": 0.4, "shape": (6, 90, 90), "errors": False}
@@ -181,7 +217,9 @@ def motion() -> tuple[Figure, Numbers]:
         "taken to stand still": data.reconstruct("fdk", **grid).data[:, 40],
         "motion of each frame found": followed.reconstruct("fdk", **grid).data[:, 40],
     }
-    truth = fx.DataSet.from_arrays(seen.counts(), rising, **frames).reconstruct("fdk", **grid)
+    truth = fx.DataSet.from_arrays(seen.counts(), rising, **frames).reconstruct(
+        "fdk", **grid
+    )
     return slices(images, 0.0, 0.06), before_and_after(images, truth.data[:, 40])
 
 
@@ -232,9 +270,12 @@ def cupping() -> tuple[Figure, Numbers]:
     before = data.reconstruct("fdk", **grid).data[1]
     after = data.reconstruct("fdk", material="aluminium", tube=tube, **grid).data[1]
     figure, axes = plt.subplots(
-        1, 3, figsize=(WIDTH_INCH, HEIGHT_INCH), layout="constrained",
+        1,
+        3,
+        figsize=(WIDTH_INCH, HEIGHT_INCH),
+        layout="constrained",
         width_ratios=[1, 1, 1.5],
-    )  # fmt: skip
+    )
     images = {"measured": before, "material='aluminium'": after}
     for axis, (title, image) in zip(axes, images.items(), strict=False):
         axis.imshow(image, cmap="gray", vmin=0.0, vmax=0.16, origin="lower")
@@ -247,8 +288,10 @@ def cupping() -> tuple[Figure, Numbers]:
     axes[2].set_ylabel("1/mm")
     axes[2].legend(fontsize=8)
     inside = np.hypot(*np.meshgrid(across, across))
-    ratio = [float(one[inside < 3].mean() / one[(inside > 9) & (inside < 11)].mean() - 1)
-             for one in (before, after)]  # fmt: skip
+    ratio = [
+        float(one[inside < 3].mean() / one[(inside > 9) & (inside < 11)].mean() - 1)
+        for one in (before, after)
+    ]
     numbers = {"middle_less_rim_before": ratio[0], "middle_less_rim_after": ratio[1]}
     return figure, numbers
 
@@ -258,7 +301,12 @@ def metal() -> tuple[Figure, Numbers]:
     disc: dict[str, Any] = {"kind": "cylinder", "center": [0, 0, 0], "height": 40}
     parts = [disc | {"radius": 14, "material": "pmma"}]
     for x in (-6, 6):
-        pin = {"center": [x, 0, 0], "radius": 1.5, "material": "steel", "replaces": "pmma"}
+        pin = {
+            "center": [x, 0, 0],
+            "radius": 1.5,
+            "material": "steel",
+            "replaces": "pmma",
+        }
         parts.append(disc | pin)
     turn = scan(200, shape=(8, 120), pixel=0.5)
     tube = fx.Tube(kV=90)
@@ -267,13 +315,16 @@ def metal() -> tuple[Figure, Numbers]:
     grid = {"voxel": 0.35, "shape": (4, 96, 96), "tube": tube}
     shown = {
         "FDK": data.reconstruct("fdk", errors=False, **grid).data[2],
-        "material='pmma'": data.reconstruct("fdk", errors=False, material="pmma", **grid).data[2],
+        "material='pmma'": data.reconstruct(
+            "fdk", errors=False, material="pmma", **grid
+        ).data[2],
         "sart, material=('pmma', 'steel')": data.reconstruct(
             "sart", material=("pmma", "steel"), iterations=20, **grid
         ).data[2],
     }
     numbers = {
-        f"between_pins_{i}": float(one[46:50, 44:52].mean()) for i, one in enumerate(shown.values())
+        f"between_pins_{i}": float(one[46:50, 44:52].mean())
+        for i, one in enumerate(shown.values())
     }
     return slices(shown, 0.0, 0.05), numbers
 
@@ -281,10 +332,14 @@ def metal() -> tuple[Figure, Numbers]:
 def bound() -> tuple[Figure, Numbers]:
     """Show a volume with the noise and the bound of its bias at each place."""
     turn = scan(150, shape=(64, 100), pixel=0.9)
-    data = fx.simulate(pieces(), turn, tube=fx.Tube(mono_keV=50), noise=SEED, exposure_ms=4)
+    data = fx.simulate(
+        pieces(), turn, tube=fx.Tube(mono_keV=50), noise=SEED, exposure_ms=4
+    )
     volume = data.reconstruct("fdk", voxel=0.7, shape=(48, 72, 72))
     middle = 24
-    figure, axes = plt.subplots(1, 3, figsize=(WIDTH_INCH, HEIGHT_INCH), layout="constrained")
+    figure, axes = plt.subplots(
+        1, 3, figsize=(WIDTH_INCH, HEIGHT_INCH), layout="constrained"
+    )
     layers = {
         "attenuation": (volume.data[middle], 0.06),
         "sigma (noise)": (volume.sigma[middle], None),
@@ -308,7 +363,9 @@ def contradiction() -> tuple[Figure, Numbers]:
     alphabetical = sorted(range(len(turn)), key=str)
     shown = {
         "images in order": fx.fdk(images, turn, grid, errors=False).data[1],
-        "in alphabetical order": fx.fdk(images[alphabetical], turn, grid, errors=False).data[1],
+        "in alphabetical order": fx.fdk(
+            images[alphabetical], turn, grid, errors=False
+        ).data[1],
     }
     right, wrong = shown.values()
     return slices(shown, 0.0, 0.06), {"correlation": correlation(right, wrong)}
@@ -344,9 +401,17 @@ def chain() -> tuple[Figure, Numbers]:
     """Show one radiograph by the three kinds of physics."""
     view = scan(1, shape=(190, 239), pixel=0.5984)
     exact = fx.project("lego", view)[0]
-    quiet = fx.simulate("lego", view, noise=SEED, tube=fx.Tube(kV=90, power_W=50), exposure_ms=100)
-    faint = fx.simulate("lego", view, noise=SEED, tube=fx.Tube(kV=90, power_W=2), exposure_ms=100)
-    images = {"50 keV, no noise": exact, "spectrum, 50 W": quiet[0], "spectrum, 2 W": faint[0]}
+    quiet = fx.simulate(
+        "lego", view, noise=SEED, tube=fx.Tube(kV=90, power_W=50), exposure_ms=100
+    )
+    faint = fx.simulate(
+        "lego", view, noise=SEED, tube=fx.Tube(kV=90, power_W=2), exposure_ms=100
+    )
+    images = {
+        "50 keV, no noise": exact,
+        "spectrum, 50 W": quiet[0],
+        "spectrum, 2 W": faint[0],
+    }
     drawn = {name: image[::-1] for name, image in images.items()}
     return slices(drawn, 0.0, 1.5, "line integral"), {}
 
@@ -361,11 +426,15 @@ def growth() -> tuple[Figure, Numbers]:
     for axis, (name, label) in zip(axes, labels.items(), strict=True):
         points = document["growth"][name]
         for series in dict.fromkeys(point["series"] for point in points):
-            line = [(point["x"], point["ms"]) for point in points if point["series"] == series]
+            line = [
+                (point["x"], point["ms"]) for point in points if point["series"] == series
+            ]
             axis.loglog(*zip(*line, strict=True), marker="o", markersize=3, label=series)
         ticks = sorted({point["x"] for point in points})
         axis.minorticks_off()
-        axis.set_xticks(ticks, [f"{x:.0e}" if x > 9999 else str(x) for x in ticks], fontsize=6)
+        axis.set_xticks(
+            ticks, [f"{x:.0e}" if x > 9999 else str(x) for x in ticks], fontsize=6
+        )
         axis.set_xlabel(label)
         axis.legend(fontsize=7)
     axes[0].set_ylabel("ms a view")
@@ -382,17 +451,21 @@ ADJOINT_OVER_FORWARD = 1.2
 def sizes() -> tuple[Figure, Numbers]:
     """Show memory and time against voxels a side, for n views into n^3 voxels.
 
-    Memory is of n x n pixels a view. Times are those of the kept benchmark: FDK scaled with views
-    and voxels; an iteration is one forward and one adjoint a view of 956 x 760 pixels, not
-    extrapolated.
+    Memory is of n x n pixels a view. Times are those of the kept benchmark: FDK scaled with
+    views and voxels; an iteration is one forward and one adjoint a view of 956 x 760 pixels,
+    not extrapolated.
     """
     from flexdt.twin.algorithms import ALGORITHMS
 
     document = json.loads((ROOT / "docs" / "images" / "bench.json").read_text("utf-8"))
-    measured = {case["name"]: case for case in document["cases"]}["FDK"]["ms_per_view"] / 1e3
+    measured = {case["name"]: case for case in document["cases"]}["FDK"][
+        "ms_per_view"
+    ] / 1e3
     update_s = measured / (360 * 256**3)
     points = document["growth"]["voxels"]
-    forward_ms = {point["x"]: point["ms"] for point in points if point["series"] == "level"}
+    forward_ms = {
+        point["x"]: point["ms"] for point in points if point["series"] == "level"
+    }
     numbers: Numbers = {}
     figure, axes = plt.subplots(1, 2, figsize=(WIDTH_INCH, 2.8), layout="constrained")
     for name in ("fdk", "sirt", "tv"):
@@ -400,14 +473,20 @@ def sizes() -> tuple[Figure, Numbers]:
         arrays = 2 if one.direct else one.stacks + one.grids
         for n in SIDES:
             numbers[f"{name}_{n}_GiB"] = arrays * n**3 * FLOAT_BYTES / 2**30
-        axes[0].loglog(SIDES, [numbers[f"{name}_{n}_GiB"] for n in SIDES], marker="o", label=name)
+        axes[0].loglog(
+            SIDES, [numbers[f"{name}_{n}_GiB"] for n in SIDES], marker="o", label=name
+        )
     for n in SIDES:
         numbers[f"fdk_{n}_s"] = update_s * n**4
         if n in forward_ms:
-            numbers[f"iteration_{n}_s"] = n * forward_ms[n] / 1e3 * (1 + ADJOINT_OVER_FORWARD)
+            numbers[f"iteration_{n}_s"] = (
+                n * forward_ms[n] / 1e3 * (1 + ADJOINT_OVER_FORWARD)
+            )
     for key, label in (("fdk", "FDK"), ("iteration", "one iteration")):
         known = [n for n in SIDES if f"{key}_{n}_s" in numbers]
-        axes[1].loglog(known, [numbers[f"{key}_{n}_s"] for n in known], marker="o", label=label)
+        axes[1].loglog(
+            known, [numbers[f"{key}_{n}_s"] for n in known], marker="o", label=label
+        )
     for axis, label in zip(axes, ("GiB in memory", "s, two cores"), strict=True):
         axis.minorticks_off()
         axis.set_xticks(SIDES, [str(n) for n in SIDES])
@@ -438,8 +517,13 @@ def geometry() -> tuple[Figure, Numbers]:
 
 
 def clearance() -> tuple[Figure, Numbers]:
-    """Show the least clearance while a sample nears the source, and where the motion is stopped."""
-    lines = ["tube xrayoff", "mag_obj move absolute 600 ACK", "mag_det move absolute 500 ACK"]
+    """Show the least clearance while a sample nears the source, and where the motion is
+    stopped."""
+    lines = [
+        "tube xrayoff",
+        "mag_obj move absolute 600 ACK",
+        "mag_det move absolute 500 ACK",
+    ]
     text = "\n".join([*lines, "camera take image", "camera save image scan_0.tif"])
     folder = Path(__file__).parent
     script = folder / ".clearance.txt"
@@ -454,20 +538,35 @@ def clearance() -> tuple[Figure, Numbers]:
     contact = report.clearance.collisions[0]
     axis.axvline(contact.time_s, color="tab:red")
     axis.annotate(
-        f" line {contact.line}: {' and '.join(contact.pair)}", (contact.time_s, trace[0][1]),
-        color="tab:red", fontsize=8,
-    )  # fmt: skip
+        f" line {contact.line}: {' and '.join(contact.pair)}",
+        (contact.time_s, trace[0][1]),
+        color="tab:red",
+        fontsize=8,
+    )
     axis.set_xlabel("time of the script [s]")
     axis.set_ylabel("least clearance [mm]")
     return figure, {"contact_s": contact.time_s}
 
 
 FIGURES: dict[str, Callable[[], tuple[Figure, Numbers]]] = {
-    "calibrated": calibrated, "aligned": aligned, "tile-gap": gap, "motion": motion,
-    "streaks": streaks, "rings": rings, "cupping": cupping, "metal": metal, "bound": bound,
-    "contradiction": contradiction, "frames": frames, "timeline": timeline, "physics": chain,
-    "growth": growth, "sizes": sizes, "geometry": geometry, "clearance": clearance,
-}  # fmt: skip
+    "calibrated": calibrated,
+    "aligned": aligned,
+    "tile-gap": gap,
+    "motion": motion,
+    "streaks": streaks,
+    "rings": rings,
+    "cupping": cupping,
+    "metal": metal,
+    "bound": bound,
+    "contradiction": contradiction,
+    "frames": frames,
+    "timeline": timeline,
+    "physics": chain,
+    "growth": growth,
+    "sizes": sizes,
+    "geometry": geometry,
+    "clearance": clearance,
+}
 """Name of the picture -> what draws it and returns the numbers of its caption."""
 
 
@@ -488,7 +587,9 @@ def make(folder: Path, names: list[str]) -> None:
     numbers = json.loads(kept.read_text()) if kept.exists() else {}
     for name in names:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is wrong with these scans is their subject
+            warnings.simplefilter(
+                "ignore"
+            )  # what is wrong with these scans is their subject
             figure, numbers[name] = FIGURES[name]()
         save(figure, folder / f"{name}.png")
     rounded = {

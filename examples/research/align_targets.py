@@ -1,18 +1,19 @@
-"""`flexdt align` on scans of known geometry: errors, sigmas and refusals beside what was aimed at.
+"""`flexdt align` on scans of known geometry: errors, sigmas and refusals beside what was aimed
+at.
 
-    python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10] [--json]
-    python examples/research/align_targets.py --spoilt
+    python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10]
+    [--json] python examples/research/align_targets.py --spoilt
     python examples/research/align_targets.py --jitter 1
     python examples/research/align_targets.py --edge
 
 `--jitter` shifts every frame at random and tells what is left of the shifts after
-`align(per_frame=True)`. `--edge` reconstructs a ball (FDK) as the data set says it was scanned, as
-aligned and as it really was, and tells how wide its edge is (10 to 90 %).
+`align(per_frame=True)`. `--edge` reconstructs a ball (FDK) as the data set says it was scanned,
+as aligned and as it really was, and tells how wide its edge is (10 to 90 %).
 
-Objects are sums of ellipsoids and boxes, whose line integrals are closed forms, written out here
-with kinematics of their own: nothing is shared with what is tested. Geometries are drawn by a seed.
-Errors are in pixels of the binned panel; the table also gives them in those of the default mode
-(956 x 760 of 0.1496 mm).
+Objects are sums of ellipsoids and boxes, whose line integrals are closed forms, written out
+here with kinematics of their own: nothing is shared with what is tested. Geometries are drawn
+by a seed. Errors are in pixels of the binned panel; the table also gives them in those of the
+default mode (956 x 760 of 0.1496 mm).
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ class Hidden:
         pixel: [mm].
         axis_x: the axis beside the beam [mm].
         panel: (x, z) of the panel's centre [mm].
-        tilts: roll about the beam, pitch about x, yaw about the vertical, right-handed about the
-            directions that conventions.md names [deg].
+        tilts: roll about the beam, pitch about x, yaw about the vertical, right-handed about
+            the directions that conventions.md names [deg].
         span: of the turn [deg].
         drift: of the source in x over the scan [mm].
         jitter: (views, 2) columns and rows by which frames show the object aside; None: not.
@@ -73,7 +74,11 @@ class Hidden:
     def nominal(self) -> fx.ConeVec:
         """What the data set says."""
         return fx.ConeVec.circular(
-            sod=self.sod, sdd=self.sdd, angles=self.degrees(), shape=self.shape, pixel=self.pixel
+            sod=self.sod,
+            sdd=self.sdd,
+            angles=self.degrees(),
+            shape=self.shape,
+            pixel=self.pixel,
         )
 
     def steps(self) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +98,8 @@ class Hidden:
         part = k / self.views
         phi = math.radians(part * self.span)
         c, s = math.cos(phi), math.sin(phi)
-        # The object turns clockwise seen from above; seen from it, everything else the other way.
+        # The object turns clockwise seen from above; seen from it, everything else the other
+        # way.
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         pivot = np.array([self.axis_x, self.sod, 0.0])
         source = turn @ (np.array([self.drift * (part - 0.5), 0.0, 0.0]) - pivot)
@@ -105,8 +111,8 @@ class Hidden:
         return source, centre, u, v
 
     def axis_in_image(self) -> tuple[float, float]:
-        """Column where the axis crosses the middle row [px], its angle [deg]: its upper end leans
-        to the right for positive ones."""
+        """Column where the axis crosses the middle row [px], its angle [deg]: its upper end
+        leans to the right for positive ones."""
         u, v = self.steps()
         centre = np.array([self.panel[0], self.sdd, self.panel[1]])
         seen = []
@@ -115,7 +121,9 @@ class Hidden:
             seen.append(np.linalg.solve(np.column_stack([u, v, -ray]), -centre)[:2])
         (c0, r0), (c1, r1) = seen
         column = c0 - r0 * (c1 - c0) / (r1 - r0)
-        return column + (self.shape[1] - 1) / 2, math.degrees(math.atan2(c1 - c0, r0 - r1))
+        return column + (self.shape[1] - 1) / 2, math.degrees(
+            math.atan2(c1 - c0, r0 - r1)
+        )
 
     def source_row(self) -> float:
         """Row of the ray from the source, level, to the axis [px]."""
@@ -133,7 +141,11 @@ def drawn(rng: np.random.Generator, plain: Hidden) -> Hidden:
         plain,
         axis_x=float(rng.uniform(-12, 12)) * plain.pixel * SOD / SDD,
         panel=(float(rng.uniform(-3, 3)) * wide, float(rng.uniform(-30, 30)) * wide),
-        tilts=(float(rng.uniform(-1, 1)), float(rng.normal(0, 0.4)), float(rng.normal(0, 0.2))),
+        tilts=(
+            float(rng.uniform(-1, 1)),
+            float(rng.normal(0, 0.4)),
+            float(rng.normal(0, 0.2)),
+        ),
     )
 
 
@@ -176,7 +188,9 @@ def smooth(rng: np.random.Generator) -> Solids:
     out = []
     for _ in range(5):
         centre, half = rng.uniform(-9, 9, 3), rng.uniform(7, 12, 3)
-        out += [[*centre, *(half * math.sqrt((k + 0.5) / 12)), 0.02 / 12] for k in range(12)]
+        out += [
+            [*centre, *(half * math.sqrt((k + 0.5) / 12)), 0.02 / 12] for k in range(12)
+        ]
     return Solids(np.array(out), np.zeros((0, 7)))
 
 
@@ -197,8 +211,8 @@ OBJECTS: Final[Mapping[str, Callable[[np.random.Generator], Solids]]] = {
 
 @numba.njit(cache=True, fastmath=True)
 def _window(solid, source, centre, u, v, shape):  # type: ignore[no-untyped-def]
-    """First row and column of the pixels that may see the solid's bounding box, and those after the
-    last."""
+    """First row and column of the pixels that may see the solid's bounding box, and those after
+    the last."""
     normal, to = np.cross(u, v), centre - source
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for corner in range(8):
@@ -218,7 +232,8 @@ def _window(solid, source, centre, u, v, shape):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath=True)
 def add_chords(source, centre, u, v, solids, round_, out):  # type: ignore[no-untyped-def]
-    """Adds the line integrals of ellipsoids (`round_`) or boxes (k, 7); u is perpendicular to v."""
+    """Adds the line integrals of ellipsoids (`round_`) or boxes (k, 7); u is perpendicular to
+    v."""
     rows, cols = out.shape
     for k in range(len(solids)):
         e = solids[k]
@@ -279,14 +294,22 @@ def measured(
         ramp: error of the flat images from the left end to the right one.
     """
     gain = 1.0 if photons > 1000 else 60.0
-    flat = np.stack([rng.poisson(photons, hidden.shape) for _ in range(20)]).mean(axis=0) * gain
+    flat = (
+        np.stack([rng.poisson(photons, hidden.shape) for _ in range(20)]).mean(axis=0)
+        * gain
+    )
     flat *= 1.0 + ramp * (np.arange(hidden.shape[1]) / (hidden.shape[1] - 1) - 0.5)
-    counts = np.minimum(rng.poisson(photons * np.exp(-lines)) * gain, 65535).astype(np.uint16)
+    counts = np.minimum(rng.poisson(photons * np.exp(-lines)) * gain, 65535).astype(
+        np.uint16
+    )
     chosen = np.arange(len(lines)) if keep is None else keep
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return fx.DataSet.from_arrays(
-            counts[chosen], hidden.nominal()[chosen], dark=np.zeros(hidden.shape), flat=flat
+            counts[chosen],
+            hidden.nominal()[chosen],
+            dark=np.zeros(hidden.shape),
+            flat=flat,
         )
 
 
@@ -294,11 +317,16 @@ def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
     """Error and sigma of the column [px], the axis's angle, the yaw [deg] and the row [px]."""
     column, angle = hidden.axis_in_image()
     p = found.parameters
-    out = {"column": (p["axis_column_px"]["value"] - column, p["axis_column_px"]["sigma"])}
+    out = {
+        "column": (p["axis_column_px"]["value"] - column, p["axis_column_px"]["sigma"])
+    }
     out["roll"] = (_angle(found) - angle, p["det_roll"]["sigma"])
     if "det_yaw" in p:
         aside = math.degrees(math.atan(hidden.panel[0] / SDD))
-        out["yaw"] = (p["det_yaw"]["value"] - hidden.tilts[2] + aside, p["det_yaw"]["sigma"])
+        out["yaw"] = (
+            p["det_yaw"]["value"] - hidden.tilts[2] + aside,
+            p["det_yaw"]["sigma"],
+        )
     if "source_row_px" in p:
         row = p["source_row_px"]
         out["row"] = (row["value"] - hidden.source_row(), row["sigma"])
@@ -315,16 +343,20 @@ def _angle(found: Any) -> float:
 def left_of(
     true: np.ndarray, motion: Any, hidden: Hidden, degrees: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a motion leaves of shifts, without what all frames share or turns once with the stage,
-    and its sigmas, both (n, 2) as columns and rows [px]."""
+    """What a motion leaves of shifts, without what all frames share or turns once with the
+    stage, and its sigmas, both (n, 2) as columns and rows [px]."""
     to_px = hidden.sdd / hidden.sod / hidden.pixel
     angle = np.radians(degrees)
     modes = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
     left = motion.values * [to_px, -to_px] - true
-    return left - modes @ np.linalg.lstsq(modes, left, rcond=None)[0], motion.sigma * to_px
+    return left - modes @ np.linalg.lstsq(modes, left, rcond=None)[
+        0
+    ], motion.sigma * to_px
 
 
-def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[int, ...]) -> str:
+def shifted(
+    name: str, plain: Hidden, size: float, photons: float, seed: tuple[int, ...]
+) -> str:
     """What is left of shifts of `size` pixels (0.1496 mm, rms) in every frame, in words."""
     rng = np.random.default_rng([*seed, sorted(OBJECTS).index(name)])
     hidden, solids = drawn(rng, plain), OBJECTS[name](rng)
@@ -342,7 +374,10 @@ def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[i
     cells = [f"{name} {photons:g}", "left"]
     cells += [f"{a * factor:.3f}" for a in left.std(axis=0)]
     cells += ["+-", *(f"{a * factor:.3f}" for a in sigma)]
-    cells += ["row", "-" if row is None else f"{row[0] * factor:.2f} +- {row[1] * factor:.2f}"]
+    cells += [
+        "row",
+        "-" if row is None else f"{row[0] * factor:.2f} +- {row[1] * factor:.2f}",
+    ]
     cells += [f"{took:.1f} s"]
     return "  ".join(cells)
 
@@ -357,7 +392,9 @@ def edges(plain: Hidden, rng: np.random.Generator) -> list[float]:
     ball = Solids(np.array([[2.0, -1.0, 0.0, *3 * [RADIUS], 0.02]]), np.zeros((0, 7)))
     data = measured(project(hidden, ball), hidden, 10_000.0, rng)
     aligned = data.with_correction(data.align().correction)
-    true = fx.ConeVec(np.array([np.concatenate(hidden.placed(k)) for k in range(hidden.views)]))
+    true = fx.ConeVec(
+        np.array([np.concatenate(hidden.placed(k)) for k in range(hidden.views)])
+    )
     voxel = hidden.pixel * SOD / SDD
     across = int(2.4 * RADIUS / voxel)
     like = fx.Grid((3, across, across), voxel).blank()
@@ -383,8 +420,8 @@ SPOILT: Final = ("clean", "flat ramp 1 %", "flat ramp 3 %", "frame repeated", "3
 def spoilt(
     kind: str, hidden: Hidden, solids: Solids, rng: np.random.Generator
 ) -> tuple[np.ndarray, Hidden, np.ndarray, float]:
-    """Line integrals with something wrong with them, the scanner, which frames there are, and the
-    flat field's error."""
+    """Line integrals with something wrong with them, the scanner, which frames there are, and
+    the flat field's error."""
     n = hidden.views
     span = {"200 deg": 200.0, "350 deg": 350.0}.get(kind, 360.0)
     drift = 0.5 * hidden.pixel * SOD / (SDD - SOD) if kind.startswith("drift") else 0.0
@@ -415,28 +452,44 @@ def main() -> None:
     parser.add_argument("--objects", default=",".join(OBJECTS))
     parser.add_argument("--photons", default="10000,100")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--spoilt", action="store_true", help="data sets with something wrong")
-    parser.add_argument("--jitter", type=float, help="rms shift of every frame [px of 0.1496 mm]")
-    parser.add_argument("--edge", action="store_true", help="edges of a reconstructed ball")
-    parser.add_argument("--json", action="store_true", help="one line for each scan instead")
+    parser.add_argument(
+        "--spoilt", action="store_true", help="data sets with something wrong"
+    )
+    parser.add_argument(
+        "--jitter", type=float, help="rms shift of every frame [px of 0.1496 mm]"
+    )
+    parser.add_argument(
+        "--edge", action="store_true", help="edges of a reconstructed ball"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="one line for each scan instead"
+    )
     o = parser.parse_args()
     shape = (760 // o.binning, 956 // o.binning)
     plain = Hidden(o.views, shape, PIXEL * o.binning)
     if o.edge:
-        print("width of a ball's edge, voxels: as the data set says, aligned, as it really was")
+        print(
+            "width of a ball's edge, voxels: as the data set says, aligned, as it really was"
+        )
         for k in range(o.geometries):
             widths = edges(plain, np.random.default_rng([o.seed, k]))
             print("  ".join(f"{w:6.1f}" for w in widths), flush=True)
         return
     if o.jitter is not None:
-        print(f"shifts of {o.jitter:g} px in every frame, rms: left in columns and rows, px")
+        print(
+            f"shifts of {o.jitter:g} px in every frame, rms: left in columns and rows, px"
+        )
         for name in o.objects.split(","):
             for photons in map(float, o.photons.split(",")):
                 for k in range(o.geometries):
-                    print(shifted(name, plain, o.jitter, photons, (o.seed, k)), flush=True)
+                    print(
+                        shifted(name, plain, o.jitter, photons, (o.seed, k)), flush=True
+                    )
         return
     if not o.json:
-        print(f"{o.views} views of {shape[0]} x {shape[1]} px; errors in px of 0.1496 mm and deg")
+        print(
+            f"{o.views} views of {shape[0]} x {shape[1]} px; errors in px of 0.1496 mm and deg"
+        )
         print(
             f"{'scan':40s}  told  column rms  max  roll rms  max  yaw rms  row rms  max  rows"
             "  pulls c/r/y/row  >4 sigma  s"
@@ -456,17 +509,24 @@ def main() -> None:
                     told = errors(found, hidden) if found.identifiable else {}
                     told_of.append((told, took))
                     if o.json:
-                        why = None if told else found.document["refused"]["axis_column_px"]
+                        why = (
+                            None if told else found.document["refused"]["axis_column_px"]
+                        )
                         line = {"object": name, "kind": kind, "photons": photons, "geometry": k,
                                 "errors": told, "refused": why, "warnings": found.warnings,
                                 "seconds": round(took, 2)}  # fmt: skip
                         print(json.dumps(line), flush=True)
             for photons, told_of in runs.items():
                 if not o.json:
-                    print(_line(f"{name} {photons:g} {kind}", told_of, o.binning), flush=True)
+                    print(
+                        _line(f"{name} {photons:g} {kind}", told_of, o.binning),
+                        flush=True,
+                    )
 
 
-def _line(label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], factor: int) -> str:
+def _line(
+    label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], factor: int
+) -> str:
     told = [r for r, _ in runs if r]
     cells = [f"{label:40s}  {len(told)}/{len(runs)}"]
     pulls, wild = [], 0
@@ -477,13 +537,17 @@ def _line(label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], 
             pulls.append("-")
             continue
         rms, most = math.sqrt(np.mean(values[:, 0] ** 2)), np.abs(values[:, 0]).max()
-        cells.append(f"{rms * unit:.4f}" + ("" if name == "yaw" else f" {most * unit:.4f}"))
+        cells.append(
+            f"{rms * unit:.4f}" + ("" if name == "yaw" else f" {most * unit:.4f}")
+        )
         if name == "row":
             cells[-1] += f" {len(values)}"
         pull = values[:, 0] / values[:, 1]
         wild += int((np.abs(pull) > 4).sum())
         pulls.append(f"{math.sqrt(np.mean(pull**2)):.2f}")
-    return "  ".join([*cells, "/".join(pulls), str(wild), f"{np.mean([s for _, s in runs]):.1f}"])
+    return "  ".join(
+        [*cells, "/".join(pulls), str(wild), f"{np.mean([s for _, s in runs]):.1f}"]
+    )
 
 
 if __name__ == "__main__":

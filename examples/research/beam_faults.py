@@ -1,12 +1,14 @@
-"""Faults of detector and beam in the images: are they named, and is no answer confidently wrong?
+"""Faults of detector and beam in the images: are they named, and is no answer confidently
+wrong?
 
 `python examples/research/beam_faults.py [--each 5] [--seed 0] [--kinds a,b] [--json]` makes
-radiographs of balls in a body, with all seventeen offsets drawn from their priors, and calibrates
-from them. Light of three energies, a detector's blur, lag, distortion, tiles, dead pixels and
-scattered light are written out here, with the rays and planes of `prior_coverage`; nothing of
-flexdt is in the images. An offset, the axis's image or the magnification that is offered and more
-than four sigmas off is a confident wrong answer, and the command fails. `--json` prints a line as
-soon as a scan is judged, one scan of every kind before the second of any, and the sums last.
+radiographs of balls in a body, with all seventeen offsets drawn from their priors, and
+calibrates from them. Light of three energies, a detector's blur, lag, distortion, tiles, dead
+pixels and scattered light are written out here, with the rays and planes of `prior_coverage`;
+nothing of flexdt is in the images. An offset, the axis's image or the magnification that is
+offered and more than four sigmas off is a confident wrong answer, and the command fails.
+`--json` prints a line as soon as a scan is judged, one scan of every kind before the second of
+any, and the sums last.
 """
 
 from __future__ import annotations
@@ -30,7 +32,12 @@ from scipy import ndimage
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.poses import Poses
 
@@ -100,12 +107,15 @@ def rays(truth: Mapping[str, float], step: int = 1) -> Array:
 
 
 def cylinder(ray: Array, low: Array, high: Array, radius: float) -> Array:
-    """Chords of rays from the origin in the endless cylinder about the line from low to high."""
+    """Chords of rays from the origin in the endless cylinder about the line from low to
+    high."""
     way = (high - low) / np.linalg.norm(high - low)
     across = ray - (ray @ way)[..., None] * way
     start = low - (low @ way) * way
     a, b = (across**2).sum(axis=-1), across @ start
-    return np.asarray(2.0 * np.sqrt(np.maximum(b * b - a * (start @ start - radius**2), 0.0)) / a)
+    return np.asarray(
+        2.0 * np.sqrt(np.maximum(b * b - a * (start @ start - radius**2), 0.0)) / a
+    )
 
 
 def radiographs(
@@ -123,7 +133,9 @@ def radiographs(
     parts = (np.arange(EXPOSED) + 0.5) / EXPOSED - 0.5 if lab.arc else np.zeros(1)
     for i, angle in enumerate(angles.tolist()):
         some = angle + lab.arc * step * parts
-        shown = np.mean([light(lab, beads, float(a), truth, straight) for a in some], axis=0)
+        shown = np.mean(
+            [light(lab, beads, float(a), truth, straight) for a in some], axis=0
+        )
         if lab.shift is not None:
             shown = _shifted(shown, lab.shift)
         shown = _blurred(shown, lab.blur_px) + lab.scatter
@@ -137,7 +149,11 @@ def radiographs(
 
 
 def light(
-    lab: Laboratory, beads: Array, angle: float, truth: Mapping[str, float], straight: Array
+    lab: Laboratory,
+    beads: Array,
+    angle: float,
+    truth: Mapping[str, float],
+    straight: Array,
 ) -> Array:
     """What part of the beam passes at one angle, (rows, cols)."""
     ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
@@ -148,9 +164,13 @@ def light(
     parts /= parts.sum()
     ball, body = (np.array(ATTENUATION[m])[energies] for m in (lab.ball, lab.body))
     shown = np.zeros(own.SHAPE)
-    inside = cylinder(straight, *at[-2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
+    inside = (
+        cylinder(straight, *at[-2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
+    )
     through = [np.zeros(own.SHAPE) for _ in energies]
-    for place, centre in zip(at[:-2], own.pixels(beads, turn, own.SOD, truth)[0], strict=True):
+    for place, centre in zip(
+        at[:-2], own.pixels(beads, turn, own.SOD, truth)[0], strict=True
+    ):
         where, passed = own.shadow(place, centre, panel, lab.cast_mm, own.SOD)
         for e in range(len(energies)):  # a ball takes its place in the body
             through[e][where] -= np.log(passed(ball[e] - body[e]))
@@ -168,7 +188,9 @@ def _blurred(image: Array, blur: tuple[float, float, float]) -> Array:
     y, x = np.mgrid[-n : n + 1, -n : n + 1].astype(float)
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     kernel = np.exp(-0.5 * (((c * x + s * y) / one) ** 2 + ((c * y - s * x) / two) ** 2))
-    return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT))
+    return np.asarray(
+        cv2.filter2D(image, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+    )
 
 
 def _shifted(image: Array, shift: tuple[Array, Array]) -> Array:
@@ -180,7 +202,10 @@ def _shifted(image: Array, shift: tuple[Array, Array]) -> Array:
 
 def _radial(rng: Rng) -> tuple[Array, Array]:
     row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
-    y, x = (row - (own.SHAPE[0] - 1) / 2) / 305.0, (column - (own.SHAPE[1] - 1) / 2) / 305.0
+    y, x = (
+        (row - (own.SHAPE[0] - 1) / 2) / 305.0,
+        (column - (own.SHAPE[1] - 1) / 2) / 305.0,
+    )
     size = float(rng.choice([-1, 1]) * rng.uniform(0.3, 1.0)) * (x * x + y * y)
     return size * y, size * x
 
@@ -206,7 +231,9 @@ def _strained(i: int, j: int) -> Change:
 
     def change(lab: Laboratory, rng: Rng) -> Laboratory:
         strain = np.zeros((3, 3))
-        strain[i, j] = rng.choice([-1, 1]) * math.exp(rng.uniform(math.log(5e-4), math.log(1e-2)))
+        strain[i, j] = rng.choice([-1, 1]) * math.exp(
+            rng.uniform(math.log(5e-4), math.log(1e-2))
+        )
         return replace(lab, mono=True, strain=strain)
 
     return change
@@ -324,7 +351,9 @@ def magnification(truth: Mapping[str, float]) -> float:
     step = across / np.linalg.norm(across)
     columns = []
     for place in (foot - 0.5 * step, foot + 0.5 * step):
-        columns.append(np.linalg.solve(np.stack([place, -across, -down], axis=1), panel)[1])
+        columns.append(
+            np.linalg.solve(np.stack([place, -across, -down], axis=1), panel)[1]
+        )
     return float((columns[1] - columns[0]) * own.PIXEL)
 
 
@@ -353,13 +382,18 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
     off = _errors(result, truth, lab) if result.identifiable else {}
     where = max(off, key=lambda n: off[n], default="")
     named = any(re.match(name, one) for one in said) if name else True
-    return Scored(kind, seed, result.identifiable, named, off.get(where, 0.0), where, said, off)
+    return Scored(
+        kind, seed, result.identifiable, named, off.get(where, 0.0), where, said, off
+    )
 
 
-def _errors(result: Calibration, truth: Mapping[str, float], lab: Laboratory) -> dict[str, float]:
+def _errors(
+    result: Calibration, truth: Mapping[str, float], lab: Laboratory
+) -> dict[str, float]:
     """Of every value that is offered [sigma].
 
-    Where beads see one tile alone, no border is found, and the axis's column is that of its tile.
+    Where beads see one tile alone, no border is found, and the axis's column is that of its
+    tile.
     """
     fit = result.fit
     assert fit is not None
@@ -370,7 +404,9 @@ def _errors(result: Calibration, truth: Mapping[str, float], lab: Laboratory) ->
     true = {**truth, **image, "magnification": magnification(truth)}
     found = {**fit.certificate.estimates, **image_quantities(fit)[0]}
     return {
-        n: abs(e.value - true[n]) / e.sigma for n, e in found.items() if e.sigma > 0 and n in true
+        n: abs(e.value - true[n]) / e.sigma
+        for n, e in found.items()
+        if e.sigma > 0 and n in true
     }
 
 
@@ -388,7 +424,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{'kind':28}{'offered':>8}{'named':>7}{'worst':>7}  what was said")
     kinds = args.kinds.split(",")
     runs = [(kind, args.seed + i) for i in range(args.each) for kind in kinds]
-    for kind, seed in runs if args.json else sorted(runs, key=lambda run: kinds.index(run[0])):
+    for kind, seed in (
+        runs if args.json else sorted(runs, key=lambda run: kinds.index(run[0]))
+    ):
         scans.append(scored(kind, seed))
         some = [s for s in scans if s.kind == kind]
         if args.json:

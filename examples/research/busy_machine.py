@@ -2,11 +2,11 @@
 
     python examples/research/busy_machine.py --loops 8 --rounds 5
 
-Rounds take turns: each runs every case once while the loops are stopped and once while they run.
-A line a case: median wall time of both [s], their ratio, and processor time beside the loops as a
-multiple of that without them. A fair scheduler gives n threads beside m loops on c cores
-c / (n + m) of a core each, where it shares by process; Linux with `sched_autogroup_enabled` shares
-by session, and the loops are one session.
+Rounds take turns: each runs every case once while the loops are stopped and once while they
+run. A line a case: median wall time of both [s], their ratio, and processor time beside the
+loops as a multiple of that without them. A fair scheduler gives n threads beside m loops on c
+cores c / (n + m) of a core each, where it shares by process; Linux with
+`sched_autogroup_enabled` shares by session, and the loops are one session.
 
 `OMP_WAIT_POLICY=active` before the command shows threads that spin while they wait.
 """
@@ -57,7 +57,8 @@ def cases() -> dict[str, Callable[[], object]]:
 def busy_loops(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Processes that never wait, stopped, in a session of their own."""
     script = (
-        f"import os\nfor _ in range({count - 1}):\n    if os.fork() == 0: break\nwhile True: pass\n"
+        f"import os\nfor _ in range({count - 1}):\n    if os.fork() == 0: break\nwhile "
+        "True: pass\n"
     )
     loops = [subprocess.Popen([sys.executable, "-c", script], start_new_session=True)]
     try:
@@ -82,7 +83,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=None)
     chosen = parser.parse_args()
     warnings.simplefilter("ignore")
-    every = {n: work for n, work in cases().items() if chosen.only is None or n in chosen.only}
+    every = {
+        n: work for n, work in cases().items() if chosen.only is None or n in chosen.only
+    }
     for work in every.values():
         work()
     found: dict[tuple[str, bool], list[tuple[float, float]]] = {}

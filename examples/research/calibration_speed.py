@@ -1,7 +1,9 @@
-"""How fast calibration is: `python examples/research/calibration_speed.py DATASET --phantom lego`.
+"""How fast calibration is: `python examples/research/calibration_speed.py DATASET --phantom
+lego`.
 
-Three figures, best and median of several runs with kernels compiled and files in the page cache:
-the fit alone (bead positions in, parameters out), everything from counts in memory, and everything
+Three figures, best and median of several runs with kernels compiled and files in the page
+cache: the fit alone (bead positions in, parameters out), everything from counts in memory, and
+    everything
 from the files. CPU seconds are given beside wall seconds, so that a busy machine shows.
 """
 
@@ -16,7 +18,11 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flexdt.library.calibration.calibrate import DatasetFrames, calibrate_datasets, find_phantom
+from flexdt.library.calibration.calibrate import (
+    DatasetFrames,
+    calibrate_datasets,
+    find_phantom,
+)
 from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.calibration.fit.fit import solve
 from flexdt.twin.calibration.pipeline import Scan, calibrate
@@ -43,7 +49,9 @@ def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
     outcome = calibrate_datasets([dataset], phantom)
     fit = outcome.calibration.fit
     if fit is None:
-        raise TwinError(f"{folder}: no calibration comes of this data set: nothing to time")
+        raise TwinError(
+            f"{folder}: no calibration comes of this data set: nothing to time"
+        )
     problem = fit.problem
     model = find_phantom(phantom)
     frames = DatasetFrames(dataset)
@@ -107,7 +115,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         row = document[name]
         assert isinstance(row, dict)
         print(
-            f"{what:30} best {1e3 * row['best_s']:9.2f} ms   median {1e3 * row['median_s']:9.2f} "
+            f"{what:30} best {1e3 * row['best_s']:9.2f} ms   median "
+            f"{1e3 * row['median_s']:9.2f} "
             f"ms   CPU {1e3 * row['cpu_s']:9.2f} ms"
         )
     return 0

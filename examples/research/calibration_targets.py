@@ -2,9 +2,9 @@
 
 `python examples/research/calibration_targets.py FOLDER...` reads what `flexdt study --out`,
 `robustness.py --out` and `calibration_speed.py --json` wrote under the folders. `--run points`
-(seconds) or `--run images` (hours) first runs the studies that are missing, into the first folder.
-A figure that is missing is listed with the command that makes it. Exit code 1 if a target is
-missed.
+(seconds) or `--run images` (hours) first runs the studies that are missing, into the first
+folder. A figure that is missing is listed with the command that makes it. Exit code 1 if a
+target is missed.
 """
 
 from __future__ import annotations
@@ -77,10 +77,16 @@ def _solved(limit: float, without: tuple[str, ...] = ()) -> Callable[[Document],
 def _refused(document: Document) -> Reading:
     (row,) = (r for r in document["rows"] if r["setting"] == "1")
     text = f"{row['unidentifiable']}/{row['runs']} reported unidentifiable"
-    return text, row["unidentifiable"] == row["runs"], f"{_thesis([row])}, given as numbers"
+    return (
+        text,
+        row["unidentifiable"] == row["runs"],
+        f"{_thesis([row])}, given as numbers",
+    )
 
 
-def _in_images(row_limit: float, run_limit: float | None) -> Callable[[Document], Reading]:
+def _in_images(
+    row_limit: float, run_limit: float | None
+) -> Callable[[Document], Reading]:
     """MAE of each row, and of each run; one bead is to be refused, one placement is weak."""
 
     def read(document: Document) -> Reading:
@@ -89,8 +95,15 @@ def _in_images(row_limit: float, run_limit: float | None) -> Callable[[Document]
         mae = max((r["mae"] for r in rows if r["mae"] is not None), default=1.0)
         worst = max((r["mae_max"] for r in rows if r["mae_max"] is not None), default=1.0)
         good = all(r["success"] == r["runs"] for r in rows)
-        rest = all(r["unidentifiable"] + r["weak"] >= r["runs"] for r in _only(document, alone))
-        met = good and rest and mae <= row_limit and (run_limit is None or worst <= run_limit)
+        rest = all(
+            r["unidentifiable"] + r["weak"] >= r["runs"] for r in _only(document, alone)
+        )
+        met = (
+            good
+            and rest
+            and mae <= row_limit
+            and (run_limit is None or worst <= run_limit)
+        )
         return f"MAE of a row {mae:.1g}, of a run {worst:.1g}", met, _thesis(rows)
 
     return read
@@ -148,7 +161,8 @@ def _study(experiment: str, fidelity: str) -> tuple[str, str]:
 
 _ROBUST = "python examples/research/robustness.py --out DIR"
 _BENCH = (
-    "python examples/research/calibration_speed.py DATASET --phantom lego --json > DIR/bench.json"
+    "python examples/research/calibration_speed.py DATASET --phantom lego --json > "
+    "DIR/bench.json"
 )
 TARGETS: Final = (
     Target("exact points, K = 2 to 7: all recovered, MAE < 1e-9, <= 8 iterations",
@@ -198,7 +212,11 @@ def collected(folders: Sequence[Path]) -> dict[str, Document]:
         if not isinstance(document, dict):
             continue
         match document:
-            case {"experiment": str(experiment), "fidelity": str(fidelity), "rows": list()}:
+            case {
+                "experiment": str(experiment),
+                "fidelity": str(fidelity),
+                "rows": list(),
+            }:
                 out[f"{experiment}-{fidelity}"] = document
             case {"camera": str(camera), "share_pct": float()}:
                 out[f"coverage_{camera}"] = document
@@ -210,7 +228,8 @@ def collected(folders: Sequence[Path]) -> dict[str, Document]:
 
 
 def targets_table(found: Mapping[str, Document]) -> list[tuple[str, str, str, str]]:
-    """Rows (target, ours, thesis, met): yes, NO, or missing, then with the command for `ours`."""
+    """Rows (target, ours, thesis, met): yes, NO, or missing, then with the command for
+    `ours`."""
     out = []
     for target in TARGETS:
         document = found.get(target.source)
@@ -229,7 +248,9 @@ def run_missing(folder: Path, found: Mapping[str, Document], images: bool) -> No
     """Run the studies that are missing, into a folder."""
     from flexdt_extensions.studies.study import run_study
 
-    for source in dict.fromkeys(t.source for t in TARGETS if t.command.startswith("flexdt study")):
+    for source in dict.fromkeys(
+        t.source for t in TARGETS if t.command.startswith("flexdt study")
+    ):
         experiment, _, fidelity = source.partition("-")
         if source not in found and (images or fidelity in QUICK):
             print(f"running {source}", file=sys.stderr, flush=True)
@@ -247,7 +268,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         run_missing(folders[0], collected(folders), args.run == "images")
     for folder in folders:
         if not folder.is_dir():
-            print(f"{folder}: no such folder; allowed: where studies were written", file=sys.stderr)
+            print(
+                f"{folder}: no such folder; allowed: where studies were written",
+                file=sys.stderr,
+            )
             return 1
     rows = targets_table(collected(folders))
     print("| target | ours | thesis | met |\n|---|---|---|---|")

@@ -1,11 +1,13 @@
 """Does a spoilt scan get the right name, and is none offered that is wrong?
 
-`python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--json]` spoils scans
-of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates each and says whether the
-cause was named right, vaguely or not at all, and how many sigmas the worst of an answer that was
-offered is off. More than four is a confident wrong answer, and the command fails.
+`python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--json]` spoils
+scans of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates each and says
+whether the cause was named right, vaguely or not at all, and how many sigmas the worst of an
+answer that was offered is off. More than four is a confident wrong answer, and the command
+fails.
 
-Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in them.
+Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in
+them.
 """
 
 from __future__ import annotations
@@ -24,8 +26,18 @@ from faults_drawn import KINDS, Faulty, drawn
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import image_quantities
-from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames, nothing
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.frame_source import (
+    FrameSpots,
+    FrameState,
+    SpotFrames,
+    nothing,
+)
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -90,7 +102,9 @@ def calibrated(
         outlines = replace(spots, bias=np.ones(len(frame)))
         looks.append(FrameSpots(outlines, FrameState.USABLE))
     b = scan.believed
-    poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles))
+    poses = Poses.upright(
+        [0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles)
+    )
     request = CalibrationRequest(
         free=tuple(dict.fromkeys((*b.free, *free))), start=Offsets.from_edge(b.held),
         priors=b.priors, second_look=False, per_frame=per_frame,
@@ -160,7 +174,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
     all_of_them = [
-        scored(kind, args.seed + i) for kind in args.kinds.split(",") for i in range(args.each)
+        scored(kind, args.seed + i)
+        for kind in args.kinds.split(",")
+        for i in range(args.each)
     ]
     wrong = [s for s in all_of_them if s.wrong]
     right = sum(s.verdict == "right" for s in all_of_them)
@@ -177,7 +193,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1 if wrong else 0
     for s in all_of_them:
         if s.verdict != "right" or s.wrong:
-            print(f"{s.kind} {s.seed}: {s.verdict}, offered {s.offered}, {s.worst:.1f} {s.where}")
+            print(
+                f"{s.kind} {s.seed}: {s.verdict}, offered {s.offered}, {s.worst:.1f} {s.where}"
+            )
             for line in s.said:
                 print("   ", line)
     print(", ".join(f"{n} {v:.4g}" for n, v in summary.items()))

@@ -1,10 +1,12 @@
-"""Variance, sharpness, noise power and quantum efficiency of simulated images beside theory, and
-the scintillator's response beside published curves: figures and plots of docs/image-quality.md.
+"""Variance, sharpness, noise power and quantum efficiency of simulated images beside theory,
+and the scintillator's response beside published curves: figures and plots of
+docs/image-quality.md.
 
     python examples/research/detector_figures.py [--plots docs/images]
 
 Theory is formulas written here: Poisson photons of the tube's spectrum, each leaving a spread
-charge; a Gaussian for the light, a pixel's sinc, and noise folded back at the Nyquist frequency.
+charge; a Gaussian for the light, a pixel's sinc, and noise folded back at the Nyquist
+frequency.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ RIM = 8
 """Pixels at the edges that are left out: light from beyond them is that of the last pixel."""
 CSI, GOS = (Substance.of("", *what) for what in (("CsI", 4.51), ("Gd2O2S", 7.34)))
 
-# Mass energy-absorption coefficient [cm2/g]: Hubbell and Seltzer, NISTIR 5632, by way of xraylib
-# 4.3.0.
+# Mass energy-absorption coefficient [cm2/g]: Hubbell and Seltzer, NISTIR 5632, by way of
+# xraylib 4.3.0.
 MU_EN_KEV = np.array([20, 25, 30, 40, 60, 70, 80, 100, 120, 150, 200], float)
 MU_EN = {
     "CsI": [24.8752, 13.3768, 8.0383, 9.4122, 4.5840, 3.2508, 2.3969, 1.3892, 0.8742, 0.4936,
@@ -45,8 +47,8 @@ MU_EN = {
                0.3019],
 }  # fmt: skip
 # gVirtualXRay's curve for 0.6 mm of CsI (effepivi/gvxr-CMPB, Gate_data/responseDetector.txt): a
-# photon's energy and what it deposits [keV]. Nothing escapes there: a photon that interacts leaves
-# all it has.
+# photon's energy and what it deposits [keV]. Nothing escapes there: a photon that interacts
+# leaves all it has.
 GVXR = np.array([
     (20, 20.0), (25, 24.5), (30, 27.4), (32, 27.9), (34, 33.8), (40, 39.9), (50, 48.5), (60, 53.0),
     (70, 53.1), (80, 50.4), (100, 42.3), (120, 34.9), (150, 26.9), (190, 20.6),
@@ -76,7 +78,9 @@ class Theory:
     @classmethod
     def of(cls, pixel_mm: float, ms: float) -> Theory:
         panel = Detector()
-        fluence = tube_spectrum(KV, TubeModel()).fluence * POWER_W / KV * ms / 1000.0  # cm2, 1 m
+        fluence = (
+            tube_spectrum(KV, TubeModel()).fluence * POWER_W / KV * ms / 1000.0
+        )  # cm2, 1 m
         fluence = fluence * (1000.0 / FAR_MM) ** 2 * pixel_mm**2 / 100.0
         layer = Substance.of("", "CsI", 4.51 * panel.packing)
         kept = deposited(Filter(layer, panel.scintillator_mm))
@@ -88,8 +92,8 @@ class Theory:
                    panel.read_noise_e, well / 2.0**panel.bits)  # fmt: skip
 
     def shared(self, apart: int) -> float:
-        """Part of the noise's covariance that pixels so far apart have along one axis: the light's
-        spread, twice, over the overlap of two pixels."""
+        """Part of the noise's covariance that pixels so far apart have along one axis: the
+        light's spread, twice, over the overlap of two pixels."""
         x, wide = np.linspace(-1.0, 1.0, 4001), self.sigma * sqrt(2.0)
         spread = np.exp(-((x - apart) ** 2) / (2 * wide**2)) / (wide * sqrt(2 * pi))
         return float(np.trapezoid((1.0 - np.abs(x)) * spread, x))
@@ -98,7 +102,9 @@ class Theory:
     def own(self) -> float:
         """`shared(0)` in closed form."""
         wide = self.sigma * sqrt(2.0)
-        return erf(1 / (wide * sqrt(2))) - wide * sqrt(2 / pi) * (1 - exp(-1 / (2 * wide**2)))
+        return erf(1 / (wide * sqrt(2))) - wide * sqrt(2 / pi) * (
+            1 - exp(-1 / (2 * wide**2))
+        )
 
     @property
     def variance_counts(self) -> float:
@@ -121,7 +127,8 @@ class Theory:
 
 
 def images(pixel_mm: float, ms: float, count: int, side: int, seed: int) -> np.ndarray:
-    """Flat images without the fixed pattern, (count, side, side) [counts above the dark level]."""
+    """Flat images without the fixed pattern, (count, side, side) [counts above the dark
+    level]."""
     geometry = fx.ConeVec.from_vectors(
         np.tile([0.0, -600.0, 0.0], (count, 1)), (0, FAR_MM - 600.0, 0), (pixel_mm, 0, 0),
         (0, 0, -pixel_mm),
@@ -144,19 +151,25 @@ def variance_curve(side: int = 256) -> dict[str, list[tuple[float, float, float]
         for k, ms in enumerate(EXPOSURES_MS):
             stack = images(pixel, ms, 10, side, 100 + k)
             spread = float(stack.var(axis=0, ddof=1).mean())
-            rows.append((float(stack.mean()), spread, Theory.of(pixel, ms).variance_counts))
+            rows.append(
+                (float(stack.mean()), spread, Theory.of(pixel, ms).variance_counts)
+            )
         found[name] = rows
     return found
 
 
-def noise_power(pixel: float, count: int = 80, side: int = 256) -> tuple[np.ndarray, np.ndarray]:
+def noise_power(
+    pixel: float, count: int = 80, side: int = 256
+) -> tuple[np.ndarray, np.ndarray]:
     """Frequency [cycles a pixel] and noise power along an axis over the mean squared [mm2]."""
     stack = images(pixel, TIME_MS, count, side, 7)
     rest = (stack - stack.mean(axis=0)) * sqrt(count / (count - 1))  # no pattern
     n = side // BLOCK
     blocks = rest.reshape(count, n, BLOCK, n, BLOCK).transpose(0, 1, 3, 2, 4)
     window = np.hanning(BLOCK + 2)[1:-1]
-    window = np.outer(window, window)  # or much of the low frequencies leaks into the high
+    window = np.outer(
+        window, window
+    )  # or much of the low frequencies leaks into the high
     power = (np.abs(np.fft.fft2(blocks * window)) ** 2).mean(axis=(0, 1, 2))
     power /= (window**2).sum()
     near = [0, 1, -1]  # next to no change along the other axis
@@ -166,16 +179,22 @@ def noise_power(pixel: float, count: int = 80, side: int = 256) -> tuple[np.ndar
 
 
 def edge(pixel: float, rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency [cycles a pixel] and modulation, from a sheet of tungsten slanted by 3 degrees."""
+    """Frequency [cycles a pixel] and modulation, from a sheet of tungsten slanted by 3
+    degrees."""
     c, s = np.cos(np.deg2rad(3.0)), np.sin(np.deg2rad(3.0))
     geometry = fx.ConeVec.from_vectors(
-        [[0, -600, 0]], (0, FAR_MM - 600, 0), (pixel * c, 0, pixel * s), (pixel * s, 0, -pixel * c)
+        [[0, -600, 0]],
+        (0, FAR_MM - 600, 0),
+        (pixel * c, 0, pixel * s),
+        (pixel * s, 0, -pixel * c),
     )
     sheet = {"kind": "box", "center": [50, 400, 0], "size": [100, 0.1, 120],
              "material": "W@19.3"}  # fmt: skip
     sharp = fx.Tube(kV=KV, power_W=POWER_W, spot_mm=0.0)
     detector = fx.Detector(gain_sigma=0.0, dead_fraction=0.0, offset_sigma_counts=0.0)
-    scan = fx.simulate(sheet, geometry, tube=sharp, detector=detector, shape=(160, 120), rays=rays)
+    scan = fx.simulate(
+        sheet, geometry, tube=sharp, detector=detector, shape=(160, 120), rays=rays
+    )
     response = edge_mtf(scan.counts(0))
     return response.frequency, response.modulation
 
@@ -200,15 +219,16 @@ def quality() -> dict[str, dict[str, np.ndarray]]:
 
 
 def thin_response(material: str) -> tuple[np.ndarray, np.ndarray]:
-    """Mass energy-absorption coefficient that a layer of 0.1 um has here, and the published one."""
+    """Mass energy-absorption coefficient that a layer of 0.1 um has here, and the published
+    one."""
     substance = {"CsI": CSI, "Gd2O2S": GOS}[material]
     part = deposited(Filter(substance, 1e-4)).mean / (substance.density_g_cm3 * 1e-5)
     return np.interp(MU_EN_KEV, tables().energy_keV, part), np.array(MU_EN[material])
 
 
 def thick_response() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Energy left in 0.6 mm of CsI [keV] at `GVXR`'s energies: here if nothing escaped, here, and
-    published."""
+    """Energy left in 0.6 mm of CsI [keV] at `GVXR`'s energies: here if nothing escaped, here,
+    and published."""
     energy = tables().energy_keV
     stopped = energy * -np.expm1(-CSI.attenuation() * 0.6)
     kept = energy * deposited(Filter(CSI, 0.6)).mean
@@ -253,7 +273,9 @@ def draw(found: dict[str, dict[str, np.ndarray]], curve: dict, folder: Path) -> 
 
     plt.rcParams["font.size"] = 9
     figure, axes = plt.subplots(2, 2, figsize=(9, 6.6), layout="constrained")
-    for (name, one), colour in zip(found.items(), ("tab:blue", "tab:orange"), strict=True):
+    for (name, one), colour in zip(
+        found.items(), ("tab:blue", "tab:orange"), strict=True
+    ):
         per_mm = one["f"] / one["pixel"]
         mean, variance, theory = np.array(curve[name]).T
         axes[0, 0].plot(mean, theory, "-", color=colour, label=f"theory, {name}")
@@ -263,9 +285,13 @@ def draw(found: dict[str, dict[str, np.ndarray]], curve: dict, folder: Path) -> 
         axes[0, 1].plot(at, one["mtf_theory"][below], "-", color=colour)
         label = f"{name}, {RAYS} x {RAYS} rays"
         axes[0, 1].plot(at, one["mtf"][below], "o", ms=3, color=colour, label=label)
-        axes[0, 1].plot(at, one["mtf_one_ray"][below], ":", color=colour, label="one ray a pixel")
+        axes[0, 1].plot(
+            at, one["mtf_one_ray"][below], ":", color=colour, label="one ray a pixel"
+        )
         for axis, key in ((axes[1, 0], "power"), (axes[1, 1], "dqe")):
-            axis.plot(per_mm, one[f"{key}_theory"], "-", color=colour, label=f"theory, {name}")
+            axis.plot(
+                per_mm, one[f"{key}_theory"], "-", color=colour, label=f"theory, {name}"
+            )
             axis.plot(per_mm, one[key], "o", ms=3, color=colour, label="images")
     texts = (
         ("mean above dark [counts]", "variance [counts$^2$]", "Variance"),
@@ -285,16 +311,27 @@ def _draw_response(plt: ModuleType, folder: Path) -> None:
     figure, (thin, thick) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     energy = tables().energy_keV
     shown = (energy > 18) & (energy < 205)
-    for substance, name, colour in ((CSI, "CsI", "tab:blue"), (GOS, "Gd2O2S", "tab:orange")):
+    for substance, name, colour in (
+        (CSI, "CsI", "tab:blue"),
+        (GOS, "Gd2O2S", "tab:orange"),
+    ):
         part = deposited(Filter(substance, 1e-4)).mean / (substance.density_g_cm3 * 1e-5)
-        thin.semilogy(energy[shown], part[shown], "-", color=colour, label=f"{name}, here")
+        thin.semilogy(
+            energy[shown], part[shown], "-", color=colour, label=f"{name}, here"
+        )
         thin.plot(MU_EN_KEV, MU_EN[name], "o", ms=4, color=colour, label="NIST")
-    thin.set(xlabel="keV", ylabel="part of the energy kept [cm$^2$/g]", title="Thin layers")
+    thin.set(
+        xlabel="keV", ylabel="part of the energy kept [cm$^2$/g]", title="Thin layers"
+    )
     kept = energy * deposited(Filter(CSI, 0.6)).mean
     stopped = energy * -np.expm1(-CSI.attenuation() * 0.6)
-    thick.plot(energy[shown], stopped[shown], ":", color="tab:blue", label="if nothing escaped")
+    thick.plot(
+        energy[shown], stopped[shown], ":", color="tab:blue", label="if nothing escaped"
+    )
     thick.plot(energy[shown], kept[shown], "-", color="tab:blue", label="here")
-    thick.plot(*GVXR.T, "o", ms=4, color="tab:green", label="gVirtualXRay (nothing escapes)")
+    thick.plot(
+        *GVXR.T, "o", ms=4, color="tab:green", label="gVirtualXRay (nothing escapes)"
+    )
     thick.set(xlabel="keV", ylabel="energy kept of a photon [keV]", title="0.6 mm of CsI")
     for axis in (thin, thick):
         axis.legend(fontsize=7)

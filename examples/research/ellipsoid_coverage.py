@@ -48,7 +48,9 @@ class Draw:
     warnings: tuple[str, ...]
 
 
-def draw(seed: int, model: BeadModel, scene: Scene, camera: Rendering, frames: int = 36) -> Draw:
+def draw(
+    seed: int, model: BeadModel, scene: Scene, camera: Rendering, frames: int = 36
+) -> Draw:
     """Make, calibrate and compare one scan.
 
     Args:

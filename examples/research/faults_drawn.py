@@ -22,7 +22,14 @@ Rng = np.random.Generator
 PIXEL: Final = 0.1496
 SHAPE: Final = (760, 956)
 SIX: Final = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
-RANGE: Final = {"dO_x": 4.0, "dO_y": 4.0, "dO_z": 12.0, "alpha": 180.0, "tau_x": 2.0, "tau_z": 2.0}
+RANGE: Final = {
+    "dO_x": 4.0,
+    "dO_y": 4.0,
+    "dO_z": 12.0,
+    "alpha": 180.0,
+    "tau_x": 2.0,
+    "tau_z": 2.0,
+}
 TOUCHING: Final = 8
 """Points of an outline that are projected."""
 
@@ -107,7 +114,14 @@ def in_images(world: World) -> dict[str, float]:
     tau = np.array([still.get("tau_x", 0.0), still.get("tau_z", 0.0), 0.0])
     reach = 0.5
     points = tau + np.array(
-        [[0, 0, 9.0], [0, 0, -9.0], [reach, 0, 0], [-reach, 0, 0], [0, reach, 0], [0, -reach, 0]]
+        [
+            [0, 0, 9.0],
+            [0, 0, -9.0],
+            [reach, 0, 0],
+            [-reach, 0, 0],
+            [0, reach, 0],
+            [0, -reach, 0],
+        ]
     )
     first = replace(
         world, beads=points, radii=np.full(6, 1e-4), offsets=still, angles=world.angles[:1],
@@ -124,8 +138,8 @@ def in_images(world: World) -> dict[str, float]:
 
 
 def shadows(world: World) -> tuple[Array, Array]:
-    """Centres (n, k, 2) and radii (n, k) [px] of the outlines of the balls' shadows, the means of
-    each exposure.
+    """Centres (n, k, 2) and radii (n, k) [px] of the outlines of the balls' shadows, the means
+    of each exposure.
 
     The source is near the origin, the beam along +y, z up; a growing angle turns the object
     clockwise seen from above.
@@ -137,17 +151,24 @@ def shadows(world: World) -> tuple[Array, Array]:
             shadows(replace(world, angles=world.angles + 0.5 * world.arc * p, arc=0.0))
             for p in points
         ]
-        both = [sum(w * part[i] for w, part in zip(weights / 2, some, strict=True)) for i in (0, 1)]
+        both = [
+            sum(w * part[i] for w, part in zip(weights / 2, some, strict=True))
+            for i in (0, 1)
+        ]
         return np.asarray(both[0]), np.asarray(both[1])
     n = len(world.angles)
 
     def of(name: str) -> Array:
-        return np.broadcast_to(np.asarray(world.offsets.get(name, 0.0), dtype=float), (n,))
+        return np.broadcast_to(
+            np.asarray(world.offsets.get(name, 0.0), dtype=float), (n,)
+        )
 
     zero = np.zeros(n)
     tau = np.stack([of("tau_x"), of("tau_z"), zero], axis=1)
     foot = np.stack([of("dO_x"), world.sod + of("dO_z"), of("dO_y")], axis=1) + tau
-    spin = Rotation.from_rotvec(np.outer(-np.radians(world.angles + of("alpha")), [0, 0, 1]))
+    spin = Rotation.from_rotvec(
+        np.outer(-np.radians(world.angles + of("alpha")), [0, 0, 1])
+    )
     lean = Rotation.from_rotvec(np.outer(np.radians(of("axis_tilt_z")), [0, 1, 0]))
     lean = lean * Rotation.from_rotvec(np.outer(np.radians(of("axis_tilt_x")), [1, 0, 0]))
     steps = np.tile(world.pixel * np.array([[1.0, 0, 0], [0, 0, -1.0]]), (n, 1, 1))
@@ -156,7 +177,9 @@ def shadows(world: World) -> tuple[Array, Array]:
         axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
         turn = Rotation.from_rotvec(np.radians(of(name))[:, None] * axis)
         steps = np.stack([turn.apply(steps[:, 0]), turn.apply(steps[:, 1])], axis=1)
-    panel = np.stack([of("dD_x"), world.sdd + of("dD_z"), of("dD_y")], axis=1) - world.spot
+    panel = (
+        np.stack([of("dD_x"), world.sdd + of("dD_z"), of("dD_y")], axis=1) - world.spot
+    )
     centres = np.empty((n, len(world.beads), 2))
     radii = np.empty((n, len(world.beads)))
     round_ = 2 * math.pi * np.arange(TOUCHING) / TOUCHING
@@ -175,7 +198,8 @@ def shadows(world: World) -> tuple[Array, Array]:
             )
             s, a, b = inverse @ touch.T
             u, v = a / s, b / s
-            # u^2 + B u v + C v^2 + D u + E v + F = 0, of which the gradient vanishes in the middle
+            # u^2 + B u v + C v^2 + D u + E v + F = 0, of which the gradient vanishes in the
+            # middle
             mu, mv = u.mean(), v.mean()
             p, q = u - mu, v - mv
             rows = np.stack([p * q, q * q, p, q, np.ones_like(p)], axis=1)
@@ -219,17 +243,31 @@ def drawn(kind: str, seed: int) -> Faulty:
     offsets = {name: float(rng.uniform(-r, r)) for name, r in RANGE.items()}
     sod, sdd = float(rng.uniform(540, 640)), float(rng.uniform(1000, 1100))
     world = World(
-        beads, radii, offsets, angles, np.zeros((n, 3)), np.ones((n, k), dtype=bool), sod, sdd
+        beads,
+        radii,
+        offsets,
+        angles,
+        np.zeros((n, 3)),
+        np.ones((n, k), dtype=bool),
+        sod,
+        sdd,
     )
     draft = KINDS[kind](
-        Draft(world, Believed(beads, radii, angles, sod, sdd), float(rng.uniform(0.005, 0.04))), rng
+        Draft(
+            world,
+            Believed(beads, radii, angles, sod, sdd),
+            float(rng.uniform(0.005, 0.04)),
+        ),
+        rng,
     )
     centres, sizes = shadows(draft.world)
     spots: list[Array | None] = []
     for place, size, shown in zip(centres, sizes, draft.world.shown, strict=True):
         rows = np.column_stack([place, size])[shown]
         rows[:, :2] += draft.noise_px * rng.normal(size=(len(rows), 2))
-        inside = (rows[:, :2] > 0).all(axis=1) & (rows[:, :2] < [SHAPE[1], SHAPE[0]]).all(axis=1)
+        inside = (rows[:, :2] > 0).all(axis=1) & (rows[:, :2] < [SHAPE[1], SHAPE[0]]).all(
+            axis=1
+        )
         spots.append(rng.permutation(rows[inside]))
     if draft.after is not None:
         spots = draft.after(spots)
@@ -282,7 +320,9 @@ def _low_dose(draft: Draft, rng: Rng) -> Draft:
     return replace(draft, silent=True, noise_px=float(rng.uniform(0.05, 0.09)))
 
 
-def _offset(name: str, low: float, high: float, *names: str, silent: bool = False) -> Fault:
+def _offset(
+    name: str, low: float, high: float, *names: str, silent: bool = False
+) -> Fault:
     """The scanner is off in one parameter by `low` to `high`; right is one of `names` named."""
 
     def fault(draft: Draft, rng: Rng) -> Draft:
@@ -376,7 +416,9 @@ def _angles(
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         angles = change(draft.world.angles, rng)
-        return replace(draft, world=replace(draft.world, angles=angles), names=names, beside=beside)
+        return replace(
+            draft, world=replace(draft.world, angles=angles), names=names, beside=beside
+        )
 
     return fault
 
@@ -423,7 +465,9 @@ def _swapped_frames(draft: Draft, rng: Rng) -> Draft:
     return replace(draft, after=after, names=(rf"frames_inconsistent.*\b({a}|{b})\b",))
 
 
-def _beads(draft: Draft, beads: Array, *names: str, beside: tuple[str, ...] = ()) -> Draft:
+def _beads(
+    draft: Draft, beads: Array, *names: str, beside: tuple[str, ...] = ()
+) -> Draft:
     radii = np.full(len(beads), draft.world.radii[0])
     shown = np.ones((len(draft.world.angles), len(beads)), dtype=bool)
     world = replace(draft.world, beads=beads, radii=radii, shown=shown)
@@ -442,7 +486,9 @@ def _lost(count: int) -> Fault:
 
 def _extra(draft: Draft, rng: Rng) -> Draft:
     more = rng.uniform([-10, -10, -22], [10, 10, 22], size=(int(rng.integers(1, 3)), 3))
-    return _beads(draft, np.concatenate([draft.world.beads, more]), "extra_spots", beside=OTHERS)
+    return _beads(
+        draft, np.concatenate([draft.world.beads, more]), "extra_spots", beside=OTHERS
+    )
 
 
 def _displaced(draft: Draft, rng: Rng) -> Draft:
@@ -450,12 +496,18 @@ def _displaced(draft: Draft, rng: Rng) -> Draft:
     one = int(rng.integers(len(beads)))
     way = rng.normal(size=3)
     beads[one] += way / np.linalg.norm(way) * rng.uniform(0.3, 1.5)
-    return _beads(draft, beads, rf"(bead_displaced|bead_tolerance).*\b{one}\b", beside=OTHERS)
+    return _beads(
+        draft, beads, rf"(bead_displaced|bead_tolerance).*\b{one}\b", beside=OTHERS
+    )
 
 
 def _tolerance(draft: Draft, rng: Rng) -> Draft:
-    beads = draft.world.beads + rng.uniform(0.03, 0.1) * rng.normal(size=draft.world.beads.shape)
-    return _beads(draft, beads, "bead_tolerance|bead_errors", beside=(*OTHERS, "bead_displaced"))
+    beads = draft.world.beads + rng.uniform(0.03, 0.1) * rng.normal(
+        size=draft.world.beads.shape
+    )
+    return _beads(
+        draft, beads, "bead_tolerance|bead_errors", beside=(*OTHERS, "bead_displaced")
+    )
 
 
 def _tolerance_and_roll(draft: Draft, rng: Rng) -> Draft:
@@ -543,7 +595,9 @@ def _distorted(terms: str) -> Fault:
                 return np.stack([x * square, y * square], axis=1)
             if terms == "decentred":
                 across = one * (square + 2 * x * x) + 2 * two * x * y
-                return np.stack([across, two * (square + 2 * y * y) + 2 * one * x * y], axis=1)
+                return np.stack(
+                    [across, two * (square + 2 * y * y) + 2 * one * x * y], axis=1
+                )
             powers = [x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
             return np.asarray((bent @ np.array(powers)).T / 2)
 
@@ -591,7 +645,9 @@ def _binned(draft: Draft, rng: Rng) -> Draft:
     """Pixels are really of another size than is said."""
     world = replace(draft.world, pixel=draft.world.pixel * float(rng.choice([0.5, 1.6])))
     return replace(
-        draft, world=world, names=("bead_size|no_beads|implausible_offset|wrong_phantom.*radius",)
+        draft,
+        world=world,
+        names=("bead_size|no_beads|implausible_offset|wrong_phantom.*radius",),
     )
 
 
@@ -652,7 +708,9 @@ def _strained(kind: str) -> Fault:
         draft = _usual(draft, rng)
         size = _sign(rng) * math.exp(rng.uniform(math.log(5e-4), math.log(1e-2)))
         change = np.eye(3)
-        i, j = {"x": (0, 0), "y": (1, 1), "z": (2, 2), "shear": (0, 1), "lean": (0, 2)}[kind]
+        i, j = {"x": (0, 0), "y": (1, 1), "z": (2, 2), "shear": (0, 1), "lean": (0, 2)}[
+            kind
+        ]
         change[i, j] += size
         if kind == "shear":
             change[1, 0] += size
@@ -683,8 +741,8 @@ def _exposed_as_said(draft: Draft, rng: Rng) -> Draft:
 
 
 def _renumbered(shift: int) -> Fault:
-    """From a frame on, images are those of `shift` frames later: -1 where one was doubled, 1 where
-    one was lost."""
+    """From a frame on, images are those of `shift` frames later: -1 where one was doubled, 1
+    where one was lost."""
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         draft = _usual(draft, rng)
@@ -745,7 +803,9 @@ def _grows(draft: Draft, rng: Rng) -> Draft:
     n = len(draft.world.angles)
     # All its lengths, so its distance too, are those of any frame.
     world = replace(draft.world, size=1.0 + size * np.linspace(-0.5, 0.5, n))
-    dO_z = draft.world.offsets["dO_z"] + 0.5 * size * draft.world.sod * np.array([-1.0, 1.0])
+    dO_z = draft.world.offsets["dO_z"] + 0.5 * size * draft.world.sod * np.array(
+        [-1.0, 1.0]
+    )
     return replace(draft, world=world, names=(f"{MOVES}|grows",), beside=OTHERS,
                    truth={"dO_z": dO_z})  # fmt: skip
 

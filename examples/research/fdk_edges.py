@@ -3,17 +3,18 @@
 Four tables. A detector moved aside, level and turned about the vertical, with an object out to
 0.95 of the field of view: mean error of flat regions. Objects wider than the panel (cylinders,
 boxes, a hexagon, a triangle, and random ellipses with other materials in them): error in the
-middle, at half the field of view's radius and near its border. Drawn ellipses, boxes and irregular
-polygons wider than the panel with things of drawn sizes in them (`--count` of each): how many are
-right within 1 % at half the radius, how many are warned of, how many of these were right (false
-alarms), and how many are neither. Panels
+middle, at half the field of view's radius and near its border. Drawn ellipses, boxes and
+irregular polygons wider than the panel with things of drawn sizes in them (`--count` of each):
+how many are right within 1 % at half the radius, how many are warned of, how many of these were
+right (false alarms), and how many are neither. Panels
 rolled, pitched and yawed, with a ball that holds eight smaller ones: mean error and root mean
 square error of voxels away from surfaces, width of the smaller balls' edges (10 to 90 %), and
 noise. Projections are exact path lengths of the solids, means of 3 x 3 rays a pixel in the last
 table.
 
-`--rtk` does the same with itk-rtk's FDK (`pip install itk-rtk`) and writes its figures behind ours:
-its weights for displaced detectors; for wide objects its filter's truncation correction of 0.5. The
+`--rtk` does the same with itk-rtk's FDK (`pip install itk-rtk`) and writes its figures behind
+ours: its weights for displaced detectors; for wide objects its filter's truncation correction
+    of 0.5. The
 first table has RTK for level panels only, the third none. `--only tilted` (or `aside`, `wider`,
 `told`) makes one table.
 """
@@ -130,7 +131,9 @@ def layer() -> tuple[FloatArray, FloatArray]:
 
 
 def moved_aside(views: int, rtk: bool) -> None:
-    print("detector moved aside by a part of its half width; object out to 0.95 of the field")
+    print(
+        "detector moved aside by a part of its half width; object out to 0.95 of the field"
+    )
     print(
         "shift "
         + "".join(f"{f'yaw {yaw} deg':>14}" for yaw in (0, 20, -40))
@@ -140,7 +143,9 @@ def moved_aside(views: int, rtk: bool) -> None:
         line, theirs = f"{part:5.2f} ", ""
         for yaw in np.deg2rad((0.0, 20.0, -40.0)):
             far = max(
-                np.arctan2((part + s) * HALF * np.cos(yaw), SDD + (part + s) * HALF * np.sin(yaw))
+                np.arctan2(
+                    (part + s) * HALF * np.cos(yaw), SDD + (part + s) * HALF * np.sin(yaw)
+                )
                 for s in (1.0, -1.0)
             )
             radius = 0.95 * SOD * np.sin(abs(far))
@@ -177,8 +182,8 @@ INSIDE = {
     "five voids": (5, (0.15, 0.35), (-1.0, -0.6)),
     "five large voids": (5, (0.2, 0.5), (-1.0, -0.8)),
 }
-"""How many ellipses, their half axes over the field of view's radius, and their attenuation over
-the object's own; where voids overlap, a voxel may have less than none."""
+"""How many ellipses, their half axes over the field of view's radius, and their attenuation
+over the object's own; where voids overlap, a voxel may have less than none."""
 
 
 def put_in(
@@ -203,11 +208,15 @@ def wider(views: int, rtk: bool) -> None:
     print("\nobjects wider than the panel, error of the attenuation at r / field of view")
     print(f"{'':34}   0.0      0.5      0.9" + "        RTK: 0.0      0.5      0.9" * rtk)
     geometry, r = scan(views), distance()
-    rings = [(r >= low) & (r < high) for low, high in ((0.0, 0.15), (0.4, 0.6), (0.8, 0.95))]
+    rings = [
+        (r >= low) & (r < high) for low, high in ((0.0, 0.15), (0.4, 0.6), (0.8, 0.95))
+    ]
 
     def row(name: str, solids: list[Solid], even: npt.NDArray[np.bool_]) -> FloatArray:
         found = layers(solids, geometry, FIELD, rtk, wide=True)
-        errors = np.array([100 * (f[ring & even].mean() - 1.0) for f in found for ring in rings])
+        errors = np.array(
+            [100 * (f[ring & even].mean() - 1.0) for f in found for ring in rings]
+        )
         if name:
             print(f"{name:34}{figures(errors)}")
         return errors
@@ -236,7 +245,9 @@ def wider(views: int, rtk: bool) -> None:
         solids = [Solid(Ellipsoid((*place.tolist(), 0.0), (*half, 1e5)), "a", MU)]
         outer = ((x - place[0]) / half[0]) ** 2 + ((y - place[1]) / half[1]) ** 2
         even = outer < 0.95
-        even &= put_in(solids, int(rng.integers(0, 5)), *INSIDE["three of any density"][1:], rng)
+        even &= put_in(
+            solids, int(rng.integers(0, 5)), *INSIDE["three of any density"][1:], rng
+        )
         worst.append(np.abs(row("", solids, even)))
     print(f"{'20 random ones, median':34}{figures(np.median(worst, 0))}")
     print(f"{'20 random ones, worst':34}{figures(np.max(worst, 0))}")
@@ -245,13 +256,18 @@ def wider(views: int, rtk: bool) -> None:
 def drawn(
     outline: str, inside: str, rng: np.random.Generator
 ) -> tuple[list[Solid], npt.NDArray[np.bool_]]:
-    """An object wider than the field of view, and where a layer of it is of its own material."""
+    """An object wider than the field of view, and where a layer of it is of its own
+    material."""
     x, y = layer()
     turn, place = rng.uniform(0.0, np.pi), FIELD * rng.uniform(-0.2, 0.2, 2)
     if outline == "polygon":
         corners = int(rng.integers(4, 9))
         turns = (
-            turn + 2 * np.pi * (np.arange(corners) + rng.uniform(-0.25, 0.25, corners)) / corners
+            turn
+            + 2
+            * np.pi
+            * (np.arange(corners) + rng.uniform(-0.25, 0.25, corners))
+            / corners
         )
         far = FIELD * rng.uniform(1.0, 1.9, corners)
     else:
@@ -261,7 +277,9 @@ def drawn(
     if outline == "ellipse":
         axes = tuple((float(a), float(b), 0.0) for a, b in zip(c[:2], s[:2], strict=True))
         body: Shape = Ellipsoid(
-            (*place.tolist(), 0.0), (*half.tolist(), 1e5), (axes[0], axes[1], (0.0, 0.0, 1.0))
+            (*place.tolist(), 0.0),
+            (*half.tolist(), 1e5),
+            (axes[0], axes[1], (0.0, 0.0, 1.0)),
         )
         u, v = x - place[0], y - place[1]
         along = [(u * c[i] + v * s[i]) / half[i] for i in (0, 1)]
@@ -271,7 +289,9 @@ def drawn(
         body = ConvexPolyhedron(
             (*normals, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), (*far.tolist(), 1e5, 1e5)
         )
-        even = np.all([a * x + b * y < d - 1 for a, b, d in zip(c, s, far, strict=True)], axis=0)
+        even = np.all(
+            [a * x + b * y < d - 1 for a, b, d in zip(c, s, far, strict=True)], axis=0
+        )
     solids = [Solid(body, "a", MU)]
     return solids, even & put_in(solids, *INSIDE[inside], rng)
 
@@ -288,7 +308,9 @@ def told(views: int, count: int) -> None:
             rows = []
             for seed in range(count):
                 kind = [OUTLINES.index(outline), list(INSIDE).index(inside)]
-                solids, even = drawn(outline, inside, np.random.default_rng([seed, *kind]))
+                solids, even = drawn(
+                    outline, inside, np.random.default_rng([seed, *kind])
+                )
                 images = project_scene(Scene(tuple(solids)), geometry, (2, COLS))
                 grid = Grid((1, CELLS, CELLS), 2.0 * FIELD / CELLS)
                 with warnings.catch_warnings(record=True) as said:
@@ -297,7 +319,8 @@ def told(views: int, count: int) -> None:
                 assert volume.bias_bound is not None
                 there = ring & even
                 mean, bound = (
-                    float(each[0][there].mean()) / MU for each in (volume.data, volume.bias_bound)
+                    float(each[0][there].mean()) / MU
+                    for each in (volume.data, volume.bias_bound)
                 )
                 rows.append([abs(mean - 1.0), bound, bool(said)])
             error, most, warned = np.array(rows).T
@@ -323,14 +346,19 @@ def tilted(views: int, rtk: bool) -> None:
     rng = np.random.default_rng(3)
     balls: list[tuple[FloatArray, float, float]] = []
     while len(balls) < 8:
-        place, radius = rng.uniform(-16, 16, 3) * (1.0, 1.0, 0.8), float(rng.uniform(2.5, 4.5))
+        place, radius = (
+            rng.uniform(-16, 16, 3) * (1.0, 1.0, 0.8),
+            float(rng.uniform(2.5, 4.5)),
+        )
         if np.linalg.norm(place) + radius < BODY - 2 and all(
             np.linalg.norm(place - p) > radius + r + 1.5 for p, r, _ in balls
         ):
             balls.append((place, radius, float(rng.choice([-0.8, -0.5, 0.6, 1.2]))))
     solids = [Solid(Sphere((0, 0, 0), BODY), "a", MU)]
     for (px, py, pz), radius, part in balls:
-        solids.append(Solid(Sphere((float(px), float(py), float(pz)), radius), "b", MU * part))
+        solids.append(
+            Solid(Sphere((float(px), float(py), float(pz)), radius), "b", MU * part)
+        )
     at = (np.arange(SIDE) - (SIDE - 1) / 2) * VOXEL
     z, y, x = np.meshgrid(at, at, at, indexing="ij")
     body = np.sqrt(x**2 + y**2 + z**2) - BODY
@@ -358,14 +386,18 @@ def tilted(views: int, rtk: bool) -> None:
         scan = ConeVec.circular(
             sod=SOD, sdd=SDD, angles=views, shape=(TALL, COLS), pixel=PITCH, tilts=tilts
         )
-        fine = ConeVec.from_vectors(scan.source, scan.detector, scan.u / rays, scan.v / rays)
+        fine = ConeVec.from_vectors(
+            scan.source, scan.detector, scan.u / rays, scan.v / rays
+        )
         many = project_scene(Scene(tuple(solids)), fine, (TALL * rays, COLS * rays))
         images = many.reshape(views, TALL, rays, COLS, rays).mean(axis=(2, 4))
         noise = rng.normal(0.0, 0.01, images.shape).astype(np.float32)
         line = f"{tilts!s:12}"
         for theirs in (False, True)[: 1 + rtk]:
             found, grain = (
-                by_rtk(im, scan, grid) if theirs else fdk(im, scan, grid, errors=False).data / MU
+                by_rtk(im, scan, grid)
+                if theirs
+                else fdk(im, scan, grid, errors=False).data / MU
                 for im in (images, noise)
             )
             error = 100 * (found - truth)[flat]
@@ -381,9 +413,13 @@ TABLES = ("aside", "wider", "told", "tilted")
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=int, default=360)
-    parser.add_argument("--rtk", action="store_true", help="itk-rtk's figures beside ours")
+    parser.add_argument(
+        "--rtk", action="store_true", help="itk-rtk's figures beside ours"
+    )
     parser.add_argument("--only", choices=TABLES, help="one table; default: all")
-    parser.add_argument("--count", type=int, default=10, help="drawn objects of each kind")
+    parser.add_argument(
+        "--count", type=int, default=10, help="drawn objects of each kind"
+    )
     options = parser.parse_args()
     if options.only in (None, "aside"):
         moved_aside(options.views, options.rtk)

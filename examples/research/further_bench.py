@@ -1,13 +1,13 @@
-"""What `flexdt bench` leaves out: the adjoint, scenes and meshes, FDK, growth, cold start, memory,
-what memory allows, and the way through the projector server.
+"""What `flexdt bench` leaves out: the adjoint, scenes and meshes, FDK, growth, cold start,
+memory, what memory allows, and the way through the projector server.
 
     python examples/research/further_bench.py --out out/further [--only FDK growth] [--no-peers]
 
-writes `bench.json`, of the form that `flexdt bench` writes: `docs/tools/bench_page.py` takes both.
-`--list` names what there is.
+writes `bench.json`, of the form that `flexdt bench` writes: `docs/tools/bench_page.py` takes
+both. `--list` names what there is.
 
-Growth is time against the number of rays, voxels along an edge and threads; the points of a curve
-are timed in rotation, so that a disturbance affects all of them alike.
+Growth is time against the number of rays, voxels along an edge and threads; the points of a
+curve are timed in rotation, so that a disturbance affects all of them alike.
 
 Scenes and meshes are compared with the same integrals in plain NumPy of double precision.
 """
@@ -206,7 +206,9 @@ def fdk_entry(
         if other is not None:
             other.close()
     entry["cpu_ms"] = _spent(ours, time.process_time, rounds=2)[1]
-    entry["errors_times"] = _spent(partial(ours, errors=True), time.process_time, rounds=2)[1]
+    entry["errors_times"] = _spent(
+        partial(ours, errors=True), time.process_time, rounds=2
+    )[1]
     entry["errors_times"] /= entry["cpu_ms"]
     entry["peak_MB"] = peak_bytes(ours) / 1e6
     return entry
@@ -264,8 +266,8 @@ def _middle_error(volume: Volume) -> float:
 
 
 def cold_start() -> list[Entry]:
-    """A new process until its first image, of 8^3 voxels on C1's detector: imports and `forward`
-    alone, its kernels on disk or compiled.
+    """A new process until its first image, of 8^3 voxels on C1's detector: imports and
+    `forward` alone, its kernels on disk or compiled.
     """
     code = (
         "import time; t = time.perf_counter(); "
@@ -282,7 +284,11 @@ def cold_start() -> list[Entry]:
         with tempfile.TemporaryDirectory() as folder:
             env = {**os.environ, **({"NUMBA_CACHE_DIR": folder} if "un" in name else {})}
             done = subprocess.run(
-                [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True
+                [sys.executable, "-c", code],
+                env=env,
+                capture_output=True,
+                text=True,
+                check=True,
             )
         ms = float(done.stdout) * 1e3
         entries.append(plain(name, ms, what))
@@ -366,8 +372,10 @@ BOUNDS = ("bound-C1", "bound-C2", "bound-C3", "bound-C1x36", "bound-C2x10", "bou
 def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
     """What memory allows, and what threads cannot share; all for one view but FDK's.
 
-    least: bytes that any method reads once; asked: those that ours asks for, of caches or memory.
-    bound_ms: `least` at the speed at which all threads read. cached_ms: with every voxel column in
+    least: bytes that any method reads once; asked: those that ours asks for, of caches or
+        memory.
+    bound_ms: `least` at the speed at which all threads read. cached_ms: with every voxel column
+        in
     one place, where it stays in the cache. cpu_ms: of all threads, as loads disturb it less.
     serial_ms: what one thread does beside the kernels, by its own clock.
     """
@@ -378,13 +386,24 @@ def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
         if name not in BOUNDS or not wanted(name):
             continue
         volume = case.volume()
-        box, rays = box_of(volume.layout), voxel_rays(case.geometry, volume.layout, case.shape)
+        box, rays = (
+            box_of(volume.layout),
+            voxel_rays(case.geometry, volume.layout, case.shape),
+        )
         out = np.empty((views, *case.shape), np.float32)
         call = partial(forward, volume, case.geometry, case.shape, out)
         same_place = partial(cpu.project, box._replace(hop_x=0, hop_y=0), rays, out)
-        asked = 4 * box.nz * np.mean([columns_passed(ray, box, case.shape[1]) for ray in rays])
-        entry = _bound(name, case.what, call, rate, volume.data.nbytes, float(asked), views)
-        entry["cached_ms"], entry["cached_cpu_ms"] = (x / views for x in _spent(same_place))
+        asked = (
+            4
+            * box.nz
+            * np.mean([columns_passed(ray, box, case.shape[1]) for ray in rays])
+        )
+        entry = _bound(
+            name, case.what, call, rate, volume.data.nbytes, float(asked), views
+        )
+        entry["cached_ms"], entry["cached_cpu_ms"] = (
+            x / views for x in _spent(same_place)
+        )
         with mock.patch.object(fan_kernels, "project_fans"):
             entry["serial_ms"] = _spent(call, time.thread_time)[1] / views
         entries.append(entry)
@@ -403,12 +422,15 @@ def columns_passed(ray: FloatArray, box: VoxelBox, cols: int) -> int:
     cuts = np.stack([-start / far, ((box.nx, box.ny) - start) / far])
     enter, leave = cuts.min(axis=0).max(axis=1), cuts.max(axis=0).min(axis=1)
     hit = enter < leave
-    ends = [np.floor(start + t[hit, None] * far[hit]) for t in (enter + 1e-9, leave - 1e-9)]
+    ends = [
+        np.floor(start + t[hit, None] * far[hit]) for t in (enter + 1e-9, leave - 1e-9)
+    ]
     return int(hit.sum() + np.abs(ends[1] - ends[0]).sum())
 
 
 def _fdk_bound(rate: float) -> Entry:
-    """FDK of `fdk_entry`: images are read once, or by each tile of voxel columns that they meet."""
+    """FDK of `fdk_entry`: images are read once, or by each tile of voxel columns that they
+    meet."""
     from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.feldkamp import backprojection, fdk_views
 
@@ -418,7 +440,10 @@ def _fdk_bound(rate: float) -> Entry:
     rows, cols = FDK_SHAPE
     x, y, _ = (np.sort(c)[[0, -1]] for c in grid.centers())
     tile = kernels.TILE
-    places = [np.linspace(*ends, n + 1) for ends, n in zip((x, y), grid.shape[:0:-1], strict=True)]
+    places = [
+        np.linspace(*ends, n + 1)
+        for ends, n in zip((x, y), grid.shape[:0:-1], strict=True)
+    ]
     px, py = np.meshgrid(places[0][::tile], places[1][::tile])
     asked = 0.0
     for g in fdk_views.view_table(geometry, (rows, cols)):
@@ -439,11 +464,22 @@ def _fdk_bound(rate: float) -> Entry:
 
 
 def _bound(
-    name: str, what: str, call: Callable[[], object], rate: float, least: int, asked: float, n: int
+    name: str,
+    what: str,
+    call: Callable[[], object],
+    rate: float,
+    least: int,
+    asked: float,
+    n: int,
 ) -> Entry:
     wall, cpu_ms = _spent(call)
     entry = plain(name, wall / n, what)
-    entry |= {"views": n, "cpu_ms": cpu_ms / n, "least_MB": least / 1e6, "asked_MB": asked / 1e6}
+    entry |= {
+        "views": n,
+        "cpu_ms": cpu_ms / n,
+        "least_MB": least / 1e6,
+        "asked_MB": asked / 1e6,
+    }
     entry["bound_ms"] = least / rate / 1e6
     entry["share"] = entry["bound_ms"] / entry["ms_per_view"]
     return entry
@@ -454,7 +490,8 @@ def _spent(
     clock: Callable[[], float] = time.process_time,
     rounds: int = 5,
 ) -> tuple[float, float]:
-    """Least time [ms] of some calls, after a first one, by the clock on the wall and by another."""
+    """Least time [ms] of some calls, after a first one, by the clock on the wall and by
+    another."""
     found = []
     for _ in range(rounds + 1):
         wall, own = time.perf_counter(), clock()
@@ -465,7 +502,8 @@ def _spent(
 
 
 def bodies() -> list[Entry]:
-    """Solids and meshes of several sizes on both detectors: what a device would have to beat."""
+    """Solids and meshes of several sizes on both detectors: what a device would have to
+    beat."""
     things: dict[str, Body] = {
         name: load_phantom(name).scene for name in ("normal", "shepp-logan", "lego")
     }
@@ -474,7 +512,9 @@ def bodies() -> list[Entry]:
     for name, thing in things.items():
         for panel, shape in (("C1", BINNED), ("C3", FULL)):
             wall, cpu_ms = _spent(partial(project_body, thing, circle(1, shape), shape))
-            entries.append(plain(f"body-{name}-{panel}", wall, "a view") | {"cpu_ms": cpu_ms})
+            entries.append(
+                plain(f"body-{name}-{panel}", wall, "a view") | {"cpu_ms": cpu_ms}
+            )
     return entries
 
 
@@ -484,7 +524,8 @@ SERIES = (("level", NONE), ("tilted", TILT_DEG))
 
 @dataclass(frozen=True)
 class Point:
-    """A point of a curve: which curve, where on it, what is timed, how many views that makes."""
+    """A point of a curve: which curve, where on it, what is timed, how many views that
+    makes."""
 
     series: str
     x: int
@@ -540,15 +581,25 @@ def growth_with_threads() -> list[Entry]:
         numba.set_num_threads(before)
 
 
-def _forward(volume: Volume, view: ConeVec, shape: tuple[int, int]) -> Callable[[], object]:
-    return partial(forward, volume, view, shape, np.empty((len(view), *shape), np.float32))
+def _forward(
+    volume: Volume, view: ConeVec, shape: tuple[int, int]
+) -> Callable[[], object]:
+    return partial(
+        forward, volume, view, shape, np.empty((len(view), *shape), np.float32)
+    )
 
 
 def _curve(points: Sequence[Point]) -> list[Entry]:
     """Best times a view of all points, taken turn by turn: what disturbs one disturbs all."""
-    timing = interleaved({f"{i}": point.call for i, point in enumerate(points)}, budget_s=3.0)
+    timing = interleaved(
+        {f"{i}": point.call for i, point in enumerate(points)}, budget_s=3.0
+    )
     return [
-        {"series": point.series, "x": point.x, "ms": timing[f"{i}"].best * 1e3 / point.views}
+        {
+            "series": point.series,
+            "x": point.x,
+            "ms": timing[f"{i}"].best * 1e3 / point.views,
+        }
         for i, point in enumerate(points)
     ]
 
@@ -573,7 +624,9 @@ def scenes() -> list[Entry]:
         view = circle(1, shape)
         call = partial(project_scene, scene, view, shape, out)
         entry = timed(name, 1, {"flexdt": call}, "box and five beads, analytic")
-        entry["mean_error"], entry["worst_error"] = errors(out, scene_chords(scene, view, shape))
+        entry["mean_error"], entry["worst_error"] = errors(
+            out, scene_chords(scene, view, shape)
+        )
         entries.append(entry)
     return entries
 
@@ -634,7 +687,9 @@ def meshes(part: frozenset[str]) -> list[Entry]:
         at = (0, *pixels.T)
         entry["mean_error"], entry["worst_error"] = errors(out[at], exact)
         if embree is not None:
-            entry["peers"]["embreex"]["mean_error"] = errors(embree.images()[at], exact)[0]
+            entry["peers"]["embreex"]["mean_error"] = errors(embree.images()[at], exact)[
+                0
+            ]
         entries.append(entry)
     return entries
 
@@ -651,7 +706,9 @@ class Embree:
         ends = view.pixel_centers(shape)[0].reshape(-1, 3)
         ray = ends - view.source[0]
         self._length = np.linalg.norm(ray, axis=1)
-        self._ahead = np.ascontiguousarray((ray / self._length[:, None]).astype(np.float32))
+        self._ahead = np.ascontiguousarray(
+            (ray / self._length[:, None]).astype(np.float32)
+        )
         self._behind = np.ascontiguousarray(-self._ahead)
         origins = np.broadcast_to(view.source[0], ends.shape)
         self._source = np.ascontiguousarray(origins.astype(np.float32))
@@ -674,10 +731,13 @@ class Embree:
 
 
 def mesh_paths(
-    mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int], pixels: np.ndarray[tuple[int, ...]]
+    mesh: TriangleMesh,
+    view: ConeVec,
+    shape: tuple[int, int],
+    pixels: np.ndarray[tuple[int, ...]],
 ) -> FloatArray:
-    """Path lengths [mm] of single rays through the same triangles: every triangle asked for every
-    ray (Moeller and Trumbore), in double precision.
+    """Path lengths [mm] of single rays through the same triangles: every triangle asked for
+    every ray (Moeller and Trumbore), in double precision.
 
     Args:
         pixels: (k, 2) row, column.
@@ -739,7 +799,9 @@ def names() -> list[str]:
 def run(only: Sequence[str], with_peers: bool) -> Document:
     """Measure what is named, everything if nothing is, and return the document."""
     warm_up()
-    missing = {name: absent(name) for name in ("itk-rtk", "embreex")} if with_peers else {}
+    missing = (
+        {name: absent(name) for name in ("itk-rtk", "embreex")} if with_peers else {}
+    )
     part = frozenset(name for name, why in missing.items() if why is None)
     document: Document = {"machine": machine(missing), "cases": [], "growth": {}}
 
@@ -766,8 +828,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, help="write bench.json here, do not print it")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", choices=names())
-    parser.add_argument("--no-peers", action="store_true", help="do not run other programs")
-    parser.add_argument("--list", action="store_true", help="name the cases, measure nothing")
+    parser.add_argument(
+        "--no-peers", action="store_true", help="do not run other programs"
+    )
+    parser.add_argument(
+        "--list", action="store_true", help="name the cases, measure nothing"
+    )
     options = parser.parse_args()
     if options.list:
         print("\n".join(names()))

@@ -36,8 +36,8 @@ class PhotonTransfer:
     """Result of `photon_transfer`.
 
     Attributes:
-        counts_per_quantum: slope of variance over signal; its inverse is the number of effective
-            quanta a count stands for.
+        counts_per_quantum: slope of variance over signal; its inverse is the number of
+            effective quanta a count stands for.
         read_noise_counts: noise without signal, quantisation taken off.
         signal, variance: the curve, (k,) both [counts, counts^2].
     """
@@ -66,7 +66,9 @@ class EdgeResponse:
         i = int(below[0])
         m0, m1 = self.modulation[i - 1], self.modulation[i]
         part = (m0 - modulation) / (m0 - m1)
-        return float(self.frequency[i - 1] + part * (self.frequency[i] - self.frequency[i - 1]))
+        return float(
+            self.frequency[i - 1] + part * (self.frequency[i] - self.frequency[i - 1])
+        )
 
 
 def region(values: npt.ArrayLike) -> Region:
@@ -84,8 +86,8 @@ def photon_transfer(
     """Conversion gain and read noise from pairs of equal exposures.
 
     The difference of two equal images has no fixed pattern. Blur spreads the noise of a quantum
-    over neighbours without changing its sum, so the covariance with neighbours up to `reach` pixels
-    counts as variance.
+    over neighbours without changing its sum, so the covariance with neighbours up to `reach`
+    pixels counts as variance.
 
     Args:
         pairs: flats of growing exposure, none saturated, (rows, cols) each.
@@ -98,7 +100,9 @@ def photon_transfer(
     variance = np.array([_difference_variance(a, b, reach) for a, b in pairs]) - floor
     # Relative errors of all variances are alike, so each point weighs with its inverse.
     slope = float(np.mean(variance / signal))
-    return PhotonTransfer(slope, float(np.sqrt(max(floor - 1.0 / 12.0, 0.0))), signal, variance)
+    return PhotonTransfer(
+        slope, float(np.sqrt(max(floor - 1.0 / 12.0, 0.0))), signal, variance
+    )
 
 
 def _mean(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
@@ -140,20 +144,30 @@ def edge_mtf(image: npt.ArrayLike) -> EdgeResponse:
     at = (steep * x).sum(axis=1) / strength
     line = np.polyfit(np.arange(rows), at, 1)
     for _ in range(3):
-        near = np.abs(x[None, :] - np.polyval(line, np.arange(rows))[:, None]) < max(4, cols / 8)
+        near = np.abs(x[None, :] - np.polyval(line, np.arange(rows))[:, None]) < max(
+            4, cols / 8
+        )
         weight = steep * near
-        line = np.polyfit(np.arange(rows), (weight * x).sum(axis=1) / weight.sum(axis=1), 1)
+        line = np.polyfit(
+            np.arange(rows), (weight * x).sum(axis=1) / weight.sum(axis=1), 1
+        )
     tilt = float(np.cos(np.arctan(line[0])))
-    distance = (np.arange(cols)[None, :] - np.polyval(line, np.arange(rows))[:, None]) * tilt
+    distance = (
+        np.arange(cols)[None, :] - np.polyval(line, np.arange(rows))[:, None]
+    ) * tilt
     half = int(np.floor(np.abs(distance).min(axis=0)[[0, -1]].min()))
     if half < 4:
-        raise LimitError("the edge lies too close to the border", {"pixels": half, "allowed": 4})
+        raise LimitError(
+            "the edge lies too close to the border", {"pixels": half, "allowed": 4}
+        )
     edges = np.arange(-half * FINE, half * FINE + 1) / FINE
     which = np.digitize(distance.ravel(), edges) - 1
     inside = (which >= 0) & (which < len(edges) - 1)
     count = np.bincount(which[inside], minlength=len(edges) - 1)
     if count.min() == 0:
-        raise LimitError("the edge is not slanted enough for this region", {"slope": line[0]})
+        raise LimitError(
+            "the edge is not slanted enough for this region", {"slope": line[0]}
+        )
     profile = np.bincount(which[inside], data.ravel()[inside], len(edges) - 1) / count
     spread = np.diff(profile)
     spectrum = np.abs(np.fft.rfft(spread * np.hanning(len(spread) + 2)[1:-1]))

@@ -1,15 +1,16 @@
 """Is motion during a scan found, and are the sigmas true that are given with it?
 
-`python examples/research/motion_during_scan.py [--scans 20] [--images 1] [--seed 1] [--json]` makes
-scans of five balls in which something moves: a runout (harmonics 2 to 5 of the turn, 20 um), a
-screw (1 mm along the axis), a drift of the focal spot (0.1 mm, exponential), jitter (20 um, every
-frame by itself), or nothing; by tracks with 0.02 px noise, and by radiographs. Tracks and images
-are those of the rays, planes and balls of `prior_coverage`; nothing of the fit's model is in them.
+`python examples/research/motion_during_scan.py [--scans 20] [--images 1] [--seed 1] [--json]`
+makes scans of five balls in which something moves: a runout (harmonics 2 to 5 of the turn, 20
+um), a screw (1 mm along the axis), a drift of the focal spot (0.1 mm, exponential), jitter (20
+um, every frame by itself), or nothing; by tracks with 0.02 px noise, and by radiographs. Tracks
+and images are those of the rays, planes and balls of `prior_coverage`; nothing of the fit's
+model is in them.
 
-For each kind: the beads' distance from where the geometry has them before and after [px rms], the
-error of the deviations [um rms] without what turns once with the table (an object that stands aside
-does the same), errors over sigmas of the six parameters and of the deviations, and how often a
-parameter that does not move was said to.
+For each kind: the beads' distance from where the geometry has them before and after [px rms],
+the error of the deviations [um rms] without what turns once with the table (an object that
+stands aside does the same), errors over sigmas of the six parameters and of the deviations, and
+how often a parameter that does not move was said to.
 """
 
 from __future__ import annotations
@@ -86,16 +87,21 @@ def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
     turn = np.arange(count) / count
     angles = 360.0 * turn
     truth, frames, deviation = truths(rng, kind, turn)
-    seen = np.concatenate([pixels(beads, angles[i : i + 1], SOD, t) for i, t in enumerate(frames)])
+    seen = np.concatenate(
+        [pixels(beads, angles[i : i + 1], SOD, t) for i, t in enumerate(frames)]
+    )
     names, poses = ASKED[kind], nominal(angles)
     model = BeadModel(beads, np.full(len(beads), 1.0))
     if images:
         shown = [
-            radiographs(rng, beads, angles[i : i + 1], SOD, t)[0] for i, t in enumerate(frames)
+            radiographs(rng, beads, angles[i : i + 1], SOD, t)[0]
+            for i, t in enumerate(frames)
         ]
         scan = Scan(ArrayFrames(shown, SHAPE), poses, priors=exact(SIX))
         still = calibrate([scan], model, CalibrationRequest(priors=exact(SIX)))
-        found = calibrate([scan], model, CalibrationRequest(priors=exact(SIX), per_frame=names))
+        found = calibrate(
+            [scan], model, CalibrationRequest(priors=exact(SIX), per_frame=names)
+        )
         if found.fit is None or not found.motions:
             return {"kind": kind, "refused": [f.code for f in found.findings]}
         before = still.fit.certificate.rms_px if still.fit else np.nan
@@ -146,7 +152,9 @@ def summary(kind: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "error_um": float(np.max([r["error_um"] for r in good])),
         "pull": float(np.sqrt(np.mean(pulls**2))),
         "worst_pull": float(np.abs(pulls).max()),
-        "deviation_pull": float(np.sqrt(np.mean(deviations**2))) if len(deviations) else None,
+        "deviation_pull": float(np.sqrt(np.mean(deviations**2)))
+        if len(deviations)
+        else None,
         "missed": sum(r["missed"] for r in good),
         "false": sum(r["false"] for r in good),
     }
@@ -155,13 +163,17 @@ def summary(kind: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=20, help="of each kind, by tracks")
-    parser.add_argument("--images", type=int, default=1, help="of each kind, by radiographs")
+    parser.add_argument(
+        "--images", type=int, default=1, help="of each kind, by radiographs"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", action="store_true")
     words = parser.parse_args(argv)
     document = {
         what: [
-            summary(kind, [one(words.seed + i, kind, what == "images") for i in range(count)])
+            summary(
+                kind, [one(words.seed + i, kind, what == "images") for i in range(count)]
+            )
             for kind in ASKED
         ]
         for what, count in (("tracks", words.scans), ("images", words.images))
@@ -175,7 +187,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for r in rows:
             own = "-" if r["deviation_pull"] is None else f"{r['deviation_pull']:.2f}"
             print(
-                f"  {r['kind']:8} {r['before_px']:8.4f} {r['after_px']:8.4f} {r['error_um']:7.2f} "
+                f"  {r['kind']:8} {r['before_px']:8.4f} {r['after_px']:8.4f} "
+                f"{r['error_um']:7.2f} "
                 f"{r['pull']:6.2f} ({r['worst_pull']:.2f}) {own:>5}  missed {r['missed']}, "
                 f"false {r['false']}, refused {r['refused']} of {r['scans']}"
             )

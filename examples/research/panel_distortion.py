@@ -1,12 +1,12 @@
 """How well is a distorted panel found, and are the intervals true with it?
 
-`python examples/research/panel_distortion.py [--each 25] [--seed 100]` calibrates scans whose panel
-is distorted as `faults_drawn` draws it (radially, decentred, by any cubic, or with a gap between
-tiles; panel and axis elsewhere than is said, by the usual amounts) and prints how far the
-distortion that was found is from the true one, and pulls and coverage of the offsets.
+`python examples/research/panel_distortion.py [--each 25] [--seed 100]` calibrates scans whose
+panel is distorted as `faults_drawn` draws it (radially, decentred, by any cubic, or with a gap
+between tiles; panel and axis elsewhere than is said, by the usual amounts) and prints how far
+the distortion that was found is from the true one, and pulls and coverage of the offsets.
 
-Shifts, turns, scales and perspective belong to the offsets; they are removed from the difference of
-the distortions.
+Shifts, turns, scales and perspective belong to the offsets; they are removed from the
+difference of the distortions.
 """
 
 from __future__ import annotations
@@ -59,12 +59,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             geometry = np.concatenate([columns, rows])
             off -= geometry @ np.linalg.lstsq(geometry, off, rcond=None)[0]
             rest.append(float(np.sqrt(np.mean(off**2))))
-        print(f"{kind}: rms of the distortion {np.median(rest):.4f} px, at worst {max(rest):.3f}")
-    print(f"{len(KINDS) * args.each} scans, {offered} offered, {found} with the distortion named")
+        print(
+            f"{kind}: rms of the distortion {np.median(rest):.4f} px, at worst {max(rest):.3f}"
+        )
+    print(
+        f"{len(KINDS) * args.each} scans, {offered} offered, {found} with the distortion named"
+    )
     for name, values in pulls.items():
         print(f"{name:12} pulls {np.sqrt(np.mean(np.square(values))):.2f}")
     every = np.abs(np.concatenate(list(pulls.values())))
-    print(f"largest {every.max():.1f} sigma; {100 * np.mean(every < 1.96):.1f} % within 1.96")
+    print(
+        f"largest {every.max():.1f} sigma; {100 * np.mean(every < 1.96):.1f} % within 1.96"
+    )
     return 0
 
 

@@ -24,14 +24,21 @@ from flexdt.twin.reconstruction import Grid, fdk, sirt
 
 VIEW = np.array([0, -600, 0, 0, 459, 0, 0.1496, 0, 0, 0, 0, -0.1496], dtype=np.float64)
 LISTING_1 = ExposureSettings(90.0, 50.0, 100.0)
-BALL, CENTRE, RADIUS, MU = Sphere((6.0, -4.0, 3.0), 5.0), np.array([6.0, -4.0, 3.0]), 5.0, 0.05
+BALL, CENTRE, RADIUS, MU = (
+    Sphere((6.0, -4.0, 3.0), 5.0),
+    np.array([6.0, -4.0, 3.0]),
+    5.0,
+    0.05,
+)
 
 
 def transmission(chain: Chain, *lengths: float) -> float:
     """Signal behind slabs over the open beam's."""
     paths = np.empty((len(lengths), 3, 3), np.float32)
     paths[:] = np.array(lengths)[:, None, None]
-    behind, free = (expected_signal(chain, p, VIEW, LISTING_1).mean_e for p in (paths, 0 * paths))
+    behind, free = (
+        expected_signal(chain, p, VIEW, LISTING_1).mean_e for p in (paths, 0 * paths)
+    )
     return float(behind[1, 1] / free[1, 1])
 
 
@@ -41,7 +48,10 @@ def slabs() -> float:
     chain = Chain(Detector(), substances=two, thickest_mm=(50.0, 5.0), mono_keV=50.25)
     mu = [s.attenuation()[90] for s in two]  # the bin about 50.25 keV
     grid = [(a, b) for a in (0.0, 1.0, 20.0, 50.0) for b in (0.0, 1.0, 4.0)]
-    return max(abs(transmission(chain, a, b) / np.exp(-a * mu[0] - b * mu[1]) - 1) for a, b in grid)
+    return max(
+        abs(transmission(chain, a, b) / np.exp(-a * mu[0] - b * mu[1]) - 1)
+        for a, b in grid
+    )
 
 
 def wedge() -> dict[str, float]:
@@ -89,8 +99,11 @@ def detector() -> dict[str, object]:
     )  # fmt: skip
     corrected = (air - dark) / (white - dark)
     return {
-        "gain_over_truth": curve.counts_per_quantum / float(noise.sum() / signal.sum()) * per_count,
-        "read_noise_over_truth": curve.read_noise_counts / (panel.read_noise(camera) / per_count),
+        "gain_over_truth": curve.counts_per_quantum
+        / float(noise.sum() / signal.sum())
+        * per_count,
+        "read_noise_over_truth": curve.read_noise_counts
+        / (panel.read_noise(camera) / per_count),
         "open_beam_counts": float(air.mean()),
         "open_beam_snr": float(air.mean() / region(air - white).noise),
         "flat_corrected_air": [float(corrected.mean()), float(corrected.std())],
@@ -103,19 +116,31 @@ def _edge(panel: Detector) -> float:
     """Line pairs a mm at which the panel's own blur (no noise, unbinned) leaves half."""
     camera = CameraSettings("HW1SW1High", Roi(0, 0, 199, 199))
     y, x = np.mgrid[:200, :200]
-    sharp = np.mean([(x + o > 100.3 + 0.06 * (y - 100)) for o in np.linspace(-0.5, 0.5, 17)], 0)
-    chain = Chain(Detector(**{**panel.__dict__, "gain_sigma": 0.0, "offset_sigma_counts": 0.0}))
-    expected = expected_signal(chain, np.zeros((0, 200, 200), np.float32), VIEW, LISTING_1)
-    image = type(expected)(expected.mean_e * sharp.astype(np.float32), expected.variance_e)
+    sharp = np.mean(
+        [(x + o > 100.3 + 0.06 * (y - 100)) for o in np.linspace(-0.5, 0.5, 17)], 0
+    )
+    chain = Chain(
+        Detector(**{**panel.__dict__, "gain_sigma": 0.0, "offset_sigma_counts": 0.0})
+    )
+    expected = expected_signal(
+        chain, np.zeros((0, 200, 200), np.float32), VIEW, LISTING_1
+    )
+    image = type(expected)(
+        expected.mean_e * sharp.astype(np.float32), expected.variance_e
+    )
     counts = read_out(chain.panel, image, camera, LISTING_1)
     return float(edge_mtf(counts.astype(float)).at(0.5) / panel.pixels.pitch_mm)
 
 
-def circle(n: int, span: float = 360.0, *, aside: float = 0.0, repeat: bool = True) -> ConeVec:
+def circle(
+    n: int, span: float = 360.0, *, aside: float = 0.0, repeat: bool = True
+) -> ConeVec:
     a = np.deg2rad(np.linspace(0.0, span, n, endpoint=repeat))
     u = np.stack([np.cos(a), np.sin(a), 0 * a], 1)
     away = np.stack([-np.sin(a), np.cos(a), 0 * a], 1)
-    return ConeVec.from_vectors(-600 * away, 459 * away + aside * u, 0.6 * u, (0, 0, -0.6))
+    return ConeVec.from_vectors(
+        -600 * away, 459 * away + aside * u, 0.6 * u, (0, 0, -0.6)
+    )
 
 
 def ball(scan: ConeVec, iterations: int = 0) -> dict[str, object]:

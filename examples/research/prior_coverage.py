@@ -1,12 +1,12 @@
 """Do the intervals hold when the detector is not where the machine file has it?
 
-`python examples/research/prior_coverage.py [--scans 1000] [--wider 2] [--skewed] [--json]` makes
-bead tracks with detector shifts, tilts and axis tilts drawn from the priors and counts how often
-the truth lies in the 95 % intervals and in the joint 95 % region. `--wider 2` draws them twice as
-wide as the fit believes, `--skewed` from a one-sided distribution of the same mean square.
-`--images` makes radiographs instead of tracks, of five balls, and calibrates from them without
-being told which ball is which. Tracks and images come from rays, planes and balls written out here;
-nothing of the fit's model is in them.
+`python examples/research/prior_coverage.py [--scans 1000] [--wider 2] [--skewed] [--json]`
+makes bead tracks with detector shifts, tilts and axis tilts drawn from the priors and counts
+how often the truth lies in the 95 % intervals and in the joint 95 % region. `--wider 2` draws
+them twice as wide as the fit believes, `--skewed` from a one-sided distribution of the same
+mean square. `--images` makes radiographs instead of tracks, of five balls, and calibrates from
+them without being told which ball is which. Tracks and images come from rays, planes and balls
+written out here; nothing of the fit's model is in them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.fixed_parameters import doubtful, judge_priors, loosened
+from flexdt.twin.calibration.diagnose.fixed_parameters import (
+    doubtful,
+    judge_priors,
+    loosened,
+)
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
@@ -37,21 +41,29 @@ PIXEL: Final = 0.1496
 SOD: Final = 600.0
 SDD: Final = 1059.0
 NOISE_PX: Final = 0.02
-REACH: Final = {"dO_x": 5.0, "dO_y": 5.0, "dO_z": 10.0, "alpha": 20.0, "tau_x": 2.0, "tau_z": 2.0}
+REACH: Final = {
+    "dO_x": 5.0,
+    "dO_y": 5.0,
+    "dO_z": 10.0,
+    "alpha": 20.0,
+    "tau_x": 2.0,
+    "tau_z": 2.0,
+}
 """Half the range [mm, deg] of what is estimated freely."""
 RADIUS: Final = 1.0
 ATTENUATION: Final = 0.4
 PHOTONS: Final = 10_000.0
 BLUR_PX: Final = 0.7
 RAYS: Final = 4
-"""Of the images: radius [mm] and attenuation [1/mm] of a ball, photons a pixel, blur [px], rays."""
+"""Of the images: radius [mm] and attenuation [1/mm] of a ball, photons a pixel, blur [px],
+rays."""
 
 
 def places(
     beads: Array, angles: Array, sod: float, truth: Mapping[str, float]
 ) -> tuple[Array, Array]:
-    """Where the beads are in the laboratory [mm], (n, k, 3), and the panel (3, 3): its centre and
-    the steps from one column and one row to the next.
+    """Where the beads are in the laboratory [mm], (n, k, 3), and the panel (3, 3): its centre
+    and the steps from one column and one row to the next.
 
     The source is at the origin, the beam along +y, z is up.
 
@@ -70,7 +82,11 @@ def places(
     lean = Rotation.from_euler("xy", [t("axis_tilt_x"), t("axis_tilt_z")], degrees=True)
     # The panel is turned about its own directions, one after the other.
     across, down = np.array([PIXEL, 0, 0]), np.array([0, 0, -PIXEL])
-    for about, angle in (("down", "det_yaw"), ("across", "det_pitch"), ("normal", "det_roll")):
+    for about, angle in (
+        ("down", "det_yaw"),
+        ("across", "det_pitch"),
+        ("normal", "det_roll"),
+    ):
         axis = {"down": down, "across": across, "normal": np.cross(across, down)}[about]
         turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * math.radians(t(angle)))
         across, down = turn.apply(across), turn.apply(down)
@@ -83,8 +99,8 @@ def places(
 def pixels(beads: Array, angles: Array, sod: float, truth: Mapping[str, float]) -> Array:
     """Columns and rows at which the beads' centres appear, (n, k, 2); arguments as of `places`.
 
-    Each ray from the source through a bead is cut with the plane of the panel by solving for the
-    three unknowns of their equation.
+    Each ray from the source through a bead is cut with the plane of the panel by solving for
+    the three unknowns of their equation.
     """
     at, (panel, across, down) = places(beads, angles, sod, truth)
     out = np.empty((*at.shape[:2], 2))
@@ -113,7 +129,9 @@ def radiographs(
             where, passed = shadow(ball, centre, panel, radius, sod)
             passing[where] *= passed(attenuation)
         seen = PHOTONS * cv2.GaussianBlur(passing, (0, 0), BLUR_PX)
-        out.append((-np.log(np.maximum(rng.poisson(seen), 0.5) / PHOTONS)).astype(np.float32))
+        out.append(
+            (-np.log(np.maximum(rng.poisson(seen), 0.5) / PHOTONS)).astype(np.float32)
+        )
     return out
 
 
@@ -155,7 +173,8 @@ def shadow(
 
 
 def axis_in_image(truth: Mapping[str, float], angle: float = 0.0) -> dict[str, float]:
-    """Where the rotation axis appears: its column in the middle row [px], and its angle [deg]."""
+    """Where the rotation axis appears: its column in the middle row [px], and its angle
+    [deg]."""
     axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
     ends = np.array([axis - [0, 0, 9], axis + [0, 0, 9]])
     ((low, high),) = pixels(ends, np.array([angle]), SOD, truth)
@@ -167,8 +186,8 @@ def axis_in_image(truth: Mapping[str, float], angle: float = 0.0) -> dict[str, f
 def drawn(rng: np.random.Generator, wider: float, skewed: bool) -> dict[str, float]:
     """Offsets of a scan [mm, deg]: the six in their range, the others from their priors.
 
-    Skewed is an exponential distribution: one-sided, and its root mean square is the width of the
-    prior times `wider`.
+    Skewed is an exponential distribution: one-sided, and its root mean square is the width of
+    the prior times `wider`.
     """
     truth = {n: float(rng.uniform(-r, r)) for n, r in REACH.items()}
     for name, width in ASSUMED.items():
@@ -181,8 +200,8 @@ def scan(
     rng: np.random.Generator, truth: Mapping[str, float], frames: int, count: int, sure: bool,
     images: bool = False,
 ) -> tuple[FitResult | None, bool, dict[str, float]]:  # fmt: skip
-    """The fit of one scan (of `count` placements, at two SODs), or None if it is refused; whether
-    its priors were widened; and the true values of what a reconstruction needs."""
+    """The fit of one scan (of `count` placements, at two SODs), or None if it is refused;
+    whether its priors were widened; and the true values of what a reconstruction needs."""
     beads = spread(rng, 4 * RADIUS if images else 0.0)
     angles = 360.0 * np.arange(frames) / frames
     sods = [SOD, 0.75 * SOD][:count]
@@ -196,7 +215,9 @@ def scan(
             for s, p in zip(sods, poses, strict=True)
         ]
         model = BeadModel(beads, np.full(len(beads), RADIUS))
-        found = calibrate(scans, model, CalibrationRequest(priors=exact() if sure else {}))
+        found = calibrate(
+            scans, model, CalibrationRequest(priors=exact() if sure else {})
+        )
         wide = "priors_narrow" in [f.code for f in found.findings]
         return found.fit if found.identifiable else None, wide, seen
     tracks = np.concatenate([pixels(beads, angles, sod, truth) for sod in sods])
@@ -204,7 +225,12 @@ def scan(
 
     def fitted(priors: Mapping[str, float]) -> FitResult:
         return estimate_geometry(
-            tracks, beads, Poses.concatenate(poses), shape=SHAPE, priors=priors, bound=math.inf
+            tracks,
+            beads,
+            Poses.concatenate(poses),
+            shape=SHAPE,
+            priors=priors,
+            bound=math.inf,
         )
 
     judged = judge_priors(fitted(loosened(priors)))  # as `pipeline.calibrate` does
@@ -240,8 +266,9 @@ def study(
         images: calibrate from radiographs.
 
     Returns:
-        Shares [%] of truths inside the intervals and regions among the answers offered, each with
-        the binomial standard error for 95 %, and the largest error of an answer offered [sigma].
+        Shares [%] of truths inside the intervals and regions among the answers offered, each
+        with the binomial standard error for 95 %, and the largest error of an answer offered
+        [sigma].
     """
     inside: dict[str, list[bool]] = {}
     worst, refused, widened, names = 0.0, 0, 0, list(REACH)
@@ -288,18 +315,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--skewed", action="store_true")
     parser.add_argument("--frames", type=int, default=36)
     parser.add_argument("--places", type=int, choices=(1, 2), default=1)
-    parser.add_argument("--images", action="store_true", help="calibrate from radiographs")
+    parser.add_argument(
+        "--images", action="store_true", help="calibrate from radiographs"
+    )
     parser.add_argument("--exact", action="store_true", help="fit as with --prior none")
     parser.add_argument("--json", action="store_true")
     a = parser.parse_args(argv)
-    found = study(a.scans, a.wider, a.skewed, a.frames, a.places, a.exact, images=a.images)
+    found = study(
+        a.scans, a.wider, a.skewed, a.frames, a.places, a.exact, images=a.images
+    )
     if a.json:
         print(json.dumps(found))
         return 0
     print(f"{found['scans']} scans, {found['refused']} refused, priors widened in "
           f"{found['widened']}; largest error offered "
           f"{found['largest_error_sigmas']:.1f} sigma")  # fmt: skip
-    print(f"inside the 95 % intervals and regions, +- {found['binomial_error_pct']:.1f} %:")
+    print(
+        f"inside the 95 % intervals and regions, +- {found['binomial_error_pct']:.1f} %:"
+    )
     for name, share in found["inside_pct"].items():
         print(f"  {name:24}{share:6.1f} %")
     listed = ", ".join(f"{n} {v:.3g}" for n, v in found["rms_error"].items())

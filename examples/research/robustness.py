@@ -2,8 +2,9 @@
 
 `python examples/research/robustness.py --sets 1000 --out DIR` writes `robustness.json` and
 prints a table of kinds (`--kinds scanner_off held_right`: of these); run again after an
-interruption, it continues where it stopped. So does `--coverage 1000 [--camera demo]`, which writes
-`coverage_demo.json`. The scans are made and judged by `spoilt_scans` and `ellipsoid_coverage`.
+interruption, it continues where it stopped. So does `--coverage 1000 [--camera demo]`, which
+writes `coverage_demo.json`. The scans are made and judged by `spoilt_scans` and
+`ellipsoid_coverage`.
 """
 
 from __future__ import annotations
@@ -33,11 +34,13 @@ SURVIVABLE = (
     "dead_pixels", "angle_slip", "angle_jitter", "angle_scale", "held_parameter", "held_right",
     "scanner_off", "detector_off",
 )  # fmt: skip
-"""Kinds whose truth can still be found, at least when they are mild: drawn twice as often, as it is
-only there that a wrong answer can be a confident one."""
+"""Kinds whose truth can still be found, at least when they are mild: drawn twice as often, as
+it is only there that a wrong answer can be a confident one."""
 
 
-def cases(sets: int, kinds: Sequence[str] = tuple(KINDS)) -> Iterator[tuple[str, int, str]]:
+def cases(
+    sets: int, kinds: Sequence[str] = tuple(KINDS)
+) -> Iterator[tuple[str, int, str]]:
     """(kind, seed, phantom) of each data set."""
     order = [k for k in kinds for _ in range(2 if k in SURVIVABLE else 1)]
     for i in range(sets):
@@ -48,7 +51,9 @@ def run_case(case: tuple[str, int, str]) -> tuple[str, Outcome]:
     """Make, spoil, calibrate and judge one data set; returns the phantom's name too."""
     kind, seed, name = case
     phantom = load_phantom(name)
-    spoilt = corrupt(kind, seed, bead_model(phantom), phantom.scene, load_phantom(OTHER).scene)
+    spoilt = corrupt(
+        kind, seed, bead_model(phantom), phantom.scene, load_phantom(OTHER).scene
+    )
     return name, judge(kind, seed, spoilt)[0]
 
 
@@ -74,7 +79,9 @@ def run(
     outcomes = [known[i] for i in range(sets) if i in known]
     rest = [case for case in work if case[1] not in known]
     with executor(jobs, None) as pool:
-        results = map(run_case, rest) if pool is None else pool.map(run_case, rest, chunksize=4)
+        results = (
+            map(run_case, rest) if pool is None else pool.map(run_case, rest, chunksize=4)
+        )
         for name, outcome in results:
             outcomes.append((name, outcome))
             if keep is not None:
@@ -82,7 +89,9 @@ def run(
                     file.write(json.dumps({"phantom": name, **asdict(outcome)}) + "\n")
             if tell and len(outcomes) % 50 == 0:
                 wrong = sum(o.wrong for _, o in outcomes)
-                print(f"{len(outcomes)}/{sets}: {wrong} confident wrong answers", flush=True)
+                print(
+                    f"{len(outcomes)}/{sets}: {wrong} confident wrong answers", flush=True
+                )
     outcomes.sort(key=lambda o: o[1].seed)
     return summary([o for _, o in outcomes], [n for n, _ in outcomes])
 
@@ -130,7 +139,13 @@ def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, o
         "wrong_sigmas": WRONG_SIGMAS,
         "rows": rows,
         "wrong": [
-            {"kind": o.kind, "seed": o.seed, "phantom": name, "sigmas": o.worst, "mae": o.mae}
+            {
+                "kind": o.kind,
+                "seed": o.seed,
+                "phantom": name,
+                "sigmas": o.worst,
+                "mae": o.mae,
+            }
             for o, name in zip(outcomes, phantoms, strict=True)
             if o.wrong
         ],
@@ -138,16 +153,21 @@ def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, o
 
 
 def kinds_table(document: Mapping[str, Any]) -> list[str]:
-    """One line of Markdown a kind: data sets, refused, offered, worst error offered, findings."""
+    """One line of Markdown a kind: data sets, refused, offered, worst error offered,
+    findings."""
     lines = [
-        "| kind | data sets | refused | offered | wrong | largest error offered (sigma) | found |",
+        "| kind | data sets | refused | offered | wrong | largest error offered (sigma) "
+        "| found |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in document["rows"]:
         worst = "" if row["worst_sigma"] is None else f"{row['worst_sigma']:.1f}"
-        found = ", ".join(f"{code} {count}" for code, count in list(row["findings"].items())[:4])
+        found = ", ".join(
+            f"{code} {count}" for code, count in list(row["findings"].items())[:4]
+        )
         lines.append(
-            f"| {row['kind']} | {row['sets']} | {row['refused']} | {row['sets'] - row['refused']} "
+            f"| {row['kind']} | {row['sets']} | {row['refused']} | "
+            f"{row['sets'] - row['refused']} "
             f"| {row['wrong']} | {worst} | {found} |"
         )
     return lines
@@ -172,7 +192,9 @@ def coverage(
     known = {d.seed for d in draws}
     work = [(i, camera) for i in range(seeds) if i not in known]
     with executor(jobs, None) as pool:
-        results = map(coverage_case, work) if pool is None else pool.map(coverage_case, work)
+        results = (
+            map(coverage_case, work) if pool is None else pool.map(coverage_case, work)
+        )
         for result in results:
             draws.append(result)
             if keep is not None:

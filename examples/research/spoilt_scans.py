@@ -50,7 +50,9 @@ class Outcome:
     findings: tuple[str, ...]
 
 
-def corrupt(kind: str, seed: int, phantom: BeadModel, scene: Scene, other: Scene) -> Spoilt:
+def corrupt(
+    kind: str, seed: int, phantom: BeadModel, scene: Scene, other: Scene
+) -> Spoilt:
     """Make a spoilt scan.
 
     Args:
@@ -92,7 +94,14 @@ def careful_scan(rng: Rng, frames: int) -> tuple[Poses, Offsets]:
     return nominal, Offsets.from_edge(edge)
 
 
-_TRUTH = {"dO_x": 5.0, "dO_y": 5.0, "dO_z": 15.0, "alpha": 180.0, "tau_x": 2.0, "tau_z": 2.0}
+_TRUTH = {
+    "dO_x": 5.0,
+    "dO_y": 5.0,
+    "dO_z": 15.0,
+    "alpha": 180.0,
+    "tau_x": 2.0,
+    "tau_z": 2.0,
+}
 
 
 def judge(kind: str, seed: int, spoilt: Spoilt) -> tuple[Outcome, Calibration]:
@@ -111,9 +120,14 @@ def judge(kind: str, seed: int, spoilt: Spoilt) -> tuple[Outcome, Calibration]:
     # What the images know best must be right too: priors do not widen it.
     middle = (np.array(SHAPE[::-1]) - 1) / 2
     # Where something moves during the scan, the right value is the mean over its frames.
-    moving = [axis_in_image(spoilt.poses[i : i + 1], spoilt.truth, middle) for i in range(FRAMES)]
+    moving = [
+        axis_in_image(spoilt.poses[i : i + 1], spoilt.truth, middle)
+        for i in range(FRAMES)
+    ]
     true = np.mean(moving, axis=0)
-    for e, value in zip(image_quantities(result.fit)[0].values(), true.tolist(), strict=True):
+    for e, value in zip(
+        image_quantities(result.fit)[0].values(), true.tolist(), strict=True
+    ):
         worst = max(worst, abs(e.value - value) / max(e.sigma, 1e-9))
     return (
         Outcome(

@@ -1,12 +1,13 @@
 """Anybody's calibration: markers of unknown positions, and markers that were marked by hand.
 
-`python examples/research/unknown_markers.py [--scans 10] [--drawn 200] [--hand 200] [--write DIR]`
-renders scans of 5 to 20 balls (rays and planes of `prior_coverage`, nothing of the fit's model),
-finds and links their spots without being told how many there are, and compares the positions found
-with the true ones up to place, turn and scale. `--drawn` does the same with 36 views of 12 markers
-of 0.05 px noise instead of images, `--hand` with annotations: 10 views of 12 markers, 0.5 px noise
-and a fifth missing. Each prints errors over sigmas. `--write` makes a folder of float TIFFs, their
-geometry and such annotations, for `flexdt calibrate --frames` and `--markers`.
+`python examples/research/unknown_markers.py [--scans 10] [--drawn 200] [--hand 200] [--write
+DIR]` renders scans of 5 to 20 balls (rays and planes of `prior_coverage`, nothing of the fit's
+model), finds and links their spots without being told how many there are, and compares the
+positions found with the true ones up to place, turn and scale. `--drawn` does the same with 36
+views of 12 markers of 0.05 px noise instead of images, `--hand` with annotations: 10 views of
+12 markers, 0.5 px noise and a fifth missing. Each prints errors over sigmas. `--write` makes a
+folder of float TIFFs, their geometry and such annotations, for `flexdt calibrate --frames` and
+`--markers`.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def balls(rng: np.random.Generator, count: int) -> Array:
 
 
 def unlike(found: Array, true: Array) -> tuple[float, float]:
-    """Largest distance [mm] of two sets of points, (k, 3) each in the same order, after the best
-    shift, turn and scale (Umeyama 1991), and that scale."""
+    """Largest distance [mm] of two sets of points, (k, 3) each in the same order, after the
+    best shift, turn and scale (Umeyama 1991), and that scale."""
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, s, vt = np.linalg.svd(a.T @ b)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -71,7 +72,12 @@ def unlike(found: Array, true: Array) -> tuple[float, float]:
 def truth_of(rng: np.random.Generator) -> dict[str, float]:
     """Offsets from their ranges and priors. Turn, height and place on the axis belong to the
     markers' own frame, and the axis's distance to their scale."""
-    return drawn(rng, 1.0, False) | {"alpha": 0.0, "tau_x": 0.0, "tau_z": 0.0, "dO_z": 0.0}
+    return drawn(rng, 1.0, False) | {
+        "alpha": 0.0,
+        "tau_x": 0.0,
+        "tau_z": 0.0,
+        "dO_z": 0.0,
+    }
 
 
 def pulls(found: Calibration, truth: Mapping[str, float]) -> dict[str, float]:
@@ -120,7 +126,11 @@ def marked(
 
 
 def annotated(
-    seed: int, views: int = 10, count: int = 12, noise: float = HAND_PX, missing: float = 0.2
+    seed: int,
+    views: int = 10,
+    count: int = 12,
+    noise: float = HAND_PX,
+    missing: float = 0.2,
 ) -> dict[str, Any]:
     """One calibration from annotations with the distance of two markers."""
     truth, angles, beads, markers = marked(seed, views, count, noise, missing)
@@ -128,7 +138,11 @@ def annotated(
     (some,), markers = seen_alone(data, markers)
     mm = float(np.linalg.norm(beads[0] - beads[1]))
     found, told = calibrate_unknown(
-        some, None, markers, CalibrationRequest(free=("dO_x",)), Scale("0", "1", mm, 0.001 * mm)
+        some,
+        None,
+        markers,
+        CalibrationRequest(free=("dO_x",)),
+        Scale("0", "1", mm, 0.001 * mm),
     )
     assert found.fit is not None
     return {

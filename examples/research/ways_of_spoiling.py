@@ -1,7 +1,8 @@
-"""The ways of spoiling a scan: changes of what is scanned and where, and of the images themselves.
+"""The ways of spoiling a scan: changes of what is scanned and where, and of the images
+themselves.
 
-Each function takes a scan and a random generator and returns the scan spoilt at a random strength;
-`spoilt_scans` makes the images and judges the calibration.
+Each function takes a scan and a random generator and returns the scan spoilt at a random
+strength; `spoilt_scans` makes the images and judges the calibration.
 """
 
 from __future__ import annotations
@@ -82,7 +83,11 @@ def _kept_beads(scan: Spoilt, keep: npt.NDArray[np.bool_]) -> Spoilt:
         for s in scan.scene.solids
         if not isinstance(s.shape, Sphere)
         or keep[
-            int(np.argmin(np.linalg.norm(scan.model.beads - np.asarray(s.shape.center), axis=1)))
+            int(
+                np.argmin(
+                    np.linalg.norm(scan.model.beads - np.asarray(s.shape.center), axis=1)
+                )
+            )
         ]
     ]
     return replace(scan, scene=Scene(tuple(solids)))
@@ -92,7 +97,9 @@ def _bead_moved(scan: Spoilt, rng: Rng) -> Spoilt:
     shift = np.zeros_like(scan.model.beads)
     direction = rng.normal(size=3)
     shift[rng.integers(len(shift))] = (
-        direction / np.linalg.norm(direction) * math.exp(rng.uniform(math.log(0.05), math.log(3)))
+        direction
+        / np.linalg.norm(direction)
+        * math.exp(rng.uniform(math.log(0.05), math.log(3)))
     )
     return _moved(scan, shift)
 
@@ -121,14 +128,17 @@ def _no_beads(scan: Spoilt, rng: Rng) -> Spoilt:
 def _mirrored(scan: Spoilt, rng: Rng) -> Spoilt:
     return replace(
         scan,
-        believed=BeadModel(scan.believed.beads * [-1.0, 1.0, 1.0], scan.believed.bead_radius_mm),
+        believed=BeadModel(
+            scan.believed.beads * [-1.0, 1.0, 1.0], scan.believed.bead_radius_mm
+        ),
         believed_scene=Scene(()),
     )
 
 
 def _scaled(scan: Spoilt, rng: Rng) -> Spoilt:
-    """The model's beads are spread by 5 to 30 % too far or too near; their size is right. (A model
-    scaled with its beads looks exactly right at another distance; see PLAUSIBLE_SHARE.)"""
+    """The model's beads are spread by 5 to 30 % too far or too near; their size is right. (A
+    model scaled with its beads looks exactly right at another distance; see
+    PLAUSIBLE_SHARE.)"""
     factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.3)
     return replace(
         scan,
@@ -143,7 +153,9 @@ def _extra_beads(scan: Spoilt, rng: Rng) -> Spoilt:
     more = []
     for _ in range(int(rng.integers(1, 4))):
         x, y, z = rng.uniform([-12, -12, -26], [12, 12, 26]).tolist()
-        more.append(Solid(Sphere((x, y, z), bead.shape.radius), bead.material, bead.mu_per_mm))
+        more.append(
+            Solid(Sphere((x, y, z), bead.shape.radius), bead.material, bead.mu_per_mm)
+        )
     return replace(scan, scene=Scene((*scan.scene.solids, *more)))
 
 
@@ -166,7 +178,10 @@ def _other_body(scan: Spoilt, rng: Rng) -> Spoilt:
 
     solids = scan.scene.solids
     return replace(
-        scan, scene=Scene(tuple(s if isinstance(s.shape, Sphere) else changed(s) for s in solids))
+        scan,
+        scene=Scene(
+            tuple(s if isinstance(s.shape, Sphere) else changed(s) for s in solids)
+        ),
     )
 
 
@@ -183,7 +198,9 @@ def _endpoint_other_way(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _small_scale(scan: Spoilt, rng: Rng) -> Spoilt:
-    return _angles(scan, scan.poses.angle * (1.0 + rng.choice([-1, 1]) * rng.uniform(1e-4, 0.02)))
+    return _angles(
+        scan, scan.poses.angle * (1.0 + rng.choice([-1, 1]) * rng.uniform(1e-4, 0.02))
+    )
 
 
 def _reversed(scan: Spoilt, rng: Rng) -> Spoilt:
@@ -194,7 +211,9 @@ def _renumbered(scan: Spoilt, rng: Rng) -> Spoilt:
     gap = int(rng.integers(1, 4))
     at = int(rng.integers(4, FRAMES - 4))
     return _angles(
-        scan, scan.poses.angle + np.where(np.arange(FRAMES) >= at, gap * 2 * np.pi / FRAMES, 0.0)
+        scan,
+        scan.poses.angle
+        + np.where(np.arange(FRAMES) >= at, gap * 2 * np.pi / FRAMES, 0.0),
     )
 
 
@@ -230,7 +249,11 @@ def _shifted_halfway(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _source_drift(scan: Spoilt, rng: Rng) -> Spoilt:
-    way = math.exp(rng.uniform(math.log(0.002), math.log(1.0))) * rng.normal(size=3) * [1, 0, 1]
+    way = (
+        math.exp(rng.uniform(math.log(0.002), math.log(1.0)))
+        * rng.normal(size=3)
+        * [1, 0, 1]
+    )
     ramp = np.linspace(0, 1, FRAMES)[:, None]
     return replace(scan, poses=replace(scan.poses, source=scan.poses.source + ramp * way))
 
@@ -246,7 +269,9 @@ def _low_dose(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _blurred(scan: Spoilt, rng: Rng) -> Spoilt:
-    return replace(scan, camera=replace(scan.camera, blur_px=float(rng.uniform(1.5, 5.0))))
+    return replace(
+        scan, camera=replace(scan.camera, blur_px=float(rng.uniform(1.5, 5.0)))
+    )
 
 
 def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
@@ -261,7 +286,9 @@ def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
 def _held_off(scan: Spoilt, rng: Rng) -> Spoilt:
     """From what no data can tell to what anybody sees."""
     return _some_held(
-        scan, rng, lambda: rng.choice([-1, 1]) * math.exp(rng.uniform(math.log(1e-5), math.log(1)))
+        scan,
+        rng,
+        lambda: rng.choice([-1, 1]) * math.exp(rng.uniform(math.log(1e-5), math.log(1))),
     )
 
 
@@ -270,11 +297,13 @@ def _held_right(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _scanner_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Detector and axis are all off at once, each as its prior allows, and half of the time some of
-    the six are held, rightly or wrongly."""
+    """Detector and axis are all off at once, each as its prior allows, and half of the time
+    some of the six are held, rightly or wrongly."""
     off = {n: w * float(np.clip(rng.normal(), -3, 3)) for n, w in ASSUMED.items()}
     scan = replace(scan, truth=Offsets.from_edge(scan.truth.to_edge() | off))
-    return (lambda s, _: s, _held_off, lambda s, _: s, _held_right)[int(rng.integers(4))](scan, rng)
+    return (lambda s, _: s, _held_off, lambda s, _: s, _held_right)[int(rng.integers(4))](
+        scan, rng
+    )
 
 
 def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
@@ -290,8 +319,12 @@ def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
 # --- the images themselves ----------------------------------------------------------------------
 
 
-def _each(scan: Spoilt, change: Callable[[Float32Array, int], Float32Array | None]) -> Spoilt:
-    images = tuple(None if im is None else change(im, i) for i, im in enumerate(scan.images))
+def _each(
+    scan: Spoilt, change: Callable[[Float32Array, int], Float32Array | None]
+) -> Spoilt:
+    images = tuple(
+        None if im is None else change(im, i) for i, im in enumerate(scan.images)
+    )
     return replace(scan, images=images)
 
 
@@ -312,7 +345,9 @@ def _half_dark(scan: Spoilt, rng: Rng) -> Spoilt:
 def _gradient(scan: Spoilt, rng: Rng) -> Spoilt:
     rows, cols = SHAPE
     x, y = rng.normal(size=2) * 1.5
-    ramp = (x * np.linspace(-1, 1, cols)[None] + y * np.linspace(-1, 1, rows)[:, None]).astype("f4")
+    ramp = (
+        x * np.linspace(-1, 1, cols)[None] + y * np.linspace(-1, 1, rows)[:, None]
+    ).astype("f4")
     wave = 0.2 * np.sin(np.linspace(0, rng.uniform(2, 40), cols))[None].astype(np.float32)
     return _each(scan, lambda im, i: im + ramp + wave)
 

@@ -18,7 +18,9 @@ class Twin:
     """One connection; a request and its answer are a line of JSON each."""
 
     def __init__(self, host: str, port: int) -> None:
-        self.lines = socket.create_connection((host, port)).makefile("rw", encoding="utf-8")
+        self.lines = socket.create_connection((host, port)).makefile(
+            "rw", encoding="utf-8"
+        )
         self.count = 0
 
     def call(self, method: str, **params: object) -> dict:
@@ -37,15 +39,20 @@ class Twin:
         raise SystemExit("the server closed the connection")
 
 
-def main(host: str = "127.0.0.1", port: str = "55000", name: str = "by-trajectory") -> None:
+def main(
+    host: str = "127.0.0.1", port: str = "55000", name: str = "by-trajectory"
+) -> None:
     """Scan, wait, say where the data set is."""
     twin = Twin(host, int(port))
     twin.call("session.hello", protocol="1.0", client="trajectory.py")
     twin.call("sample.set", name="normal-5")
     twin.call("camera.set", mode="HW4SW1High")
-    poses = [{"rot_obj": i * 360.0 / VIEWS, "mag_obj": 600.0, "tra_obj": 0.0} for i in range(VIEWS)]
-    # `flat` is true if it is left out: the server moves the sample beside the beam and back, on a
-    # path without a contact. A pose instead says where the beam is free; false takes no flat.
+    poses = [
+        {"rot_obj": i * 360.0 / VIEWS, "mag_obj": 600.0, "tra_obj": 0.0}
+        for i in range(VIEWS)
+    ]
+    # `flat` is true if it is left out: the server moves the sample beside the beam and back, on
+    # a path without a contact. A pose instead says where the beam is free; false takes no flat.
     job = twin.call("trajectory.submit", poses=poses, exposure_ms=20.0, name=name)
     for warning in job["warnings"]:
         print("warning:", warning)
@@ -53,7 +60,9 @@ def main(host: str = "127.0.0.1", port: str = "55000", name: str = "by-trajector
     while status["state"] in ("queued", "running", "paused"):
         time.sleep(0.2)
         status = twin.call("job.status", job=job["job"])
-    print(f"{status['state']}: {status['frames_done']} of {status['frames_total']} projections")
+    print(
+        f"{status['state']}: {status['frames_done']} of {status['frames_total']} projections"
+    )
     print(job["dataset"])
 
 

@@ -3,8 +3,9 @@
     flexdt up --truth truth.toml &              # or any twin; a truth file is optional
     python extensions/examples/adaptive_scan.py tau_x=0.0002,tau_z=0.0002
 
-Angles follow the golden section of a turn, so the scan may end anywhere: whatever was taken until
-then is spread over the turn. `flexdt calibrate` then makes of the data set what was asked for.
+Angles follow the golden section of a turn, so the scan may end anywhere: whatever was taken
+until then is spread over the turn. `flexdt calibrate` then makes of the data set what was asked
+for.
 """
 
 from __future__ import annotations
@@ -29,7 +30,15 @@ def main() -> None:
         poses = [{"rot_obj": round(i * GOLDEN_DEG % 360.0, 3)} for i in range(FRAMES)]
         job = twin.submit_trajectory(poses, 100.0, speed_up=1.0).job
         found = watch(twin, "lego", wanted, job, tell=lambda state: print(state.sigmas()))
-        print(found.job.state, "after", found.frames, "of", FRAMES, "frames:", dict(found.sigmas))
+        print(
+            found.job.state,
+            "after",
+            found.frames,
+            "of",
+            FRAMES,
+            "frames:",
+            dict(found.sigmas),
+        )
 
 
 if __name__ == "__main__":

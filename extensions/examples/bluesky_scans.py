@@ -3,8 +3,8 @@
     flexdt up --data my-scans --speed-up max      # in another terminal
     python extensions/examples/bluesky_scans.py 127.0.0.1 55000 --images camera-images
 
-Needs the extra `lab`. Prints each document's kind and what matters in it, and the TIFF files that
-the stream documents point at.
+Needs the extra `lab`. Prints each document's kind and what matters in it, and the TIFF files
+that the stream documents point at.
 """
 
 from __future__ import annotations
@@ -73,7 +73,9 @@ def main(host: str, port: int, images: Path) -> None:
 
     def step_scan() -> Iterator[Any]:
         yield from bps.mv(lab.tube.kV, 90.0, lab.tube.power_W, 20.0, lab.tube.on, True)
-        yield from bps.mv(lab.camera.roi, "800 620 1199 939", lab.camera.exposure_ms, 100.0)
+        yield from bps.mv(
+            lab.camera.roi, "800 620 1199 939", lab.camera.exposure_ms, 100.0
+        )
         yield from bps.mv(near, 600.0, turn, 0.0)
         yield from bp.scan([lab.camera, lab.tube], turn, 0.0, 90.0, 4)
 

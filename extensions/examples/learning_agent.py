@@ -4,11 +4,11 @@
         [--episodes N] [--judged N]
 
 Four views of one or two parallel plates at a hidden angle; the score is the quality of their
-reconstruction (1 - RMSE / RMS). The agent is fitted Q iteration with a small network, written out
-in NumPy: it plays episodes, learns what an angle was worth after what it had seen, and plays again.
-It is judged once, after its last round, on plates from seeds that neither training nor the choice
-of any parameter has seen. Writes agent.json, agent.png and agent.svg; needs the extras learn and
-docs (for Matplotlib).
+reconstruction (1 - RMSE / RMS). The agent is fitted Q iteration with a small network, written
+out in NumPy: it plays episodes, learns what an angle was worth after what it had seen, and
+plays again. It is judged once, after its last round, on plates from seeds that neither training
+nor the choice of any parameter has seen. Writes agent.json, agent.png and agent.svg; needs the
+extras learn and docs (for Matplotlib).
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ Policy = Callable[[Array, Array], Array]
 
 
 def features(images: Array) -> Array:
-    """Horizontal variance, darkest pixel, mass and steepest edge of images (k, rows, cols, 1)."""
+    """Horizontal variance, darkest pixel, mass and steepest edge of images (k, rows, cols,
+    1)."""
     grey = images[..., 0].astype(np.float64) / 255.0
     columns = np.linspace(-1.0, 1.0, grey.shape[2])
     profile = grey.sum(axis=1) + 1e-9
@@ -44,14 +45,17 @@ def features(images: Array) -> Array:
     share = profile / mass[:, None]
     variance = share @ columns**2 - (share @ columns) ** 2
     edge = np.abs(np.diff(profile, axis=1)).max(axis=1)
-    return np.stack([10.0 * variance, grey.max(axis=(1, 2)), mass / 100.0, edge / 5.0], axis=1)
+    return np.stack(
+        [10.0 * variance, grey.max(axis=(1, 2)), mass / 100.0, edge / 5.0], axis=1
+    )
 
 
 def questions(seen: Array, angles: Array, asked: Array) -> Array:
     """The network's input for every pair of a state and an angle [rad]: (k, asked, inputs).
 
-    For each frame so far: its features, alone and times cosines and sines of twice and four times
-    the angle between it and the one in question, because a plate looks the same from both sides.
+    For each frame so far: its features, alone and times cosines and sines of twice and four
+    times the angle between it and the one in question, because a plate looks the same from both
+    sides.
     """
     k, frames = angles.shape
     out = np.zeros((k, len(asked), INPUTS))
@@ -145,7 +149,8 @@ def fixed(sectors: list[int]) -> Policy:
 
 
 def greedy_sectors() -> list[int]:
-    """The package's greedy baseline: most information about upright columns, blind to images."""
+    """The package's greedy baseline: most information about upright columns, blind to
+    images."""
     env = ScanEnv(action="discrete", task="plates", frames=FRAMES, time_weight=0.0)
     env.reset(seed=0)
     chosen: list[int] = []
@@ -191,11 +196,15 @@ def learn(
             at = TRAINING_SEED * (1 + seed) + (number * episodes) + part * count
             played.append(play(envs, policy, list(range(at, at + count))))
         games += played
-        curve.append(float(np.mean([g["rewards"].sum(axis=1).mean() for g in played]) / GAIN))
-        seen, sectors, rewards = (
-            np.concatenate([g[key] for g in games]) for key in ("seen", "sectors", "rewards")
+        curve.append(
+            float(np.mean([g["rewards"].sum(axis=1).mean() for g in played]) / GAIN)
         )
-        # Backwards: the last frame's worth is its reward, an earlier one's what may follow, too.
+        seen, sectors, rewards = (
+            np.concatenate([g[key] for g in games])
+            for key in ("seen", "sectors", "rewards")
+        )
+        # Backwards: the last frame's worth is its reward, an earlier one's what may follow,
+        #     too.
         for _ in range(3):
             inputs, targets = [], []
             for frame in range(1, FRAMES):
@@ -204,12 +213,17 @@ def learn(
                 taken = np.arange(len(every)), sectors[:, frame]
                 target = rewards[:, frame] / GAIN
                 if frame + 1 < FRAMES:
-                    after = questions(seen[:, : frame + 1], ANGLES[sectors[:, : frame + 1]], ANGLES)
+                    after = questions(
+                        seen[:, : frame + 1], ANGLES[sectors[:, : frame + 1]], ANGLES
+                    )
                     target = target + network(after).max(axis=1)
                 inputs.append(every[taken])
                 targets.append(target)
             network.fit(np.concatenate(inputs), np.concatenate(targets), steps)
-        tell(f"seed {seed}, round {number + 1}: {curve[-1]:.3f} while it tries a quarter at random")
+        tell(
+            f"seed {seed}, round {number + 1}: {curve[-1]:.3f} while it tries a quarter "
+            "at random"
+        )
     return network, curve
 
 
@@ -217,7 +231,9 @@ def judge(envs: ScanVectorEnv, policy: Policy, seed: int, judged: int) -> Array:
     """Scores on objects of their own seeds, (judged,)."""
     count = envs.num_envs
     found = [
-        play(envs, policy, list(range(seed + at, seed + at + count)))["rewards"].sum(axis=1)
+        play(envs, policy, list(range(seed + at, seed + at + count)))["rewards"].sum(
+            axis=1
+        )
         for at in range(0, judged, count)
     ]
     return np.concatenate(found)[:judged] / GAIN
@@ -238,7 +254,9 @@ def draw(document: dict[str, Any], out: Path) -> None:
     means = [document["scores"][n]["mean"] for n in names]
     errors = [document["scores"][n]["standard_error"] for n in names]
     right.barh(names, means, xerr=errors, color="#1b6ca8")
-    right.set(xlabel="1 - RMSE / RMS", title=f"{document['judged']} plates not seen before")
+    right.set(
+        xlabel="1 - RMSE / RMS", title=f"{document['judged']} plates not seen before"
+    )
     for suffix in ("png", "svg"):
         figure.savefig(out / f"agent.{suffix}", dpi=110)
     plt.close(figure)
@@ -250,10 +268,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--episodes", type=int, default=384, help="of a round")
-    parser.add_argument("--steps", type=int, default=1500, help="of each fit of a network")
+    parser.add_argument(
+        "--steps", type=int, default=1500, help="of each fit of a network"
+    )
     parser.add_argument("--judged", type=int, default=256)
     parser.add_argument("--envs", type=int, default=64)
-    parser.add_argument("--pilot", action="store_true", help="judge on the pilot's plates")
+    parser.add_argument(
+        "--pilot", action="store_true", help="judge on the pilot's plates"
+    )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     envs = ScanVectorEnv(
@@ -266,12 +288,18 @@ def main() -> None:
         "equidistant, half turn": fixed([0, 4, 9, 13]),
         "greedy": fixed(greedy_sectors()),
     }
-    scores = {name: judge(envs, policy, at, given.judged) for name, policy in policies.items()}
+    scores = {
+        name: judge(envs, policy, at, given.judged) for name, policy in policies.items()
+    }
     curves, agents = [], []
     for seed in range(given.seeds):
-        network, curve = learn(envs, seed, given.rounds, given.episodes, given.steps, print)
+        network, curve = learn(
+            envs, seed, given.rounds, given.episodes, given.steps, print
+        )
         curves.append(curve)
-        agents.append(judge(envs, best(network, np.random.default_rng(0), 0.0), at, given.judged))
+        agents.append(
+            judge(envs, best(network, np.random.default_rng(0), 0.0), at, given.judged)
+        )
     scores["agent"] = np.mean(agents, axis=0)
     document = {
         "frames": FRAMES,
@@ -292,14 +320,17 @@ def main() -> None:
         "standard_error": float(better.std() / np.sqrt(len(better))),
         "better_on": float((better > 0).mean()),
     }
-    (given.out / "agent.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    (given.out / "agent.json").write_text(
+        json.dumps(document, indent=1), encoding="utf-8"
+    )
     draw(document, given.out)
     for name, score in document["scores"].items():
         print(f"{name:24s} {score['mean']:.3f} +- {score['standard_error']:.3f}")
     print("agents of each seed:", " ".join(f"{a:.3f}" for a in document["agents"]))
     less = document["agent_less_greedy"]
     print(
-        f"agent less greedy, plate by plate: {less['mean']:.3f} +- {less['standard_error']:.3f}, "
+        f"agent less greedy, plate by plate: {less['mean']:.3f} +- "
+        f"{less['standard_error']:.3f}, "
         f"better on {less['better_on']:.0%}"
     )
 

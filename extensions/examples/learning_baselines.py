@@ -56,7 +56,9 @@ def draw(found: dict[str, dict[str, dict[str, Any]]], out: Path) -> None:
         for name, curve in found[task].items():
             values, clock = np.array(curve[key]), curve["clock_s"]
             title = f"{name} (reward {curve['reward']:.1f})"
-            row[0].plot(np.arange(1, len(values) + 1), values, "o-", ms=3, color=COLOURS[name])
+            row[0].plot(
+                np.arange(1, len(values) + 1), values, "o-", ms=3, color=COLOURS[name]
+            )
             row[1].plot(clock, values, "o-", ms=3, color=COLOURS[name], label=title)
         for axis in row:
             axis.set_ylabel(label)
@@ -66,7 +68,9 @@ def draw(found: dict[str, dict[str, dict[str, Any]]], out: Path) -> None:
         row[0].set_xlabel("frames")
         row[1].set_xlabel("seconds of the scanner's clock")
         row[1].legend(fontsize=8)
-        row[0].set_title("Calibrate (LEGO phantom)" if task == "information" else "Reconstruct")
+        row[0].set_title(
+            "Calibrate (LEGO phantom)" if task == "information" else "Reconstruct"
+        )
     for suffix in ("png", "svg"):
         figure.savefig(out / f"baselines.{suffix}", dpi=110)
     plt.close(figure)
@@ -79,9 +83,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=16)
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    found = {task: run(task, given.frames, given.episodes) for task in ("information", "quality")}
+    found = {
+        task: run(task, given.frames, given.episodes)
+        for task in ("information", "quality")
+    }
     document = {"frames": given.frames, "episodes": given.episodes, **found}
-    (given.out / "baselines.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    (given.out / "baselines.json").write_text(
+        json.dumps(document, indent=1), encoding="utf-8"
+    )
     draw(found, given.out)
     for task, policies in found.items():
         for name, curve in policies.items():

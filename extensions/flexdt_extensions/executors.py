@@ -56,7 +56,9 @@ def problems_of(name: str, error: ValidationError) -> list[str]:
     for e in error.errors(include_url=False, include_context=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"
         message = message_of(e)
-        shown = "" if isinstance(e["input"], dict | BaseModel) else f" (got {e['input']!r})"
+        shown = (
+            "" if isinstance(e["input"], dict | BaseModel) else f" (got {e['input']!r})"
+        )
         lines.append(f"{name}: {path}: {message}{'' if 'got' in message else shown}")
     return lines
 
@@ -69,7 +71,9 @@ SCHEDULER_S = 10.0
 """Time limit for reaching a dask scheduler [s]."""
 
 
-def executor(jobs: int | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
+def executor(
+    jobs: int | None, scheduler: str | None
+) -> AbstractContextManager[Executor | None]:
     """Choose an executor to map tasks with: a dask scheduler, own processes, or None
     for this process."""
     if scheduler is not None:
@@ -88,7 +92,9 @@ def processes(jobs: int | None) -> Iterator[Executor]:
     Afresh, because a fork of a process whose kernels run in threads (OpenMP) is ended by them.
     """
     before = {name: os.environ[name] for name in SINGLE if name in os.environ}
-    pool = ProcessPoolExecutor(_count(jobs), get_context("spawn"), initializer=_end_with_parent)
+    pool = ProcessPoolExecutor(
+        _count(jobs), get_context("spawn"), initializer=_end_with_parent
+    )
     os.environ.update(SINGLE)
     try:
         yield pool
@@ -147,12 +153,16 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
             f"{str(address)!r} is no address of a dask scheduler, e.g. 10.0.0.1:8786: {error}",
             {"asked": str(address)},
         ) from None
-    watch = ClusterWatch(client, tend or (lambda workers: [] if workers else [_none_at(address)]))
+    watch = ClusterWatch(
+        client, tend or (lambda workers: [] if workers else [_none_at(address)])
+    )
     try:
         with client, watch, client.get_executor() as pool:
             yield pool
     except Exception as error:
-        if watch.error is not None:  # it has closed the client, which ends the work in its own ways
+        if (
+            watch.error is not None
+        ):  # it has closed the client, which ends the work in its own ways
             raise watch.error from None
         told = _told(error, address, distributed.KilledWorker)
         if told is None:
@@ -165,13 +175,15 @@ def _told(error: Exception, address: Any, killed: type[Exception]) -> CommandErr
     dask's."""
     if isinstance(error, CancelledError):
         return CommandError(
-            f"the dask scheduler at {address} is lost; once there is one, run the command again to "
+            f"the dask scheduler at {address} is lost; once there is one, run the "
+            "command again to "
             "go on",
             REFUSED,
         )
     if isinstance(error, killed):
         return CommandError(
-            f"workers died of the same task again and again (too little memory?): {error}; run the "
+            "workers died of the same task again and again (too little memory?): "
+            f"{error}; run the "
             "command again to go on"
         )
     return None
@@ -305,7 +317,10 @@ def _cluster(wanted: Slurm) -> Any:
         memory=wanted.memory,
         walltime=wanted.walltime,
         job_extra_directives=list(wanted.extra),
-        job_script_prologue=[*wanted.setup, *(f"export {k}={v}" for k, v in SINGLE.items())],
+        job_script_prologue=[
+            *wanted.setup,
+            *(f"export {k}={v}" for k, v in SINGLE.items()),
+        ],
         worker_extra_args=[] if lifetime is None else ["--lifetime", f"{lifetime}s"],
         scheduler_options={"dashboard": False},
     )

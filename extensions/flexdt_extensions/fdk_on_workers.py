@@ -114,10 +114,15 @@ def create(path: Path, grid: Grid) -> Any:
         chunks = layers, min(shape[1], CHUNK), min(shape[2], CHUNK)
         _, y, x = (-(-n // c) * c for n, c in zip(shape, chunks, strict=True))
         group.create_array(
-            str(level), shape=shape, dtype="f4", chunks=chunks, shards=(layers, min(y, ROWS), x),
+            str(level),
+            shape=shape,
+            dtype="f4",
+            chunks=chunks,
+            shards=(layers, min(y, ROWS), x),
             # Zarr makes no file of a shard that holds nothing else, and zeros are something.
-            fill_value=float("nan"), dimension_names=["z", "y", "x"],
-        )  # fmt: skip
+            fill_value=float("nan"),
+            dimension_names=["z", "y", "x"],
+        )
     group.attrs["ome"] = {"version": "0.5", "multiscales": [about]}
     return group
 
@@ -140,7 +145,9 @@ def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
     Raises:
         OSError: it cannot be written; FileNotFoundError where the store is no longer there.
     """
-    with TemporaryDirectory(prefix="slab-", dir=path.parent, ignore_cleanup_errors=True) as folder:
+    with TemporaryDirectory(
+        prefix="slab-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
         put(create(Path(folder), grid), grid, slab, values)
         for level in reversed(range(len(levels(grid)))):
             for made in sorted(Path(folder, str(level), "c").glob("*/*/0"), reverse=True):
@@ -253,7 +260,12 @@ def make_slab(work: SlabWork, slab: int, store: Path, made_by: str) -> bool:
     like = work.grid.slab(first, last).blank()
     try:
         made = fdk_parts(
-            work.parts, work.cone_vec, work.shape, like, work.window, truncation=work.truncation
+            work.parts,
+            work.cone_vec,
+            work.shape,
+            like,
+            work.window,
+            truncation=work.truncation,
         )
         put_whole(store, work.grid, slab, made.data)
     except MemoryError as error:
@@ -298,13 +310,17 @@ def fdk_on_workers(
     files = [path for i in views.indices if (path := data.frames[i].path) is not None]
     stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
     identity = (
-        asdict(replace(request, png=False)), asdict(grid), views.cone_vec.rows.tolist(),
+        asdict(replace(request, png=False)),
+        asdict(grid),
+        views.cone_vec.rows.tolist(),
         [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats],
-    )  # fmt: skip
+    )
     # Workers compute derived values of the data set themselves.
     sent = replace(views, dataset=replace(data))
     truncation = views.truncation
-    work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
+    work = SlabWork(
+        sent.parts, views.cone_vec, views.shape, grid, request.window, truncation
+    )
     home, made_by = folder_of(out, identity)
     store = home / STORE
     if not store.exists():
@@ -324,7 +340,9 @@ def fdk_on_workers(
     _finish(store, out, grid)
     shutil.rmtree(home, ignore_errors=True)
     if len(kinds) > 1:
-        return ["some slabs were made on devices, others on processors: last digits differ"]
+        return [
+            "some slabs were made on devices, others on processors: last digits differ"
+        ]
     return []
 
 
@@ -360,7 +378,9 @@ def same_version(made_by: str) -> None:
         TwinError: it has another.
     """
     if (here := version("flexdt")) != made_by:
-        raise TwinError(f"a worker has flexdt {here}, this is {made_by}: they must be the same")
+        raise TwinError(
+            f"a worker has flexdt {here}, this is {made_by}: they must be the same"
+        )
 
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:

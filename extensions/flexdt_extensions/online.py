@@ -1,4 +1,5 @@
-"""Calibration while the frames arrive: the estimate after each frame, and the angle to take next.
+"""Calibration while the frames arrive: the estimate after each frame, and the angle to take
+next.
 
 The first frames are identified together as soon as that is possible. From then on each frame is
 assigned by prediction, and the fit continues from its last result. Sampling stops when every
@@ -91,10 +92,14 @@ def require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> No
     """Check that there are tolerances, all for estimated parameters; raises as
     `Online.done`."""
     if not tolerance:
-        raise TwinError("no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)})
+        raise TwinError(
+            "no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)}
+        )
     for name in tolerance:
         if name not in free:
-            raise UnknownNameError.among(f"{name!r} is not estimated here; allowed", name, free)
+            raise UnknownNameError.among(
+                f"{name!r} is not estimated here; allowed", name, free
+            )
 
 
 def begin(
@@ -118,9 +123,18 @@ def begin(
     model = bead_model(phantom)
     k = len(model)
     return Online(
-        model, tuple(free), start, None, (), np.zeros((0, k, 2)), np.zeros((0, k, 2, 2)),
-        np.zeros((0, k)), None, 0, widths,
-    )  # fmt: skip
+        model,
+        tuple(free),
+        start,
+        None,
+        (),
+        np.zeros((0, k, 2)),
+        np.zeros((0, k, 2, 2)),
+        np.zeros((0, k)),
+        None,
+        0,
+        widths,
+    )
 
 
 def feed(state: Online, pose: Poses, detections: Detections) -> Online:
@@ -155,7 +169,9 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
         np.concatenate([getattr(state, name), getattr(found, name)])
         for name in ("tracks", "covariances", "bias")
     )
-    return _renew(replace(grown, tracks=tracks, covariances=covariances, bias=bias), fit.parameters)
+    return _renew(
+        replace(grown, tracks=tracks, covariances=covariances, bias=bias), fit.parameters
+    )
 
 
 def _first(state: Online) -> Online:
@@ -168,7 +184,9 @@ def _first(state: Online) -> Online:
         return state
     values = {n: getattr(found.parameters, n) for n in SIX if n in state.free}
     return _renew(
-        replace(state, tracks=found.tracks, covariances=found.covariances, bias=found.bias),
+        replace(
+            state, tracks=found.tracks, covariances=found.covariances, bias=found.bias
+        ),
         replace(state.start, **values),
     )
 
@@ -177,10 +195,17 @@ def _renew(state: Online, start: Offsets) -> Online:
     assert state.poses is not None
     shapes = np.array([d.shape for d in state.detections], dtype=np.float64)
     fit = estimate_geometry(
-        state.tracks, state.model, state.poses, state.free, shape=shapes,
-        covariances=state.covariances, start=start, centre=state.bias, priors=state.priors,
+        state.tracks,
+        state.model,
+        state.poses,
+        state.free,
+        shape=shapes,
+        covariances=state.covariances,
+        start=start,
+        centre=state.bias,
+        priors=state.priors,
         prior_centre=state.start,
-    )  # fmt: skip
+    )
     return replace(state, fit=fit, updates=state.updates + 1)
 
 
@@ -200,9 +225,14 @@ def _rows(state: Online, poses: Poses) -> FloatArray:
     shape = state.detections[-1].shape
     n, k = len(poses), len(state.model)
     problem = build_problem(
-        np.zeros((n, k, 2)), state.model, poses, free=state.free, shape=shape,
-        start=state.fit.parameters, priors=state.priors,
-    )  # fmt: skip
+        np.zeros((n, k, 2)),
+        state.model,
+        poses,
+        free=state.free,
+        shape=shape,
+        start=state.fit.parameters,
+        priors=state.priors,
+    )
     factor = np.array([edge_factor(name) for name in problem.layout.names])
     return np.asarray(problem.jacobian(problem.start) / factor)
 
@@ -239,7 +269,9 @@ def next_angle(
     require_estimated(state.free, tolerance)
     fit = state.fit
     if fit is None or not fit.identifiable:
-        raise TwinError("no estimate yet: feed more frames at angles spread over the turn")
+        raise TwinError(
+            "no estimate yet: feed more frames at angles spread over the turn"
+        )
     angles = np.atleast_1d(np.asarray(candidates, dtype=np.float64))
     if len(angles) == 0:
         raise TwinError("no candidate angles given")
@@ -257,7 +289,9 @@ def next_angle(
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     worst = [sigmas[:, names.index(n)] / limit for n, limit in tolerance.items()]
     best = int(np.argmin(np.max(worst, axis=0)))
-    return NextAngle(float(angles[best]), dict(zip(names, sigmas[best].tolist(), strict=True)))
+    return NextAngle(
+        float(angles[best]), dict(zip(names, sigmas[best].tolist(), strict=True))
+    )
 
 
 def _noise_px(fit: FitResult) -> float:

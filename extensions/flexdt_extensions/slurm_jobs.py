@@ -114,7 +114,9 @@ class SlurmJobs:
         said = _run("squeue", "--noheader", "--me", "--format=%i %T (%r)")
         if said.returncode:
             return None, [f"squeue: {_words(said)}"]
-        rows = [line.split(maxsplit=1) for line in said.stdout.splitlines() if line.strip()]
+        rows = [
+            line.split(maxsplit=1) for line in said.stdout.splitlines() if line.strip()
+        ]
         return {row[0]: row[-1] for row in rows}, []
 
     def _replace(self, gone: Sequence[Job], workers: Collection[str]) -> list[str]:
@@ -139,7 +141,8 @@ class SlurmJobs:
             why = _outcome(job.id)
             if self._barren >= MAX_BARREN:
                 raise CommandError(
-                    f"{MAX_BARREN} jobs have ended before a worker of theirs came, the last one, "
+                    f"{MAX_BARREN} jobs have ended before a worker of theirs came, the "
+                    "last one, "
                     f"{job.id}: {why}; slurm-{job.id}.out may say more",
                     REFUSED,
                 )
@@ -151,7 +154,9 @@ class SlurmJobs:
         return lines
 
     def _waiting(self, queue: Mapping[str, str]) -> str:
-        shown = [f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN_JOBS]]
+        shown = [
+            f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN_JOBS]
+        ]
         more = len(self.jobs) - len(shown)
         if not shown:
             return "waits for workers: no job is in the queue"
@@ -166,8 +171,8 @@ def lifetime_s(walltime: str) -> int | None:
         walltime: as SLURM reads it: minutes, MM:SS, HH:MM:SS, D-HH, D-HH:MM or D-HH:MM:SS.
 
     Returns:
-        A minute, or a twentieth, before the walltime is over; None where it is that short, or not
-        of these forms.
+        A minute, or a twentieth, before the walltime is over; None where it is that short, or
+        not of these forms.
 
     Example:
         >>> lifetime_s("01:00:00"), lifetime_s("2-00:00:00"), lifetime_s("UNLIMITED")
@@ -188,10 +193,14 @@ def lifetime_s(walltime: str) -> int | None:
 
 def _outcome(job: str) -> str:
     """Read from sacct how a job ended."""
-    said = _run("sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}")
+    said = _run(
+        "sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}"
+    )
     lines = said.stdout.split()
     return (
-        lines[0].replace("|", ", exit code ") if not said.returncode and lines else "left the queue"
+        lines[0].replace("|", ", exit code ")
+        if not said.returncode and lines
+        else "left the queue"
     )
 
 
@@ -205,11 +214,19 @@ def _run(*words: str) -> subprocess.CompletedProcess[str]:
     """Run one of SLURM's commands; one that is not there or does not answer has failed."""
     try:
         return subprocess.run(
-            words, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S, check=False,
-            stdin=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
+            words,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=TIMEOUT_S,
+            check=False,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
     except subprocess.TimeoutExpired:
-        return subprocess.CompletedProcess(words, 1, "", f"no answer within {TIMEOUT_S:g} s")
+        return subprocess.CompletedProcess(
+            words, 1, "", f"no answer within {TIMEOUT_S:g} s"
+        )
     except OSError as error:
         return subprocess.CompletedProcess(words, 1, "", f"{words[0]}: {error.strerror}")
 

@@ -83,7 +83,9 @@ def watch(
     """
     require_estimated(free, tolerance)
     model = bead_model(load_phantom(phantom))
-    state = begin(model, free, priors=_machine_priors(client) if priors is None else priors)
+    state = begin(
+        model, free, priors=_machine_priors(client) if priors is None else priors
+    )
     sigmas: dict[str, float | None] = {}
     due, goal = 0, dict.fromkeys(tolerance, math.inf)
     status = client.job_status(job)
@@ -96,12 +98,19 @@ def watch(
             continue
         fit = client.fit_calibration([name], phantom, free, priors=priors)
         sigmas = {n: p.sigma for n, p in fit.parameters.items() if n in tolerance}
-        if all((s := sigmas.get(n)) is not None and s <= most for n, most in tolerance.items()):
-            words = ", ".join(f"{n} {s:.3g} of {tolerance[n]:g}" for n, s in sigmas.items())
+        if all(
+            (s := sigmas.get(n)) is not None and s <= most
+            for n, most in tolerance.items()
+        ):
+            words = ", ".join(
+                f"{n} {s:.3g} of {tolerance[n]:g}" for n, s in sigmas.items()
+            )
             reason = f"sigmas reached after {seen} frames: {words}"
             return Watched(client.abort_job(status.job, reason), seen, sigmas, True)
         due, now = seen + 1 + seen // 8, state.sigmas()
-        goal = {n: most * now[n] / (sigmas.get(n) or now[n]) for n, most in tolerance.items()}
+        goal = {
+            n: most * now[n] / (sigmas.get(n) or now[n]) for n, most in tolerance.items()
+        }
     return Watched(client.job_status(status.job), len(state.detections), sigmas, False)
 
 
@@ -123,7 +132,9 @@ def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
         if status.state != "queued" and status.dataset:
             name = PurePath(status.dataset).name
             plan = client.dataset(name, 2000)
-            for i, kind, there in zip(plan.indices, plan.kinds, plan.present, strict=True):
+            for i, kind, there in zip(
+                plan.indices, plan.kinds, plan.present, strict=True
+            ):
                 if kind == "projection" and there and i not in seen:
                     seen.add(i)
                     image, what = client.dataset_frame(name, i, "line_integral")
@@ -145,12 +156,15 @@ def watch_job(
     twin: Twin,
     phantom: str = argument(..., "PHANTOM"),
     job: str | None = argument(None, "[JOB]"),
-    stop_when: str = option(..., "End the job at these sigmas (mm, deg).", metavar="P=SIGMA,..."),
+    stop_when: str = option(
+        ..., "End the job at these sigmas (mm, deg).", metavar="P=SIGMA,..."
+    ),
 ) -> Answer:
     """End a scan of beads once its calibration is sure enough.
 
-    PHANTOM is what is scanned. JOB: the current one if left out. The data set stays, says why it
-    ended, and calibrates as far as it goes. A job whose sigmas are not reached runs to its end.
+    PHANTOM is what is scanned. JOB: the current one if left out. The data set stays, says why
+    it ended, and calibrates as far as it goes. A job whose sigmas are not reached runs to its
+    end.
     """
     wanted = assignments(stop_when.split(","))
 

@@ -31,7 +31,9 @@ def flexdt(capsys: pytest.CaptureFixture[str]) -> Run:
 
 def test_the_listed_commands_are_those_of_the_distribution() -> None:
     points = metadata.entry_points(group=GROUP)
-    ours = {p.name.replace(".", " ") for p in points if p.dist.name == "flexdt-extensions"}
+    ours = {
+        p.name.replace(".", " ") for p in points if p.dist.name == "flexdt-extensions"
+    }
     assert ours == {*KNOWN}
 
 
@@ -54,7 +56,9 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("alone")
-@pytest.mark.parametrize("more", [[], ["--help"], ["x.json", "--out", "y"], ["--jobs", "2"]])
+@pytest.mark.parametrize(
+    "more", [[], ["--help"], ["x.json", "--out", "y"], ["--jobs", "2"]]
+)
 @pytest.mark.parametrize("name", KNOWN)
 def test_without_the_distribution_one_line_says_what_to_install(
     name: str, more: list[str], flexdt: Run
@@ -98,7 +102,9 @@ def test_bench_tells_a_wrong_option_in_one_line() -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_study_in_small(flexdt: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_study_in_small(
+    flexdt: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The command's own part: its document is what run_study gives, and summary.json is it."""
     from flexdt_extensions.studies import study as body
 
@@ -115,7 +121,9 @@ def test_study_in_small(flexdt: Run, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (document["experiment"], document["fidelity"]) == ("damping", "points")
     settings = [row["setting"] for row in document["rows"]]
     assert len(settings) == 4
-    assert all(row["success"] == row["runs"] and row["mae"] < 1e-6 for row in document["rows"])
+    assert all(
+        row["success"] == row["runs"] and row["mae"] < 1e-6 for row in document["rows"]
+    )
     code, out, _ = flexdt("study", "damping", "--jobs", 1)
     assert code == 0
     assert "thesis MAE" in out

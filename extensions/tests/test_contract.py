@@ -12,7 +12,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "python.md"
-PUBLIC = {"flexdt", *re.findall(r"^### `([\w.]+)`$", PAGE.read_text("utf-8"), re.MULTILINE)}
+PUBLIC = {
+    "flexdt",
+    *re.findall(r"^### `([\w.]+)`$", PAGE.read_text("utf-8"), re.MULTILINE),
+}
 EXTENSIONS = ROOT / "extensions"
 FILES = sorted([
     *(EXTENSIONS / "flexdt_extensions").rglob("*.py"),
@@ -28,7 +31,9 @@ def defined(source: str) -> set[str]:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
                 names.add(node.name)
             case ast.Assign(targets=targets):
-                names |= {t.id for o in targets for t in ast.walk(o) if isinstance(t, ast.Name)}
+                names |= {
+                    t.id for o in targets for t in ast.walk(o) if isinstance(t, ast.Name)
+                }
             case ast.AnnAssign(target=ast.Name(id=name)):
                 names.add(name)
     return {name for name in names if not name.startswith("_")}
@@ -65,7 +70,9 @@ def private(source: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda f: f.relative_to(EXTENSIONS).as_posix())
+@pytest.mark.parametrize(
+    "file", FILES, ids=lambda f: f.relative_to(EXTENSIONS).as_posix()
+)
 def test_only_public_names_are_imported(file: Path) -> None:
     assert private(file.read_text("utf-8")) == []
 

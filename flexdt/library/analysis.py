@@ -49,14 +49,15 @@ def calibrate(
             `geometry` are all there is.
         phantom: a phantom, its name, the path of a phantom file, or "unknown": three or
             more markers at unknown positions.
-        geometry: nominal geometry of all frames, or its file: in place of the data set's, or for a
-            folder of anybody's TIFF images (see `read_tiffs`).
+        geometry: nominal geometry of all frames, or its file: in place of the data set's, or
+            for a folder of anybody's TIFF images (see `read_tiffs`).
         progress: a bar after two seconds; False for no bar, or a function of the fraction
             done.
         options: OPTIONS
 
     Returns:
-        The calibration with its uncertainty report; `document` is the JSON of `flexdt calibrate`.
+        The calibration with its uncertainty report; `document` is the JSON of `flexdt
+        calibrate`.
 
     Raises:
         TwinError: a folder is no data set, the phantom has no beads, `free` names what does not
@@ -126,8 +127,8 @@ def reconstruct(
         algorithm: fdk, sirt, sart, cgls, em or tv.
         voxel: edge of a voxel [mm]; default: the pixel's size at the rotation axis.
         shape: (z, y, x) of the volume; default: the field of view.
-        center: (x, y, z) of the volume's centre [mm]; default: the middle of the field of view, or
-            the origin where `shape` is given.
+        center: (x, y, z) of the volume's centre [mm]; default: the middle of the field of view,
+            or the origin where `shape` is given.
         binning: mean over so many pixels a side first.
         every: use every n-th frame.
         iterations: of an iterative algorithm; default: its own.
@@ -135,10 +136,10 @@ def reconstruct(
         window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
         rings: subtract the offsets that pixels add to all views, where they exceed object
             and noise; offsets of entire columns in full turns only.
-        material: the object is made of this alone: correct beam hardening. For sirt and sart also
-            all the materials it is made of.
-        scatter_correction: the material that the object is made of, or all of them: simulate its
-            scatter and subtract it (a circular scan).
+        material: the object is made of this alone: correct beam hardening. For sirt and sart
+            also all the materials it is made of.
+        scatter_correction: the material that the object is made of, or all of them: simulate
+            its scatter and subtract it (a circular scan).
         tube: of the scan, for the two corrections; default: the tube that the data set
             states.
         parameters: correction; default: the one in force during the scan, if any.
@@ -180,7 +181,9 @@ def reconstruct(
 
 
 @public
-def align(data: Data, *, per_frame: bool = False, progress: Progress = None) -> Aligned[DataSet]:
+def align(
+    data: Data, *, per_frame: bool = False, progress: Progress = None
+) -> Aligned[DataSet]:
     """Find axis and source plane of an ordinary scan without a phantom.
 
     Args:

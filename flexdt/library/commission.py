@@ -43,10 +43,16 @@ MIN_DURATIONS: Final = 3
 """Durations of a kind of command from which its range is estimated (`docs/machine-fit.md`)."""
 NEXT_SCANS: Final = {
     "ordinary": ("a full turn of any object with structure", "fly --frames 721"),
-    "magnified": ("the same at another magnification", "fly --frames 721 --sod {sod:.0f}"),
+    "magnified": (
+        "the same at another magnification",
+        "fly --frames 721 --sod {sod:.0f}",
+    ),
     "later": ("the same on another day", "fly --frames 721"),
     "beads": ("a bead phantom at two distances, then `flexdt calibrate`", "calibration"),
-    "recorded": ("a scan with `flexdt follow ADDRESS --record FILE` beside it", "calibration"),
+    "recorded": (
+        "a scan with `flexdt follow ADDRESS --record FILE` beside it",
+        "calibration",
+    ),
 }
 """Kind of scan -> its description, and the options of `flexdt script new --kind`."""
 NEARER_SOD_RATIO: Final = 0.6
@@ -82,20 +88,48 @@ class Commissioned(NamedTuple):
             Title -> head and rows.
         """
         votes = Counter(q.settled_by for q in self.questions if q.settled_by)
-        sod = next((s.settings.sod_mm for s in self.scans[::-1] if s.settings), None) or 1000.0
+        sod = (
+            next((s.settings.sod_mm for s in self.scans[::-1] if s.settings), None)
+            or 1000.0
+        )
         files = f"--machine {out / 'machine.toml'} --profile {out / 'profile.toml'}"
         make = f"flexdt script new {files} --out next.txt --kind "
         columns = self.offsets.columns
         return {
             "scans": (
-                ("scan", "date", "executed_lines", "images", "axis_column_px", "fitted", "sigma"),
-                [(s.name, s.date and s.date.isoformat(), len(s.log), s.images,
-                  *columns.get(s.name, (None,) * 3)) for s in self.scans],
+                (
+                    "scan",
+                    "date",
+                    "executed_lines",
+                    "images",
+                    "axis_column_px",
+                    "fitted",
+                    "sigma",
+                ),
+                [
+                    (
+                        s.name,
+                        s.date and s.date.isoformat(),
+                        len(s.log),
+                        s.images,
+                        *columns.get(s.name, (None,) * 3),
+                    )
+                    for s in self.scans
+                ],
             ),
             "axes": (
                 ("axis", "lower", "upper", "max_speed", "max_acceleration", "source"),
-                [(n, a.lower, a.upper, a.max_speed, a.max_acceleration, a.source or "as shipped")
-                 for n, a in self.machine.axes.items()],
+                [
+                    (
+                        n,
+                        a.lower,
+                        a.upper,
+                        a.max_speed,
+                        a.max_acceleration,
+                        a.source or "as shipped",
+                    )
+                    for n, a in self.machine.axes.items()
+                ],
             ),
             "zero_offsets": (
                 ("offset", *tells.Line._fields),
@@ -105,11 +139,16 @@ class Commissioned(NamedTuple):
             "not_judged": (Question._fields, [*self.questions]),
             "next": (
                 ("scan", "settles", "command"),
-                [(NEXT_SCANS[kind][0], n,
-                  make + NEXT_SCANS[kind][1].format(sod=NEARER_SOD_RATIO * sod))
-                 for kind, n in votes.most_common(MAX_NEXT_SCANS)],
+                [
+                    (
+                        NEXT_SCANS[kind][0],
+                        n,
+                        make + NEXT_SCANS[kind][1].format(sod=NEARER_SOD_RATIO * sod),
+                    )
+                    for kind, n in votes.most_common(MAX_NEXT_SCANS)
+                ],
             ),
-        }  # fmt: skip
+        }
 
     def document(self, out: Path) -> dict[str, object]:
         """Make `commission.json`: the tables, each row an object, and the fit.
@@ -132,7 +171,9 @@ class Commissioned(NamedTuple):
         }
 
 
-def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog) -> Commissioned:
+def commission(
+    folders: Sequence[Path], traffic: Path | None, read_log: ReadLog
+) -> Commissioned:
     """Estimate a machine and its profile from past scans.
 
     Args:
@@ -149,35 +190,53 @@ def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog)
     ask = open_questions.append
     read = [_texts(folder, ask) for folder in dict.fromkeys(folders)]
     known = [d.builtin_machine(name) for name in d.builtin_machines()]
-    named = [m.name for s in read
-             if s.settings and (m := rebuild.named_machine(s.settings, known))]  # fmt: skip
+    named = [
+        m.name
+        for s in read
+        if s.settings and (m := rebuild.named_machine(s.settings, known))
+    ]
     shipped = machines.machine(Counter(named).most_common(1)[0][0] if named else None)
     if not named:
-        by_limits = [one for s in read
-                     if (one := tells.scanner_of(_script(s, shipped, read_log, _nothing), known))
-                     .machine]  # fmt: skip
-        taken = f"{by_limits[0].machine} is taken by {by_limits[0].by}" if by_limits else (
-            "the FleX-ray is taken")  # fmt: skip
+        by_limits = [
+            one
+            for s in read
+            if (
+                one := tells.scanner_of(_script(s, shipped, read_log, _nothing), known)
+            ).machine
+        ]
+        taken = (
+            f"{by_limits[0].machine} is taken by {by_limits[0].by}"
+            if by_limits
+            else ("the FleX-ray is taken")
+        )
         ask(Question("which scanner it is", f"no text names one that ships; {taken}"))
         shipped = machines.machine(by_limits[0].machine if by_limits else None)
-    scans = sorted((_script(s, shipped, read_log, ask) for s in read),
-                   key=lambda s: s.date or datetime.max)  # fmt: skip
+    scans = sorted(
+        (_script(s, shipped, read_log, ask) for s in read),
+        key=lambda s: s.date or datetime.max,
+    )
     if traffic is not None:
         log = read_log(traffic, shipped)
         told = [x.command for x in log]
         if all([x.command for x in s.log] != told for s in scans):
             scans.append(PastScan(str(traffic), log=log))
     if words := tells.other_scanners(scans, known):
-        raise CommandError(f"the folders are of several scanners; allowed: those of one. {words}")
+        raise CommandError(
+            f"the folders are of several scanners; allowed: those of one. {words}"
+        )
     if not any(s.settings or s.log or s.images for s in scans):
         where = ", ".join(map(str, folders))
-        raise CommandError(f"{where}: no settings text, executed script or radiograph of a scan")
+        raise CommandError(
+            f"{where}: no settings text, executed script or radiograph of a scan"
+        )
     machine, text, fit = _fitted(scans, shipped)
     scans = [_measured(s, machine, ask) for s in scans]
     offsets = tells.zero_offsets(scans, machine, d.profile_of(shipped))
     unseen = [f"limits of {n}" for n in machine.axes if fit is None or n not in fit.axes]
     times = {k: x.n for k, x in machine.timing.spread.items()} if fit else {}
-    unseen += [f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < MIN_DURATIONS]
+    unseen += [
+        f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < MIN_DURATIONS
+    ]
     why = f"no executed script tells it, or fewer than {MIN_DURATIONS} commands of one"
     rest = [*offsets.questions, *(Question(what, why, "recorded") for what in unseen)]
     findings = [
@@ -194,7 +253,9 @@ def _refused(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
     try:
         check_home(machine, profile, MACHINE_FILE)
     except TwinError as error:
-        yield tells.Finding(MACHINE_FILE, f"`flexdt machine check` refuses it: {error.message}")
+        yield tells.Finding(
+            MACHINE_FILE, f"`flexdt machine check` refuses it: {error.message}"
+        )
 
 
 def _nothing(question: Question) -> None:
@@ -258,7 +319,9 @@ def _script(
     return scan
 
 
-def _fitted(scans: Sequence[PastScan], shipped: d.Machine) -> tuple[d.Machine, str, Fit | None]:
+def _fitted(
+    scans: Sequence[PastScan], shipped: d.Machine
+) -> tuple[d.Machine, str, Fit | None]:
     """Fit a machine to the texts' signs and rates and to the executed scripts.
 
     Args:
@@ -269,24 +332,37 @@ def _fitted(scans: Sequence[PastScan], shipped: d.Machine) -> tuple[d.Machine, s
         The machine, the text of its file, and the fit; None without executed scripts.
     """
     turning = shipped.geometry.get("angle", {})
-    axes = {n: a if n in turning else _stated(a, n, scans, shipped)
-            for n, a in shipped.axes.items()}  # fmt: skip
+    axes = {
+        n: a if n in turning else _stated(a, n, scans, shipped)
+        for n, a in shipped.axes.items()
+    }
     machine, fit = shipped.model_copy(update={"axes": axes}), None
     logs = [
-        [x if own_name(getattr(x.command, "component", ""), axes) in axes
-         else replace(x, motor=None) for x in s.log]
-        for s in scans if s.log
-    ]  # fmt: skip
+        [
+            x
+            if own_name(getattr(x.command, "component", ""), axes) in axes
+            else replace(x, motor=None)
+            for x in s.log
+        ]
+        for s in scans
+        if s.log
+    ]
     if logs:
         names = ", ".join(Path(s.name).name for s in scans if s.log)
-        fit = fit_machine(logs, machine, f"measured: {names} ({sum(map(len, logs))} lines)")
+        fit = fit_machine(
+            logs, machine, f"measured: {names} ({sum(map(len, logs))} lines)"
+        )
         machine = fit.machine
     changed = [n for n, axis in machine.axes.items() if axis != shipped.axes[n]]
-    text = fitted_text(d.builtin_machine_text(shipped.name), machine, changed, machines.parsed)
+    text = fitted_text(
+        d.builtin_machine_text(shipped.name), machine, changed, machines.parsed
+    )
     return machine, text, fit
 
 
-def _stated(axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine) -> d.Axis:
+def _stated(
+    axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine
+) -> d.Axis:
     """Return an axis with the rates of the last settings text, and the sign of most of them.
 
     Args:
@@ -301,7 +377,9 @@ def _stated(axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machi
         asked = tells.scripted(scan, machine).get(name, 0.0)
         if abs(asked) > 1.0 and abs(abs(asked) - abs(motor.value)) <= rebuild.MATCH_MM:
             signs[1 if asked * motor.value > 0 else -1] += 1
-    changes: dict[str, Any] = {"settings_sign": signs.most_common(1)[0][0]} if signs else {}
+    changes: dict[str, Any] = (
+        {"settings_sign": signs.most_common(1)[0][0]} if signs else {}
+    )
     for rate in ("speed", "acceleration"):
         values = [v for _, m in told if (v := getattr(m, rate))]
         if values:
@@ -312,13 +390,17 @@ def _stated(axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machi
     return axis if stated == axis else stated.model_copy(update={"source": source})
 
 
-def _measured(scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]) -> PastScan:
+def _measured(
+    scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]
+) -> PastScan:
     """Add the poses of a scan, and its alignment; a failure becomes a question."""
     try:
         scan = tells.standing(scan, machine)
         if not scan.images:
             raise TwinError("it has no radiographs")
-        data = load_dataset(scan.name, machine=machine, profile=scan.profile, ignore_document=True)
+        data = load_dataset(
+            scan.name, machine=machine, profile=scan.profile, ignore_document=True
+        )
         found = align_dataset(data).alignment
         if found.offsets is None:
             raise TwinError(f"align: {found.refused['axis_column_px']}")
@@ -343,7 +425,10 @@ def write_commission(found: Commissioned, out: Path) -> None:
     """
     part = out.absolute().with_name(f".{out.absolute().name}.part.{os.getpid()}")
     profile = found.offsets.profile.model_dump(exclude={"priors"})
-    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in profile.items()]
+    lines = [
+        f"{key} = {json.dumps(value, ensure_ascii=False)}"
+        for key, value in profile.items()
+    ]
     body: list[str] = [heading("What past scans tell of the machine")]
     for title, (head, rows) in found.tables(out).items():
         body += [heading(title, level=2), table(head, rows)]

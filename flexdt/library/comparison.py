@@ -1,8 +1,9 @@
 """Compare a data set with the twin's own projections: `flexdt compare` (thesis 4.10).
 
-The twin is posed from the data set's texts and projects the phantom. The projections are compared
-with the radiographs before and after the correction that calibration finds, as residuals of the
-beads in pixels and as difference images. A correction that is not identifiable is an error.
+The twin is posed from the data set's texts and projects the phantom. The projections are
+compared with the radiographs before and after the correction that calibration finds, as
+residuals of the beads in pixels and as difference images. A correction that is not identifiable
+is an error.
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ def compare_folder(
     Args:
         folder: the data set; TIFFs and the two settings texts are enough.
         phantom: that was scanned, by value, name or file.
-        tolerance_px: largest allowed rms residual of the beads after correction, per coordinate.
+        tolerance_px: largest allowed rms residual of the beads after correction, per
+            coordinate.
         shown: frames of which difference images are made.
 
     Raises:
@@ -101,7 +103,9 @@ def compare_folder(
     corrected = result.fit.parameters
     before, after = (bead_residuals(outcome, p) for p in (NOMINAL, corrected))
     present = dataset.present
-    chosen = tuple(present[i] for i in np.linspace(0, len(present) - 1, shown).round().astype(int))
+    chosen = tuple(
+        present[i] for i in np.linspace(0, len(present) - 1, shown).round().astype(int)
+    )
     seen = dataset.stack(chosen)
     first = seen - virtual(outcome.phantom, dataset, chosen, NOMINAL)
     second = seen - virtual(outcome.phantom, dataset, chosen, corrected)
@@ -125,7 +129,8 @@ def compare_folder(
 
 
 def bead_residuals(outcome: Outcome[ImageSet], parameters: Offsets) -> FloatArray:
-    """Measured minus virtual bead positions of the first data set, (n, k, 2) [px], nan unseen."""
+    """Measured minus virtual bead positions of the first data set, (n, k, 2) [px], nan
+    unseen."""
     fit = outcome.calibration.fit
     assert fit is not None
     return fit.problem.pixels - predictions(fit, [parameters] * len(fit.problem.base))
@@ -139,11 +144,19 @@ def virtual(
     return line_integrals(phantom, cone, dataset.shape)
 
 
-def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, float | None]:
+def _figures(
+    residual: FloatArray, images: Float32Array | None
+) -> dict[str, float | None]:
     length = np.linalg.norm(residual, axis=2)
-    of_images = None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2)))
+    of_images = (
+        None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2)))
+    )
     return dict(
-        zip(FIGURES, (coordinate_rms(residual), float(np.nanmax(length)), of_images), strict=True)
+        zip(
+            FIGURES,
+            (coordinate_rms(residual), float(np.nanmax(length)), of_images),
+            strict=True,
+        )
     )
 
 
@@ -174,7 +187,9 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
             with room_named(file):
                 tifffile.imwrite(file, stack[k])
     document = comparison.document
-    (out / "compare.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    (out / "compare.json").write_text(
+        json.dumps(document, indent=1) + "\n", encoding="utf-8"
+    )
     rows = [[name, *figures] for name, *figures in rows_of(document)]
     before, after = (
         np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
@@ -183,13 +198,17 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
     verdict = marked("within", "good") if comparison.within else marked("exceeded", "bad")
     body: list[str] = [
         heading(f"{comparison.outcome.datasets[0].name} beside the twin"),
-        paragraph(f"Tolerance {document['tolerance_px']} px: ", verdict, " after correction."),
+        paragraph(
+            f"Tolerance {document['tolerance_px']} px: ", verdict, " after correction."
+        ),
         table(["", "rms (px)", "worst bead (px)", "rms of the difference image"], rows),
         plot(
             [Series("before", frames, before), Series("after", frames, after)],
-            title="Residual of the beads by frame", x_label="frame", y_label="rms (px)",
+            title="Residual of the beads by frame",
+            x_label="frame",
+            y_label="rms (px)",
         ),
-    ]  # fmt: skip
+    ]
     shown = {
         "radiograph": comparison.seen,
         "difference before": comparison.before,

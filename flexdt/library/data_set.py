@@ -1,7 +1,7 @@
 """`DataSet`: the images of a scan with a method for each thing that users do with them.
 
-The value itself is `ImageSet`. Each method calls the module that does the work, imported when the
-method is first called: detection, kernels and figures are heavy.
+The value itself is `ImageSet`. Each method calls the module that does the work, imported when
+the method is first called: detection, kernels and figures are heavy.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 class DataSet(ImageSet):
     """The projections of a scan with dark and flat images and geometry.
 
-    Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is the
-    data set of those projections.
+    Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is
+    the data set of those projections.
 
     Attributes:
         name: the scan's.
@@ -91,7 +91,9 @@ class DataSet(ImageSet):
         with long_work.during("calibrating", progress):
             return calibrate_with([posed], phantom, options)
 
-    def align(self, *, per_frame: bool = False, progress: Progress = None) -> Aligned[DataSet]:
+    def align(
+        self, *, per_frame: bool = False, progress: Progress = None
+    ) -> Aligned[DataSet]:
         """Estimate the geometry without a phantom; see `flexdt.align`.
 
         `data.with_correction(data.align().correction)` is the corrected data set.
@@ -132,7 +134,10 @@ class DataSet(ImageSet):
             >>> data.reconstruct("fdk", voxel=0.5)
             <Volume: 4 x 5 x 5 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
         """
-        from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
+        from flexdt.library.reconstruction.reconstruct import (
+            VolumeRequest,
+            reconstruct_volume,
+        )
 
         request = VolumeRequest(
             algorithm=algorithm,
@@ -159,8 +164,8 @@ class DataSet(ImageSet):
             )
 
     def save(self, folder: File, *, resume: bool = False) -> None:
-        """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
-        (uint16) and the geometry.
+        """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif
+        ... (uint16) and the geometry.
 
         geometry.json holds the geometry with the correction in force, warnings and the
         largest count of the panel. A data set with flexdt.json keeps that instead, as

@@ -60,7 +60,8 @@ def against_html(found: LogComparison, name: str = "script") -> str:
     title = f"{name}: predicted and executed"
     rows = table(found.HEADER, found.table(), text=("what",))
     return page(
-        title, [heading(title), facts(against_summary(found)), *_problems(found.problems), rows]
+        title,
+        [heading(title), facts(against_summary(found)), *_problems(found.problems), rows],
     )
 
 
@@ -73,9 +74,14 @@ def clearance_plot(found: Clearance) -> str:
     times, distances = np.array(found.trace, dtype=np.float64).T
     return plot(
         [Series("", times, np.maximum(distances, 0.0))],
-        title="Smallest clearance", x_label="time (s)", y_label="clearance (mm)", width=900,
-        marks=[(c.time_s, f"line {c.line}: {' and '.join(c.pair)}") for c in found.collisions],
-    )  # fmt: skip
+        title="Smallest clearance",
+        x_label="time (s)",
+        y_label="clearance (mm)",
+        width=900,
+        marks=[
+            (c.time_s, f"line {c.line}: {' and '.join(c.pair)}") for c in found.collisions
+        ],
+    )
 
 
 def printable(text: str) -> str:

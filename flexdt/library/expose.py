@@ -10,7 +10,12 @@ import numpy as np
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_doubts import DARK
 from flexdt.library.reading.folders import load_dataset
-from flexdt.phantoms.exposure_forecast import SIMULATED_VIEWS, Forecast, Transmission, expose
+from flexdt.phantoms.exposure_forecast import (
+    SIMULATED_VIEWS,
+    Forecast,
+    Transmission,
+    expose,
+)
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS
 

@@ -24,7 +24,8 @@ def package(
         return import_module(name)
     except ImportError:
         raise TwinError(
-            f"{what} needs {name}, which is not installed: pip install '{distribution}[{extra}]'",
+            f"{what} needs {name}, which is not installed: pip install "
+            f"'{distribution}[{extra}]'",
             {"missing": name},
         ) from None
 
@@ -38,7 +39,9 @@ def lacking(module: str, name: str, extra: str) -> str | None:
         name: of its distribution.
         extra: of flexdt that brings it.
     """
-    return None if find_spec(module) else f"{name} is missing: pip install 'flexdt[{extra}]'"
+    return (
+        None if find_spec(module) else f"{name} is missing: pip install 'flexdt[{extra}]'"
+    )
 
 
 def offered(name: str, group: str) -> Any:

@@ -28,7 +28,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b58900", "#17889b", "#9b2226", "#5f6c7b")
+COLOURS = (
+    "#1b6ca8",
+    "#c8553d",
+    "#3a7d44",
+    "#8e5ea2",
+    "#b58900",
+    "#17889b",
+    "#9b2226",
+    "#5f6c7b",
+)
 MARK = "#c62828"
 Floats = npt.NDArray[np.float64]
 DPI = 72.0
@@ -155,12 +164,18 @@ def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float
     values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     t = np.linspace(0, 2 * math.pi, 90)
     ring = vectors @ (
-        scale * np.sqrt(np.maximum(values, 0.0))[:, None] * np.stack([np.cos(t), np.sin(t)])
+        scale
+        * np.sqrt(np.maximum(values, 0.0))[:, None]
+        * np.stack([np.cos(t), np.sin(t)])
     )
     return plot(
-        [Series("", *ring)], title=f"{names[1]} against {names[0]}", x_label=names[0],
-        y_label=names[1], width=270, height=210,
-    )  # fmt: skip
+        [Series("", *ring)],
+        title=f"{names[1]} against {names[0]}",
+        x_label=names[0],
+        y_label=names[1],
+        width=270,
+        height=210,
+    )
 
 
 def image_under(
@@ -170,7 +185,9 @@ def image_under(
     rows.
     """
     data = np.asarray(values, dtype=np.float64)
-    figure = blank(width, 26 + (width - 90 * bool(points)) * data.shape[0] / data.shape[1])
+    figure = blank(
+        width, 26 + (width - 90 * bool(points)) * data.shape[0] / data.shape[1]
+    )
     axes = axes_of(figure, title, "", "")
     low, high = np.percentile(data, [0.5, 99.7])
     axes.imshow(data, cmap="gray_r", vmin=low, vmax=high)
@@ -196,6 +213,8 @@ def _id(*words: object) -> str:
     return re.sub(r"\W+", "-", " ".join(map(str, words)))
 
 
-def _legend(figure: Figure, series: Sequence[Series | tuple[str, Floats, Floats]]) -> None:
+def _legend(
+    figure: Figure, series: Sequence[Series | tuple[str, Floats, Floats]]
+) -> None:
     if any(s.name if isinstance(s, Series) else s[0] for s in series):
         figure.legend(loc="outside right upper", fontsize=8, frameon=False)

@@ -79,7 +79,9 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
     except (TypeError, ValueError) as error:
         if isinstance(error, GeometryError):
             raise
-        raise GeometryError(f"ASTRA's geometry: {error}", {"asked": repr(error)}) from None
+        raise GeometryError(
+            f"ASTRA's geometry: {error}", {"asked": repr(error)}
+        ) from None
     own = check_spread(ConeVec(rows, counted))
     own.of_shape(shape)
     return own
@@ -90,7 +92,8 @@ def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
     warn_of(radian_findings(geometry["ProjectionAngles"]), GeometryError, stacklevel=5)
     circle = ConeVec.circular(
         sod=float(geometry["DistanceOriginSource"]),
-        sdd=float(geometry["DistanceOriginSource"]) + float(geometry["DistanceOriginDetector"]),
+        sdd=float(geometry["DistanceOriginSource"])
+        + float(geometry["DistanceOriginDetector"]),
         angles=np.degrees(np.asarray(geometry["ProjectionAngles"], dtype=np.float64)),
         pixel=(float(geometry["DetectorSpacingX"]), float(geometry["DetectorSpacingY"])),
     )
@@ -116,7 +119,8 @@ def from_tomosipo(geometry: Any) -> ConeVec:
         lost = [name for name in names if not hasattr(vectors, name)]
         if lost:
             raise GeometryError(
-                f"a {type(geometry).__name__} has no {', '.join(lost)}; allowed: a cone geometry "
+                f"a {type(geometry).__name__} has no {', '.join(lost)}; allowed: a cone "
+                "geometry "
                 "of tomosipo",
                 {"asked": type(geometry).__name__, "missing": lost},
             )
@@ -136,7 +140,9 @@ def to_cil(cone_vec: ConeVec) -> Any:
     """Make an acquisition geometry of CIL; see `ConeVec.to_cil`."""
     arrays = cil_arrays(_scan(cone_vec))
     framework = _peer("cil.framework", "CIL", ".cil")
-    geometry = framework.AcquisitionGeometry.create_Cone3D_Flex(*(arrays[name] for name in POSES))
+    geometry = framework.AcquisitionGeometry.create_Cone3D_Flex(
+        *(arrays[name] for name in POSES)
+    )
     counts, sizes = (arrays[name].tolist() for name in PANEL[:2])
     geometry.set_panel(counts, sizes, origin=ORIGIN)
     return geometry
@@ -258,14 +264,19 @@ def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
     if format is None and path.suffix.lower() == OWN_ENDING:
         save_geometry(_scan(cone_vec), path)
     else:
-        chosen = format or _format(path, [form for form in FORMATS.values() if form.write])
+        chosen = format or _format(
+            path, [form for form in FORMATS.values() if form.write]
+        )
         write_geometry(_scan(cone_vec), path, chosen)
 
 
 def _format(path: Path, among: Iterable[Format]) -> str:
     """Return the name of the format with a file's ending; `OWN_ENDING` is flexdt's."""
     by_ending = {
-        ending: form.name for form in among for ending in form.endings if ending != OWN_ENDING
+        ending: form.name
+        for form in among
+        for ending in form.endings
+        if ending != OWN_ENDING
     }
     found = by_ending.get(path.suffix.lower())
     if found is None:
@@ -279,7 +290,9 @@ def _format(path: Path, among: Iterable[Format]) -> str:
 
 def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
     try:
-        along_columns, along_rows = np.broadcast_to(np.asarray(pixel, dtype=np.float64), (2,))
+        along_columns, along_rows = np.broadcast_to(
+            np.asarray(pixel, dtype=np.float64), (2,)
+        )
     except (TypeError, ValueError):
         along_columns = along_rows = math.nan
     if not (along_columns > 0 and along_rows > 0):

@@ -1,4 +1,5 @@
-"""Figures of geometries, data sets and plans with matplotlib, which is imported when one is made.
+"""Figures of geometries, data sets and plans with matplotlib, which is imported when one is
+made.
 
 Every function draws into axes that are given, or into a new figure, and returns the axes.
 """
@@ -20,7 +21,11 @@ from flexdt.twin.script import CheckReport, ScanPlan
 SAMPLES = 2000
 """Number of moments at which motors are drawn."""
 KINDS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
-LAYERS = {"data": "attenuation", "sigma": "noise of attenuation", "bias_bound": "bound of its bias"}
+LAYERS = {
+    "data": "attenuation",
+    "sigma": "noise of attenuation",
+    "bias_bound": "bound of its bias",
+}
 PANELS = 12
 """Largest number of panels drawn, evenly chosen."""
 
@@ -38,7 +43,9 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
     if axes is None:
         axes = _pyplot().figure().add_subplot(projection="3d")
     axes.plot(*cone_vec.source.T, ".", label="source")
-    shown = np.unique(np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), PANELS)).astype(int))
+    shown = np.unique(
+        np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), PANELS)).astype(int)
+    )
     for view in cone_vec[shown]:
         centre = view.detector[0]
         axes.plot(*np.stack([view.source[0], centre]).T, "k-", linewidth=0.4)
@@ -47,7 +54,9 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
             axes.plot(*np.vstack([corners, corners[:1]]).T, "C1-", linewidth=0.8)
     axes.plot(*cone_vec.detector.T, "C1.", markersize=2, label="detector")
     axes.plot([0.0], [0.0], [0.0], "k+", label="origin of the object")
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views")
+    axes.set(
+        xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views"
+    )
     axes.set_aspect("equal")
     axes.legend()
     return axes
@@ -58,7 +67,9 @@ def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
     axes = _pyplot().figure().add_subplot() if axes is None else axes
     shown = axes.imshow(data.line_integrals(index), cmap="gray")
     axes.figure.colorbar(shown, ax=axes, label="line integral")
-    axes.set(xlabel="column", ylabel="row", title=f"{data.name}: {data.frames[index].file}")
+    axes.set(
+        xlabel="column", ylabel="row", title=f"{data.name}: {data.frames[index].file}"
+    )
     return axes
 
 
@@ -103,14 +114,18 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
             axes.plot(times, places[name], f"C{i}", label=f"{name} [{axis.unit}]")
     motors.set(ylabel="position [mm]", title=repr(plan).strip("<>"))
     turning.set(ylabel="angle [deg]")
-    handles = [h for axes in (motors, turning) for h in axes.get_legend_handles_labels()[0]]
+    handles = [
+        h for axes in (motors, turning) for h in axes.get_legend_handles_labels()[0]
+    ]
     if handles:
         motors.legend(handles=handles, fontsize="small")
     for on in plan.beam:
         beam.axvspan(on.start_s, on.end_s, color="gold", alpha=0.5)
     for kind, colour in KINDS.items():
         starts = [g.starts for g in plan.groups if g.kind == kind]
-        beam.eventplot(np.concatenate(starts or [np.empty(0)]), colors=colour, linewidths=0.8)
+        beam.eventplot(
+            np.concatenate(starts or [np.empty(0)]), colors=colour, linewidths=0.8
+        )
     beam.set(ylabel="images", yticks=[])
     trace = () if report.clearance is None else report.clearance.trace
     space.plot(*np.array(trace).reshape(-1, 2).T, "k-")

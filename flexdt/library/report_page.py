@@ -1,6 +1,7 @@
 """The template of HTML reports: a page that needs no other file, and the parts of its body.
 
-Every part escapes the texts that it is given. Figures are SVG elements of `flexdt.library.figures`.
+Every part escapes the texts that it is given. Figures are SVG elements of
+`flexdt.library.figures`.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ def page(title: str, body: Sequence[str]) -> str:
         title: of the window.
         body: HTML, made by the functions of this module; empty parts are left out.
     """
-    return PAGE.format(title=html.escape(title), body="\n".join(part for part in body if part))
+    return PAGE.format(
+        title=html.escape(title), body="\n".join(part for part in body if part)
+    )
 
 
 def heading(*texts: str, level: int = 1) -> Markup:
@@ -75,7 +78,9 @@ def code(text: str) -> Markup:
 def bullets(texts: Iterable[str], kinds: Iterable[str] = ()) -> Markup:
     """Make a list, each item of a kind (see `paragraph`)."""
     items = zip_longest(texts, kinds, fillvalue="")
-    return _element("ul", Markup("".join(_element("li", text, kind=kind) for text, kind in items)))
+    return _element(
+        "ul", Markup("".join(_element("li", text, kind=kind) for text, kind in items))
+    )
 
 
 def facts(pairs: Iterable[tuple[str, str]]) -> Markup:
@@ -117,8 +122,13 @@ def table(
     return _element("table", Markup("".join(lines)))
 
 
-def _row(tag: str, cells: Sequence[object], sides: Sequence[str], kind: str = "") -> Markup:
-    made = (_element(tag, cell_text(c), kind=side) for c, side in zip(cells, sides, strict=True))
+def _row(
+    tag: str, cells: Sequence[object], sides: Sequence[str], kind: str = ""
+) -> Markup:
+    made = (
+        _element(tag, cell_text(c), kind=side)
+        for c, side in zip(cells, sides, strict=True)
+    )
     return _element("tr", Markup("".join(made)), kind=kind)
 
 
@@ -132,13 +142,19 @@ def cell_text(value: object) -> str:
         case float() if not math.isfinite(value):
             return "-"
         case float():
-            return f"{value:.2g}" if 0 < abs(value) < 0.01 or abs(value) >= 1e4 else f"{value:.4g}"
+            return (
+                f"{value:.2g}"
+                if 0 < abs(value) < 0.01 or abs(value) >= 1e4
+                else f"{value:.4g}"
+            )
         case _:
             return str(value)
 
 
 def _element(tag: str, *content: str, kind: str = "") -> Markup:
     """Make an element with its class; content that is no `Markup` is escaped."""
-    inner = "".join(part if isinstance(part, Markup) else html.escape(part) for part in content)
+    inner = "".join(
+        part if isinstance(part, Markup) else html.escape(part) for part in content
+    )
     mark = f" class='{kind}'" if kind else ""
     return Markup(f"<{tag}{mark}>{inner}</{tag}>")

@@ -41,15 +41,15 @@ def plan(
     """Plan a scan script on a clock that starts at 0, without a server.
 
     Args:
-        script: from `parse_script`, its text or bytes, or its path. A text of one line that names
-            a file is a path.
+        script: from `parse_script`, its text or bytes, or its path. A text of one line that
+            names a file is a path.
         machine: a machine, its shipped name or its file; the FleX-ray if None.
         profile: zero offsets, their shipped name or file; the machine's default if None.
         sample: on the stage, for truncation: anything that `flexdt.simulate` takes.
 
     Returns:
-        The plan: `.poses`, `.geometry`, `.duration_s`, `.problems`, `.check()`, `.plot()`, `==`,
-        `.to_dict()`.
+        The plan: `.poses`, `.geometry`, `.duration_s`, `.problems`, `.check()`, `.plot()`,
+        `==`, `.to_dict()`.
 
     Raises:
         ScriptError: the script does not parse; lists every error with its line.
@@ -97,7 +97,9 @@ def size_of(phantom: Phantom | None) -> SampleSize | None:
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:
     """Make the collision check with the phantom's mesh, or with the script's sample size."""
-    return collision_check(None if phantom is None else convex_pieces(phantom.mesh(around=True)))
+    return collision_check(
+        None if phantom is None else convex_pieces(phantom.mesh(around=True))
+    )
 
 
 def read(path: File) -> bytes:

@@ -1,8 +1,8 @@
 """`flexdt.simulate`: a sample and a geometry in, a data set in memory out; `flexdt.project`.
 
 The images come from the chain that the twin itself uses (`flexdt.twin.physics`): exact paths
-through each material, spectrum, panel, noise. Only the geometry is given instead of following from
-motors. Views are computed a few at a time, so memory holds the counts and little more.
+through each material, spectrum, panel, noise. Only the geometry is given instead of following
+from motors. Views are computed a few at a time, so memory holds the counts and little more.
 """
 
 from __future__ import annotations
@@ -138,12 +138,18 @@ class Truth:
         spot_mm = chain.tube.focal_spot_mm(self.exposure.power_W)
         if self.spot_points > 1:
             chain = without_spot(chain)
-        each = max(1, BATCH_BYTES // (4 * rows * cols * moments * max(1, len(self.parts))))
+        each = max(
+            1, BATCH_BYTES // (4 * rows * cols * moments * max(1, len(self.parts)))
+        )
         for start in range(0, len(self.geometry), each):
             views = slice(start, min(start + each, len(self.geometry)))
             exposures = [self.exposure] * (views.stop - views.start)
             known = self.scatter
-            added = [] if known is None else [known[i] for i in range(views.start, views.stop)]
+            added = (
+                []
+                if known is None
+                else [known[i] for i in range(views.start, views.stop)]
+            )
             cone = self.geometry.rows[views]
             if self.spot_points > 1:
                 cone = spot_views(cone, spot_mm, self.spot_points)
@@ -172,12 +178,13 @@ def project(
     """Project line integrals of attenuation, without tube, noise and detector; see
     `flexdt.simulate`.
 
-    Solids and meshes are exact path lengths times their attenuation at its effective energy, voxels
-    exact lengths through each voxel (Siddon). Bodies of one mesh that overlap count once.
+    Solids and meshes are exact path lengths times their attenuation at its effective energy,
+    voxels exact lengths through each voxel (Siddon). Bodies of one mesh that overlap count
+    once.
 
     Args:
-        sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`, or a list
-            of them, which add up.
+        sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`, or a
+            list of them, which add up.
         geometry: of the views, in the sample's frame.
         shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
@@ -204,8 +211,12 @@ def project(
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
     plain = isinstance(sample, Volume) and material is None
-    body: Any = sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    found = examine(Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes)
+    body: Any = (
+        sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
+    )
+    found = examine(
+        Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes
+    )
     warn_of(found, GeometryError)
     with long_work.during("projecting", progress):
         return (forward if plain else line_integrals)(body, cone, size)
@@ -237,16 +248,17 @@ def simulate(
         geometry: of the views, in the sample's frame; it gives the pixels' pitch. Without
             one the sample is the path of a CTSimU scenario, which states everything but
             `noise`; `flexdt-extensions` does it.
-        tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the machine's.
+        tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the
+            machine's.
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
             counting the dark image (0), the flat image (1) and the projections.
         exposure_ms: of one read-out; None: the detector's or the machine's, or, where
             neither states one, so long that the brightest pixel of the open beam reaches
             80 % of the largest count. `truth` holds it.
-        scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed of
-            `noise`; 'first' has been removed, use 'mc'. `ScatterSettings` state more. It is in the
-            data set's `truth.scatter`.
+        scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed
+            of `noise`; 'first' has been removed, use 'mc'. `ScatterSettings` state more. It is
+            in the data set's `truth.scatter`.
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
             `detector` leave them open.
         shape: detector (rows, cols), where the geometry has none.
@@ -255,10 +267,10 @@ def simulate(
         rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel does.
             With one, the default but for scenarios (3), edges along rows or columns come out in
             steps, of which `align` has wider sigmas.
-        spot_points: of the focal spot from which rays start, 3 to 1024; their signals are averaged,
-            and each depth of the sample is blurred as it is. With 1 all are blurred as the rotation
-            axis is, and the data set warns where that matters. Ghosts of edges stay where the blur
-            [pixels] is more than about a quarter of the points.
+        spot_points: of the focal spot from which rays start, 3 to 1024; their signals are
+            averaged, and each depth of the sample is blurred as it is. With 1 all are blurred
+            as the rotation axis is, and the data set warns where that matters. Ghosts of edges
+            stay where the blur [pixels] is more than about a quarter of the points.
         progress: a bar after two seconds; False for no bar, or a function of the fraction
             done.
 
@@ -312,7 +324,11 @@ def simulate(
     with long_work.during("simulating", progress) as advance:
         phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
         found = examine(
-            Operation.SIMULATE, cone, size, volume=_attenuation(phantom), boxes=phantom.boxes
+            Operation.SIMULATE,
+            cone,
+            size,
+            volume=_attenuation(phantom),
+            boxes=phantom.boxes,
         )
         placed = settled(found, GeometryError)
         parts = channels(phantom)
@@ -324,9 +340,13 @@ def simulate(
             camera = replace(camera, exposure_ms=float(exposure_ms))
         elif detector is not None and detector.exposure_ms is None:
             unit = settings.exposure(1.0)
-            brightest = max(_different(cone), key=lambda row: float(flux_of(row, size).max()))
+            brightest = max(
+                _different(cone), key=lambda row: float(flux_of(row, size).max())
+            )
             beam = expected_signal(chain, open_paths, brightest, unit).mean_e
-            camera = replace(camera, exposure_ms=_chosen_ms(panel, camera, float(beam.max())))
+            camera = replace(
+                camera, exposure_ms=_chosen_ms(panel, camera, float(beam.max()))
+            )
         exposure = settings.exposure(camera.exposure_ms, camera.averages)
         scattered = None
         if scatter != "off":
@@ -334,12 +354,25 @@ def simulate(
             if not isinstance(how, ScatterSettings):
                 how = ScatterSettings(seed=noise or 0)
             grid = scatter_object(parts, phantom.size_mm, how.voxels)
-            scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
+            scattered = scan_scatter(
+                grid, cone.rows, size, Beam.of(chain, exposure.kV), how
+            )
         truth = Truth(
-            phantom, cone, chain, exposure, camera, noise, parts, scattered, rays, spot_points
+            phantom,
+            cone,
+            chain,
+            exposure,
+            camera,
+            noise,
+            parts,
+            scattered,
+            rays,
+            spot_points,
         )
 
-        def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
+        def read(
+            number: int, expected: Expected, lit: ExposureSettings = exposure
+        ) -> Counts:
             rng = None if noise is None else frame_rng(noise, number)
             return read_out(panel, expected, camera, lit, rng)
 
@@ -350,7 +383,9 @@ def simulate(
             assert image.expected is not None
             counts[i] = read(2 + i, image.expected)
             advance((i + 1) / len(cone))
-    made = DataSet.from_arrays(counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth)
+    made = DataSet.from_arrays(
+        counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth
+    )
     made = replace(made, full_scale=panel.full_scale)
     told = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
     for doubt in told:
@@ -367,13 +402,16 @@ def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
-    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the open beam [ms].
+    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the open beam
+    [ms].
 
     Raises:
         LimitError: the panel's offset leaves no range to fill.
     """
     # A panel that is half full in the dark has little range left: say so, not an odd exposure.
-    require_within("offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts")
+    require_within(
+        "offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts"
+    )
     dark_e_per_ms = panel.dark_charge(camera) / 1000.0
     range_e = (FILLED_SHARE * panel.full_scale - panel.offset_counts) * panel.gain(camera)
     low, high = EXPOSURES_MS
@@ -395,9 +433,12 @@ def _pitch(cone: ConeVec) -> tuple[float, float]:
 
 
 def _panel(
-    detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float,
+    detector: Detector | None,
+    machine: Machine | None,
+    shape: tuple[int, int],
+    pitch: float,
     row_pitch: float,
-) -> tuple[Detector, CameraSettings]:  # fmt: skip
+) -> tuple[Detector, CameraSettings]:
     """Make detector and camera settings for a geometry's pixels.
 
     Args:
@@ -410,7 +451,9 @@ def _panel(
         LimitError: the machine's detector has no such pixels.
     """
     if detector is not None:
-        grid = PixelGrid(shape[1], shape[0], pitch, None if row_pitch == pitch else row_pitch)
+        grid = PixelGrid(
+            shape[1], shape[0], pitch, None if row_pitch == pitch else row_pitch
+        )
         return detector.of_pixels(grid), detector.camera(shape)
     assert machine is not None
     spec = machine.detector
@@ -418,8 +461,10 @@ def _panel(
     edges = spec.pixels.edges_mm
     if np.abs(binning * np.array(edges) / (pitch, row_pitch) - 1.0).max() > SAME_PITCH:
         raise LimitError(
-            f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with {spec.model}: "
-            f"one whole number times {edges[0]:g} x {edges[1]:g} mm. Give detector=Detector(...) "
+            f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with "
+            f"{spec.model}: "
+            f"one whole number times {edges[0]:g} x {edges[1]:g} mm. Give "
+            "detector=Detector(...) "
             "for another detector",
             {"asked": [pitch, row_pitch], "allowed": list(edges), "unit": "mm"},
         )
@@ -430,7 +475,10 @@ def _panel(
             raise LimitError(
                 f"{shape[0]} x {shape[1]} pixels (rows x columns) of {pitch:g} mm do not fit "
                 f"{spec.model}; allowed: {spec.rows // binning} x {spec.columns // binning}",
-                {"asked": list(shape), "allowed": [spec.rows // binning, spec.columns // binning]},
+                {
+                    "asked": list(shape),
+                    "allowed": [spec.rows // binning, spec.columns // binning],
+                },
             )
         left, top = (spec.columns - cols) // 2, (spec.rows - rows) // 2
         roi = Roi(left, top, left + cols - 1, top + rows - 1)
@@ -443,12 +491,16 @@ def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
     """Warn if the flat image, valid for views of one distance, differs between views."""
     first = flux_of(cone.rows[0], shape)
     worst = max(
-        (float(np.abs(flux_of(row, shape) / first - 1.0).max()) for row in _different(cone)),
+        (
+            float(np.abs(flux_of(row, shape) / first - 1.0).max())
+            for row in _different(cone)
+        ),
         default=0.0,
     )
     if worst > 1e-3:
         yield (
-            "the flat image is that of the first view; the open beam of other views differs by up "
+            "the flat image is that of the first view; the open beam of other views "
+            "differs by up "
             f"to {100.0 * worst:.2g} %"
         )
 
@@ -462,7 +514,8 @@ def _spot_doubt(truth: Truth) -> Iterator[str]:
     if truth.spot_points == 1 and near - far > DOUBTED_PX:
         yield (
             f"the focal spot blurs the whole sample by {axis:.2g} pixels (standard deviation), "
-            f"really by {far:.2g} to {near:.2g}, from its far side to its near one: spot_points="
+            f"really by {far:.2g} to {near:.2g}, from its far side to its near one: "
+            "spot_points="
             f"{max(16, 4 * int(np.ceil(min(near, 200.0))))} has each depth as it is"
         )
 

@@ -20,7 +20,10 @@ def images_to_xarray(data: ImageSet) -> Any:
         name="line_integrals",
         coords={
             "angle": ("view", data.angles_deg, {"units": "deg"}),
-            **{n: ("view", c, {"units": "mm"}) for n, c in zip(VECTOR_NAMES, rows.T, strict=True)},
+            **{
+                n: ("view", c, {"units": "mm"})
+                for n, c in zip(VECTOR_NAMES, rows.T, strict=True)
+            },
             "file": ("view", [frame.file for frame in data.frames]),
         },
         attrs={"title": data.name, "units": "1"},

@@ -16,12 +16,16 @@ __all__ = ["flexdt_twin"]
 
 
 @pytest.fixture
-def flexdt_twin(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[testing.InProcessTwin]:
+def flexdt_twin(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> Iterator[testing.InProcessTwin]:
     """Provide a twin in process (`flexdt.testing.twin`), its data in `tmp_path`, one for
     each test.
 
     Arguments of `twin` come by indirect parameters:
     `@pytest.mark.parametrize("flexdt_twin", [{"machine": "micro_ct"}], indirect=True)`.
     """
-    with testing.twin(**{"data": tmp_path / "twin", **getattr(request, "param", {})}) as scanner:
+    with testing.twin(
+        **{"data": tmp_path / "twin", **getattr(request, "param", {})}
+    ) as scanner:
         yield scanner

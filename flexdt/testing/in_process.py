@@ -1,8 +1,9 @@
 """A complete twin in the process and thread of its test: no socket, no server process, no
 sleep.
 
-The server, its connections and its clients are the real ones. They share one event loop, whose time
-is virtual and passes only while a call waits, so the same calls give the same answers, at once.
+The server, its connections and its clients are the real ones. They share one event loop, whose
+time is virtual and passes only while a call waits, so the same calls give the same answers, at
+once.
 
 The event loop never sleeps, and the same seed gives the same run. When nothing is ready
 the clock jumps to the next timer. Work for threads runs in the loop itself, at once, or a
@@ -101,7 +102,9 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         return done
 
 
-def _work(done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]) -> None:
+def _work(
+    done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]
+) -> None:
     """Run a function as a thread would: to its end, even if its future was cancelled."""
     try:
         result = func(*args)
@@ -150,7 +153,9 @@ class DirectProjector:
         """Forget a body."""
         del self.known[name]
 
-    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
         """Compute line integrals, float32 (n, rows, cols)."""
         return project_body(self.known[name], cone_vec, shape)
 
@@ -173,7 +178,9 @@ class InProcessTransport(asyncio.Transport):
         serve: makes the server's end of a connection.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, serve: Callable[[], _Receiver]) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, serve: Callable[[], _Receiver]
+    ) -> None:
         super().__init__({"peername": ("in-process", 0)})
         self._loop, self._serve = loop, serve
         self._server: _Receiver | None = None
@@ -255,7 +262,9 @@ class InProcessTwin:
 
     def __init__(self, loop: SimulatedLoop, server: TwinServer) -> None:
         self.loop, self.server, self.data = loop, server, server.root
-        self._shell = TcpServer(partial(TwinSession, server), ConnectionLimits(), None, METHODS)
+        self._shell = TcpServer(
+            partial(TwinSession, server), ConnectionLimits(), None, METHODS
+        )
 
     def advance(self, seconds: float) -> None:
         """Let virtual seconds of the laboratory pass, and whatever happens in them happen."""
@@ -282,7 +291,9 @@ class InProcessTwin:
             return asyncio.run_coroutine_threadsafe(work, self.loop).result()
         if here is not None:
             work.close()
-            raise RuntimeError("a blocking call in an event loop: await it, or use LocalTwin")
+            raise RuntimeError(
+                "a blocking call in an event loop: await it, or use LocalTwin"
+            )
         return self.loop.run_until_complete(work)
 
     async def close(self) -> None:
@@ -303,15 +314,15 @@ def twin(
 ) -> Iterator[InProcessTwin]:
     """Start a twin in this process, for tests; it ends with the `with` block.
 
-    Motion takes the machine's true time, by its speeds and accelerations, on a virtual clock that
-    passes while a call waits (`move(..., wait=True)`, `wait_job`) or in `advance`, and at no other
-    time. Nothing sleeps. Meshes and scenes that are sent, the calls about data sets,
+    Motion takes the machine's true time, by its speeds and accelerations, on a virtual clock
+    that passes while a call waits (`move(..., wait=True)`, `wait_job`) or in `advance`, and at
+    no other time. Nothing sleeps. Meshes and scenes that are sent, the calls about data sets,
     `fit_calibration`, `align_dataset` and `predict_exposure` are worked on in a process with
     limits, as always.
 
     Args:
-        machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero offsets are
-            those of its default profile.
+        machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero offsets
+            are those of its default profile.
         sample: on the stage at start, a phantom's name; empty for no sample.
         physics: how images are made: ideal, mono or poly.
         speed_up: the twin's seconds for each of the loop; "max" ends each motion at once.
@@ -334,9 +345,15 @@ def twin(
     loop = SimulatedLoop()
     with folder as root, asyncio.Runner(loop_factory=lambda: loop):
         server = TwinServer(
-            chosen, machines.profile(None, chosen), DirectProjector(), open_data(Path(root)),
-            speed_up=speed_up, seed=lambda: seed, physics=physics, wall=loop.time,
-        )  # fmt: skip
+            chosen,
+            machines.profile(None, chosen),
+            DirectProjector(),
+            open_data(Path(root)),
+            speed_up=speed_up,
+            seed=lambda: seed,
+            physics=physics,
+            wall=loop.time,
+        )
         server.submissions.checks = Checks(apart=False)
         found = InProcessTwin(loop, server)
         found.run(server.start(Sample(sample)))

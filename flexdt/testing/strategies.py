@@ -70,11 +70,18 @@ def geometries(draw: st.DrawFn, *, max_views: int = 8, max_pixels: int = 64) -> 
     shape = draw(st.tuples(*2 * [st.integers(1, max_pixels)]))
     sdd = draw(st.floats(50.0, 2000.0))
     pixel = draw(st.tuples(*2 * [st.floats(0.005, 1.0)]))
-    aside = [draw(st.floats(-n * p, n * p)) / 2 for n, p in zip(shape[::-1], pixel, strict=True)]
+    aside = [
+        draw(st.floats(-n * p, n * p)) / 2
+        for n, p in zip(shape[::-1], pixel, strict=True)
+    ]
     return ConeVec.helical(
-        sod=sdd * draw(st.floats(0.02, 0.98)), sdd=sdd, shape=shape, pixel=pixel, offset=aside,
+        sod=sdd * draw(st.floats(0.02, 0.98)),
+        sdd=sdd,
+        shape=shape,
+        pixel=pixel,
+        offset=aside,
         angles=draw(st.lists(st.floats(-720.0, 720.0), min_size=1, max_size=max_views)),
         rise=draw(st.just(0.0) | st.floats(-50.0, 50.0)),
         tilts=draw(st.tuples(*3 * [st.floats(-10.0, 10.0)])),
         height=draw(st.floats(-50.0, 50.0)),
-    )  # fmt: skip
+    )

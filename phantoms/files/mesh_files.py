@@ -53,12 +53,23 @@ scene has it.
 
 trimesh walks from the scene's root to each.
 """
-HARMLESS_EXTENSIONS: Final = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
+HARMLESS_EXTENSIONS: Final = (
+    "KHR_materials_",
+    "KHR_texture_",
+    "KHR_lights_",
+    "EXT_texture_",
+)
 """Prefixes of glTF extensions that change how an object looks, not its shape."""
 ITEM_BYTES: Final = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 ITEM_COLUMNS: Final = {
-    "SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16,
-}  # fmt: skip
+    "SCALAR": 1,
+    "VEC2": 2,
+    "VEC3": 3,
+    "VEC4": 4,
+    "MAT2": 4,
+    "MAT3": 9,
+    "MAT4": 16,
+}
 """Sizes of glTF's component types and element types (glTF 2.0 specification, 3.6.2)."""
 TRIANGLE_FAN: Final = 6
 STL_HEAD_BYTES: Final = 84
@@ -150,7 +161,8 @@ def filled_mesh(
     high = vertices.max(axis=0)
     if (high - low).max() > MAX_EXTENT_MM or (high - low).max() <= 0.0:
         raise PhantomError(
-            f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more than 0, "
+            f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more "
+            "than 0, "
             f"at most {MAX_EXTENT_MM:g} mm. Is the unit right ({', '.join(UNITS_MM)})?",
             {"asked": float((high - low).max()), "allowed": MAX_EXTENT_MM},
         )
@@ -173,7 +185,9 @@ def filled_mesh(
         what,
         Scene(() if solid is None else (Solid(solid, material, mu),)),
         (x, y, z),
-        surfaces=() if solid is not None else (Surface(vertices, mesh.faces, material, mu),),
+        surfaces=()
+        if solid is not None
+        else (Surface(vertices, mesh.faces, material, mu),),
     )
 
 
@@ -200,18 +214,23 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     """
     kind = Path(path).suffix.lstrip(".").lower()
     if kind not in PART_FORMATS:
-        raise PhantomError(f"{path}: not the mesh of a part; allowed: {', '.join(PART_FORMATS)}")
+        raise PhantomError(
+            f"{path}: not the mesh of a part; allowed: {', '.join(PART_FORMATS)}"
+        )
     raw, _, _ = _read(path, kind)
     if len(raw) > MAX_PART_BYTES:
         raise PhantomError(f"{path} has {len(raw)} bytes; allowed: {MAX_PART_BYTES}")
     mesh = _parse(raw, kind)
     if len(mesh.faces) > MAX_PART_FACES:
-        raise PhantomError(f"{path}: {len(mesh.faces)} triangles; allowed: {MAX_PART_FACES}")
+        raise PhantomError(
+            f"{path}: {len(mesh.faces)} triangles; allowed: {MAX_PART_FACES}"
+        )
     mesh.vertices *= UNITS_MM[default_unit(kind)]
     largest = float(mesh.extents.max())
     if not 0.0 < largest <= MAX_PART_MM:
         raise PhantomError(
-            f"{path} measures {largest:g} mm; allowed: more than 0, at most {MAX_PART_MM:g} mm. "
+            f"{path} measures {largest:g} mm; allowed: more than 0, at most "
+            f"{MAX_PART_MM:g} mm. "
             "An STL file is taken to be in mm, a GLB file in m"
         )
     return mesh
@@ -249,7 +268,9 @@ def voxel_phantom(
         (4.0, 3.0, 2.0)
     """
     edges = np.asarray(voxel_mm, dtype=np.float64)
-    if edges.shape not in ((), (3,)) or not (np.isfinite(edges).all() and (edges > 0).all()):
+    if edges.shape not in ((), (3,)) or not (
+        np.isfinite(edges).all() and (edges > 0).all()
+    ):
         raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: one or three above 0")
     dx, dy, dz = np.broadcast_to(edges, 3).tolist()
     voxels = Voxels(data, (dx, dy, dz), center_mm, material)
@@ -264,7 +285,9 @@ def voxel_phantom(
     )
 
 
-def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tuple[bytes, str, str]:
+def _read(
+    source: bytes | str | os.PathLike[str], file_type: str | None
+) -> tuple[bytes, str, str]:
     """Read a mesh file, or take its bytes; check size and format.
 
     Args:
@@ -332,13 +355,20 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
                 io.BytesIO(raw),
                 file_type=kind,
                 force="mesh",
-                process=kind != "glb",  # It drops vertices that are not finite without a word.
+                process=kind
+                != "glb",  # It drops vertices that are not finite without a word.
                 skip_materials=True,
             )
     except MemoryError:
-        raise PhantomError(f"reading this {kind.upper()} file takes too much memory") from None
-    except Exception as error:  # A third party's parser on a stranger's bytes: anything may come.
-        raise PhantomError(f"not a readable {kind.upper()} file: {str(error)[:500]}") from None
+        raise PhantomError(
+            f"reading this {kind.upper()} file takes too much memory"
+        ) from None
+    except (
+        Exception
+    ) as error:  # A third party's parser on a stranger's bytes: anything may come.
+        raise PhantomError(
+            f"not a readable {kind.upper()} file: {str(error)[:500]}"
+        ) from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise PhantomError(f"the {kind.upper()} file holds no triangles")
     if len(mesh.faces) > MAX_FACES:
@@ -347,7 +377,9 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
         raise PhantomError("the mesh has vertices that are not finite numbers")
     if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-        raise PhantomError(f"a triangle uses a vertex beyond the {len(mesh.vertices)} of the mesh")
+        raise PhantomError(
+            f"a triangle uses a vertex beyond the {len(mesh.vertices)} of the mesh"
+        )
     # Its triangles alone: colours and normals of the file may be anything.
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
@@ -364,7 +396,9 @@ def _check_ply(raw: bytes) -> None:
         raise ValueError(f"no PLY header within {MAX_PLY_HEADER} bytes")
     for line in raw[:end].split(b"\n"):
         words = line.split()
-        if words[:1] == [b"element"] and (len(words) != 3 or int(words[2]) > len(raw) - end):
+        if words[:1] == [b"element"] and (
+            len(words) != 3 or int(words[2]) > len(raw) - end
+        ):
             raise ValueError(
                 f"{line[:80].decode('ascii', 'replace').strip()!r}: more than it holds"
             )
@@ -383,7 +417,9 @@ def _check_glb(raw: bytes) -> None:
         raise ValueError("it does not begin as a GLB file (glTF 2.0) does")
     (size,) = struct.unpack_from("<I", raw, 12)
     if size > min(MAX_GLB_DOCUMENT, len(raw) - 20):
-        what = f"its document has {size} bytes; allowed: {MAX_GLB_DOCUMENT}, all in the file"
+        what = (
+            f"its document has {size} bytes; allowed: {MAX_GLB_DOCUMENT}, all in the file"
+        )
         raise ValueError(what)
     try:
         _check_gltf(json.loads(raw[20 : 20 + size]), len(raw))
@@ -403,7 +439,9 @@ def _check_gltf(document: Any, total: int) -> None:
     """
     for name in document.get("extensionsRequired", []):
         if not name.startswith(HARMLESS_EXTENSIONS):
-            raise ValueError(f"it needs the extension {name[:80]!r}, which is not read here")
+            raise ValueError(
+                f"it needs the extension {name[:80]!r}, which is not read here"
+            )
     if any("uri" in buffer for buffer in document.get("buffers", [])):
         raise ValueError("its data are not in this file")
     accessors = document.get("accessors", [])
@@ -412,7 +450,8 @@ def _check_gltf(document: Any, total: int) -> None:
             raise ValueError(f"accessor {i}: its data are not in the file as they are")
     views = [view["byteLength"] for view in document.get("bufferViews", [])]
     sizes = [
-        a["count"] * ITEM_BYTES[a["componentType"]] * ITEM_COLUMNS[a["type"]] for a in accessors
+        a["count"] * ITEM_BYTES[a["componentType"]] * ITEM_COLUMNS[a["type"]]
+        for a in accessors
     ]
     if min((*views, *sizes), default=0) < 0 or not max(sum(views), sum(sizes)) <= total:
         raise ValueError(f"it claims more than its {total} bytes hold")
@@ -431,7 +470,10 @@ def _check_gltf(document: Any, total: int) -> None:
     for part in (part for primitives in drawn for part in primitives):
         if part.get("mode") == TRIANGLE_FAN:
             raise ValueError("it has triangle fans, which are not read here")
-        used = [part["attributes"]["POSITION"], *([part["indices"]] if "indices" in part else [])]
+        used = [
+            part["attributes"]["POSITION"],
+            *([part["indices"]] if "indices" in part else []),
+        ]
         corners += max(accessors[i]["count"] for i in used)
     if corners > 3 * MAX_FACES:
         raise ValueError(f"it has more than {MAX_FACES} triangles")
@@ -443,7 +485,9 @@ def _check_stl(raw: bytes) -> None:
     Raises:
         ValueError: they differ.
     """
-    if len(raw) < STL_HEAD_BYTES or (raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]):
+    if len(raw) < STL_HEAD_BYTES or (
+        raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]
+    ):
         return
     count = int.from_bytes(raw[STL_HEAD_BYTES - 4 : STL_HEAD_BYTES], "little")
     announced = STL_HEAD_BYTES + STL_TRIANGLE_BYTES * count
@@ -512,7 +556,9 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     other = np.where(forward[a] != forward[b], 0, n)
     rows = np.concatenate([owner[a], owner[a] + n])
     columns = np.concatenate([owner[b] + other, owner[b] + n - other])
-    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * n, 2 * n))
+    graph = coo_matrix(
+        (np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * n, 2 * n)
+    )
     _, component = connected_components(graph, directed=False)
     body = np.minimum(component[:n], component[n:])
     turned = component[:n] > component[n:]
@@ -533,5 +579,6 @@ def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | N
     if len(first) > MAX_PLANES:
         return None
     return ConvexPolyhedron(
-        tuple((n[0], n[1], n[2]) for n in normals[first].tolist()), tuple(offsets[first].tolist())
+        tuple((n[0], n[1], n[2]) for n in normals[first].tolist()),
+        tuple(offsets[first].tolist()),
     )

@@ -58,7 +58,9 @@ def read_phantom_file(path: Path) -> Phantom:
     return load_phantom_file(text, str(path), path.parent)
 
 
-def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = None) -> Phantom:
+def load_phantom_file(
+    text: str, file: str = "<phantom>", folder: Path | None = None
+) -> Phantom:
     """Parse the phantom of a TOML or JSON text.
 
     Args:
@@ -73,11 +75,15 @@ def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = 
         text = text.removeprefix(BYTE_ORDER_MARK)
         document = parse_json(text) if text.lstrip()[:1] == "{" else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise PhantomError(f"{file}: not valid TOML or JSON: {error}", {"file": file}) from None
+        raise PhantomError(
+            f"{file}: not valid TOML or JSON: {error}", {"file": file}
+        ) from None
     try:
         return phantom_of(document, folder)
     except TwinError as error:
-        raise PhantomError(f"{file}: {error.message}", {"file": file, **error.data}) from None
+        raise PhantomError(
+            f"{file}: {error.message}", {"file": file, **error.data}
+        ) from None
 
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
@@ -122,9 +128,13 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
     name = given.get("name", "scene")
     listed = given.get("solid", ())
     if len(listed) > MAX_SOLIDS:
-        raise reading.wrong(f"{len(listed)} solids", "phantom.solid", f"at most {MAX_SOLIDS}")
+        raise reading.wrong(
+            f"{len(listed)} solids", "phantom.solid", f"at most {MAX_SOLIDS}"
+        )
     scene = Scene(tuple(solid for several in listed for solid in several))
-    parts = [] if not listed else [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
+    parts = (
+        [] if not listed else [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
+    )
     parts += given.get("mesh", ())
     description = given.get("description", "")
     ranks = [rank for _, rank in parts]
@@ -146,15 +156,22 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
     from flexdt.phantoms.voxelise import voxelise
 
     listed = solids if isinstance(solids, list | tuple) else [solids]
-    replaced = [one["replaces"] for one in listed if isinstance(one, Mapping) and "replaces" in one]
+    replaced = [
+        one["replaces"]
+        for one in listed
+        if isinstance(one, Mapping) and "replaces" in one
+    ]
     for name in dict.fromkeys(replaced):
         present = tuple(one for one in phantom.scene.solids if one.material == name)
         meshes = [one for one in phantom.surfaces if one.material == name]
         edge = max(phantom.size_mm) / CHECKED_VOXELS_ALONG
-        least = float(voxelise(Scene(present), meshes, phantom.size_mm, edge, 2).data.min())
+        least = float(
+            voxelise(Scene(present), meshes, phantom.size_mm, edge, 2).data.min()
+        )
         if least < -MAX_ABSENT_SHARE * material_of(name).mu_per_mm:
             raise PhantomError(
-                f"{name} is replaced where there is none of it, or twice; allowed: inside solids "
+                f"{name} is replaced where there is none of it, or twice; allowed: "
+                "inside solids "
                 f"of {name} that are not replaced already",
                 {"asked": name, "allowed": "inside it"},
             )
@@ -196,8 +213,10 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
     )
     if folder is None:
         raise PhantomError(
-            f"{where}.file is {given['file']!r}, but a text by itself has no folder to look in; "
-            "read the scene from its file, or send it as `flexdt sample FILE` does, with the mesh "
+            f"{where}.file is {given['file']!r}, but a text by itself has no folder to "
+            "look in; "
+            "read the scene from its file, or send it as `flexdt sample FILE` does, with "
+            "the mesh "
             "inside",
             {"path": f"{where}.file", "asked": given["file"]},
         )
@@ -252,7 +271,8 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
     overlap = worst_overlap(centers, radii)
     if overlap is not None and "bead" in given:
         raise PhantomError(
-            f"phantom.bead: beads {overlap[0]} and {overlap[1]} overlap by {overlap[2]:.4g} mm; "
+            f"phantom.bead: beads {overlap[0]} and {overlap[1]} overlap by "
+            f"{overlap[2]:.4g} mm; "
             "attenuation is additive, so solids must not overlap",
             {"beads": [overlap[0], overlap[1]], "asked": -overlap[2], "allowed": ">= 0"},
         )
@@ -272,7 +292,9 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
 def _body(value: object, where: str) -> tuple[Vector, str]:
     """Read the body: size [mm] and material."""
-    given = reading.fields(value, where, {"size_mm": reading.lengths}, {"material": reading.string})
+    given = reading.fields(
+        value, where, {"size_mm": reading.lengths}, {"material": reading.string}
+    )
     return given["size_mm"], given.get("material", "abs")
 
 
@@ -297,7 +319,11 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
     given = reading.fields(value, where, {"beads": reading.positive}, others)
     if given["beads"] != int(given["beads"]):
         raise reading.wrong(given["beads"], f"{where}.beads", "a whole number")
-    return int(given["beads"]), given.get("radius_mm", 2.0), given.get("material", "steel")
+    return (
+        int(given["beads"]),
+        given.get("radius_mm", 2.0),
+        given.get("material", "steel"),
+    )
 
 
 def sent_scene(text: bytes, *, name: str) -> Phantom:

@@ -63,7 +63,9 @@ def openrpc_document(
         ref_template="#/components/schemas/{model}",
     )
     schemas = definitions.get("$defs", {})
-    for field in (f for schema in schemas.values() for f in schema.get("properties", {}).values()):
+    for field in (
+        f for schema in schemas.values() for f in schema.get("properties", {}).values()
+    ):
         if "description" in field:  # a docstring, which may have several lines
             field["description"] = " ".join(field["description"].split())
     return {
@@ -75,7 +77,8 @@ def openrpc_document(
             "license": {"name": "Apache-2.0"},
         },
         "methods": [
-            _method(m, schemas, refs[m.result, "validation"]["$ref"]) for m in methods.values()
+            _method(m, schemas, refs[m.result, "validation"]["$ref"])
+            for m in methods.values()
         ],
         "components": {
             "schemas": schemas,

@@ -149,11 +149,15 @@ class DatasetFrameResult(ImageValue):
     """for projection.get"""
 
 
-DATASET_LIST = read("dataset.list", DatasetList, DatasetListResult, "data sets, the newest first")
+DATASET_LIST = read(
+    "dataset.list", DatasetList, DatasetListResult, "data sets, the newest first"
+)
 DATASET_GET = read(
     "dataset.get", DatasetGet, DatasetResult, "a data set: settings, poses over time"
 )
-DATASET_FRAME = read("dataset.frame", DatasetFrame, DatasetFrameResult, "an image of a data set")
+DATASET_FRAME = read(
+    "dataset.frame", DatasetFrame, DatasetFrameResult, "an image of a data set"
+)
 
 
 class CalibrationApply(f.Params):
@@ -186,7 +190,8 @@ class CalibrationGet(f.Params):
 
 
 class Mark(f.Params):
-    """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left one."""
+    """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left
+    one."""
 
     frame: Annotated[int, Ge(0), Le(10_000_000)]
     """projection, counted from 0"""
@@ -204,8 +209,8 @@ class CalibrationFit(f.Params):
     datasets: Annotated[list[DataSetName], Len(1, 8)]
     """of their folders"""
     phantom: f.Name
-    """one that ships, a TOML or JSON file among the data sets, or unknown: markers of which nobody
-    knows where they are, in one data set"""
+    """one that ships, a TOML or JSON file among the data sets, or unknown: markers of which
+    nobody knows where they are, in one data set"""
     free: Annotated[Parameters, MinLen(1)] | None = None
     """what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown markers dO_x"""
     priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), few(17)] = Field(
@@ -246,7 +251,8 @@ class CorrectionResult(f.Result):
 
 
 class Estimated(f.Result):
-    """An estimate [mm, deg, px or 1]; None where the images do not tell or must not be trusted."""
+    """An estimate [mm, deg, px or 1]; None where the images do not tell or must not be
+    trusted."""
 
     value: float | None
     sigma: float | None
@@ -270,7 +276,8 @@ class CalibrationProblem(f.Result):
 
 
 class CalibrationFitResult(f.Result):
-    """A calibration; nothing is applied. Further fields are those of `flexdt calibrate --json`."""
+    """A calibration; nothing is applied. Further fields are those of `flexdt calibrate
+    --json`."""
 
     identifiable: bool
     parameters: dict[str, Estimated]
@@ -314,7 +321,9 @@ CALIBRATION_APPLY = command(
 CALIBRATION_GET = read(
     "calibration.get", CalibrationGet, CorrectionResult, "the correction in force"
 )
-CALIBRATION_LIST = read("calibration.list", f.Empty, CorrectionListResult, "all corrections")
+CALIBRATION_LIST = read(
+    "calibration.list", f.Empty, CorrectionListResult, "all corrections"
+)
 CALIBRATION_REVERT = command(
     "calibration.revert", f.Empty, CorrectionResult, "back to the correction before"
 )

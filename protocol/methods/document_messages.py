@@ -115,6 +115,10 @@ class Discovery(f.Result):
     methods: list[dict[str, JsonValue]]
 
 
-SCENE_SAVE = read("scene.save", SceneSave, SceneResult, "whole state as one versioned document")
+SCENE_SAVE = read(
+    "scene.save", SceneSave, SceneResult, "whole state as one versioned document"
+)
 SCENE_LOAD = by_hand("scene.load", SceneLoad, State, "restore such a document")
-RPC_DISCOVER = read("rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document")
+RPC_DISCOVER = read(
+    "rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document"
+)

@@ -103,8 +103,8 @@ class Projection(f.ImageValue):
     origin: ImageOrigin | None = None
     """what it was made of"""
     marks: f.ImageValue | None = None
-    """uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, 4 sample cut
-    off at this pixel of the edge; judged as though X-rays were on"""
+    """uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, 4 sample
+    cut off at this pixel of the edge; judged as though X-rays were on"""
 
 
 class RayResult(f.Result):
@@ -136,7 +136,8 @@ class PredictedSetting(f.Result):
     exposure_ms: float
     averages: int
     cnr: float | None
-    """contrast of the detail to the noise of a pixel of one image; null where it is saturated"""
+    """contrast of the detail to the noise of a pixel of one image; null where it is
+    saturated"""
     kerma_mGy: float
     """air kerma of the scan on the axis, without a sample"""
 
@@ -164,7 +165,10 @@ class ExposurePrediction(f.Result):
 
 
 PROJECTION_GET = read(
-    "projection.get", ProjectionGet, Projection, "an image at the current pose, or another"
+    "projection.get",
+    ProjectionGet,
+    Projection,
+    "an image at the current pose, or another",
 )
 PROJECTION_RAY = read(
     "projection.ray", RayGet, RayResult, "paths through materials on the ray of a pixel"

@@ -62,8 +62,8 @@ class TrajectoryInput(f.Params):
     """each: axis -> value [mm or deg]; axes left out stay"""
     exposure_ms: f.Exposure | None = None
     flat: bool | f.Targets = True
-    """the flat image: at a place beside the beam that the server finds (true), at this pose, or not
-    at all (false)"""
+    """the flat image: at a place beside the beam that the server finds (true), at this pose, or
+    not at all (false)"""
     name: f.Name | None = None
     speed_up: f.SpeedUp | None = None
     motion_samples: Moments = 1
@@ -80,7 +80,8 @@ class JobAbort(JobRef):
     """Which job, and why it ends."""
 
     reason: Annotated[
-        f.ShortText | None, Field(description="is written into the data set; none says aborted")
+        f.ShortText | None,
+        Field(description="is written into the data set; none says aborted"),
     ] = None
 
 
@@ -200,10 +201,14 @@ JOB_STATUS = read("job.status", JobRef, JobStatus, "how far a job is")
 JOB_PAUSE = command(
     "job.pause", JobRef, JobStatus, "pause a job; a frame under exposure is taken again"
 )
-JOB_RESUME = command("job.resume", JobRef, JobStatus, "return to the pose of the pause and go on")
+JOB_RESUME = command(
+    "job.resume", JobRef, JobStatus, "return to the pose of the pause and go on"
+)
 JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step")
 JOB_ABORT = Method(
     "job.abort", JobAbort, JobStatus, "end a job, its data set incomplete", urgent=True
 )
 JOB_LIST = read("job.list", f.Empty, JobListResult, "all jobs, oldest first")
-JOB_FORGET = command("job.forget", JobForget, JobForgetResult, "forget ended jobs; data sets stay")
+JOB_FORGET = command(
+    "job.forget", JobForget, JobForgetResult, "forget ended jobs; data sets stay"
+)

@@ -11,7 +11,15 @@ from pydantic import Field, model_validator
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.field_checks import require_extent
-from flexdt.protocol.fields import Exposure, Params, Power, RoiAsked, ShortText, SpeedUp, Voltage
+from flexdt.protocol.fields import (
+    Exposure,
+    Params,
+    Power,
+    RoiAsked,
+    ShortText,
+    SpeedUp,
+    Voltage,
+)
 from flexdt.protocol.method import Method, by_hand, command, read
 from flexdt.protocol.methods.document_messages import Averages, Frames, Placement
 from flexdt.protocol.state_model import (
@@ -101,11 +109,19 @@ class AxisSetResult(f.Result):
     acceleration: float
 
 
-AXES_MOVE = by_hand("axes.move", Move, MoveResult, "move axes to targets, starting together")
-AXES_JOG = by_hand("axes.jog", Jog, MoveResult, "move at a velocity until the lease runs out")
-AXES_SET = by_hand("axes.set", AxisSet, AxisSetResult, "set an axis's speed and acceleration")
+AXES_MOVE = by_hand(
+    "axes.move", Move, MoveResult, "move axes to targets, starting together"
+)
+AXES_JOG = by_hand(
+    "axes.jog", Jog, MoveResult, "move at a velocity until the lease runs out"
+)
+AXES_SET = by_hand(
+    "axes.set", AxisSet, AxisSetResult, "set an axis's speed and acceleration"
+)
 AXES_STOP = Method("axes.stop", f.Empty, Stopped, "bring all axes to rest", urgent=True)
-SAFETY_ESTOP = Method("safety.estop", f.Empty, Stopped, "emergency stop; X-rays off", urgent=True)
+SAFETY_ESTOP = Method(
+    "safety.estop", f.Empty, Stopped, "emergency stop; X-rays off", urgent=True
+)
 SAFETY_RESET = command("safety.reset", Reset, State, "leave the emergency stop")
 
 
@@ -134,7 +150,9 @@ class CameraSet(Params):
     frames: Frames | None = None
 
 
-CLOCK_SET = command("clock.set", ClockSet, ClockState, "set how fast the twin's time runs")
+CLOCK_SET = command(
+    "clock.set", ClockSet, ClockState, "set how fast the twin's time runs"
+)
 TUBE_SET = by_hand("tube.set", TubeSet, TubeState, "set kV, power and X-rays on or off")
 CAMERA_SET = by_hand(
     "camera.set", CameraSet, CameraState, "set exposure, mode, ROI, averages, frames"
@@ -168,13 +186,14 @@ class SampleMesh(f.Params):
 
 
 class SampleUpload(f.Params):
-    """A chunk of a mesh, of voxels or of a scene; the sample exists when all bytes have come."""
+    """A chunk of a mesh, of voxels or of a scene; the sample exists when all bytes have
+    come."""
 
     name: f.Name
     kind: Literal["mesh", "voxels", "scene"] = "mesh"
     format: Literal[MeshFormat, VoxelFormat, SceneFormat]
-    """raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, toml: the text of a
-    phantom or scene file"""
+    """raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, toml: the text
+    of a phantom or scene file"""
     total: Annotated[Bytes, Gt(0)]
     """size of the whole [bytes]"""
     start: Bytes = 0
@@ -192,7 +211,9 @@ class SampleUpload(f.Params):
     def _fits(self) -> SampleUpload:
         """Check that the chunk fits into the total, and that format and kind agree."""
         if self.start + len(self.data) > self.total:
-            raise ValueError(f"chunk ends at {self.start + len(self.data)}, total is {self.total}")
+            raise ValueError(
+                f"chunk ends at {self.start + len(self.data)}, total is {self.total}"
+            )
         own = KINDS[self.format]
         if self.kind != own:
             raise ValueError(f"format {self.format} is for kind {own}, not {self.kind}")
@@ -280,4 +301,6 @@ SAMPLE_UPLOAD = Method(
     "send a mesh, voxels or a scene in chunks",
     bulky=True,
 )
-SAMPLE_DELETE = command("sample.delete", SampleDelete, SampleDeleteResult, "delete an upload")
+SAMPLE_DELETE = command(
+    "sample.delete", SampleDelete, SampleDeleteResult, "delete an upload"
+)

@@ -103,11 +103,15 @@ class Pong(Result):
     """the twin's clock [s]"""
 
 
-SESSION_HELLO = read("session.hello", Hello, HelloResult, "introduce the client; bring the token")
+SESSION_HELLO = read(
+    "session.hello", Hello, HelloResult, "introduce the client; bring the token"
+)
 SESSION_CONTROL = Method(
     "session.control", Control, ControlResult, "acquire, release or force control"
 )
 SESSION_PING = read("session.ping", Empty, Pong, "a heartbeat", urgent=True)
 STATE_GET = read("state.get", Empty, State, "everything, as one snapshot")
-STATE_SUBSCRIBE = read("state.subscribe", Subscribe, Nothing, "send events of these topics")
+STATE_SUBSCRIBE = read(
+    "state.subscribe", Subscribe, Nothing, "send events of these topics"
+)
 STATE_UNSUBSCRIBE = read("state.unsubscribe", Unsubscribe, Nothing, "send them no longer")

@@ -269,7 +269,9 @@ def read_document(folder: Directory) -> DatasetDocument:
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:
-        raise ds.DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
+        raise ds.DatasetFormatError(
+            f"cannot read {path}: {error}", {"path": str(path)}
+        ) from None
     return parse_document(text, str(path))
 
 
@@ -277,7 +279,9 @@ COUNTS: Final = ("u2", "u1", "i2")
 """Kinds of numbers in TIFFs that are read as counts; none may be below 0."""
 
 
-def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
+def read_image(
+    path: Path, shape: tuple[int, int] | None = None
+) -> npt.NDArray[np.uint16]:
     """Read one TIFF image, uint16 (rows, cols); raises as `read_values`."""
     return np.asarray(read_values(path, shape, "u"), dtype=np.uint16)
 
@@ -303,13 +307,18 @@ def read_values(
     except FileNotFoundError:
         raise ds.DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
     except OSError as error:
-        raise ds.DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
-    except Exception as error:  # A third party's parser on a damaged file: anything may come.
+        raise ds.DatasetFormatError(
+            f"cannot read {path}: {error}", {"path": str(path)}
+        ) from None
+    except (
+        Exception
+    ) as error:  # A third party's parser on a damaged file: anything may come.
         message = f"{path} is not a readable TIFF image: {error}"
         raise ds.DatasetFormatError(message, {"path": str(path)}) from None
     if shape is not None and image.shape != shape:
         raise ds.DatasetFormatError(
-            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has {shape[1]} "
+            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has "
+            f"{shape[1]} "
             f"x {shape[0]}",
             {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
         )
@@ -348,13 +357,23 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
         packing = tifffile.COMPRESSION
         if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
             _check_inflation(path, raw, page, size)
-        elif page.compression != packing.NONE:  # LZW and others, which tifffile leaves to a codec
+        elif (
+            page.compression != packing.NONE
+        ):  # LZW and others, which tifffile leaves to a codec
             import cv2
 
             raw.seek(0)
-            image = cv2.imdecode(np.frombuffer(raw.read(), np.uint8), cv2.IMREAD_UNCHANGED)
-            if image is None or image.shape != shape or image.dtype != kind.newbyteorder("="):
-                raise ValueError(f"its compression ({page.compression!r}) cannot be undone")
+            image = cv2.imdecode(
+                np.frombuffer(raw.read(), np.uint8), cv2.IMREAD_UNCHANGED
+            )
+            if (
+                image is None
+                or image.shape != shape
+                or image.dtype != kind.newbyteorder("=")
+            ):
+                raise ValueError(
+                    f"its compression ({page.compression!r}) cannot be undone"
+                )
             return np.asarray(image, dtype=wanted)
         values = series.asarray()
         if kind.kind == "i" and values.size and values.min() < 0:
@@ -363,7 +382,9 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
         return np.asarray(values, dtype=wanted)
 
 
-def _check_kind(path: Path, shape: tuple[int, ...], kind: np.dtype[Any], kinds: str) -> None:
+def _check_kind(
+    path: Path, shape: tuple[int, ...], kind: np.dtype[Any], kinds: str
+) -> None:
     """Refuse what is no image of counts or, where `kinds` has an f, of other values.
 
     Raises:
@@ -376,7 +397,8 @@ def _check_kind(path: Path, shape: tuple[int, ...], kind: np.dtype[Any], kinds: 
     way = ""
     if len(shape) == 3:
         way = (
-            "; several images in one file: fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)"
+            "; several images in one file: fx.DataSet.from_arrays(tifffile.imread(FILE), "
+            "geometry)"
         )
     raise ds.DatasetFormatError(
         f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns){way}",
@@ -393,10 +415,13 @@ def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
     raw.seek(0)
     content = raw.read()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
-        inflated = zlib.decompressobj().decompress(content[start : start + length], size + 1)
+        inflated = zlib.decompressobj().decompress(
+            content[start : start + length], size + 1
+        )
         if len(inflated) > size:
             raise ds.DatasetFormatError(
-                f"{path} inflates to more than its {size} bytes of pixels", {"path": str(path)}
+                f"{path} inflates to more than its {size} bytes of pixels",
+                {"path": str(path)},
             )
 
 
@@ -471,7 +496,9 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
     entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
     trailer = software + struct.pack("<II", 1, 1)
     head = struct.pack("<2sHI", b"II", 42, at + len(trailer))
-    return b"".join((head, pixels, trailer, struct.pack("<H", len(tags)), entries, bytes(4)))
+    return b"".join(
+        (head, pixels, trailer, struct.pack("<H", len(tags)), entries, bytes(4))
+    )
 
 
 def free_name(root: Directory, wish: str) -> str:
@@ -481,7 +508,9 @@ def free_name(root: Directory, wish: str) -> str:
         DatasetNameError: `wish` is not plain.
     """
     plain_name(wish, "data set")
-    candidates: Iterable[str] = (wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000))
+    candidates: Iterable[str] = (
+        wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000)
+    )
     return next(n for n in candidates if root.stat(n) is None)
 
 

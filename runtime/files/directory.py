@@ -43,7 +43,9 @@ FALLBACK_MEMORY_BYTES: Final = 4 << 30
 
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _RELATIVE: Final = hasattr(os, "O_DIRECTORY")
-_DIRECTORY: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+_DIRECTORY: Final = (
+    os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+)
 _NO_FOLLOW: Final = getattr(os, "O_NOFOLLOW", 0)
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 _READ: Final = os.O_RDONLY | _NO_FOLLOW | _BINARY | getattr(os, "O_NONBLOCK", 0)
@@ -68,7 +70,8 @@ def writing(path: Path, refused: str) -> Iterator[None]:
     except OSError as error:
         kind = ds.DiskFullError if error.errno in _NO_ROOM else ds.DatasetWriteError
         raise kind(
-            f"{refused}: {error.strerror or error}", {"path": str(path), "errno": error.errno}
+            f"{refused}: {error.strerror or error}",
+            {"path": str(path), "errno": error.errno},
         ) from None
 
 
@@ -111,7 +114,9 @@ class Directory:
             with writing(path, f"cannot use folder {path}"):
                 self._fd = os.open(path, _DIRECTORY)
 
-    def folder(self, name: str, *, sync: bool = True, write: Write = write_some) -> Directory:
+    def folder(
+        self, name: str, *, sync: bool = True, write: Write = write_some
+    ) -> Directory:
         """Return the directory called `name` in this one, which need not exist yet.
 
         It is opened for every call, unless it is `held`.
@@ -144,7 +149,10 @@ class Directory:
         """
         if self._above is None:
             return
-        with writing(self.path, f"cannot make {self.path}"), self._above._opened() as above:
+        with (
+            writing(self.path, f"cannot make {self.path}"),
+            self._above._opened() as above,
+        ):
             try:
                 os.mkdir(self._above._at(self.path.name), dir_fd=above)
             except FileExistsError:
@@ -192,7 +200,9 @@ class Directory:
             file = os.open(self._at(name), _WRITE, dir_fd=fd)
         try:
             if not stat.S_ISREG(os.fstat(file).st_mode):
-                raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
+                raise OSError(
+                    errno.EINVAL, "it is no regular file", str(self.path / name)
+                )
             left = memoryview(data)
             while left.nbytes:
                 left = left[self._write(file, left) :]
@@ -246,11 +256,15 @@ class Directory:
             except OSError as error:
                 if error.errno != errno.ELOOP:
                     raise
-                raise OSError(error.errno, "it is a link", str(self.path / name)) from None
+                raise OSError(
+                    error.errno, "it is a link", str(self.path / name)
+                ) from None
         if not stat.S_ISREG(os.fstat(file).st_mode):
             os.close(file)
             raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
-        return open(name, "rb", opener=lambda *_: file)  # some readers want to know a name
+        return open(
+            name, "rb", opener=lambda *_: file
+        )  # some readers want to know a name
 
     def read(self, name: str, most: int = MAX_READ_BYTES) -> bytes:
         """Read the content of a regular file of at most `most` bytes.
@@ -334,7 +348,9 @@ class Directory:
                 with os.scandir(self.path) as found:
                     yield found
                 return
-            own_fd = os.open(".", _DIRECTORY, dir_fd=fd)  # with a place in the listing of its own
+            own_fd = os.open(
+                ".", _DIRECTORY, dir_fd=fd
+            )  # with a place in the listing of its own
             try:
                 with os.scandir(own_fd) as found:
                     yield found
@@ -439,7 +455,9 @@ class Directory:
         """Make a file under an unused name; return the name and its descriptor."""
         while True:
             # Processes in containers may share a number, and killed ones leave files behind.
-            number = f"{os.getpid()}-{threading.get_native_id()}-{next(_TEMPORARY_NUMBERS)}"
+            number = (
+                f"{os.getpid()}-{threading.get_native_id()}-{next(_TEMPORARY_NUMBERS)}"
+            )
             name = self._at(f"{TEMPORARY}{number}")
             with suppress(FileExistsError):
                 return name, os.open(name, _NEW | flags, mode, dir_fd=fd)
@@ -471,11 +489,18 @@ class Directory:
     def _failed(self, name: str, error: OSError, size: int) -> ds.DatasetWriteError:
         """Convert a system error to DiskFullError or DatasetWriteError."""
         path = str(self.path / name)
-        data = {"path": path, "bytes": size, "errno": error.errno, "free": free_bytes(self.path)}
+        data = {
+            "path": path,
+            "bytes": size,
+            "errno": error.errno,
+            "free": free_bytes(self.path),
+        }
         if error.errno in _NO_ROOM:
             free = "" if data["free"] is None else f", {data['free']} bytes free"
             return ds.DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
-        return ds.DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
+        return ds.DatasetWriteError(
+            f"cannot write {path}: {error.strerror or error}", data
+        )
 
 
 def _allocate(file: int, size: int) -> None:
@@ -517,7 +542,9 @@ def free_memory_bytes() -> int:
     free = memory_bytes() // 2
     with suppress(OSError, ValueError, KeyError):
         free = 1024 * _fields(MEMORY_INFORMATION)["MemAvailable:"]
-    with suppress(OSError, ValueError, KeyError):  # no container, or none with a limit ("max")
+    with suppress(
+        OSError, ValueError, KeyError
+    ):  # no container, or none with a limit ("max")
         limit = int(CGROUP_LIMIT.read_text(encoding="ascii"))
         used = int(CGROUP_USED.read_text(encoding="ascii"))
         free = min(free, limit - used + _fields(CGROUP_STATISTICS)["inactive_file"])
@@ -527,7 +554,11 @@ def free_memory_bytes() -> int:
 def _fields(file: Path) -> dict[str, int]:
     """Parse the numbers of a file of lines "name number ..." by name."""
     lines = (line.split() for line in file.read_text(encoding="ascii").splitlines())
-    return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}
+    return {
+        words[0]: int(words[1])
+        for words in lines
+        if len(words) > 1 and words[1].isdigit()
+    }
 
 
 def open_data(root: Path) -> Directory:

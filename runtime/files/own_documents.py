@@ -41,7 +41,8 @@ def file_stem(name: str) -> str:
     stem = encoded(name)
     if len(stem) > MAX_STEM:
         raise LimitError(
-            f"the name {name[:40]!r}... is too long: {len(stem)} bytes encoded, {MAX_STEM} allowed",
+            f"the name {name[:40]!r}... is too long: {len(stem)} bytes encoded, "
+            f"{MAX_STEM} allowed",
             {"asked": len(stem), "allowed": MAX_STEM},
         )
     return stem
@@ -84,7 +85,9 @@ class _Change:
         if self.data is None:
             return self.folder.stat(self.name) is None
         found = self.folder.read(self.name, max(MAX_READ_BYTES, len(self.data)))
-        return found == self.data or (self.keep is not None and found.rstrip(b" ") == self.data)
+        return found == self.data or (
+            self.keep is not None and found.rstrip(b" ") == self.data
+        )
 
 
 class Changes:
@@ -98,7 +101,9 @@ class Changes:
     def __init__(self) -> None:
         self._made: list[_Change] = []
 
-    def put(self, folder: Directory, name: str, data: bytes, keep: Keep | None = None) -> None:
+    def put(
+        self, folder: Directory, name: str, data: bytes, keep: Keep | None = None
+    ) -> None:
         """Write a file like `Directory.keep`, and keep the one it replaces until
         `done` or `undo`.
 
@@ -146,7 +151,9 @@ class Changes:
     def __enter__(self) -> Changes:
         return self
 
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+    def __exit__(
+        self, _kind: object, error: BaseException | None, _trace: object
+    ) -> None:
         if error is None:
             self.done()
         else:
@@ -188,7 +195,9 @@ def _second_name(folder: Directory, name: str, second: str) -> bool:
         if about is None:
             return False
         with suppress(FileNotFoundError):
-            folder.unlink(second)  # of a killed writer with the same numbers, as in a container
+            folder.unlink(
+                second
+            )  # of a killed writer with the same numbers, as in a container
         try:
             folder.link(name, second)
         except OSError:  # a file system without links
@@ -202,8 +211,12 @@ def read_json(data: bytes) -> object:
     Raises:
         ValueError: it is no such document.
     """
-    document = json.loads(data.decode("utf-8"), parse_float=_finite, parse_constant=_finite)
-    json.dumps(document, ensure_ascii=False).encode("utf-8")  # an escaped lone surrogate is no text
+    document = json.loads(
+        data.decode("utf-8"), parse_float=_finite, parse_constant=_finite
+    )
+    json.dumps(document, ensure_ascii=False).encode(
+        "utf-8"
+    )  # an escaped lone surrogate is no text
     return document
 
 
@@ -302,7 +315,9 @@ def lock_folder(root: Directory) -> Callable[[], None]:
     except OSError:
         return lambda: None
 
-    def release(held: Directory = root) -> None:  # as long as it is referred to, it stays open
+    def release(
+        held: Directory = root,
+    ) -> None:  # as long as it is referred to, it stays open
         fcntl.flock(fd, fcntl.LOCK_UN)
 
     return release

@@ -59,11 +59,15 @@ class SpareFiles:
         """
         for spare in sorted(self._there):
             self._there.discard(spare)
-            if not self._usable(spare):  # another name of the document, from a change taken back
+            if not self._usable(
+                spare
+            ):  # another name of the document, from a change taken back
                 with suppress(OSError):
                     self._folder.unlink(spare)
                 continue
-            with writing(self._folder.path / name, f"cannot write {self._folder.path / name}"):
+            with writing(
+                self._folder.path / name, f"cannot write {self._folder.path / name}"
+            ):
                 self._folder.overwrite(spare, data)
                 self._save(name)
                 self._folder.rename(spare, name)

@@ -31,7 +31,9 @@ def require_bytes(path: Path, needed: int) -> None:
     """
     free = free_bytes(path)
     if needed > free:
-        said = f"{os.strerror(errno.ENOSPC)}: it takes {needed} bytes; {free} bytes are free"
+        said = (
+            f"{os.strerror(errno.ENOSPC)}: it takes {needed} bytes; {free} bytes are free"
+        )
         raise OSError(errno.ENOSPC, said, str(path))
 
 

@@ -117,7 +117,11 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
         if type(value) not in (int, float) or not abs(value) < MAX_TRUTH_VALUE:
             raise MachineFileError(
                 f"{path}: {name}: the value must be a number below {MAX_TRUTH_VALUE:g}",
-                {"file": str(path), "path": name, "allowed": [-MAX_TRUTH_VALUE, MAX_TRUTH_VALUE]},
+                {
+                    "file": str(path),
+                    "path": name,
+                    "allowed": [-MAX_TRUTH_VALUE, MAX_TRUTH_VALUE],
+                },
             )
     try:
         parameters = Offsets.from_edge({k: float(v) for k, v in values.items()})
@@ -135,7 +139,9 @@ class Projector(Protocol):
     async def remove(self, name: str) -> None:
         """Remove a body."""
 
-    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
         """Compute line integrals, float32 (n, rows, cols)."""
 
 
@@ -223,7 +229,9 @@ class Imaging:
                 return await self.projector.project(apart.names[0], cone, camera.shape)
             total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
             for name, factor in zip(apart.names, factors, strict=True):
-                total += np.float32(factor) * await self.projector.project(name, cone, camera.shape)
+                total += np.float32(factor) * await self.projector.project(
+                    name, cone, camera.shape
+                )
             return total
 
     async def path_lengths(
@@ -254,7 +262,11 @@ class Imaging:
         if spot[1] > 1:
             cone = ConeVec(spot_views(cone.rows, *spot))
         if not sample.name:
-            return (), np.empty((0, len(cone), *camera.shape), dtype=np.float32), cone.rows
+            return (
+                (),
+                np.empty((0, len(cone), *camera.shape), dtype=np.float32),
+                cone.rows,
+            )
         async with self._sent(sample, "material") as apart:
             out = np.empty((len(apart.names), len(cone), *camera.shape), dtype=np.float32)
             for i, name in enumerate(apart.names):
@@ -337,18 +349,26 @@ class Imaging:
             apart = await self._taken_apart(sample, pieces)
         mine = (_name(sample), pieces)
         if self.memory_limit is not None:
-            others = sum(self._known[key].nbytes for key in self._pinned_keys() if key != mine)
+            others = sum(
+                self._known[key].nbytes for key in self._pinned_keys() if key != mine
+            )
             left = self.memory_limit - others
             if apart.nbytes > left:
-                raise self._too_large(sample, apart.nbytes, left, self.memory_limit, "the twin")
+                raise self._too_large(
+                    sample, apart.nbytes, left, self.memory_limit, "the twin"
+                )
         available = None if self.room is None else await self.room()
         need = sum(memory_of(body) for body in apart.bodies)
         if available is not None and need > available:
             raise self._too_large(sample, need, available, available, "the projector")
 
-    def _too_large(self, sample: Sample, need: int, left: int, limit: int, who: str) -> RpcError:
+    def _too_large(
+        self, sample: Sample, need: int, left: int, limit: int, who: str
+    ) -> RpcError:
         """Make the error for a sample that needs more memory than is left."""
-        error = too_large(f"the sample {sample.name!r} in the memory of {who}", need, max(0, left))
+        error = too_large(
+            f"the sample {sample.name!r} in the memory of {who}", need, max(0, left)
+        )
         assert isinstance(error.data, dict)
         error.data.update(sample=sample.name, memory_limit=limit, option="--memory-limit")
         return error
@@ -448,7 +468,9 @@ class Imaging:
                     raise
                 for other in self._versions:
                     await self._remove(other, 1)
-                await self.projector.put(named, body)  # older servers forget nothing by themselves
+                await self.projector.put(
+                    named, body
+                )  # older servers forget nothing by themselves
         versions[:] = [*(v for v in versions if v != named), named]
         return named
 
@@ -456,7 +478,9 @@ class Imaging:
         """Have the projector remove all but the `left` newest versions."""
         versions = self._versions[name]
         while len(versions) > left:
-            with suppress(ProjectorUnavailable, RpcError):  # then it may have forgotten more
+            with suppress(
+                ProjectorUnavailable, RpcError
+            ):  # then it may have forgotten more
                 await self.projector.remove(versions[0])
             versions.pop(0)
 
@@ -471,7 +495,9 @@ def bytes_of(body: Body) -> int:
 def digest_of(body: Body) -> str:
     """Hash everything that images depend on: equal for equal contents, in every process."""
     if isinstance(body, Scene):
-        sha = hashlib.sha256(json.dumps(scene_to_dict(body), default=np.ndarray.tolist).encode())
+        sha = hashlib.sha256(
+            json.dumps(scene_to_dict(body), default=np.ndarray.tolist).encode()
+        )
     elif isinstance(body, TriangleMesh):
         sha = hashlib.sha256(body.vertices.astype("<f8").tobytes())
         sha.update(body.faces.astype("<i8").data)

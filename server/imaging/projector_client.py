@@ -118,12 +118,23 @@ class ProjectorClient:
             if body is not None:
                 await self.give(name, body)
             try:
-                return await self._ask("project", lambda c: c.ask_array("project", params, sizes))
+                return await self._ask(
+                    "project", lambda c: c.ask_array("project", params, sizes)
+                )
             except RpcError as error:
-                allowed = error.data.get("allowed") if isinstance(error.data, Mapping) else None
-                if body is None or not isinstance(allowed, list) or name in allowed or not left:
+                allowed = (
+                    error.data.get("allowed") if isinstance(error.data, Mapping) else None
+                )
+                if (
+                    body is None
+                    or not isinstance(allowed, list)
+                    or name in allowed
+                    or not left
+                ):
                     raise
-            self._sent.pop(name, None)  # it was forgotten for another, or removed by another client
+            self._sent.pop(
+                name, None
+            )  # it was forgotten for another, or removed by another client
         raise AssertionError("the last try returns or raises")
 
     async def health(self) -> Health:
@@ -134,7 +145,9 @@ class ProjectorClient:
         """Call any method and return its result; raises as `project`."""
         return await self._ask(method, lambda channel: channel.ask(method, params))
 
-    async def _ask(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
+    async def _ask(
+        self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]
+    ) -> _T:
         """Do some work on a connection, made if there is none.
 
         Raises:
@@ -162,13 +175,17 @@ class ProjectorClient:
         try:
             channel = await ProjectorLink.connect(self.host, self.port, self.ssl)
             try:
-                answer = await channel.ask("session.hello", hello_params("flexdt twin", self.token))
+                answer = await channel.ask(
+                    "session.hello", hello_params("flexdt twin", self.token)
+                )
             except BaseException:
                 channel.close()
                 raise
         except OSError as error:
             why = getattr(error, "strerror", None) or str(error) or "no answer"
-            raise ProjectorUnavailable(f"no projector at {self.host}:{self.port} ({why})") from None
+            raise ProjectorUnavailable(
+                f"no projector at {self.host}:{self.port} ({why})"
+            ) from None
         instance = answer.get("instance") if isinstance(answer, Mapping) else None
         self._evicts = isinstance(answer, Mapping) and answer.get("evicts") is True
         if instance != self._instance:
@@ -177,7 +194,9 @@ class ProjectorClient:
         return channel
 
 
-async def _send(channel: ProjectorLink, name: str, value: Body, how: Mapping[str, object]) -> None:
+async def _send(
+    channel: ProjectorLink, name: str, value: Body, how: Mapping[str, object]
+) -> None:
     """Send a volume or mesh in chunks, or a scene; `how` are further parameters.
 
     Args:
@@ -187,7 +206,9 @@ async def _send(channel: ProjectorLink, name: str, value: Body, how: Mapping[str
         how: further parameters of `volume.put`.
     """
     if isinstance(value, Scene):
-        await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value), **how})
+        await channel.ask(
+            "volume.put", {"name": name, "scene": scene_to_dict(value), **how}
+        )
         return
     what: dict[str, object]
     if isinstance(value, TriangleMesh):

@@ -63,7 +63,9 @@ class ProjectorPool:
         patience_s: how long a call goes on when every server fails [s].
     """
 
-    def __init__(self, clients: Sequence[ProjectorClient], patience_s: float = 5.0) -> None:
+    def __init__(
+        self, clients: Sequence[ProjectorClient], patience_s: float = 5.0
+    ) -> None:
         self._members = [_Member(client) for client in clients]
         self.patience_s = patience_s
         self._values: dict[str, Body] = {}
@@ -109,7 +111,9 @@ class ProjectorPool:
         removals = (member.client.remove(name) for member in self._members)
         await asyncio.gather(*removals, return_exceptions=True)
 
-    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
         """Compute line integrals, float32 (n, rows, cols);
         errors as `ProjectorClient.project`."""
         images = await self._deal(name, cone_vec, shape)
@@ -152,7 +156,11 @@ class ProjectorPool:
                     members.add(member)
                     asking = self._ask(member, name, value, views, shape)
                     running[self._begin(member, asking)] = member
-                    late = now + LATE_S + LATE_FACTOR * (member.pace_s or 0.0) * len(views or ())
+                    late = (
+                        now
+                        + LATE_S
+                        + LATE_FACTOR * (member.pace_s or 0.0) * len(views or ())
+                    )
                 wakes = [m.rests_until for m in self._members if m.rests_until > now]
                 wakes += [late] if late > now else []
                 done, _ = await asyncio.wait(
@@ -185,7 +193,9 @@ class ProjectorPool:
         then the fastest."""
         limit = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (
-            m for m in self._members if m not in asked and m.open < limit and m.rests_until <= now
+            m
+            for m in self._members
+            if m not in asked and m.open < limit and m.rests_until <= now
         )
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
@@ -250,10 +260,14 @@ class ProjectorPool:
             if isinstance(error, ProjectorUnavailable) or len(self) > 1:
                 member.rests_until = loop.time() + REST_S
                 member.kind = None
-                self._lines.log("a projector gave no answer", logging.WARNING, reason=str(error))
+                self._lines.log(
+                    "a projector gave no answer", logging.WARNING, reason=str(error)
+                )
             raise
         taken = (loop.time() - begun) / len(views)
-        member.pace_s = taken if member.pace_s is None else (3 * member.pace_s + taken) / 4
+        member.pace_s = (
+            taken if member.pace_s is None else (3 * member.pace_s + taken) / 4
+        )
         member.views += len(views)
         return images
 
@@ -262,7 +276,11 @@ class ProjectorPool:
         kinds = sorted({m.kind for m in self._members if m.kind is not None})
         if len(kinds) > 1:
             kept = "; ".join(" ".join(kind) for kind in kinds)
-            log("projectors differ: so may the last digits of frames", logging.WARNING, kinds=kept)
+            log(
+                "projectors differ: so may the last digits of frames",
+                logging.WARNING,
+                kinds=kept,
+            )
 
 
 async def _room_of(member: _Member) -> int | None:

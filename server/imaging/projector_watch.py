@@ -78,7 +78,10 @@ class ProjectorWatch:
         answer = asyncio.ensure_future(client.health())
         try:
             if not (await asyncio.wait([answer], timeout=self.silent_s))[0]:
-                self._found(client, f"the projector at {client.host}:{client.port} does not answer")
+                self._found(
+                    client,
+                    f"the projector at {client.host}:{client.port} does not answer",
+                )
             await answer
         except ProjectorUnavailable as error:
             self._found(client, str(error))

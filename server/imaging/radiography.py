@@ -37,7 +37,13 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
 from flexdt.twin.physics import scatter as mc
-from flexdt.twin.physics.chain import Chain, Radiograph, Scattered, radiographs, without_spot
+from flexdt.twin.physics.chain import (
+    Chain,
+    Radiograph,
+    Scattered,
+    radiographs,
+    without_spot,
+)
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.predicted_beam import CountShares, Physics
@@ -182,7 +188,9 @@ class Radiography:
             lines = await self.imaging.line_integrals(sample, poses, camera, truth=truth)
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
-            return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
+            return [
+                Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])
+            ]
         points = self.tube.spot_points
         moments = len(poses) // count
         if points > 1 and count > 1:  # one by one: each holds the paths of all its points
@@ -207,7 +215,9 @@ class Radiography:
             added = await asyncio.to_thread(
                 self._scattered, thing, chain, middles, camera, exposures
             )
-        return await asyncio.to_thread(radiographs, chain, paths, views, exposures, moments, added)
+        return await asyncio.to_thread(
+            radiographs, chain, paths, views, exposures, moments, added
+        )
 
     def _scattered(
         self,
@@ -228,7 +238,9 @@ class Radiography:
             camera: of all images.
             exposures: of each image.
         """
-        beams = {kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
+        beams = {
+            kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}
+        }
         return [
             mc.view_scatter(thing, view, camera.shape, beams[exposure.kV], SCATTER)
             for view, exposure in zip(views, exposures, strict=True)
@@ -248,7 +260,9 @@ class Radiography:
         cone = probe.cone_vec
         if self.physics == "ideal":
             lines = await self.imaging.nominal_integrals(sample, cone)
-            counts = np.exp(-lines) * np.float32(ideal.open_beam(self.model, probe.exposure))
+            counts = np.exp(-lines) * np.float32(
+                ideal.open_beam(self.model, probe.exposure)
+            )
             return CountShares.of(counts, self.saturating)
         parts, paths = await self.imaging.nominal_paths(sample, cone)
         mono_keV = stated_keV() if self.physics == "mono" else None
@@ -353,7 +367,9 @@ def marks_of(
     small = marks[: rows * binning, : cols * binning].astype(np.uint8)
     height, width = small.shape
     small[-1] |= np.bitwise_or.reduce(marks[height - 1 :, :width]).astype(np.uint8)
-    small[:, -1] |= np.bitwise_or.reduce(marks[:height, width - 1 :], axis=1).astype(np.uint8)
+    small[:, -1] |= np.bitwise_or.reduce(marks[:height, width - 1 :], axis=1).astype(
+        np.uint8
+    )
     blocks = small.reshape(rows, binning, cols, binning)
     return np.asarray(np.bitwise_or.reduce(blocks, axis=(1, 3)), dtype=np.uint8)
 
@@ -375,12 +391,16 @@ def flags_of(
         time: of its pose [s].
     """
     lines = radiograph.shown
-    signal = radiography.signal(radiograph, camera, exposure)[::JUDGED_STEP_PX, ::JUDGED_STEP_PX]
+    signal = radiography.signal(radiograph, camera, exposure)[
+        ::JUDGED_STEP_PX, ::JUDGED_STEP_PX
+    ]
     top = radiography.saturating
     # The signal of an open beam, as a logarithm. Two digits: with more, poly would reveal
     # distances.
     beam = float(
-        np.median(lines[::JUDGED_STEP_PX, ::JUDGED_STEP_PX] + np.log(np.maximum(signal, 1e-30)))
+        np.median(
+            lines[::JUDGED_STEP_PX, ::JUDGED_STEP_PX] + np.log(np.maximum(signal, 1e-30))
+        )
     )
     edges: dict[ImageEdge, Float32Array] = {
         "left": lines[:, 0],
@@ -392,9 +412,14 @@ def flags_of(
         time=time,
         saturated=float(np.mean(signal >= top)),
         starved=float(np.mean(signal < ideal.FEW_COUNTS)),
-        truncated=[name for name, edge in edges.items() if float(edge.max()) > CUT_OFF_INTEGRAL],
+        truncated=[
+            name for name, edge in edges.items() if float(edge.max()) > CUT_OFF_INTEGRAL
+        ],
         good_counts=(radiography.offset + ideal.FEW_COUNTS, radiography.full_scale),
-        good_lines=(round(beam - math.log(top), 2), round(beam - math.log(ideal.FEW_COUNTS), 2)),
+        good_lines=(
+            round(beam - math.log(top), 2),
+            round(beam - math.log(ideal.FEW_COUNTS), 2),
+        ),
     )
 
 
@@ -422,7 +447,9 @@ def predict(
         RpcError: an argument that the machine does not allow.
     """
     answer = asdict(exposure_forecast.expose(phantom, machine=machine, **settings))
-    answer["transmission"]["edges"] = answer["transmission"]["edges"][:-1]  # no infinity in JSON
+    answer["transmission"]["edges"] = answer["transmission"]["edges"][
+        :-1
+    ]  # no infinity in JSON
     answer |= {
         "sample": phantom.name,
         "best": answer["best"][:MAX_PROPOSALS],

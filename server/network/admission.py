@@ -23,7 +23,9 @@ class TokenCheck:
         lines: of the log.
     """
 
-    def __init__(self, token: str | None, close: Callable[[], object], lines: Sparing) -> None:
+    def __init__(
+        self, token: str | None, close: Callable[[], object], lines: Sparing
+    ) -> None:
         self._token = token
         self._close = close
         self._lines = lines

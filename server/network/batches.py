@@ -37,7 +37,9 @@ class Batch:
         self._bodies: dict[int, list[bytes]] = {}
         self._size = 0
         self._most = most
-        self.too_large = errors.too_large("the answers to a batch", f"more than {most}", most)
+        self.too_large = errors.too_large(
+            "the answers to a batch", f"more than {most}", most
+        )
 
     @property
     def full(self) -> bool:

@@ -37,7 +37,12 @@ class SendTarget(Protocol):
         """Abort the connection."""
 
     def log(
-        self, event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
+        self,
+        event: str,
+        level: int = logging.INFO,
+        *,
+        error: bool = False,
+        **facts: object,
     ) -> None:
         """Write a line about the connection."""
 

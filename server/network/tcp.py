@@ -26,7 +26,16 @@ from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
-from flexdt.protocol import METHODS, AnyMethod, Codec, Connection, Correlation, Prepared, Role, find
+from flexdt.protocol import (
+    METHODS,
+    AnyMethod,
+    Codec,
+    Connection,
+    Correlation,
+    Prepared,
+    Role,
+    find,
+)
 from flexdt.protocol import messages as m
 from flexdt.protocol import rpc_errors as errors
 from flexdt.protocol.connection import MAX_ANSWER
@@ -170,7 +179,9 @@ class _Link(asyncio.BufferedProtocol):
     def __init__(self, server: TcpServer) -> None:
         self.server = server
         self.limits = server.limits
-        self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
+        self.wire = Connection(
+            max_message=self.limits.max_message, max_batch=self.limits.max_batch
+        )
         self.name = self.address = ""
         self.number = self.served = 0
         self.calls: Correlation[None] = Correlation(Role.SERVER)
@@ -179,11 +190,15 @@ class _Link(asyncio.BufferedProtocol):
         self.session: parts.Session | None = None
         self.let_in = server.token is None
         self.arrived = asyncio.Event()
-        self.estop_came = False  # and is, maybe, among the messages that have not been examined
+        self.estop_came = (
+            False  # and is, maybe, among the messages that have not been examined
+        )
         self.ended = False
         self.broken = 0
         self.token_check = admission.TokenCheck(
-            server.token, lambda: self.loop.call_soon(self.close, "wrong tokens"), server.lines
+            server.token,
+            lambda: self.loop.call_soon(self.close, "wrong tokens"),
+            server.lines,
         )
         self.allowance = 0.0
         self.allowance_at = 0.0
@@ -297,7 +312,9 @@ class _Link(asyncio.BufferedProtocol):
             ):
                 return False
             if isinstance(message, m.Batch) and not all(map(self._urgent, message.items)):
-                split = self.split[id(raw)] = batches.Split(raw, self._batch(message.items))
+                split = self.split[id(raw)] = batches.Split(
+                    raw, self._batch(message.items)
+                )
                 found.append(self._begin(split))
                 return False  # its other items stay in the queue
             found.append(self._serve(message, urgent=True))
@@ -384,11 +401,18 @@ class _Link(asyncio.BufferedProtocol):
             self.end()
 
     def log(
-        self, event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
+        self,
+        event: str,
+        level: int = logging.INFO,
+        *,
+        error: bool = False,
+        **facts: object,
     ) -> None:
         """Write a line about this connection, unless there are too many of its kind."""
         kind = event if self.let_in else f"{event}, no token"
-        self.server.lines.log(event, level, kind=kind, error=error, client=self.name, **facts)
+        self.server.lines.log(
+            event, level, kind=kind, error=error, client=self.name, **facts
+        )
 
     def abort(self, reason: str) -> None:
         """Abort the connection and log the reason."""
@@ -476,7 +500,9 @@ class _Link(asyncio.BufferedProtocol):
         except ProtocolError as error:
             self.out.reply(m.Failure(None, errors.parse_error(str(error))))
 
-    async def _decoded(self, raw: bytes) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
+    async def _decoded(
+        self, raw: bytes
+    ) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
         """Decode a message, a large one in another process; errors become `Malformed`."""
         read = self.server.read
         if not self.let_in and len(raw) > MAX_INLINE_BYTES:
@@ -492,7 +518,10 @@ class _Link(asyncio.BufferedProtocol):
             return m.Malformed(errors.internal())
 
     async def _serve(
-        self, message: m.Message | parts.Frozen | tuple[parts.Frozen, ...], *, urgent: bool = False
+        self,
+        message: m.Message | parts.Frozen | tuple[parts.Frozen, ...],
+        *,
+        urgent: bool = False,
     ) -> None:
         """Answer one message or batch; an urgent one waits for a turn first."""
         match message:
@@ -533,7 +562,10 @@ class _Link(asyncio.BufferedProtocol):
                 await self._turn(item)
             waits = True
             full = batch.full and not self._urgent(item)
-            batch.keep(await self._answer(item, batch.too_large if full else None), self.out.encode)
+            batch.keep(
+                await self._answer(item, batch.too_large if full else None),
+                self.out.encode,
+            )
 
     async def _send(self, body: list[bytes]) -> None:
         """Send a body, and wait while the client has too many unread replies."""
@@ -564,7 +596,9 @@ class _Link(asyncio.BufferedProtocol):
             return m.Failure(None, errors.invalid_request(str(error)))
         match item:
             case m.Request(id, name, params) | parts.Call(id, name, params, True):
-                answer = await self._call(id, name, params if refused is None else refused)
+                answer = await self._call(
+                    id, name, params if refused is None else refused
+                )
                 self._count(broken=False)
                 return self.calls.answer(answer)
             case m.Notification(name, params) | parts.Call(_, name, params, False):
@@ -579,7 +613,9 @@ class _Link(asyncio.BufferedProtocol):
         """Count broken messages in a row; without the token every message counts. Close
         after too many."""
         self.broken = self.broken + 1 if broken or not self.let_in else 0
-        if self.broken >= (self.limits.malformed if self.let_in else MAX_STRANGE_MESSAGES):
+        if self.broken >= (
+            self.limits.malformed if self.let_in else MAX_STRANGE_MESSAGES
+        ):
             self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
 
     async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
@@ -595,7 +631,9 @@ class _Link(asyncio.BufferedProtocol):
             observe=self.server.observe,
         )
 
-    async def _try(self, id: m.Id, name: str, given: Given, trace: str) -> m.Response | m.Failure:
+    async def _try(
+        self, id: m.Id, name: str, given: Given, trace: str
+    ) -> m.Response | m.Failure:
         """Check token, rate, place and parameters of a call, and have the session handle it.
 
         Args:
@@ -650,7 +688,9 @@ class _Link(asyncio.BufferedProtocol):
         self.allowance = min(rate, self.allowance + (now - self.allowance_at) * rate)
         self.allowance_at = now
         if self.allowance < 1.0:
-            raise errors.busy(f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"})
+            raise errors.busy(
+                f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"}
+            )
         self.allowance -= 1.0
 
     @property

@@ -129,7 +129,9 @@ class ComputeThread:
     def __init__(self, begin: Callable[[], None]) -> None:
         self._steps: SimpleQueue[tuple[Future[object], Step] | None] = SimpleQueue()
         self.ready = asyncio.wrap_future(self.put(begin))
-        self._thread = threading.Thread(target=self._run, name="projector-compute", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name="projector-compute", daemon=True
+        )
         self._thread.start()
 
     def put(self, step: Step) -> Future[object]:
@@ -185,7 +187,9 @@ def begin(threads: int) -> None:
     numba.set_num_threads(threads)
     LOG.setLevel(logging.ERROR)  # the supervisor reports the wait
     warm_up_forward()
-    threading.Thread(target=_compile_back, name="projector-compiling", daemon=True).start()
+    threading.Thread(
+        target=_compile_back, name="projector-compiling", daemon=True
+    ).start()
 
 
 def _compile_back() -> None:

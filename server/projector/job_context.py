@@ -97,7 +97,9 @@ class Context:
     @property
     def waiting(self) -> int:
         """Number of requests whose work waits for its turn."""
-        return sum(job.waits for client in self.clients.values() for job in client.jobs.values())
+        return sum(
+            job.waits for client in self.clients.values() for job in client.jobs.values()
+        )
 
     async def run(self, client: JobClient, id: Id, step: Step) -> object:
         """Compute the one step of a request and return its value."""

@@ -53,7 +53,9 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
     }
 
 
-async def volume_put(context: Context, client: JobClient, id: Id, p: wire.VolumePut) -> object:
+async def volume_put(
+    context: Context, client: JobClient, id: Id, p: wire.VolumePut
+) -> object:
     """Store a scene, or a chunk of voxels or of a mesh; prepare a complete volume.
 
     Args:
@@ -78,10 +80,17 @@ async def volume_put(context: Context, client: JobClient, id: Id, p: wire.Volume
         volume = await context.run(client, id, lambda: _prepared(ready()))
         assert isinstance(volume, Volume | TriangleMesh)
         context.store.put(p.name, volume, evictable=p.evictable)
-    return {"name": p.name, "received": received, "total": what.nbytes, "complete": complete}
+    return {
+        "name": p.name,
+        "received": received,
+        "total": what.nbytes,
+        "complete": complete,
+    }
 
 
-async def volume_get(context: Context, client: JobClient, id: Id, p: wire.VolumeRef) -> object:
+async def volume_get(
+    context: Context, client: JobClient, id: Id, p: wire.VolumeRef
+) -> object:
     """Send a volume's voxels.
 
     Raises:
@@ -89,7 +98,9 @@ async def volume_get(context: Context, client: JobClient, id: Id, p: wire.Volume
     """
     volume = context.store.get(p.name)
     if not isinstance(volume, Volume):
-        raise invalid_params(f"{p.name!r} is a mesh or an analytic scene and has no voxels")
+        raise invalid_params(
+            f"{p.name!r} is a mesh or an analytic scene and has no voxels"
+        )
     data = volume.data
     voxels = await context.run(client, id, lambda: np.ascontiguousarray(data))
     assert isinstance(voxels, np.ndarray)
@@ -105,7 +116,9 @@ async def volume_list(context: Context, client: JobClient, id: Id, p: Params) ->
     }
 
 
-async def volume_remove(context: Context, client: JobClient, id: Id, p: wire.VolumeRef) -> object:
+async def volume_remove(
+    context: Context, client: JobClient, id: Id, p: wire.VolumeRef
+) -> object:
     """Remove a volume."""
     return {"removed": context.store.remove(p.name)}
 
@@ -150,7 +163,9 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
     return {"dtype": "float32", "shape": [len(rows), *p.detector], "parts": parts}
 
 
-async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backproject) -> object:
+async def backproject(
+    context: Context, client: JobClient, id: Id, p: wire.Backproject
+) -> object:
     """Compute the adjoint, and answer it or add it to a named volume.
 
     Args:
@@ -226,7 +241,9 @@ def _document() -> object:
     return openrpc_document(wire.PROJECTOR_METHODS, title="flexdt projector server")
 
 
-def _accumulator(context: Context, name: str | None, grid: wire.VoxelGrid) -> Volume | None:
+def _accumulator(
+    context: Context, name: str | None, grid: wire.VoxelGrid
+) -> Volume | None:
     """Return the named volume that a back projection is added to, or None.
 
     Raises:
@@ -256,7 +273,9 @@ def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
     """Compute a back projection, added to `old`."""
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
-    volume = back(p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm))
+    volume = back(
+        p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm)
+    )
     data = np.ascontiguousarray(volume.data)
     if old is not None:
         data = data + old.data

@@ -120,7 +120,9 @@ class ProjectorServer(ListeningServer):
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
         """Send an error and end the connection."""
-        self.context.lines.log("refused", logging.WARNING, client=link.peer, reason=error.message)
+        self.context.lines.log(
+            "refused", logging.WARNING, client=link.peer, reason=error.message
+        )
         link.dismiss(m.Failure(None, error))
 
     def frame(self, link: FrameLink, body: memoryview) -> None:
@@ -161,7 +163,9 @@ class ProjectorServer(ListeningServer):
         try:
             match message := frames.unpack(body):
                 case m.Batch():
-                    await link.send(m.Failure(None, errors.invalid_request("one request a frame")))
+                    await link.send(
+                        m.Failure(None, errors.invalid_request("one request a frame"))
+                    )
                     return
                 case m.Request(id) if calls.owes(id):
                     error = errors.invalid_request(f"request id {id!r} is in use")
@@ -171,7 +175,9 @@ class ProjectorServer(ListeningServer):
             match message:
                 case m.Request(id, name, params):
                     request = id
-                    await link.send(calls.answer(await self._call(client, id, name, params)))
+                    await link.send(
+                        calls.answer(await self._call(client, id, name, params))
+                    )
                 case m.Notification("cancel", params):
                     await self._call(client, None, "cancel", params)
                 case m.Malformed() as broken:
@@ -231,15 +237,26 @@ class ProjectorServer(ListeningServer):
         except RpcError as error:
             return m.Failure(id, error)
         except TwinError as error:
-            return m.Failure(id, errors.invalid_params(error.message, [], error.data or None))
+            return m.Failure(
+                id, errors.invalid_params(error.message, [], error.data or None)
+            )
         except MemoryError as error:
             return m.Failure(
-                id, errors.too_large(f"a result ({error})", "more", 0, "bytes of free memory")
+                id,
+                errors.too_large(
+                    f"a result ({error})", "more", 0, "bytes of free memory"
+                ),
             )
         except ConnectionError:
             raise
         except Exception:
-            log("handler failed", logging.ERROR, error=True, method=name, client=client.link.peer)
+            log(
+                "handler failed",
+                logging.ERROR,
+                error=True,
+                method=name,
+                client=client.link.peer,
+            )
             return m.Failure(id, errors.internal(current()))
 
 

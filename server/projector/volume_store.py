@@ -248,7 +248,9 @@ def _info(name: str, value: Body) -> wire.VolumeInfo:
     """
     if isinstance(value, TriangleMesh):
         triangles = len(value.faces)
-        return wire.VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)
+        return wire.VolumeInfo(
+            name=name, kind="mesh", bytes=memory_of(value), triangles=triangles
+        )
     if isinstance(value, Volume):
         return wire.VolumeInfo(
             name=name,

@@ -25,7 +25,15 @@ from typing import Any, Final, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol import MAX_FRAME, Answered, Code, Correlation, Role, image, parse_result
+from flexdt.protocol import (
+    MAX_FRAME,
+    Answered,
+    Code,
+    Correlation,
+    Role,
+    image,
+    parse_result,
+)
 from flexdt.protocol import connection as frames
 from flexdt.protocol import messages as m
 from flexdt.protocol.connection import pack
@@ -246,10 +254,14 @@ class ProjectorLink:
         self._calls: Correlation[_Pending] = Correlation(Role.CLIENT)
         self._notes: set[asyncio.Future[Any]] = set()
         self._closed = False
-        self.link = FrameLink(self._frame, self._broken, self._lost, send_timeout_s=SILENT_S)
+        self.link = FrameLink(
+            self._frame, self._broken, self._lost, send_timeout_s=SILENT_S
+        )
 
     @classmethod
-    async def connect(cls, host: str, port: int, ssl: tls.SSLContext | None = None) -> Self:
+    async def connect(
+        cls, host: str, port: int, ssl: tls.SSLContext | None = None
+    ) -> Self:
         """Connect to a server.
 
         Raises:
@@ -297,7 +309,9 @@ class ProjectorLink:
         elif parts is not None and tuple(parse_result(Array, answer).shape) == shape:
             parts.setflags(write=False)
             return np.asarray(parts.reshape(shape))
-        raise RpcError(Code.INTERNAL, f"the projector's answer to {method} is no {shape} array")
+        raise RpcError(
+            Code.INTERNAL, f"the projector's answer to {method} is no {shape} array"
+        )
 
     async def _request(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None

@@ -1,9 +1,9 @@
 """Complete processing of batches of a plan's frames: positions, line integrals, counts,
 files.
 
-Projection is awaited, counts and files are made in worker threads, so neither waits for the other.
-A frame depends on the plan, the sample, the truth and the scan's seed only. When frames are due is
-decided in `runner`; `dataset_writer` writes the files.
+Projection is awaited, counts and files are made in worker threads, so neither waits for the
+other. A frame depends on the plan, the sample, the truth and the scan's seed only. When frames
+are due is decided in `runner`; `dataset_writer` writes the files.
 """
 
 from __future__ import annotations
@@ -129,7 +129,9 @@ class Acquisition:
             return None
         async with self._trapping:
             at = max((i for i in self._trapped if i <= frame.index), default=0)
-            charge = self._trapped.get(at, np.zeros(self.plan.exposures[at].camera.shape, "f4"))
+            charge = self._trapped.get(
+                at, np.zeros(self.plan.exposures[at].camera.shape, "f4")
+            )
             for index in range(at, frame.index):
                 now, later = self.plan.exposures[index : index + 2]
                 if now.camera != later.camera:
@@ -138,7 +140,11 @@ class Acquisition:
                     lit = (await self._image(now)).expected if now.xrays_on else None
                     gap = later.start_s - now.start_s - now.duration_s
                     charge = trapped_after(
-                        self.radiography.panel, charge, lit, settings_of(now), max(gap, 0.0)
+                        self.radiography.panel,
+                        charge,
+                        lit,
+                        settings_of(now),
+                        max(gap, 0.0),
                     )
                 self._trapped[index + 1] = charge
                 self._trapped.pop(index + 1 - KEPT_IMAGES, None)
@@ -152,9 +158,13 @@ class Acquisition:
         else:
             axes = self.plan.machine.axes
             positions = {n: np.array([e.positions[n] for e in batch]) for n in axes}
-        nominal = motor_poses(self.plan.machine, self.plan.profile, frame.camera, positions)
+        nominal = motor_poses(
+            self.plan.machine, self.plan.profile, frame.camera, positions
+        )
         exposures = [settings_of(e) for e in batch]
-        images = await self.radiography.take(self.sample, nominal, frame.camera, exposures)
+        images = await self.radiography.take(
+            self.sample, nominal, frame.camera, exposures
+        )
         self.ensure_same()  # of the projected sample, not of the earlier one
         return images
 
@@ -184,11 +194,19 @@ class Acquisition:
             before: earlier frames on the panel, for each frame.
             trapped: charge in the panel's traps, for each frame.
         """
-        for frame, image, earlier, traps in zip(batch, images, before, trapped, strict=True):
+        for frame, image, earlier, traps in zip(
+            batch, images, before, trapped, strict=True
+        ):
             assert frame.file is not None
-            rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
+            rng = (
+                None
+                if self.seed is None
+                else frame_rng(self.seed, self._numbers[frame.file])
+            )
             settings = settings_of(frame)
-            counts = self.radiography.counts(image, frame.camera, settings, rng, earlier, traps)
+            counts = self.radiography.counts(
+                image, frame.camera, settings, rng, earlier, traps
+            )
             self.put(frame.file, counts)
 
 

@@ -1,4 +1,5 @@
-"""Scripts and poses parsed, planned and swept: here when they are light, else in a worker process.
+"""Scripts and poses parsed, planned and swept: here when they are light, else in a worker
+process.
 
 The answer to a check comes back encoded, a plan in pieces that are each unpickled in a
 moment, so that the loop's interpreter is never held for long. The limits of one check are
@@ -103,14 +104,24 @@ class CheckInput:
             sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
         if wish.poses is None:
             return dry_run.check_script(
-                wish.script, machine, self.profile,
-                start=self.start, sample=self.size, collision=sweep,
+                wish.script,
+                machine,
+                self.profile,
+                start=self.start,
+                sample=self.size,
+                collision=sweep,
                 physics=self.physics,
-            )  # fmt: skip
+            )
         plan = plan_poses(
-            wish.poses.decoded(), machine, self.profile, wish.exposure_ms, start=self.start,
-            sample=self.size, flat=wish.flat, route=self.free_moves if sweep else None,
-        )  # fmt: skip
+            wish.poses.decoded(),
+            machine,
+            self.profile,
+            wish.exposure_ms,
+            start=self.start,
+            sample=self.size,
+            flat=wish.flat,
+            route=self.free_moves if sweep else None,
+        )
         return dry_run.check_plan(plan, (), sweep, physics=self.physics)
 
     def free_moves(
@@ -119,7 +130,9 @@ class CheckInput:
         """Moves without a contact, one after the other; None if there are none."""
         scene = build_scene(self.machine, self.profile, self.pieces, self.parameters)
         begin = self.start
-        paces = {axis: (begin.speeds[axis], begin.accelerations[axis]) for axis in begin.speeds}
+        paces = {
+            axis: (begin.speeds[axis], begin.accelerations[axis]) for axis in begin.speeds
+        }
         return free_moves(scene, self.machine, start, goal, paces)[0]
 
 
@@ -183,7 +196,9 @@ class Checks:
             said, *parts = await self._workers.ask(in_pieces, _bare(matter))
             warnings = json.loads(said)
             plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
-            if isinstance(asyncio.get_running_loop(), ServerLoop):  # a process of one twin
+            if isinstance(
+                asyncio.get_running_loop(), ServerLoop
+            ):  # a process of one twin
                 gc.freeze()  # a million objects that are no garbage, see `announce`
         self._last = Checked(matter, plan, warnings)
         return self._last
@@ -225,7 +240,9 @@ def _bare(matter: CheckInput) -> CheckInput:
     wish = matter.wish
     if wish.poses is None:
         return matter
-    return replace(matter, wish=replace(wish, script=b"", poses=PoseList(wish.poses.text, b"")))
+    return replace(
+        matter, wish=replace(wish, script=b"", poses=PoseList(wish.poses.text, b""))
+    )
 
 
 def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
@@ -308,7 +325,11 @@ def _pieces_of(plan: ScanPlan) -> list[bytes]:
     axes = {f"axis {axis}": parts for axis, parts in rest.pop("trajectories").items()}
     files = {f"files {i}": group.files for i, group in enumerate(plan.groups)}
     rest["groups"] = tuple(replace(group, files=()) for group in plan.groups)
-    long = {name: parts for name, parts in rest.items() if isinstance(parts, tuple)} | axes | files
+    long = (
+        {name: parts for name, parts in rest.items() if isinstance(parts, tuple)}
+        | axes
+        | files
+    )
     short = {name: value for name, value in rest.items() if name not in long}
     pieces = [
         (name, parts[at : at + PARTS_A_PIECE])
@@ -331,10 +352,13 @@ def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan
         files = [whole.pop(name) for name in long if name.startswith("files ")]
         groups = zip(whole.pop("groups"), files, strict=True)
         return ScanPlan(
-            machine=machine, profile=profile, trajectories=axes,
+            machine=machine,
+            profile=profile,
+            trajectories=axes,
             groups=tuple(replace(group, files=names) for group, names in groups),
-            **short, **whole,
-        )  # fmt: skip
+            **short,
+            **whole,
+        )
 
 
 @contextmanager

@@ -98,7 +98,11 @@ class FramePipeline(Generic[T]):
         """Remove a batch of consecutive frames of one kind from the queue."""
         batch = [self._waiting.popleft()]
         kind = self.kind(batch[0])
-        while self._waiting and len(batch) < self.batch and self.kind(self._waiting[0]) == kind:
+        while (
+            self._waiting
+            and len(batch) < self.batch
+            and self.kind(self._waiting[0]) == kind
+        ):
             batch.append(self._waiting.popleft())
         return batch
 

@@ -106,7 +106,9 @@ class Jobs:
             last = list(self._all)[-MAX_NAMED_JOBS:]
             older = len(self._all) - len(last)
             more = f"{older} older ones and " if older else ""
-            there = f"there are: {more}{', '.join(last)}" if last else "there are no jobs yet"
+            there = (
+                f"there are: {more}{', '.join(last)}" if last else "there are no jobs yet"
+            )
             raise UnknownNameError(asked + there, {"asked": job, "allowed": last})
         return self._all[job]
 
@@ -167,12 +169,16 @@ class Jobs:
 
     def uses(self, folder: str) -> bool:
         """Return whether a job that has not ended writes into `folder`."""
-        return any(j.folder == folder and j.phase not in ENDED for j in self._all.values())
+        return any(
+            j.folder == folder and j.phase not in ENDED for j in self._all.values()
+        )
 
     def showing(self, sample: str) -> Job | None:
         """Return a job that has not ended and uses the sample of that name, or None."""
         unended = (j for j in self._all.values() if j.phase not in ENDED)
-        return next((j for j in unended if j.sample is not None and j.sample.name == sample), None)
+        return next(
+            (j for j in unended if j.sample is not None and j.sample.name == sample), None
+        )
 
     def shows(self, sample: Sample) -> None:
         """Set the sample of the current job."""
@@ -196,7 +202,9 @@ class Jobs:
             frames_done=job.frames_done,
             frames_total=job.frames_total,
             elapsed_s=job.elapsed_s,
-            remaining_s=0.0 if job.phase in ENDED else max(0.0, job.duration_s - job.elapsed_s),
+            remaining_s=0.0
+            if job.phase in ENDED
+            else max(0.0, job.duration_s - job.elapsed_s),
             time=self._clock.now(),
             speed_up=self._clock.speed_up if job.speed_up is None else job.speed_up,
             real_time_factor=self._clock.real_time_factor,
@@ -242,10 +250,18 @@ class Jobs:
         if job is not None and job.phase not in ENDED:
             raise self._cannot("resume", job, ENDED)
         return replace(
-            job or Job(f"job-{self._count + 1}", name, folder), prepare=prepare, phase="queued",
-            error=None, ended=None, ended_by=None, speed_up=speed_up, frames_total=plan.frames,
-            duration_s=plan.duration_s, warnings=warnings or [], sample=sample,
-        )  # fmt: skip
+            job or Job(f"job-{self._count + 1}", name, folder),
+            prepare=prepare,
+            phase="queued",
+            error=None,
+            ended=None,
+            ended_by=None,
+            speed_up=speed_up,
+            frames_total=plan.frames,
+            duration_s=plan.duration_s,
+            warnings=warnings or [],
+            sample=sample,
+        )
 
     def enqueue(self, draft: Job) -> Job:
         """Put a drafted job at the end of the queue; a continued job stays the same
@@ -328,7 +344,9 @@ class Jobs:
         """Return jobs changed since the last call by name; None for a forgotten one."""
         names, self._changed = self._changed, set()
         known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
-        return {name: None if job is None else job.memory() for name, job in known.items()}
+        return {
+            name: None if job is None else job.memory() for name, job in known.items()
+        }
 
     def kept_of(self, jobs: Sequence[JobMemory]) -> list[JobMemory]:
         """Select the jobs of an earlier server that are not forgotten at once, oldest
@@ -378,7 +396,9 @@ class Jobs:
 
     def _forget_old(self) -> None:
         """Forget the ended jobs beyond those that are kept, and those that are too old."""
-        ended = [j for j in self._all.values() if j.phase in ENDED and j is not self.current]
+        ended = [
+            j for j in self._all.values() if j.phase in ENDED and j is not self.current
+        ]
         self.forget(ended[: max(0, len(ended) - self._max_ended)])
         self.forget(self._older(self._today() - self._max_age))
 
@@ -386,7 +406,9 @@ class Jobs:
         return [
             job
             for job in self._all.values()
-            if job.phase in ENDED and job is not self.current and (job.ended or than) <= than
+            if job.phase in ENDED
+            and job is not self.current
+            and (job.ended or than) <= than
         ]
 
     def _tell(self, job: Job) -> None:
@@ -408,7 +430,9 @@ class Jobs:
             try:
                 self._clock.set_speed_up(wanted)
                 phase = await self._run(job)
-            except Exception as error:  # whatever it is, it is this job's, and the next one runs
+            except (
+                Exception
+            ) as error:  # whatever it is, it is this job's, and the next one runs
                 phase = self._failed(job, error)
             finally:
                 job.phase, job.ended = phase, self._today()
@@ -426,7 +450,9 @@ class Jobs:
         """Run one job to its end, whatever that is."""
         self._interrupted, self._by_hand = None, False
         try:
-            await self._clock.at_rest(self._scanner.rest_time)  # of motion from before the job
+            await self._clock.at_rest(
+                self._scanner.rest_time
+            )  # of motion from before the job
             assert job.prepare is not None
             self._preparing = True
             if job.start is None:
@@ -489,7 +515,9 @@ class Jobs:
         elapsed = 0.0 if job.runner is None else job.runner.progress.tau
         try:
             scan.store.mark_incomplete(reason, duration_s=elapsed)
-        except TwinError as error:  # the disk may be full: the data set says incomplete anyway
+        except (
+            TwinError
+        ) as error:  # the disk may be full: the data set says incomplete anyway
             log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
 
     def _failed(self, job: Job, error: Exception) -> JobPhase:

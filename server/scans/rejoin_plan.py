@@ -1,9 +1,9 @@
 """How a scanner gets back onto a plan: the pose to return to, and the programme from there on.
 
-A plan may be left while an axis moves (a fly scan). To rejoin it at plan time tau, each moving axis
-goes back to where its run-up would begin, speeds up, and passes the plan's position with the plan's
-velocity at one moment common to all; from there the plan's own trajectories continue. All of it is
-plain calculation.
+A plan may be left while an axis moves (a fly scan). To rejoin it at plan time tau, each moving
+axis goes back to where its run-up would begin, speeds up, and passes the plan's position with
+the plan's velocity at one moment common to all; from there the plan's own trajectories
+continue. All of it is plain calculation.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Runs a scan plan on the twin's clock: motion, settings and frames, with pause, step and abort.
+"""Runs a scan plan on the twin's clock: motion, settings and frames, with pause, step and
+abort.
 
-The plan says everything: the runner waits for each moment, applies what the command sets, and puts
-each frame into the pipeline, which computes and stores it. Positions, times and noise of a frame
-come from the plan and not from when the runner got there, so the bytes are the same at any speed-up
-and with any pauses. The clock is held while the pipeline is full.
+The plan says everything: the runner waits for each moment, applies what the command sets, and
+puts each frame into the pipeline, which computes and stores it. Positions, times and noise of a
+frame come from the plan and not from when the runner got there, so the bytes are the same at
+any speed-up and with any pauses. The clock is held while the pipeline is full.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
         case c.SetSpeed(component=axis, speed=speed):
             scanner.set_axis(axis, speed=_allowed(scanner, axis, speed, "max_speed"))
         case c.SetAcceleration(component=axis, acceleration=rate):
-            scanner.set_axis(axis, acceleration=_allowed(scanner, axis, rate, "max_acceleration"))
+            scanner.set_axis(
+                axis, acceleration=_allowed(scanner, axis, rate, "max_acceleration")
+            )
 
 
 def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float:
@@ -119,7 +122,9 @@ class ScanRunner:
     def __post_init__(self) -> None:
         plan, done = self.plan, frozenset(self.done)
         self._frames = [e for e in plan.exposures if e.file is not None]
-        self._events = _events(plan.steps, [e for e in self._frames if e.file not in done])
+        self._events = _events(
+            plan.steps, [e for e in self._frames if e.file not in done]
+        )
         self._quick = {e.step for e in self._frames}
         counted = [e for e in self._frames if e.kind == "projection" and e.file in done]
         self.progress = Progress(frames_done=len(counted))
@@ -227,10 +232,13 @@ class ScanRunner:
                         await self._until(moment)
                         # A frame that a pause falls into is discarded: the run goes back before
                         # it and exposes it completely, at the speed of the scan.
-                        await self._until(moment + event.duration_s, exposing_since=moment)
+                        await self._until(
+                            moment + event.duration_s, exposing_since=moment
+                        )
                         steps = self._steps
                         await self._put(event)
-                        # A step requested while the frame waited for room is for the next frame.
+                        # A step requested while the frame waited for room is for the next
+                        # frame.
                         length = event.duration_s if steps == self._steps else 0.0
                 if self._stepping and length > 0.0:
                     await self._until(moment + length)
@@ -272,7 +280,9 @@ class ScanRunner:
         while True:
             try:
                 apply_command(self.scanner, step.command, self.clock.now())
-            except TwinError as error:  # an E-stop refuses X-rays on: wait for reset and resume
+            except (
+                TwinError
+            ) as error:  # an E-stop refuses X-rays on: wait for reset and resume
                 self.pause(error)
                 await self._obey(self.progress.tau)
             else:
@@ -288,7 +298,9 @@ class ScanRunner:
         """
         while True:
             if self._told():
-                reached = max(self.progress.tau, min(self.clock.now() - self.origin, moment))
+                reached = max(
+                    self.progress.tau, min(self.clock.now() - self.origin, moment)
+                )
                 await self._obey(reached if exposing_since is None else exposing_since)
                 continue
             until = self.origin + moment
@@ -337,7 +349,8 @@ class ScanRunner:
             self.scanner.stop(self.clock.now())
 
     async def _begin(self) -> None:
-        """Wait where a stop came before the run has begun: nothing is set before it may go on."""
+        """Wait where a stop came before the run has begun: nothing is set before it may go
+        on."""
         while self._told():
             await self._until_told(0.0)
             self._set(phase="running", error=None)
@@ -441,7 +454,9 @@ class ScanRunner:
                 self._signal.clear()
                 signal = asyncio.ensure_future(self._signal.wait())
                 with self.clock.held():
-                    await asyncio.wait({task, signal}, return_when=asyncio.FIRST_COMPLETED)
+                    await asyncio.wait(
+                        {task, signal}, return_when=asyncio.FIRST_COMPLETED
+                    )
                 signal.cancel()
             task.result()
         finally:

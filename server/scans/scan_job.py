@@ -113,7 +113,12 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
         "code": int(Code.BUSY),
         "message": f"the server ended while this job was {was}; {there} images are on disk; "
         "job.resume makes the others",
-        "data": {"was": was, "images": there, "before": memory.error, "allowed": "job.resume"},
+        "data": {
+            "was": was,
+            "images": there,
+            "before": memory.error,
+            "allowed": "job.resume",
+        },
     }
     return job
 

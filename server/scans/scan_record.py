@@ -1,8 +1,8 @@
 """A scan's request and start conditions, kept in DATA/jobs so that it can be resumed.
 
 One JSON file a data set that is not complete: the wish (script byte for byte, or poses), the
-scanner's state at the start, sample, seed, pace. With it any later server makes exactly the missing
-images.
+scanner's state at the start, sample, seed, pace. With it any later server makes exactly the
+missing images.
 
 Poses of a trajectory are kept as text: 200 000 of them are two strings and no million objects.
 """
@@ -19,7 +19,12 @@ from typing import Annotated, Any, Final
 from pydantic import Field, TypeAdapter
 
 from flexdt.runtime.files.directory import Directory
-from flexdt.runtime.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
+from flexdt.runtime.files.own_documents import (
+    Changes,
+    file_stem,
+    read_json,
+    read_or_set_aside,
+)
 from flexdt.runtime.log import log
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 from flexdt.server.storage.job_files import RECORDS
@@ -171,8 +176,11 @@ class JobRecord:
         try:
             root.folder(FOLDER).discard(f"{file_stem(name)}.json")
         except DatasetWriteError as error:
-            log("the record of a complete scan was not deleted", logging.WARNING,
-                reason=str(error))  # fmt: skip
+            log(
+                "the record of a complete scan was not deleted",
+                logging.WARNING,
+                reason=str(error),
+            )
 
     @staticmethod
     def forget(changes: Changes, root: Directory, name: str) -> None:
@@ -215,7 +223,9 @@ class JobRecord:
                 _EXPOSURE.validate_python(wish["exposure_ms"]),
                 begin.moments,
                 begin.seed,
-                _FLAT.validate_python(wish.get("flat", False)),  # servers before took none
+                _FLAT.validate_python(
+                    wish.get("flat", False)
+                ),  # servers before took none
             ),
             begin,
             None if speed_up is None else check_speed_up(speed_up),

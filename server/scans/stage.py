@@ -2,12 +2,12 @@
 checks, drawings.
 
 Convex pieces and sizes of samples follow from the phantoms and are worked out once. A guard is
-made for one sample and one correction; another of either is another guard. Clients that draw get
-binary STL in mm, in the sample's own frame.
+made for one sample and one correction; another of either is another guard. Clients that draw
+get binary STL in mm, in the sample's own frame.
 
-A move around obstacles is free moves one after the other, found before the first one starts. The
-way is planned from where the motors will rest; every leg goes through the scanner's own guard
-again. Any other command to the motors ends it. The search is
+A move around obstacles is free moves one after the other, found before the first one starts.
+The way is planned from where the motors will rest; every leg goes through the scanner's own
+guard again. Any other command to the motors ends it. The search is
 `flexdt.twin.collision.obstacle_path`.
 """
 
@@ -55,7 +55,9 @@ class Stage:
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
-        self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = OrderedDict()
+        self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = (
+            OrderedDict()
+        )
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
@@ -72,7 +74,9 @@ class Stage:
         """
         return self._samples.revision(sample.name)
 
-    def pieces(self, sample: Sample, upload: ReceivedSample | None = None) -> tuple[Polytope, ...]:
+    def pieces(
+        self, sample: Sample, upload: ReceivedSample | None = None
+    ) -> tuple[Polytope, ...]:
         """Compute convex pieces that contain the sample, object frame; may take a second.
 
         Args:
@@ -103,7 +107,10 @@ class Stage:
         return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
 
     def scene(
-        self, sample: Sample, parameters: Offsets = NOMINAL, upload: ReceivedSample | None = None
+        self,
+        sample: Sample,
+        parameters: Offsets = NOMINAL,
+        upload: ReceivedSample | None = None,
     ) -> CollisionScene | None:
         """Build the scene of bodies that may collide; None for a machine without
         components.
@@ -126,7 +133,10 @@ class Stage:
         return scene
 
     def guard(
-        self, sample: Sample, parameters: Offsets = NOMINAL, upload: ReceivedSample | None = None
+        self,
+        sample: Sample,
+        parameters: Offsets = NOMINAL,
+        upload: ReceivedSample | None = None,
     ) -> Guard | None:
         """Create the guard that sweeps every motion; None for a machine without
         components.
@@ -145,7 +155,9 @@ class Stage:
 
 def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
     return convex_pieces(
-        phantom.mesh(around=True), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
+        phantom.mesh(around=True),
+        rotation=offset.rotation,
+        offset=(offset.x, offset.y, offset.z),
     )
 
 
@@ -220,7 +232,11 @@ class ObstacleMoves:
             self._task = None
 
     async def plan(
-        self, targets: Mapping[str, float], *, relative: bool = False, shortest: bool = False
+        self,
+        targets: Mapping[str, float],
+        *,
+        relative: bool = False,
+        shortest: bool = False,
     ) -> Way:
         """Plan a free way from where the motors will rest.
 
@@ -238,13 +254,19 @@ class ObstacleMoves:
             )
         return way
 
-    async def _plan(self, targets: Mapping[str, float], *, relative: bool, shortest: bool) -> Way:
+    async def _plan(
+        self, targets: Mapping[str, float], *, relative: bool, shortest: bool
+    ) -> Way:
         """Resolve targets and find a free way; see `plan`."""
         scanner = self.scanner
         require_ready(scanner.safety, "motion")
-        goal = scanner.resolve(targets, self.clock.now(), relative=relative, shortest=shortest)
+        goal = scanner.resolve(
+            targets, self.clock.now(), relative=relative, shortest=shortest
+        )
         start = scanner.final_positions()
-        scene = await asyncio.to_thread(self.stage.scene, scanner.sample, scanner.parameters)
+        scene = await asyncio.to_thread(
+            self.stage.scene, scanner.sample, scanner.parameters
+        )
         if scene is None:
             return self._way(start, [goal])
         found, contact = await asyncio.to_thread(
@@ -255,7 +277,8 @@ class ObstacleMoves:
         pair = ("?", "?") if contact is None else contact.pair
         if found is None:
             raise CollisionError(
-                f"no free way to {_text(goal)} was found: {' and '.join(pair)} would collide on "
+                f"no free way to {_text(goal)} was found: {' and '.join(pair)} would "
+                "collide on "
                 "the direct one",
                 {
                     "asked": dict(goal),
@@ -269,7 +292,8 @@ class ObstacleMoves:
         return self._way(start, found, warning)
 
     def go(self, way: Way) -> asyncio.Task[None]:
-        """Set off; the task is done when the last leg has ended, or fails where one cannot go."""
+        """Set off; the task is done when the last leg has ended, or fails where one cannot
+        go."""
         self.cancel()
         self._task = asyncio.create_task(self._legs(way))
         return self._task
@@ -296,13 +320,19 @@ class ObstacleMoves:
         await clock.at_rest(scanner.rest_time)
 
     def _way(
-        self, start: Mapping[str, float], legs: Sequence[Mapping[str, float]], *warnings: str
+        self,
+        start: Mapping[str, float],
+        legs: Sequence[Mapping[str, float]],
+        *warnings: str,
     ) -> Way:
         """Make the `Way` of legs from `start` with its total time."""
         seconds, here = 0.0, dict(start)
         for leg in legs:
             moves = {axis: (here[axis], 0.0, value) for axis, value in leg.items()}
-            ends = [motion.move(*m, *self.scanner.settings(a), 0.0).end for a, m in moves.items()]
+            ends = [
+                motion.move(*m, *self.scanner.settings(a), 0.0).end
+                for a, m in moves.items()
+            ]
             seconds += max(ends, default=0.0)
             here.update(leg)
         return Way(tuple(legs), seconds, warnings)

@@ -37,7 +37,13 @@ from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.job_files import JobFiles, number_of
 from flexdt.server.storage.memory import Memory, StateStore
 from flexdt.twin.dataset import dataset_errors as ds
-from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
+from flexdt.twin.dataset.file_names import (
+    DOCUMENT,
+    SCAN_SETTINGS,
+    SCRIPT,
+    XRE_SETTINGS,
+    plain_name,
+)
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import check_cone_vec
@@ -162,13 +168,17 @@ class Submissions:
         )
         folder = str(self.root.path / chosen)
         return await self._queued(
-            sidecar, chosen, ensure_allowed,
+            sidecar,
+            chosen,
+            ensure_allowed,
             lambda: self.jobs.draft(
                 chosen, folder, plan, prepare, speed_up, warnings, sample=begin.sample
             ),
-        )  # fmt: skip
+        )
 
-    async def again(self, job: Job, ensure_allowed: Callable[[], None] = lambda: None) -> None:
+    async def again(
+        self, job: Job, ensure_allowed: Callable[[], None] = lambda: None
+    ) -> None:
         """Put a job that ended early into the queue again; only missing images are made.
 
         Raises:
@@ -180,7 +190,9 @@ class Submissions:
         try:
             sidecar = await asyncio.to_thread(JobRecord.read, self.root, name)
         except (OSError, KeyError, TypeError, ValueError) as error:
-            raise refused(f"what it started from is not known any more ({error})") from None
+            raise refused(
+                f"what it started from is not known any more ({error})"
+            ) from None
         begun = self.root.stat(name) is not None
         if begun:
             begin = self._resumable(name, sidecar.wish)
@@ -188,12 +200,20 @@ class Submissions:
             sidecar = replace(sidecar, begin=begin)
         plan, prepare, warnings = await self._ready(sidecar, name, begun, ensure_allowed)
         await self._queued(
-            sidecar, name, ensure_allowed,
+            sidecar,
+            name,
+            ensure_allowed,
             lambda: self.jobs.draft(
-                name, job.folder, plan, prepare, sidecar.speed_up, warnings, job,
+                name,
+                job.folder,
+                plan,
+                prepare,
+                sidecar.speed_up,
+                warnings,
+                job,
                 sidecar.begin.sample,
             ),
-        )  # fmt: skip
+        )
 
     async def _queued(
         self,
@@ -228,7 +248,11 @@ class Submissions:
         return await self.keeper.keep(take, after, files)
 
     async def _ready(
-        self, asked: JobRecord, name: str, resume: bool, ensure_allowed: Callable[[], None]
+        self,
+        asked: JobRecord,
+        name: str,
+        resume: bool,
+        ensure_allowed: Callable[[], None],
     ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check a scan completely and prepare its start.
 
@@ -236,7 +260,9 @@ class Submissions:
             the plan, a function that makes the job's inputs at its turn, and warnings.
         """
         begin = asked.begin
-        checked = await self.checks.sound(await self._matter(asked.wish, begin.start, begin.sample))
+        checked = await self.checks.sound(
+            await self._matter(asked.wish, begin.start, begin.sample)
+        )
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         await self.radiography.require_room(begin.sample)
@@ -244,21 +270,30 @@ class Submissions:
         warnings = [*checked.warnings, *(p.where_and_what for p in predicted.problems)]
         if resume:
             there = sum(n.endswith(".tif") for n in self.root.folder(name).names())
-            warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
+            warnings.insert(
+                0, f"taking up the data set {name}, of which {there} images exist"
+            )
             shown, stands = asked.begin.sample, self.scanner.sample
             if shown != stands:
                 a, b = shown.name or "nothing", stands.name or "nothing"
-                warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
+                warnings.insert(
+                    1, f"its images go on showing {a}, although {b} is on the stage"
+                )
         ensure_allowed()
 
         async def prepare() -> JobInputs:
             """Check the scan again at its turn, and open its data set."""
             begun = asked
-            if not resume:  # others may have moved since, and put something else on the stage
-                begin = replace(asked.begin, start=self.start(), sample=self.scanner.sample)
+            if (
+                not resume
+            ):  # others may have moved since, and put something else on the stage
+                begin = replace(
+                    asked.begin, start=self.start(), sample=self.scanner.sample
+                )
                 begun = replace(asked, begin=begin)
                 self.jobs.shows(begin.sample)
-            # The sample's file and the correction may be others by now; then it is checked again.
+            # The sample's file and the correction may be others by now; then it is checked
+            # again.
             final = await self.checks.sound(
                 await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
             )
@@ -274,7 +309,8 @@ class Submissions:
         return checked.plan, prepare, warnings
 
     async def _predicted(self, begin: StartConditions, plan: ScanPlan) -> Prediction:
-        """Predict the counts of a scan's projections; of the sample only if it can be projected."""
+        """Predict the counts of a scan's projections; of the sample only if it can be
+        projected."""
         probes = sample_probes(plan)
         shares = await self._shares(begin, probes)
 
@@ -296,21 +332,29 @@ class Submissions:
         A failed prediction ends no submission: errors of the sample are reported by the
         scan itself.
         """
-        radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
+        radiography = replace(
+            self.radiography, physics=begin.physics, scatter=begin.scatter
+        )
 
         async def each() -> list[CountShares | None]:
             with suppress(ProjectorUnavailable, RpcError, TwinError):
-                return [await radiography.predicted_shares(begin.sample, one) for one in probes]
+                return [
+                    await radiography.predicted_shares(begin.sample, one)
+                    for one in probes
+                ]
             return [None] * len(probes)
 
         task = asyncio.create_task(each())
         self._predicting.add(task)
         task.add_done_callback(self._predicting.discard)
-        # The data sent to the projector meanwhile are needed by the scan as well: no cancelling.
+        # The data sent to the projector meanwhile are needed by the scan as well: no
+        # cancelling.
         done, _ = await asyncio.wait({task}, timeout=PREDICTION_PATIENCE_S)
         return task.result() if done else [None] * len(probes)
 
-    async def _matter(self, wish: ScanSource, start: StartState, shown: Sample) -> CheckInput:
+    async def _matter(
+        self, wish: ScanSource, start: StartState, shown: Sample
+    ) -> CheckInput:
         """Collect the input of a check: bodies of the sample on the stage, beam through
         `shown`.
         """
@@ -322,7 +366,14 @@ class Submissions:
             size = stage.size(shown)
             machine, profile = scanner.machine, scanner.profile
             return CheckInput(
-                wish, machine, profile, start, size, pieces, parameters, self.radiography.physics
+                wish,
+                machine,
+                profile,
+                start,
+                size,
+                pieces,
+                parameters,
+                self.radiography.physics,
             )
 
         return await asyncio.to_thread(work)
@@ -350,7 +401,9 @@ class Submissions:
     ) -> JobInputs:
         """Create (or resume) the data set and the inputs of the run; in a worker thread."""
         begin = asked.begin
-        radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
+        radiography = replace(
+            self.radiography, physics=begin.physics, scatter=begin.scatter
+        )
         noise = NoiseRecord(begin.seed, radiography.record())
         size = self.stage.size(begin.sample)
         record = ScanRecord.from_plan(
@@ -375,9 +428,15 @@ class Submissions:
         asked.write(self.root, name)
         writer = DatasetWriter(self.root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(
-            plan, radiography, begin.sample, begin.seed, writer.put, begin.moments, self.shown,
+            plan,
+            radiography,
+            begin.sample,
+            begin.seed,
+            writer.put,
+            begin.moments,
+            self.shown,
             lambda: self._ensure_same(begin),
-        )  # fmt: skip
+        )
         finished = partial(JobRecord.remove, self.root, name)
         return JobInputs(plan, writer, acquisition.produce, finished)
 
@@ -390,7 +449,8 @@ class Submissions:
         now, name = self.stage.revision(begin.sample), begin.sample.name
         if begin.revision not in (None, now):
             raise busy(
-                f"the sample {name!r} has been uploaded anew since this scan began, and its images "
+                f"the sample {name!r} has been uploaded anew since this scan began, and "
+                "its images "
                 "would show two objects; upload the first file again, or begin another scan",
                 {"asked": now, "allowed": begin.revision, "sample": name},
             )
@@ -428,9 +488,13 @@ class Submissions:
         except FileNotFoundError:
             if is_complete(folder):
                 raise refused("that data set is complete") from None
-            raise refused("there is something that no scan of this twin has begun") from None
+            raise refused(
+                "there is something that no scan of this twin has begun"
+            ) from None
         except (OSError, ds.DatasetError, ValueError, KeyError, TypeError) as error:
-            raise refused(f"it holds something that cannot be resumed ({error})") from None
+            raise refused(
+                f"it holds something that cannot be resumed ({error})"
+            ) from None
         if complete:
             raise refused("that data set is complete")
         asked, known = (
@@ -450,14 +514,19 @@ class Submissions:
         numbers = ((n, dated_name(now, n)) for n in itertools.count(last))
         free = ((n, name) for n, name in numbers if name not in used)
         number, name = next((n, name) for n, name in free if self.root.stat(name) is None)
-        self._numbered = day, number  # the next look does not begin with the first of the day
+        self._numbered = (
+            day,
+            number,
+        )  # the next look does not begin with the first of the day
         return name
 
     def _require_room(self, size: int, name: str) -> None:
         """Refuse a scan that does not fit on the disk."""
         there = 0
         with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:
-            images = (e.stat(follow_symlinks=False) for e in entries if e.name.endswith(".tif"))
+            images = (
+                e.stat(follow_symlinks=False) for e in entries if e.name.endswith(".tif")
+            )
             there = sum(about.st_size for about in images)
         self.room.require(name, size, there)
 

@@ -1,4 +1,5 @@
-"""The twin's clock: virtual seconds that run at a multiple of real ones, or as fast as possible.
+"""The twin's clock: virtual seconds that run at a multiple of real ones, or as fast as
+possible.
 
 With a number for `speed_up` time flows; with "max" it stops while any task works and
 jumps to the next awaited moment. Work that must not be outrun (a scan whose frames are
@@ -61,7 +62,9 @@ class TwinClock:
         wall: real time [s]; monotonic.
     """
 
-    def __init__(self, speed_up: SpeedUp = 1.0, wall: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, speed_up: SpeedUp = 1.0, wall: Callable[[], float] = time.monotonic
+    ) -> None:
         self._wall = wall
         self._speed_up = check_speed_up(speed_up)
         self._base = 0.0
@@ -102,7 +105,9 @@ class TwinClock:
         wall, now = self._wall(), self._time()
         self._sample(wall, now)
         first_wall, first = self._samples[0]
-        return (now - first) / (wall - first_wall) if wall - first_wall > SAMPLE_S else None
+        return (
+            (now - first) / (wall - first_wall) if wall - first_wall > SAMPLE_S else None
+        )
 
     def at(self, moment: float) -> asyncio.Future[None]:
         """Return a future that is done once the clock has reached `moment` [s].
@@ -145,7 +150,11 @@ class TwinClock:
             return self._base
         passed = self._wall() - self._base_wall
         quick = min(passed, max(0.0, LATE_S - self._base) / self._speed_up)
-        return self._base + quick * self._speed_up + (passed - quick) * min(1.0, self._speed_up)
+        return (
+            self._base
+            + quick * self._speed_up
+            + (passed - quick) * min(1.0, self._speed_up)
+        )
 
     def _rebase(self) -> None:
         self._base, self._base_wall = self._time(), self._wall()

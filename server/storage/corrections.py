@@ -81,7 +81,9 @@ class Corrections:
             known.append(None)
         self._written: History | None = None
         """History that was written last."""
-        self._history: History = [name for name in known if name is None or name in self._all]
+        self._history: History = [
+            name for name in known if name is None or name in self._all
+        ]
 
     @property
     def history(self) -> History:
@@ -124,7 +126,11 @@ class Corrections:
         return self._all[name]
 
     def make(
-        self, values: Mapping[str, float], name: str | None, note: str, when: datetime | None = None
+        self,
+        values: Mapping[str, float],
+        name: str | None,
+        note: str,
+        when: datetime | None = None,
     ) -> NamedCorrection:
         """Make a correction from edge values [mm, deg]; nothing is stored yet.
 
@@ -163,7 +169,9 @@ class Corrections:
             return self.history
         return [*self.history, name][-MAX_HISTORY:]
 
-    def store(self, changes: own.Changes, correction: NamedCorrection, source: str | None) -> None:
+    def store(
+        self, changes: own.Changes, correction: NamedCorrection, source: str | None
+    ) -> None:
         """Write a new correction; a known one stays as it is.
 
         Raises:
@@ -171,7 +179,9 @@ class Corrections:
         """
         if correction.name in self._all:
             return
-        document = CorrectionFile(schema=1, source=source, **correction_fields(correction))
+        document = CorrectionFile(
+            schema=1, source=source, **correction_fields(correction)
+        )
         name = _file(correction)
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
 
@@ -208,7 +218,10 @@ class Corrections:
         if correction is self.in_force:
             raise LimitError(
                 f"the correction {name!r} is in force and cannot be deleted",
-                {"asked": name, "allowed": "calibration.apply or calibration.revert first"},
+                {
+                    "asked": name,
+                    "allowed": "calibration.apply or calibration.revert first",
+                },
             )
         return [known for known in self.history if known != name]
 

@@ -62,7 +62,9 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
             c = fitted.certificate
             document["residuals_px"] = [
                 [bead if used else None for bead, used in zip(frame, some, strict=True)]
-                for frame, some in zip(c.residuals_px.tolist(), c.used.tolist(), strict=True)
+                for frame, some in zip(
+                    c.residuals_px.tolist(), c.used.tolist(), strict=True
+                )
             ]
         document["steps"] = [
             {"frames": n, "covariance": None if matrix is None else matrix.tolist()}
@@ -73,7 +75,9 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     return p.CalibrationFitResult.model_validate(from_root(document, root.path))
 
 
-def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.CalibrationAlignResult:
+def align(
+    root: Directory, asked: p.CalibrationAlign, *_: object
+) -> p.CalibrationAlignResult:
     """Align a data set; blocks. Raises as `fit`."""
     from flexdt.library.analysis import align as align_data_set
 
@@ -84,7 +88,9 @@ def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.Calibrati
 def _there(root: Directory, name: str) -> Path:
     """Return the folder of a data set, or raise DatasetMissingError."""
     if not root.is_directory(plain_name(name, "data set")):
-        raise DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
+        raise DatasetMissingError(
+            f"no data set {name!r} in the data directory", {"asked": name}
+        )
     return root.path / name
 
 
@@ -95,5 +101,7 @@ def _text(root: Directory, name: str) -> str:
         DatasetMissingError: no such file.
     """
     if plain_name(name, "phantom") not in root.names():
-        raise DatasetMissingError(f"no phantom {name!r} in the data directory", {"asked": name})
+        raise DatasetMissingError(
+            f"no phantom {name!r} in the data directory", {"asked": name}
+        )
     return read_text(root.path / name)

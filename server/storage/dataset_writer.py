@@ -62,12 +62,16 @@ class DatasetWriter:
         for file in record.files:
             plain_name(file)
         self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
-        self._files = root.folder(plain_name(record.name, "data set"), sync=sync, write=write)
+        self._files = root.folder(
+            plain_name(record.name, "data set"), sync=sync, write=write
+        )
         self._files.make()
         self._files.held()
         self.folder = self._files.path
         self._lock = threading.Lock()
-        self._shapes = {file: block.camera.shape for block in record.blocks for file in block.files}
+        self._shapes = {
+            file: block.camera.shape for block in record.blocks for file in block.files
+        }
         try:
             self._present = self._begin(resume)
             self._check_room()
@@ -131,7 +135,8 @@ class DatasetWriter:
         missing = self.missing
         if missing:
             raise ds.DatasetMissingError(
-                f"{self.folder}: {len(missing)} of {len(self.record.files)} images are missing: "
+                f"{self.folder}: {len(missing)} of {len(self.record.files)} images are "
+                "missing: "
                 f"{summary(missing)}",
                 {"path": str(self.folder), "missing": list(missing[:100])},
             )
@@ -155,7 +160,8 @@ class DatasetWriter:
         names = self._files.names()
         if names and not resume:
             raise ds.DatasetExistsError(
-                f"{self.folder} holds {len(names)} files already; allowed: another name, or resume",
+                f"{self.folder} holds {len(names)} files already; allowed: another name, "
+                "or resume",
                 {"path": str(self.folder), "files": len(names)},
             )
         if DOCUMENT in names:
@@ -174,7 +180,8 @@ class DatasetWriter:
                 return (
                     tuple(page.shape) == self._shapes[name]
                     and page.dtype == np.uint16
-                    and os.fstat(file.fileno()).st_size >= max((o + n for o, n in ends), default=0)
+                    and os.fstat(file.fileno()).st_size
+                    >= max((o + n for o, n in ends), default=0)
                 )
         except (OSError, tifffile.TiffFileError, IndexError, ValueError):
             return False
@@ -202,7 +209,8 @@ class DatasetWriter:
         ):
             if a != b:
                 raise ds.DatasetExistsError(
-                    f"{self.folder} holds another scan (its {what} differ); allowed: another name",
+                    f"{self.folder} holds another scan (its {what} differ); allowed: "
+                    "another name",
                     {"path": str(self.folder), "differs": what},
                 )
         # The scan began then, and with that correction in force.
@@ -217,11 +225,15 @@ class DatasetWriter:
             DiskFullError: they do not.
         """
         missing = self.missing
-        need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
+        need = (
+            sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing)
+            + RESERVE_BYTES
+        )
         free = free_bytes(self.folder)
         if free is not None and free < need:
             raise ds.DiskFullError(
-                f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes are free",
+                f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes "
+                "are free",
                 {"path": str(self.folder), "bytes": need, "free": free},
             )
 
@@ -229,7 +241,9 @@ class DatasetWriter:
         """Write the texts with the end of the scan, after the images are safe on the disk."""
         length = self.record.duration_s if duration_s is None else duration_s
         self._files.sync()  # no power cut leaves a complete data set without its images
-        self.record = replace(self.record, complete=complete, reason=reason, duration_s=length)
+        self.record = replace(
+            self.record, complete=complete, reason=reason, duration_s=length
+        )
         put_texts(self._files, self.record)
         self._files.sync()
 

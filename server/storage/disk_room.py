@@ -57,7 +57,9 @@ class UsedBytes:
             return total
         return 0
 
-    def _count(self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]) -> int:
+    def _count(
+        self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]
+    ) -> int:
         """Sum up a folder, reusing what is known of unchanged ones; record them in `there`.
 
         Args:
@@ -81,7 +83,9 @@ class UsedBytes:
                 about = folder.stat(inner)
                 if about is not None:
                     below = folder.folder(inner)
-                    total += self._count(below, f"{name}/{inner}", about.st_mtime_ns, there)
+                    total += self._count(
+                        below, f"{name}/{inner}", about.st_mtime_ns, there
+                    )
         return total
 
 
@@ -135,7 +139,8 @@ class DiskRoom:
             free = left if free is None else min(free, left)
         if free is not None and free < need:
             raise DiskFullError(
-                f"{what} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
+                f"{what} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} "
+                "MB are to "
                 f"stay free; {free / 1e6:.1f} MB are free in {self.root.path}",
                 {"asked": need, "allowed": free, "path": str(self.root.path)},
             )
@@ -156,7 +161,8 @@ def require_last(folder: Path, what: str, size: int) -> None:
     need = size + LAST_BYTES
     if free is not None and free < need:
         raise DiskFullError(
-            f"no room for {what}: {size} bytes asked, {free} bytes free, of which {LAST_BYTES} are "
+            f"no room for {what}: {size} bytes asked, {free} bytes free, of which "
+            f"{LAST_BYTES} are "
             "kept for the state",
             {"path": str(folder / what), "bytes": need, "free": free},
         )

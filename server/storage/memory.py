@@ -33,7 +33,12 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.spare_files import SpareFiles
 from flexdt.runtime.log import log
 from flexdt.server.storage.job_files import Count, JobFiles, JobMemory
-from flexdt.server.storage.scene_document import apply_settings, require_fit, sample_of, save_scene
+from flexdt.server.storage.scene_document import (
+    apply_settings,
+    require_fit,
+    sample_of,
+    save_scene,
+)
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine
@@ -97,7 +102,9 @@ def remember(
         unfiled: jobs of an earlier server that could not be given files yet.
         ended: whether the server has ended.
     """
-    scene = save_scene(scanner, now).model_copy(update={"positions": scanner.positions(now)})
+    scene = save_scene(scanner, now).model_copy(
+        update={"positions": scanner.positions(now)}
+    )
     return Memory(
         schema=1,
         saved=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -120,7 +127,9 @@ def as_of(
         scanner: as it will be.
         corrections: as `Memory` has them; None leaves them.
     """
-    scene = save_scene(scanner, 0.0).model_copy(update={"positions": memory.scene.positions})
+    scene = save_scene(scanner, 0.0).model_copy(
+        update={"positions": memory.scene.positions}
+    )
     names = memory.corrections if corrections is None else corrections
     return memory.model_copy(update={"scene": scene, "corrections": names})
 
@@ -255,7 +264,9 @@ class StateStore:
         """
         async with self._writing:
             try:
-                await asyncio.to_thread(self._put, self._make(False), self._unwritten_jobs())
+                await asyncio.to_thread(
+                    self._put, self._make(False), self._unwritten_jobs()
+                )
             except (OSError, DatasetError) as error:
                 self._note(str(error))
                 raise
@@ -394,4 +405,7 @@ def _text(memory: Memory) -> bytes:
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
     """Move positions into the travel: a motion in mid-flight has rounding errors."""
     axes = machine.axes
-    return {name: min(max(x, axes[name].lower), axes[name].upper) for name, x in positions.items()}
+    return {
+        name: min(max(x, axes[name].lower), axes[name].upper)
+        for name, x in positions.items()
+    }

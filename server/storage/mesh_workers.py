@@ -22,7 +22,9 @@ TIMEOUT_S = 180.0
 MEMORY_BYTES = 3 << 30
 
 
-def mesh_apart(raw: bytes, *, unit: str, material: str, file_type: str, name: str) -> Phantom:
+def mesh_apart(
+    raw: bytes, *, unit: str, material: str, file_type: str, name: str
+) -> Phantom:
     """Read a mesh from untrusted bytes, as `flexdt.phantoms.mesh_phantom`; blocks.
 
     Raises:
@@ -53,7 +55,9 @@ def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Pha
     try:
         [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)
     except RpcError as error:
-        prefix = f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
+        prefix = (
+            f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
+        )
         data = error.data if isinstance(error.data, dict) else None
         raise PhantomError(prefix + error.message, data) from None
     finally:

@@ -34,7 +34,12 @@ from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, FrameKind, parse_document
+from flexdt.twin.dataset.flexdt_json import (
+    DatasetDocument,
+    FrameEntry,
+    FrameKind,
+    parse_document,
+)
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -85,7 +90,9 @@ class PastScans:
         self._machine = machine.model_dump(mode="json", by_alias=True)
         self._profile = profile.model_dump(mode="json")
         self._workers = Workers(WORKERS, MEMORY_BYTES, SECONDS)
-        self._fitters = Workers(1, dataset_fits.MAX_MEMORY_BYTES, dataset_fits.MAX_SECONDS)
+        self._fitters = Workers(
+            1, dataset_fits.MAX_MEMORY_BYTES, dataset_fits.MAX_SECONDS
+        )
 
     async def ask(self, params: Params, running: str, codec: Codec) -> Encoded:
         """Answer a request in a worker process.
@@ -197,7 +204,9 @@ class _Scan:
     @property
     def beam(self) -> tuple[float | None, float | None]:
         """kV and W of the projections."""
-        settings = self.document.tube if self.document else self.texts and self.texts.settings
+        settings = (
+            self.document.tube if self.document else self.texts and self.texts.settings
+        )
         if settings:
             return (settings.kV, settings.power_W)
         return (None, None)
@@ -211,9 +220,14 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """
     about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
-        raise ds.DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
+        raise ds.DatasetMissingError(
+            f"no data set {name!r} in the data directory", {"asked": name}
+        )
     parts = [s for s in (about, root.folder(name).stat(DOCUMENT)) if s is not None]
-    return root.path / name, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
+    return root.path / name, (
+        name,
+        *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts),
+    )
 
 
 def _scan(folder: files.Folder, most: int) -> _Scan:
@@ -256,11 +270,15 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
             "projection",
             **shown,
             cone_vec=row,
-            positions={name: float(at[frame.index]) for name, at in texts.positions.items()},
+            positions={
+                name: float(at[frame.index]) for name, at in texts.positions.items()
+            },
         )
         for frame, row in zip(texts.frames, texts.cone_vec.rows.tolist(), strict=True)
     ]
-    return _Scan(folder, tuple(bare), None, texts, f"there is no {DOCUMENT}: its texts are read")
+    return _Scan(
+        folder, tuple(bare), None, texts, f"there is no {DOCUMENT}: its texts are read"
+    )
 
 
 def _texts(folder: files.Folder) -> Any:
@@ -370,7 +388,9 @@ def _list(
             try:
                 if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
                     plain_name(entry.name)
-                    folders.append((entry.stat(follow_symlinks=False).st_mtime, entry.name))
+                    folders.append(
+                        (entry.stat(follow_symlinks=False).st_mtime, entry.name)
+                    )
             except ds.DatasetNameError:
                 left_out += 1
             except OSError:  # it has gone meanwhile
@@ -408,8 +428,12 @@ def _list(
             found.append(info)
     shown = found[asked.start : asked.start + asked.count]
     if asked.thumbnail:
-        shown = [_with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown]
-    return p.DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
+        shown = [
+            _with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown
+        ]
+    return p.DatasetListResult(
+        datasets=shown, total=len(found), unread=unread, left_out=left_out
+    )
 
 
 def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
@@ -433,7 +457,9 @@ def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
     return _info(path, modified, scan)
 
 
-def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: float) -> p.DatasetInfo:
+def _with_thumbnail(
+    root: Directory, info: p.DatasetInfo, side: int, until: float
+) -> p.DatasetInfo:
     """Add a thumbnail to a summary, unless the time is over.
 
     Args:
@@ -495,7 +521,9 @@ def _get(
     info = _info(folder.path, 0.0 if about is None else about.st_mtime, scan)
     info = _as_it_runs(info, around)
     last = len(images) - 1
-    at = np.unique(np.linspace(0, last, min(asked.points, last + 1)).round().astype(int)).tolist()
+    at = np.unique(
+        np.linspace(0, last, min(asked.points, last + 1)).round().astype(int)
+    ).tolist()
     chosen = [images[i] for i in at]
     motors = list(chosen[-1].positions if chosen else ())
     times = [frame.time_s for frame in chosen if frame.time_s is not None]
@@ -507,7 +535,9 @@ def _get(
         kinds=[frame.kind for frame in chosen],
         present=[frame.file in folder.names for frame in chosen],
         times_s=times if chosen and len(times) == len(chosen) else None,
-        positions={name: [frame.positions.get(name) for frame in chosen] for name in motors},
+        positions={
+            name: [frame.positions.get(name) for frame in chosen] for name in motors
+        },
         same_machine=_same(scan, around),
         script=_script(folder) if asked.script else None,
         **(_measured(scan, tuple(at)) if asked.measure else {}),
@@ -535,7 +565,9 @@ def _script(folder: files.Folder) -> str:
         RpcError: -32008, it is too large.
     """
     if SCRIPT not in folder.names:
-        raise ds.DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
+        raise ds.DatasetMissingError(
+            f"{folder.path.name}: no script lies with this data set"
+        )
     with files.opened(folder.path / SCRIPT) as file:
         if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT_BYTES:
             raise too_large("the script of a data set", size, MAX_SCRIPT_BYTES)
@@ -600,7 +632,9 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
     what = "the machine without a sample, whose size is not known"
     if sample.diameter_mm > 0 and sample.height_mm > 0:
         # It contains the sample at every angle, so the sample is nowhere nearer.
-        pieces = (UprightCylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),)
+        pieces = (
+            UprightCylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),
+        )
         what = "the machine and the cylinder around the sample"
     correction = document.correction_in_force()
     offsets = NOMINAL if correction is None else correction.parameters
@@ -638,14 +672,20 @@ def _frame(
             {"asked": asked.index, "allowed": [0, len(images) - 1]},
         )
     frame = images[asked.index]
-    shape = document.shape_of(frame) if document and isinstance(frame, FrameEntry) else None
+    shape = (
+        document.shape_of(frame) if document and isinstance(frame, FrameEntry) else None
+    )
     counts = files.read_image(folder.path / _there(folder, frame.file), shape)
     if asked.binning > min(counts.shape):
-        raise LimitError(f"binning {asked.binning} leaves nothing of {counts.shape} pixels")
+        raise LimitError(
+            f"binning {asked.binning} leaves nothing of {counts.shape} pixels"
+        )
     pixels: npt.NDArray[np.generic] = counts
     if asked.kind == "line_integral":
         if frame.kind != "projection":
-            raise LimitError(f"{frame.file} is a {frame.kind} image: it has no line integrals")
+            raise LimitError(
+                f"{frame.file} is a {frame.kind} image: it has no line integrals"
+            )
         rows, cols = counts.shape
         pixels = _normal(scan, (rows, cols))(counts)
     small = binned_mean(pixels.astype(np.float32), asked.binning)
@@ -684,7 +724,9 @@ def _there(folder: files.Folder, file: str) -> str:
         DatasetMissingError: it does not.
     """
     if file not in folder.names:
-        raise ds.DatasetMissingError(f"{folder.path.name}: {file} is not there", {"path": file})
+        raise ds.DatasetMissingError(
+            f"{folder.path.name}: {file} is not there", {"path": file}
+        )
     return file
 
 
@@ -697,11 +739,14 @@ def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
     """
     folder = scan.folder
     dark, flat = (
-        folder.paths([f.file for f in scan.images if f.kind == kind]) for kind in ("dark", "flat")
+        folder.paths([f.file for f in scan.images if f.kind == kind])
+        for kind in ("dark", "flat")
     )
     if not flat:
         name = folder.path.name
-        raise ds.DatasetMissingError(f"{name} has no flat image: there are no line integrals")
+        raise ds.DatasetMissingError(
+            f"{name} has no flat image: there are no line integrals"
+        )
     light = files.mean_image(flat, shape)
     lost = files.mean_image(dark, shape) if dark else np.zeros_like(light)
     return LineIntegrals.of(lost, light)

@@ -47,7 +47,9 @@ class UploadHead(SampleUpload):
     def of(cls, chunk: SampleUpload) -> UploadHead:
         """Make the description of the upload to which a chunk belongs."""
         given = chunk.model_dump(exclude={"start", "data"})
-        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
+        return cls.model_validate(
+            given | {"unit": chunk.unit or default_unit(chunk.format)}
+        )
 
 
 @dataclass
@@ -66,7 +68,9 @@ class Incoming:
         room: on the disk; None for any.
     """
 
-    def __init__(self, folder: Directory, limit: int, room: DiskRoom | None = None) -> None:
+    def __init__(
+        self, folder: Directory, limit: int, room: DiskRoom | None = None
+    ) -> None:
         self._folder = folder
         self._limit = limit
         self._disk = room
@@ -91,7 +95,9 @@ class Incoming:
         """
         with self._lock:
             known = self._open.get(head.name)
-            if start == 0 and (known is None or known.head != head or known.received >= head.total):
+            if start == 0 and (
+                known is None or known.head != head or known.received >= head.total
+            ):
                 known = self._begin(head)
             if known is None or known.head != head or start > known.received:
                 received = 0 if known is None or known.head != head else known.received
@@ -169,7 +175,8 @@ class Incoming:
         """Make the error for a chunk that does not follow the last one."""
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
-            f"chunks come in order, from 0, and {MAX_UPLOADS} uploads and {self._limit} bytes are "
+            f"chunks come in order, from 0, and {MAX_UPLOADS} uploads and {self._limit} "
+            "bytes are "
             "kept at a time: one begun before may have been dropped for newer ones",
             {"asked": start, "allowed": received},
         )

@@ -17,7 +17,12 @@ from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
 
 def save_scene(
-    scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
+    scanner: ScannerTwin,
+    now: float,
+    *,
+    name: str = "",
+    saved: str = "",
+    version: str = "",
 ) -> p.Scene:
     """Convert the scanner to a document; a motor under way is saved at its target.
 
@@ -38,7 +43,9 @@ def save_scene(
         positions=scanner.targets(now),
         speeds={axis: pace[0] for axis, pace in scanner.paces.items()},
         accelerations={axis: pace[1] for axis, pace in scanner.paces.items()},
-        tube=p.TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
+        tube=p.TubePart(
+            kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on
+        ),
         camera=p.CameraPart(**scanner.camera.stated),
         sample=p.SamplePart(
             name=scanner.sample.name,
@@ -115,5 +122,7 @@ def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
 def sample_of(scene: p.Scene) -> Sample:
     """Return the scene's sample."""
     return Sample(
-        scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
+        scene.sample.name,
+        StagePlacement(**scene.sample.offset.model_dump()),
+        scene.sample.material,
     )

@@ -96,7 +96,11 @@ class SampleStore:
         for file in own.ours(folder):
             without = "an upload cannot be read; without it"
             head = own.read_or_set_aside(folder, file, _head_of(file), without)
-            if head is not None and head.name != EMPTY and not phantoms.is_shipped(head.name):
+            if (
+                head is not None
+                and head.name != EMPTY
+                and not phantoms.is_shipped(head.name)
+            ):
                 self._heads[head.name] = head
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
@@ -156,11 +160,15 @@ class SampleStore:
                 return phantom
         phantom, revision = self._load(head, name, material)
         with self._lock:
-            if self._heads.get(name) is head:  # else another file has come under this name
+            if (
+                self._heads.get(name) is head
+            ):  # else another file has come under this name
                 self._keep(key, phantom, revision)
         return phantom
 
-    def _keep(self, key: tuple[str, str | None], phantom: Phantom, revision: str | None) -> None:
+    def _keep(
+        self, key: tuple[str, str | None], phantom: Phantom, revision: str | None
+    ) -> None:
         """Cache a phantom; drop the oldest ones beyond the limits, except that on the stage."""
         self._loaded[key] = phantom
         if revision is not None:
@@ -195,7 +203,8 @@ class SampleStore:
         own.file_stem(head.name)
         if head.name not in self._heads and len(self._heads) >= self._most:
             raise LimitError(
-                f"there are {len(self._heads)} uploads, {self._most} allowed; sample.delete makes "
+                f"there are {len(self._heads)} uploads, {self._most} allowed; "
+                "sample.delete makes "
                 "room",
                 {"asked": len(self._heads) + 1, "allowed": self._most},
             )
@@ -331,13 +340,17 @@ class SampleStore:
                 raise ValueError("its bytes are others than were stored")
         except (OSError, ValueError) as error:
             with self._lock:
-                if self._heads.get(head.name) is head:  # else another has come under this name
+                if (
+                    self._heads.get(head.name) is head
+                ):  # else another has come under this name
                     del self._heads[head.name]
                     for damaged in (file, f"{own.file_stem(head.name)}.json"):
                         if self._folder.stat(damaged) is not None:
                             without = "an upload cannot be read; without it"
                             own.set_aside(self._folder, damaged, error, without)
-            raise PhantomError(f"the upload {head.name!r} cannot be read: {error}") from None
+            raise PhantomError(
+                f"the upload {head.name!r} cannot be read: {error}"
+            ) from None
         return raw
 
 

@@ -91,30 +91,47 @@ def twin_pages(
         }
 
     return watching_pages(
-        health, lambda: _figures(twin, server, projector), requests, failed=twin.failed.is_set
+        health,
+        lambda: _figures(twin, server, projector),
+        requests,
+        failed=twin.failed.is_set,
     )
 
 
-def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorPool) -> list[Metric]:
+def _figures(
+    twin: TwinServer, server: TcpServer, projector: ProjectorPool
+) -> list[Metric]:
     """List the metrics of the twin server."""
     jobs = Counter(job.phase for job in twin.jobs.all())
     phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}
-    events: dict[str, float] = {topic: twin.hub.count(topic) for topic in get_args(TopicName)}
+    events: dict[str, float] = {
+        topic: twin.hub.count(topic) for topic in get_args(TopicName)
+    }
     in_force = twin.scanner.safety.state
     safety = {state: float(in_force == state) for state in get_args(SafetyName)}
     factor = twin.clock.real_time_factor
     views, free = projector.views, free_bytes(twin.root)
-    room = [] if free is None else [gauge("flexdt_data_free_bytes", "Room on the data disk.", free)]
+    room = (
+        []
+        if free is None
+        else [gauge("flexdt_data_free_bytes", "Room on the data disk.", free)]
+    )
     return [
         gauge("flexdt_connections", "Clients connected.", len(server.links)),
-        counter("flexdt_connections_total", "Clients that ever connected.", server.opened),
+        counter(
+            "flexdt_connections_total", "Clients that ever connected.", server.opened
+        ),
         counter("flexdt_events_total", "Events published, by topic.", events, "topic"),
         gauge("flexdt_jobs", "Jobs known, by state.", phases, "state"),
-        counter("flexdt_frames_total", "Projections of scans made.", twin.jobs.frames_made),
+        counter(
+            "flexdt_frames_total", "Projections of scans made.", twin.jobs.frames_made
+        ),
         gauge("flexdt_safety", "1 for the safety state in force.", safety, "state"),
         gauge("flexdt_clock_seconds", "The twin's clock.", twin.clock.now()),
         gauge("flexdt_real_time_factor", "Twin seconds a second.", factor or 0.0),
         gauge("flexdt_projector_connected", "Whether there is one.", projector.connected),
-        counter("flexdt_projector_views_total", "Views by projector.", views, "projector"),
+        counter(
+            "flexdt_projector_views_total", "Views by projector.", views, "projector"
+        ),
         *room,
     ]

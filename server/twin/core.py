@@ -1,7 +1,7 @@
 """Everything of one twin server but its sockets: built once, owned by one event loop.
 
-`TwinServer` holds the parts and the few operations that concern several of them; handlers translate
-to it. Framing is in `server/network`, the process in `main`.
+`TwinServer` holds the parts and the few operations that concern several of them; handlers
+translate to it. Framing is in `server/network`, the process in `main`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,11 @@ from flexdt.server.storage import memory as kept
 from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.job_files import JobFiles, JobMemory, number_of
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
+from flexdt.server.storage.stored_samples import (
+    ReceivedSample,
+    SampleStore,
+    sample_material,
+)
 from flexdt.server.twin import state_views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, StateFeed
@@ -130,7 +134,11 @@ class ControlLease:
         return busy(
             f"{what}: {self.holder} is the controller; session.control with action force takes "
             "control over",
-            {"asked": what, "controller": self.holder, "allowed": "session.control force"},
+            {
+                "asked": what,
+                "controller": self.holder,
+                "allowed": "session.control force",
+            },
         )
 
 
@@ -186,16 +194,25 @@ class TwinServer:
             machine, profile, self.clock.now(), last_stop=secrets.randbits(48)
         )  # numbers of a server before this one release nothing here
         self.hub = Hub(
-            self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
+            self.clock.now,
+            {"log": LOG_KEPT},
+            self.limits.max_subscriptions,
+            self.limits.max_views,
         )
         self.control = ControlLease(self.limits.control_idle_s, wall)
         settle(root, RESERVED)
         room = DiskRoom(root, self.limits.disk_quota)
         self.samples = SampleStore(
-            root.folder("samples"), self.limits.max_upload, self.limits.max_samples, room,
+            root.folder("samples"),
+            self.limits.max_upload,
+            self.limits.max_samples,
+            room,
             memory_limit,
-        )  # fmt: skip
-        self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
+        )
+        self.samples.standing = lambda: (
+            self.scanner.sample.name,
+            self.scanner.sample.material,
+        )
         self.shapes = Shapes()
         self.past_scans = PastScans(self.root, machine, profile)
         self.predictors = predictors()
@@ -210,25 +227,41 @@ class TwinServer:
         self.stage = Stage(machine, profile, self.samples)
         self.detours = ObstacleMoves(self.scanner, self.clock, self.stage, self.changed)
         self.imaging = Imaging(
-            projector, truth or TrueGeometry(), self.samples, machine.detector.pixels,
-            memory_limit, self._in_use, projector_room,
-        )  # fmt: skip
+            projector,
+            truth or TrueGeometry(),
+            self.samples,
+            machine.detector.pixels,
+            memory_limit,
+            self._in_use,
+            projector_room,
+        )
         self.jobs = Jobs(
-            self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
-            projectors=projectors, root=self.root, max_ended=self.limits.max_ended_jobs,
+            self.scanner,
+            self.clock,
+            self._job_changed,
+            max_waiting=self.limits.max_jobs,
+            projectors=projectors,
+            root=self.root,
+            max_ended=self.limits.max_ended_jobs,
             max_age=timedelta(days=self.limits.ended_job_days),
-        )  # fmt: skip
+        )
         self.radiography = Radiography.of(self.imaging, machine, physics, scatter)
         self.live = LiveView(
-            self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy,
+            self.scanner,
+            self.clock,
+            self.hub,
+            self.radiography,
+            lambda: self.jobs.busy,
             self.stage.revision,
-        )  # fmt: skip
+        )
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
         )
         self.job_files = JobFiles(root)
         self.job_files.settle()
-        self.keeper = kept.StateStore(root, self._memory, self.job_files, self.jobs.changed)
+        self.keeper = kept.StateStore(
+            root, self._memory, self.job_files, self.jobs.changed
+        )
         self.keeper.noticed = self._noticed_disk
         self._unfiled: list[JobMemory] = []
         """Jobs that an earlier server kept in its state and that have no files."""
@@ -263,8 +296,13 @@ class TwinServer:
         """
         shown, correction = sample or Sample(), self.scanner.correction
         guard = await self.guard(shown, correction)
-        for warning in self.scanner.initialise_stage(shown, correction, guard, self.clock.now()):
-            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
+        for warning in self.scanner.initialise_stage(
+            shown, correction, guard, self.clock.now()
+        ):
+            self.tell(
+                "warning",
+                f"at the start {warning}; motion that brings them apart is free",
+            )
         if not self._recalled:
             await asyncio.to_thread(self.job_files.clear)
         self.changed()
@@ -307,8 +345,10 @@ class TwinServer:
                 "warning",
                 "restored what was known when the server ended"
                 + ("" if memory.ended else " without having been stopped"),
-                saved=memory.saved, jobs_to_resume=names, estop=memory.estop,
-            )  # fmt: skip
+                saved=memory.saved,
+                jobs_to_resume=names,
+                estop=memory.estop,
+            )
         return None if sample is None else self._readable(sample)
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
@@ -322,7 +362,9 @@ class TwinServer:
         try:
             for job in unfiled:
                 self.job_files.write(job.id, job)
-        except DatasetWriteError:  # tried again with each change; until then the state has them
+        except (
+            DatasetWriteError
+        ):  # tried again with each change; until then the state has them
             self._unfiled = unfiled
             self.keeper.owe(unfiled)
         known = sorted([*jobs, *unfiled], key=lambda job: number_of(job.id))
@@ -332,13 +374,18 @@ class TwinServer:
         """Apply the correction of the previous server at the start, if possible."""
         last, lost = self.corrections.in_force, self.corrections.lost
         if lost is not None:
-            self.tell("warning", f"the correction in force, {lost!r}, is lost: none is in force")
+            self.tell(
+                "warning", f"the correction in force, {lost!r}, is lost: none is in force"
+            )
         try:
             self.scanner.initialise_stage(Sample(), last, None, self.clock.now())
         except GeometryError as error:
             self.corrections.history = self.corrections.after(None)
-            self.tell("warning", "the correction in force does not fit this machine: none is",
-                      reason=str(error))  # fmt: skip
+            self.tell(
+                "warning",
+                "the correction in force does not fit this machine: none is",
+                reason=str(error),
+            )
 
     def _readable(self, sample: Sample) -> Sample:
         """Return the stored sample, or the empty stage if the sample cannot be read."""
@@ -348,8 +395,12 @@ class TwinServer:
         try:
             self.stage.guard(sample, self.scanner.parameters)
         except Exception as error:  # whatever its file holds: the twin starts
-            self.tell("warning", f"the sample {sample.name!r}, which stood on the stage, cannot be "
-                      "read: the stage is empty", reason=str(error)[:500])  # fmt: skip
+            self.tell(
+                "warning",
+                f"the sample {sample.name!r}, which stood on the stage, cannot be "
+                "read: the stage is empty",
+                reason=str(error)[:500],
+            )
             return Sample()
         return sample
 
@@ -384,7 +435,9 @@ class TwinServer:
         watch = self.projector_watch
         return w.State(
             time=snapshot.time,
-            axes={name: w.AxisState(**vars(axis)) for name, axis in snapshot.axes.items()},
+            axes={
+                name: w.AxisState(**vars(axis)) for name, axis in snapshot.axes.items()
+            },
             tube=state_views.tube_view(snapshot.tube, snapshot.time),
             camera=state_views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
@@ -403,7 +456,11 @@ class TwinServer:
 
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
         guard = self.scanner.guard  # its scene is the one in force, and has been made
-        motors = {name: axis.position for name, axis in snapshot.axes.items() if not axis.virtual}
+        motors = {
+            name: axis.position
+            for name, axis in snapshot.axes.items()
+            if not axis.virtual
+        }
         return clearance(guard.scene, motors) if isinstance(guard, SceneGuard) else None
 
     def sample_state(self) -> w.SampleState:
@@ -412,7 +469,9 @@ class TwinServer:
         offset = w.SamplePlacement(**asdict(sample.offset))
         phantom = self.stage.phantom(sample)
         if phantom is None:
-            return w.SampleState(name=sample.name or None, material=sample.material, offset=offset)
+            return w.SampleState(
+                name=sample.name or None, material=sample.material, offset=offset
+            )
         return w.SampleState(
             name=sample.name,
             material=sample_material(self.samples.head(sample.name), sample.material),
@@ -455,9 +514,13 @@ class TwinServer:
         history = self.corrections.in_state(self.corrections.history)
         self._unfiled = [job for job in self._unfiled if self.keeper.is_unwritten(job.id)]
         return kept.remember(
-            self.scanner, self.clock.now(), self.jobs.made, history,
-            unfiled=self._unfiled, ended=ended,
-        )  # fmt: skip
+            self.scanner,
+            self.clock.now(),
+            self.jobs.made,
+            history,
+            unfiled=self._unfiled,
+            ended=ended,
+        )
 
     async def guard(
         self,
@@ -486,7 +549,9 @@ class TwinServer:
 
     def interrupt(self, what: str) -> None:
         """Pause the running scan after a stop from outside."""
-        self.jobs.interrupt(SafetyError(f"{what} was commanded; resume goes on", {"asked": what}))
+        self.jobs.interrupt(
+            SafetyError(f"{what} was commanded; resume goes on", {"asked": what})
+        )
 
     def tell(self, level: w.LogLevel, message: str, **data: object) -> None:
         """Publish a message on the topic `log` and in the server's log."""
@@ -501,11 +566,16 @@ class TwinServer:
             self.tell("info", "the state is on the disk again")
         else:
             reason = str(from_root(problem, self.root))
-            self.tell("error", "the state is not on the disk, and a kill would lose it",
-                      reason=reason)  # fmt: skip
+            self.tell(
+                "error",
+                "the state is not on the disk, and a kill would lose it",
+                reason=reason,
+            )
         self.feed.changed()
 
-    def _publish_log(self, level: w.LogLevel, message: str, data: dict[str, object]) -> None:
+    def _publish_log(
+        self, level: w.LogLevel, message: str, data: dict[str, object]
+    ) -> None:
         entry = w.LogEntry(level=level, message=message, data=data)
         self.hub.publish("log", entry, slot=None)
 

@@ -42,7 +42,12 @@ class _Event:
     """One event with its encodings, one a view and codec."""
 
     def __init__(
-        self, topic: TopicName, seq: int, time: float, data: object | Render, slot: str | None
+        self,
+        topic: TopicName,
+        seq: int,
+        time: float,
+        data: object | Render,
+        slot: str | None,
     ) -> None:
         self.topic, self.seq, self.time, self._data = topic, seq, time, data
         self.slot = None if slot is None else f"{topic}:{slot}"
@@ -108,7 +113,8 @@ class Hub:
         A second call changes rate and view.
 
         Raises:
-            RpcError: -32003, more subscriptions or views than there may be; nothing has changed.
+            RpcError: -32003, more subscriptions or views than there may be; nothing has
+                changed.
         """
         interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
         topics, view = set(topics), view or ImageWish()
@@ -122,7 +128,9 @@ class Hub:
                 if earlier.seq > told:
                     self._deliver(listener, subscription, earlier)
 
-    def _require_room(self, listener: Peer, topics: set[TopicName], view: ImageWish) -> None:
+    def _require_room(
+        self, listener: Peer, topics: set[TopicName], view: ImageWish
+    ) -> None:
         """Refuse subscriptions and views beyond the limits."""
         views = [
             s.view
@@ -136,7 +144,9 @@ class Hub:
         ):
             if asked > most:
                 data = {"asked": asked, "allowed": most}
-                raise busy(f"there would be {asked} {what}; this server has {most} at most", data)
+                raise busy(
+                    f"there would be {asked} {what}; this server has {most} at most", data
+                )
 
     def unsubscribe(self, listener: Peer, topics: Iterable[TopicName]) -> None:
         """Send them no longer; topics that were not subscribed to are fine."""
@@ -191,7 +201,11 @@ class Hub:
             self._offer(listener, subscription, new)
 
     def snapshot(
-        self, listener: Peer, topic: TopicName, data: object | Render, slot: str | None = ""
+        self,
+        listener: Peer,
+        topic: TopicName,
+        data: object | Render,
+        slot: str | None = "",
     ) -> None:
         """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
 
@@ -204,7 +218,9 @@ class Hub:
         subscription = self._listeners.get(topic, {}).get(listener)
         if subscription is not None:
             seq = max(0, self._seq.get(topic, 0) - 1)
-            self._deliver(listener, subscription, _Event(topic, seq, self._now(), data, slot))
+            self._deliver(
+                listener, subscription, _Event(topic, seq, self._now(), data, slot)
+            )
 
     def _offer(self, listener: Peer, subscription: _Subscription, new: _Event) -> None:
         """Deliver an event now, or keep it until the subscription's rate allows it."""
@@ -213,14 +229,18 @@ class Hub:
         if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
             subscription.pending[new.slot] = new
             if subscription.timer is None:
-                subscription.timer = loop.call_later(wait, self._flush, listener, subscription)
+                subscription.timer = loop.call_later(
+                    wait, self._flush, listener, subscription
+                )
             return
         subscription.next_at = loop.time() + subscription.min_interval_s
         self._deliver(listener, subscription, new)
 
     def _flush(self, listener: Peer, subscription: _Subscription) -> None:
         subscription.timer = None
-        subscription.next_at = asyncio.get_running_loop().time() + subscription.min_interval_s
+        subscription.next_at = (
+            asyncio.get_running_loop().time() + subscription.min_interval_s
+        )
         pending, subscription.pending = subscription.pending, {}
         for newest in pending.values():
             self._deliver(listener, subscription, newest)

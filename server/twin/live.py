@@ -212,7 +212,9 @@ class LiveView:
                     break
                 await asyncio.sleep(max(0.0, begun + FRAME_INTERVAL_S - loop.time()))
 
-    async def shoot(self, shot: Shot, *, predicted: bool = False) -> tuple[Radiograph, ConeVec]:
+    async def shoot(
+        self, shot: Shot, *, predicted: bool = False
+    ) -> tuple[Radiograph, ConeVec]:
         """Compute the image of a shot and its public geometry.
 
         Args:
@@ -224,9 +226,12 @@ class LiveView:
         cone = scanner.corrected(poses, shot.camera, shot.correction)
         known = NOMINAL if shot.correction is None else shot.correction.parameters
         images = await self.radiography.take(
-            shot.sample, poses, shot.camera, [shot.exposure],
+            shot.sample,
+            poses,
+            shot.camera,
+            [shot.exposure],
             truth=TrueGeometry(known) if predicted else None,
-        )  # fmt: skip
+        )
         if not predicted:
             self._seen = (images[0], shot)
         return images[0], cone
@@ -240,7 +245,9 @@ class LiveView:
         """Flags of the last image, such as saturation."""
         if isinstance(self._seen, tuple):  # computed at the first access
             image, shot = self._seen
-            self._seen = flags_of(self.radiography, image, shot.camera, shot.exposure, shot.time)
+            self._seen = flags_of(
+                self.radiography, image, shot.camera, shot.exposure, shot.time
+            )
         return self._seen
 
     async def _show(self, shot: Shot) -> None:
@@ -260,7 +267,9 @@ class LiveView:
         async with self.turn:
             made = await asyncio.to_thread(lambda: {view: make(view) for view in views})
         self._seen = (radiograph, shot)
-        self.hub.publish("projection", lambda view: made.get(view) or make(view), time=shot.time)
+        self.hub.publish(
+            "projection", lambda view: made.get(view) or make(view), time=shot.time
+        )
 
     def publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Publish a scan's image to the subscribers; the newest one replaces older ones."""

@@ -1,8 +1,8 @@
 """`python -m flexdt.server.twin.main`: the twin server as a process.
 
 Chooses every implementation, prints one JSON `ready` line on standard output, ends cleanly on
-SIGTERM and SIGINT (a running scan's data set is then marked incomplete). Nothing else is printed on
-standard output, and the hidden truth is never printed at all.
+SIGTERM and SIGINT (a running scan's data set is then marked incomplete). Nothing else is
+printed on standard output, and the hidden truth is never printed at all.
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ from collections.abc import Sequence
 from flexdt.library import machines
 from flexdt.runtime import access
 from flexdt.runtime.log import LEVELS, set_up
-from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
+from flexdt.runtime.process import (
+    FAILED,
+    OK,
+    announce,
+    first_of,
+    run_process,
+    stop_signal,
+)
 from flexdt.runtime.process_settings import TwinSettings
 from flexdt.runtime.settings import parse
 
@@ -53,7 +60,8 @@ async def run(options: TwinSettings) -> int:
     token = access.read_token(options.projector_token_file)
     secure = access.client_tls(options.projector_tls_ca)
     clients = [
-        ProjectorClient(place.host, place.port, token=token, ssl=secure) for place in options.places
+        ProjectorClient(place.host, place.port, token=token, ssl=secure)
+        for place in options.places
     ]
     projector = ProjectorPool(clients, PATIENCE_S)
     requests, reader = Requests(), Reader()
@@ -72,7 +80,9 @@ async def run(options: TwinSettings) -> int:
         projector_room=projector.room,
         projector_watch=ProjectorWatch(clients),
         limits=access.with_limits(
-            options.limit, access.TwinLimits(), access.limit_names(access.ConnectionLimits())
+            options.limit,
+            access.TwinLimits(),
+            access.limit_names(access.ConnectionLimits()),
         ),
     )
     sample = None if options.fresh else twin.recall()
@@ -87,19 +97,30 @@ async def run(options: TwinSettings) -> int:
         token=access.read_token(options.token_file),
         ssl=access.server_tls(options.tls_cert, options.tls_key),
         limits=access.with_limits(
-            options.limit, access.ConnectionLimits(), access.limit_names(access.TwinLimits())
+            options.limit,
+            access.ConnectionLimits(),
+            access.limit_names(access.TwinLimits()),
         ),
         observe=requests.observe,
         read=reader,
     )
-    async with served_pages(twin_pages(twin, server, projector, requests), options) as pages:
+    async with served_pages(
+        twin_pages(twin, server, projector, requests), options
+    ) as pages:
         twin.state()  # what the first answer needs is loaded before anybody waits for it
         document()
         stop = stop_signal()
-        announce("twin", {
-            "host": options.host, "port": server.port, "machine": machine.name,
-            "profile": profile.name, "data": str(root), **pages,
-        })  # fmt: skip
+        announce(
+            "twin",
+            {
+                "host": options.host,
+                "port": server.port,
+                "machine": machine.name,
+                "profile": profile.name,
+                "data": str(root),
+                **pages,
+            },
+        )
         await first_of(stop, twin.failed)
     await server.close()
     reader.close()

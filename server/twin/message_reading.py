@@ -1,4 +1,5 @@
-"""Large messages are decoded and their parameters validated in a worker process, not on the loop.
+"""Large messages are decoded and their parameters validated in a worker process, not on the
+loop.
 
 Decoding 15 MB of JSON, or describing their errors, holds an interpreter for seconds. What
 comes back is small, or bytes: parameters of a call are unpickled when its turn comes.
@@ -38,7 +39,9 @@ class Reader:
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """
-        kind, *items = await self._workers.ask(work, wire.codec, wire.max_batch, raw=(raw,))
+        kind, *items = await self._workers.ask(
+            work, wire.codec, wire.max_batch, raw=(raw,)
+        )
         pairs = zip(items[::2], items[1::2], strict=True)
         frozen = tuple(Frozen(item, method.decode()) for method, item in pairs)
         return frozen if kind == b"batch" else frozen[0]

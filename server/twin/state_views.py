@@ -42,19 +42,24 @@ def geometry_view(readout: Readout | None) -> w.GeometryState:
     """
     if readout is None:
         raise GeometryError(
-            "the rotation axis or the detector is not in front of the source", {"check": "sod"}
+            "the rotation axis or the detector is not in front of the source",
+            {"check": "sod"},
         )
     return w.GeometryState(**vars(readout))
 
 
-def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float) -> w.SafetyState:
+def safety_view(
+    safety: Safety, clearance: NearestPair | None, margin_mm: float
+) -> w.SafetyState:
     """Convert safety state and clearance to their wire form; below `margin_mm` is a
     warning.
     """
     near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
     warnings = []
     if near is not None and near.pair is not None and near.mm < margin_mm:
-        warnings = [f"{' and '.join(near.pair)} are within the margin, {near.mm:.2f} mm apart"]
+        warnings = [
+            f"{' and '.join(near.pair)} are within the margin, {near.mm:.2f} mm apart"
+        ]
     return w.SafetyState(
         state=SAFETY_NAMES[safety.state],
         estop=safety.state == "estopped",
@@ -68,7 +73,9 @@ def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float)
     )
 
 
-def correction_view(correction: NamedCorrection | None, source: str | None) -> w.Correction | None:
+def correction_view(
+    correction: NamedCorrection | None, source: str | None
+) -> w.Correction | None:
     """Convert a correction to its wire form, in mm and deg."""
     if correction is None:
         return None
@@ -78,7 +85,9 @@ def correction_view(correction: NamedCorrection | None, source: str | None) -> w
 def clock_view(clock: TwinClock) -> w.ClockState:
     """Convert the clock's state to its wire form."""
     return w.ClockState(
-        time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
+        time_s=clock.now(),
+        speed_up=clock.speed_up,
+        real_time_factor=clock.real_time_factor,
     )
 
 

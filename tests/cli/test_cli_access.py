@@ -38,7 +38,9 @@ def state(server: str, *words: str) -> int:
 
 
 def test_with_token_and_certificate(
-    locked: tuple[str, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    locked: tuple[str, Path],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     server, token = locked
     monkeypatch.setenv("FLEXDT_TLS_CA", str(CERTIFICATE))

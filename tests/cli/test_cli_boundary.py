@@ -63,7 +63,10 @@ def test_positions_of_script_errors_are_printed() -> None:
         {"line": 3, "column": 7, "message": "unknown command 'warp'", "code": "unknown_command"},
     ])  # fmt: skip
     lines, _ = boundary.describe(error)
-    assert lines == ("flexdt: the script has 1 error", "script:3:7: unknown command 'warp'")
+    assert lines == (
+        "flexdt: the script has 1 error",
+        "script:3:7: unknown command 'warp'",
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,7 +83,9 @@ def test_positions_of_script_errors_are_printed() -> None:
         ["projector", "--memory-limit", "much"],
     ],
 )
-def test_usage_errors_leave_with_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_usage_errors_leave_with_2(
+    argv: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert command_tree.run(argv) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -108,7 +113,9 @@ def test_ctrl_c_is_clean(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexdt.clients.cli.commands.process_commands.become", interrupted)
+    monkeypatch.setattr(
+        "flexdt.clients.cli.commands.process_commands.become", interrupted
+    )
     assert command_tree.run(["projector"]) == 130
     assert capsys.readouterr().err == "flexdt: interrupted\n"
 
@@ -118,7 +125,8 @@ def test_help_imports_nothing_heavy() -> None:
         "import sys\n"
         "from flexdt.clients.cli.command_tree import run\n"
         "code = run(['--help'])\n"
-        f"bad = [m for m in sys.modules for h in {HEAVY!r} if m == h or m.startswith(h + '.')]\n"
+        f"bad = [m for m in sys.modules for h in {HEAVY!r} if m == h or m.startswith(h + "
+        "'.')]\n"
         "sys.exit(str(bad) if bad else code)\n"
     )
     done = subprocess.run(
@@ -202,7 +210,11 @@ def test_each_process_takes_its_port_by_the_name_that_up_has(
 @pytest.mark.parametrize(
     ("argv", "code", "says"),
     [
-        (["projector", "--port", "0", "--token-file", "nope"], 1, "token file nope: No such file"),
+        (
+            ["projector", "--port", "0", "--token-file", "nope"],
+            1,
+            "token file nope: No such file",
+        ),
     ],
 )
 @pytest.mark.slow

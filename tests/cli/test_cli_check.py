@@ -32,7 +32,9 @@ def test_a_good_script_exits_0(script: Path, capsys: pytest.CaptureFixture[str])
     assert captured.out.splitlines()[-1] == f"{script}: ok"
 
 
-def test_the_text_says_what_is_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_text_says_what_is_assumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "shot.txt"
     shot = "tube\txrayon\t\t\tACK\t\t\r\ncamera\ttake image\t\t\tACK\t\t\r\n"
     path.write_text(GOOD + shot + "camera\tsave image\tscan_0.tif\t\tACK\t\t\r\n")
@@ -44,12 +46,16 @@ def test_the_text_says_what_is_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     column = rows[0].index("of it commands")
     document = json_of(path, capsys)
     # Each step's assumed part is its own, as in the document.
-    told = [float(row[column:].split("  ")[0] or 0.0) for row in rows[1 : 1 + len(document)]]
+    told = [
+        float(row[column:].split("  ")[0] or 0.0) for row in rows[1 : 1 + len(document)]
+    ]
     assert told == [pytest.approx(step["assumed_s"], abs=0.006) for step in document]
     assert sum(told) > 0.0
     facts = dict(row.split(":", 1) for row in rows if ":" in row)
     assert facts["sample"].strip() == "none (empty stage assumed)"
-    assert facts["start"].strip().startswith("the machine's home, assumed: ver_tube=26.2917")
+    assert (
+        facts["start"].strip().startswith("the machine's home, assumed: ver_tube=26.2917")
+    )
 
 
 def json_of(path: Path, capsys: pytest.CaptureFixture[str]) -> list[dict[str, float]]:
@@ -63,7 +69,14 @@ def test_json_is_one_document(script: Path, capsys: pytest.CaptureFixture[str]) 
     document = json.loads(capsys.readouterr().out)
     assert document["ok"] is True
     assert document["problems"] == []
-    for key in ("steps", "duration_s", "frames", "bytes", "collisions", "min_clearance_mm"):
+    for key in (
+        "steps",
+        "duration_s",
+        "frames",
+        "bytes",
+        "collisions",
+        "min_clearance_mm",
+    ):
         assert key in document
     assert {"line", "start_s", "duration_s", "what"} <= document["steps"][0].keys()
 
@@ -75,7 +88,12 @@ def test_every_error_of_a_bad_script_has_its_place(
     assert run(["check", str(script)]) == 1
     captured = capsys.readouterr()
     places = [line for line in captured.err.splitlines() if ": error: " in line]
-    assert {int(line.removeprefix(f"{script}:").split(":")[0]) for line in places} == {1, 2, 3, 4}
+    assert {int(line.removeprefix(f"{script}:").split(":")[0]) for line in places} == {
+        1,
+        2,
+        3,
+        4,
+    }
     assert captured.out.splitlines()[-1] == f"{script}: not ok"
 
 
@@ -108,7 +126,9 @@ def test_a_limit_that_the_machine_rejects_exits_3(
     machine.write_text(text.replace('on_limit = "clamp"', 'on_limit = "reject"'))
     script.write_bytes(b"mag_det move absolute 1200 ACK\r\n")
     assert run(["check", str(script), "--machine", str(machine)]) == 3
-    script.write_bytes(b"mag_det move absolute 1200 ACK\r\ntra_obj move sideways 1 ACK\r\n")
+    script.write_bytes(
+        b"mag_det move absolute 1200 ACK\r\ntra_obj move sideways 1 ACK\r\n"
+    )
     assert run(["check", str(script), "--machine", str(machine)]) == 1
     assert "mag_det" in capsys.readouterr().err
 
@@ -121,7 +141,11 @@ def test_a_limit_that_the_machine_rejects_exits_3(
             'default_profile = "nix"',
             "own.toml: default_profile: no profile called 'nix'",
         ),
-        ("factor = -1.0", "factor = 0.0", "own.toml: virtual_axes.ver_obj.factor: must be "),
+        (
+            "factor = -1.0",
+            "factor = 0.0",
+            "own.toml: virtual_axes.ver_obj.factor: must be ",
+        ),
         (
             "moves = { ver_tube = -1.0, ver_det = -1.0 }",
             "moves = {}",
@@ -204,11 +228,23 @@ def test_script_new_writes_what_check_accepts(
     assert run(["check", str(path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["problems"] == []
-    assert (report["frames"], report["duration_s"]) == (made["frames"], made["duration_s"])
+    assert (report["frames"], report["duration_s"]) == (
+        made["frames"],
+        made["duration_s"],
+    )
 
 
 def test_script_new_positions(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
-    words = ["--frames", "41", "--exposure", "500", "--position", "500:3", "--position", "700"]
+    words = [
+        "--frames",
+        "41",
+        "--exposure",
+        "500",
+        "--position",
+        "500:3",
+        "--position",
+        "700",
+    ]
     assert run(["script", "new", "--kind", "calibration", *words]) == 0
     text = capsysbinary.readouterr().out.decode()
     assert text.count("take and save image sequence") == 2
@@ -219,14 +255,18 @@ def test_script_new_refuses_the_impossible(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "x.txt"
-    assert run(["script", "new", "--kind", "fly", "--sdd", "3000", "--out", str(path)]) == 3
+    assert (
+        run(["script", "new", "--kind", "fly", "--sdd", "3000", "--out", str(path)]) == 3
+    )
     assert "mag_det target" in capsys.readouterr().err
     assert not path.exists()
     assert run(["script", "new", "--kind", "fly", "--roi", "1 2 3"]) == 2
     assert run(["script", "new", "--kind", "sideways"]) == 2
     assert run(["script", "new", "--kind", "fly", "--roi", "0 0 5000 100"]) == 3
     assert run(["script", "new", "--kind", "fly", "--kv", "-1", "--out", str(path)]) == 3
-    assert run(["script", "new", "--kind", "fly", "--kv", "1000", "--out", str(path)]) == 3
+    assert (
+        run(["script", "new", "--kind", "fly", "--kv", "1000", "--out", str(path)]) == 3
+    )
     capsys.readouterr()
     close = ["--sod", "600", "--sdd", "600"]
     assert run(["script", "new", "--kind", "fly", *close, "--out", str(path)]) == 3
@@ -245,7 +285,10 @@ def test_script_new_refuses_the_impossible(
         (["--kind", "helical", "--rise", "0"], "rise_mm is 0; allowed"),
         (["--kind", "helical", "--rise", "nan"], "rise_mm is nan; allowed"),
         (["--kind", "fly", "--sdd", "nan"], "sdd_mm is nan; allowed"),
-        (["--kind", "fly", "--roi", "10 10 0 0"], "ROI 10 10 0 0 holds no pixel at binning"),
+        (
+            ["--kind", "fly", "--roi", "10 10 0 0"],
+            "ROI 10 10 0 0 holds no pixel at binning",
+        ),
         (["--kind", "fly", "--mode", "HW9"], "HW9"),
         (["--kind", "fly", "--kv", "1e6"], "tube kV 1e+06 is outside [0, 90]"),
     ],
@@ -278,16 +321,23 @@ def test_script_new_refuses_options_of_another_kind(
 def test_script_new_takes_a_roi_as_one_word_or_as_four(
     roi: list[str], capsysbinary: pytest.CaptureFixture[bytes]
 ) -> None:
-    assert run(["script", "new", "--kind", "fly", "--exposure", "500", "--roi", *roi]) == 0
+    assert (
+        run(["script", "new", "--kind", "fly", "--exposure", "500", "--roi", *roi]) == 0
+    )
     assert b"set ROI\t800 620 1199 939\t" in capsysbinary.readouterr().out
 
 
-def test_html_report_and_a_named_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_html_report_and_a_named_sample(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     script, page = tmp_path / "s.txt", tmp_path / "s.html"
     words = ["script", "new", "--kind", "fly", "--sod", "150", "--out", str(script)]
     assert run(words) == 0
     capsys.readouterr()
-    assert run(["check", str(script), "--sample", "wide", "--html", str(page), "--json"]) == 0
+    assert (
+        run(["check", str(script), "--sample", "wide", "--html", str(page), "--json"])
+        == 0
+    )
     report = json.loads(capsys.readouterr().out)
     assert report["sample"]["diameter_mm"] == pytest.approx(80 * 2**0.5)
     assert any("truncat" in p["code"] for p in report["problems"])

@@ -36,14 +36,18 @@ def test_a_collision_exits_3_and_names_line_pair_and_time(
     # 403.08 mm at 50 mm/s, and half a second more for the ramp.
     start = document["steps"][2]["start_s"]
     assert first["time_s"] == pytest.approx(start + 0.5 + 403.0816 / 50.0, abs=1e-3)
-    assert first["last_free"]["mag_det"] == pytest.approx(1059 - 403.0816 + 0.02, abs=1e-3)
+    assert first["last_free"]["mag_det"] == pytest.approx(
+        1059 - 403.0816 + 0.02, abs=1e-3
+    )
     assert document["min_clearance_mm"] == pytest.approx(1.0, abs=0.011)
     assert len(document["clearance"]) > 50
 
 
 def test_an_invalid_script_wins_over_a_collision(tmp_path: Path) -> None:
     path = tmp_path / "scan.txt"
-    path.write_bytes((INTO_THE_SAMPLE + "tra_obj\tmove sideways\t1\t\tACK\t\t\r\n").encode())
+    path.write_bytes(
+        (INTO_THE_SAMPLE + "tra_obj\tmove sideways\t1\t\tACK\t\t\r\n").encode()
+    )
     assert run(["check", str(path)]) == 1
 
 

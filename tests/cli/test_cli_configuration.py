@@ -67,7 +67,9 @@ def test_an_address_without_a_port_is_refused_by_the_command(
     assert len(begun) == 1
 
 
-def test_nobody_there_says_how_to_start_a_server(capsys: pytest.CaptureFixture[str]) -> None:
+def test_nobody_there_says_how_to_start_a_server(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert run(["state", "--server", NOBODY]) == 4
     assert capsys.readouterr().err == (
         f"flexdt: no server at {NOBODY} (Connection refused): start one with `flexdt up`\n"
@@ -104,7 +106,9 @@ def test_the_file_the_environment_and_the_option_in_this_order(
 
 
 def test_a_table_of_the_file_holds_the_options_of_a_process(
-    no_configuration: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    no_configuration: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     begun: list[tuple[str, dict[str, object]]] = []
     monkeypatch.setattr(process_commands, "become", lambda *given: begun.append(given))
@@ -127,7 +131,9 @@ def test_a_table_of_the_file_holds_the_options_of_a_process(
     assert begun[0][1]["physics"] == "mono"
     no_configuration.write_text("[twin]\nhttp_prot = 9101\n")
     assert run(["twin"]) == 1
-    assert "[twin] unknown key 'http_prot'; allowed: host, port" in capsys.readouterr().err
+    assert (
+        "[twin] unknown key 'http_prot'; allowed: host, port" in capsys.readouterr().err
+    )
 
 
 COMMANDS = [kind for kind in TABLES.values() if not issubclass(kind, ProcessSettings)]
@@ -142,7 +148,11 @@ COMMANDS = [kind for kind in TABLES.values() if not issubclass(kind, ProcessSett
     ],
 )  # fmt: skip
 def test_an_option_that_went_to_the_file_names_its_key(
-    command: str, flag: str, table: str, no_configuration: Path, capsys: pytest.CaptureFixture[str]
+    command: str,
+    flag: str,
+    table: str,
+    no_configuration: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = [*command.split(), f"--{flag.replace('_', '-')}", "1"]
     assert run(words) == 2
@@ -176,7 +186,12 @@ def test_commands_read_their_tables(
 
 
 @pytest.mark.parametrize(
-    "words", [["job", "status", "7"], ["move", "a=1", "--relative"], ["camera", "--roi", "1,2,3,4"]]
+    "words",
+    [
+        ["job", "status", "7"],
+        ["move", "a=1", "--relative"],
+        ["camera", "--roi", "1,2,3,4"],
+    ],
 )
 @pytest.mark.parametrize("form", [["--server", NOBODY], [f"--server={NOBODY}"]])
 @pytest.mark.daily(4)

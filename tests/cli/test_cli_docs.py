@@ -1,4 +1,5 @@
-"""docs/command-line.md names every command there is; options have help, and are not too many."""
+"""docs/command-line.md names every command there is; options have help, and are not too
+many."""
 
 from __future__ import annotations
 
@@ -83,7 +84,11 @@ def test_there_are_no_more_options_than_a_person_can_read() -> None:
 
 def taken(path: str, command: Any) -> set[str]:
     """Flags that a command takes: its own, those of `flexdt` itself, those it passes on."""
-    out = {flag for option in options(command) for flag in (*option.opts, *option.secondary_opts)}
+    out = {
+        flag
+        for option in options(command)
+        for flag in (*option.opts, *option.secondary_opts)
+    }
     out |= {"--help", *getattr(command.callback, "heeds", ())}
     name = path.split()[-1]
     for table in PROCESSES if name == "up" else {name} & set(PROCESSES):
@@ -93,7 +98,9 @@ def taken(path: str, command: Any) -> set[str]:
 
 
 def test_options_that_the_pages_name_are_taken() -> None:
-    by_name = {path.removeprefix("flexdt "): taken(path, command) for path, command in parts()}
+    by_name = {
+        path.removeprefix("flexdt "): taken(path, command) for path, command in parts()
+    }
     found = []
     texts = pages() | {ROOT / "README.md": (ROOT / "README.md").read_text("utf-8")}
     for page, whole in texts.items():
@@ -103,7 +110,9 @@ def test_options_that_the_pages_name_are_taken() -> None:
         for line in re.findall(r"(?:^|`)flexdt ([^`\n]*)", text, re.MULTILINE):
             words = line.split()
             name = " ".join(words[:2]) if " ".join(words[:2]) in by_name else words[0]
-            flags = re.findall(r"(?<![\w-])--[a-zA-Z][\w-]*", line) if name in by_name else ()
+            flags = (
+                re.findall(r"(?<![\w-])--[a-zA-Z][\w-]*", line) if name in by_name else ()
+            )
             found += [(page.name, name, flag, flag in by_name[name]) for flag in flags]
     assert len(found) > 100
     assert [each for *each, there in found if not there] == []
@@ -111,7 +120,13 @@ def test_options_that_the_pages_name_are_taken() -> None:
 
 @pytest.mark.slow
 def test_h_is_help_and_every_section_names_commands() -> None:
-    for words in (["-h"], ["move", "-h"], ["job", "-h"], ["job", "list", "-h"], ["twin", "-h"]):
+    for words in (
+        ["-h"],
+        ["move", "-h"],
+        ["job", "-h"],
+        ["job", "list", "-h"],
+        ["twin", "-h"],
+    ):
         done = subprocess.run(
             [sys.executable, "-m", "flexdt.clients.cli", *words],
             capture_output=True, text=True, check=True,

@@ -60,13 +60,19 @@ def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture)
         server = ["--server", "{}:{}".format(*servers.address)]
         long = written(tmp_path, 700.0)
         capsys.readouterr()
-        assert run(["run", str(long), "--out", "long", "--sample", "normal-5", *server]) == 0
+        assert (
+            run(["run", str(long), "--out", "long", "--sample", "normal-5", *server]) == 0
+        )
         told = share(capsys.readouterr().err, "are saturated")
         saved = sorted((tmp_path / "data" / "long").glob("*.tif*"))
         counts = [tifffile.imread(file) for file in saved]
-        assert any(abs((image == TOP).mean() - told) < 0.02 + 0.1 * told for image in counts)
+        assert any(
+            abs((image == TOP).mean() - told) < 0.02 + 0.1 * told for image in counts
+        )
         assert run(["check", str(long), "--sample", "normal-5"]) == 0
-        assert share(capsys.readouterr().err, "will be saturated") == pytest.approx(told, abs=0.02)
+        assert share(capsys.readouterr().err, "will be saturated") == pytest.approx(
+            told, abs=0.02
+        )
         snapped = tmp_path / "now.tif"
         assert run(["tube", "--on", *server]) == 0
         assert run(["snap", str(snapped), *server]) == 0
@@ -76,7 +82,9 @@ def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture)
         dim = written(tmp_path, 20.0, 25.0)
         capsys.readouterr()
         assert run(["run", str(dim), "--out", "dim", *server]) == 0
-        predicted = re.findall(r"about ([\d.e+-]+) % .* will be starved", capsys.readouterr().err)
+        predicted = re.findall(
+            r"about ([\d.e+-]+) % .* will be starved", capsys.readouterr().err
+        )
         [kept] = json.loads((tmp_path / "data/dim/flexdt.json").read_text())["predicted"]
         folder = tmp_path / "data/dim"
         dark = tifffile.imread(folder / "di000000.tif")
@@ -84,7 +92,9 @@ def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture)
         signal = [image.astype(float) - dark for image in images]
         starved = max(float((image < 10).mean()) for image in signal)
         assert kept["starved"] == pytest.approx(starved, abs=0.03)
-        assert [float(one) / 100 for one in predicted] == [pytest.approx(kept["starved"], rel=0.01)]
+        assert [float(one) / 100 for one in predicted] == [
+            pytest.approx(kept["starved"], rel=0.01)
+        ]
         short = written(tmp_path, 60.0)
         capsys.readouterr()
         assert run(["run", str(short), "--out", "short", *server]) == 0

@@ -85,7 +85,10 @@ def test_the_scenes_draw_them_as_they_are(lab: Path) -> None:
         ("cad/words.glb", "not a readable GLB file"),
         ("cad/many.stl", "many.stl: 12 triangles; allowed: 11"),
         ("cad/bytes.stl", "bytes.stl has [0-9]+ bytes; allowed: 2000"),
-        ("cad/inch.glb", "measures 50000 mm; .* STL file is taken to be in mm, a GLB file in m"),
+        (
+            "cad/inch.glb",
+            "measures 50000 mm; .* STL file is taken to be in mm, a GLB file in m",
+        ),
     ],
 )
 def test_a_mesh_that_does_not_hold_is_told_with_file_and_part(
@@ -100,6 +103,10 @@ def test_a_mesh_that_does_not_hold_is_told_with_file_and_part(
     if "many" in mesh:
         monkeypatch.setattr(mesh_files, "MAX_PART_FACES", 11)
     monkeypatch.setattr(mesh_files, "MAX_PART_BYTES", 2000)
-    lab.write_text(TEXT.split('[[components]]\nname = "cabinet"')[0].replace("cad/tube.glb", mesh))
-    with pytest.raises(MachineFileError, match=f"lab.toml: components.source.mesh: .*{message}"):
+    lab.write_text(
+        TEXT.split('[[components]]\nname = "cabinet"')[0].replace("cad/tube.glb", mesh)
+    )
+    with pytest.raises(
+        MachineFileError, match=f"lab.toml: components.source.mesh: .*{message}"
+    ):
         machines.machine(lab)

@@ -28,7 +28,11 @@ def test_options_make_a_file_that_the_other_commands_take(
     assert run(["machine", "check", str(file)]) == 0
     made = machines.machine(file)
     assert (made.detector.columns, made.detector.row_pitch_mm) == (1000, 0.12)
-    assert (made.fixed["detector_y"], made.axes["Z"].upper, made.tube.kV) == (800.0, 500.0, 100.0)
+    assert (made.fixed["detector_y"], made.axes["Z"].upper, made.tube.kV) == (
+        800.0,
+        500.0,
+        100.0,
+    )
     assert "Y" not in made.axes
     script = tmp_path / "scan.txt"
     fly = ["script", "new", "--kind", "fly", "--frames", "61", "--exposure", "500"]
@@ -69,7 +73,11 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         (["--base", "nix"], 1, "no machine called 'nix' ships"),
         (["--detector", "big"], 2, "not of the form NUMBERxNUMBER"),
         (["--sod", "9:3"], 2, "not of the form VALUE or LOWER:UPPER"),
-        (["--base", "micro_ct", "--sod", "3:9"], 3, "micro_ct has no motor along the SOD"),
+        (
+            ["--base", "micro_ct", "--sod", "3:9"],
+            3,
+            "micro_ct has no motor along the SOD",
+        ),
         (["--bits", "24"], 1, "detector.bits"),
         (["--limit", "tilt=0:1"], 1, "unknown axis 'tilt'"),
         (["--pitch", "nan"], 2, "not finite"),
@@ -77,14 +85,22 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         (["--sod", "60:500", "--limit", "Z=100:400"], 3, "are both said"),
         (["--kv", "200:100"], 2, "not of the form VALUE or LOWER:UPPER"),
         (["--kv", "20"], 1, "tube.kV: must be from min_kV to max_kV, [30, 20]"),
-        (["--sod=-20:500"], 1, "SOD goes from -20 to 500 mm over the travel (Z; zero offset 0 mm)"),
+        (
+            ["--sod=-20:500"],
+            1,
+            "SOD goes from -20 to 500 mm over the travel (Z; zero offset 0 mm)",
+        ),
         (["--limit", "Z=-20:850"], 1, "SOD goes from -20 to 850 mm over the travel"),
         (["--sod", "1:15"], 1, "at home source and"),
         (["--sod", "900", "--sdd", "800"], 1, "at home SOD is 900 mm and SDD 800 mm"),
     ],
 )
 def test_wrong_answers_write_nothing(
-    words: list[str], code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    code: int,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = tmp_path / "mine.toml"
     assert run(["machine", "new", "mine", "--out", str(file), *words]) == code
@@ -94,11 +110,25 @@ def test_wrong_answers_write_nothing(
 
 def test_a_panel_on_a_rail(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "rail.toml"
-    words = ["machine", "new", "rail", "--out", str(file), "--sdd", "500:1200", "--kv", "40:160"]
+    words = [
+        "machine",
+        "new",
+        "rail",
+        "--out",
+        str(file),
+        "--sdd",
+        "500:1200",
+        "--kv",
+        "40:160",
+    ]
     assert run(words) == 0
     made = machines.machine(file)
     assert (made.tube.min_kV, made.tube.max_kV) == (40.0, 160.0)
-    assert (made.axes["D"].lower, made.axes["D"].upper, made.axes["D"].home) == (500, 1200, 1000)
+    assert (made.axes["D"].lower, made.axes["D"].upper, made.axes["D"].home) == (
+        500,
+        1200,
+        1000,
+    )
     assert made.chain(next(c for c in made.components if c.role == "panel")) == ("D",)
     capsys.readouterr()
     assert run(["machine", "check", str(file)]) == 0
@@ -119,7 +149,9 @@ def test_a_panel_on_a_rail(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ]
     assert run([*words, "--machine", str(file), "--out", str(script)]) == 0
     moves = [line.split("\t") for line in script.read_text().splitlines()]
-    assert {row[2] for row in moves if row[:2] == ["D", "move absolute"]} == {"700.000000"}
+    assert {row[2] for row in moves if row[:2] == ["D", "move absolute"]} == {
+        "700.000000"
+    }
     capsys.readouterr()
 
 
@@ -142,7 +174,10 @@ def test_check_says_what_distances_are_the_sum_of(
     ("text", "said"),
     [
         ("[axes.Z]\nhome = 25.0\n", "axes: at home source and lift touch"),
-        ("[fixed]\ndetector_y = 300.0\n", "at home SOD is 400 mm and SDD 300 mm; allowed: 0 < SOD"),
+        (
+            "[fixed]\ndetector_y = 300.0\n",
+            "at home SOD is 400 mm and SDD 300 mm; allowed: 0 < SOD",
+        ),
         ("[fixed]\nobject_y = -420.0\n", "at home SOD is -20 mm"),
     ],
 )
@@ -155,7 +190,9 @@ def test_a_machine_that_cannot_stand_at_home_is_refused(
     assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_show_says_whose_a_value_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_says_whose_a_value_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(
         'base = "unitom_xl"\nname = "mine"\n[axes.mag_obj]\nupper = 900.0\n'
@@ -170,7 +207,9 @@ def test_show_says_whose_a_value_is(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("name", ["", 'a"b', "a b", "tab\there", "a\udcff"])
-def test_a_name_is_one_word(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_is_one_word(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "mine.toml"
     code = run(["machine", "new", name, "--out", str(file)])
     if code == 0:  # a quotation mark in a word is none of our business

@@ -40,7 +40,9 @@ def test_phantom_from_a_mesh(tmp_path: Path) -> None:
     mesh, path = tmp_path / "box.stl", tmp_path / "box.json"
     trimesh.creation.box((1.0, 2.0, 3.0)).export(mesh)
     assert run(["phantom", "make", str(path), "--mesh", str(mesh), "--unit", "cm"]) == 0
-    np.testing.assert_allclose(as_phantom(str(path)).size_mm, (10.0, 20.0, 30.0), atol=1e-6)
+    np.testing.assert_allclose(
+        as_phantom(str(path)).size_mm, (10.0, 20.0, 30.0), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -56,7 +58,11 @@ def test_phantom_from_a_mesh(tmp_path: Path) -> None:
     ],
 )
 def test_bad_wishes(
-    words: list[str], code: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    code: int,
+    says: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run(["phantom", "make", str(tmp_path / "x.json"), *words]) == code
     captured = capsys.readouterr()
@@ -68,7 +74,15 @@ def test_bad_wishes(
 def test_make_says_what_is_assumed_and_that_beads_overlap(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["phantom", "make", str(tmp_path / "p.json"), "--size", "20,20,40", "--beads", "500"]
+    words = [
+        "phantom",
+        "make",
+        str(tmp_path / "p.json"),
+        "--size",
+        "20,20,40",
+        "--beads",
+        "500",
+    ]
     assert run(words) == 0
     said = capsys.readouterr()
     assert "assumed: the spiral's formula" in said.err

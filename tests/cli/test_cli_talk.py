@@ -1,4 +1,5 @@
-"""`-q` shows no progress and keeps warnings; `-v` says what took time. Both go before or after."""
+"""`-q` shows no progress and keeps warnings; `-v` says what took time. Both go before or
+after."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ def as_before() -> Iterator[None]:
     logging.getLogger().handlers[:] = root
 
 
-@pytest.mark.parametrize("words", [["-q", "check", LISTING], ["check", LISTING, "--quiet"]])
+@pytest.mark.parametrize(
+    "words", [["-q", "check", LISTING], ["check", LISTING, "--quiet"]]
+)
 def test_quiet_keeps_warnings_and_shows_no_progress(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -39,7 +42,9 @@ def test_quiet_keeps_warnings_and_shows_no_progress(
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("words", [["-v", "check", LISTING], ["check", LISTING, "--verbose"]])
+@pytest.mark.parametrize(
+    "words", [["-v", "check", LISTING], ["check", LISTING, "--verbose"]]
+)
 def test_verbose_logs_how_long_works_took(words: list[str]) -> None:
     assert run(words) == 0
     assert LOG.isEnabledFor(logging.INFO)

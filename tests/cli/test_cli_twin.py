@@ -175,7 +175,10 @@ def test_uploads_and_corrections_are_deleted_unless_they_are_in_use(
     code, _, err = flexdt("delete", "sample", name)
     assert (code, "stands on the stage" in err) == (3, True)
     assert flexdt("sample", "normal-3")[0] == 0
-    assert document("delete", "sample", name) == {"name": name, "bytes": file.stat().st_size}
+    assert document("delete", "sample", name) == {
+        "name": name,
+        "bytes": file.stat().st_size,
+    }
     assert name not in {one["name"] for one in document("sample")["samples"]}
     code, _, err = flexdt("delete", "sample", name)
     assert (code, f"no upload called {name!r}" in err) == (1, True)
@@ -217,7 +220,9 @@ def test_run_a_script_to_its_data_set(
     assert "done" in flexdt("job", "status", last["job"])[1]
     assert document("job", "forget", last["job"])["jobs"] == [last["job"]]
     flexdt("job", "forget", "all")
-    assert all(j["state"] in ("running", "paused") for j in document("job", "list")["jobs"])
+    assert all(
+        j["state"] in ("running", "paused") for j in document("job", "list")["jobs"]
+    )
 
 
 def test_detached_run_can_be_watched_and_aborted(
@@ -226,7 +231,9 @@ def test_detached_run_can_be_watched_and_aborted(
     script.write_bytes(SCRIPT.encode() + b"scanner\tpause\t3600000\t\tACK\t\t\r\n")
     job = document("run", str(script), "--detach", "--speed-up", "1")["job"]
     deadline = time.monotonic() + 60
-    while document("job", "status", job)["state"] == "queued":  # what is queued cannot be paused
+    while (
+        document("job", "status", job)["state"] == "queued"
+    ):  # what is queued cannot be paused
         assert time.monotonic() < deadline
     code, out, err = flexdt("move", "tra_obj=3")
     assert (code, out) == (4, ""), err
@@ -235,21 +242,36 @@ def test_detached_run_can_be_watched_and_aborted(
     code, _, err = flexdt("job", "resume", job)
     assert code in (0, 1, 4)
     assert "Traceback" not in err
-    document("job", "abort", job)  # an aborted scan can be taken up again, so end it for good
+    document(
+        "job", "abort", job
+    )  # an aborted scan can be taken up again, so end it for good
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, servers: Servers) -> None:
+def test_ctrl_c_leaves_the_scan_running(
+    document: Document, script: Path, servers: Servers
+) -> None:
     script.write_bytes(SCRIPT.encode() + b"scanner\tpause\t3600000\t\tACK\t\t\r\n")
     address = "{}:{}".format(*servers.address)
-    words = ["run", str(script), "--speed-up", "1", "--server", address, "--out", "left-alone"]
+    words = [
+        "run",
+        str(script),
+        "--speed-up",
+        "1",
+        "--server",
+        address,
+        "--out",
+        "left-alone",
+    ]
     with subprocess.Popen(
         [sys.executable, "-m", "flexdt.clients.cli", *words],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         deadline = time.monotonic() + 60
         while True:
-            named = [j for j in document("job", "list")["jobs"] if j["name"] == "left-alone"]
+            named = [
+                j for j in document("job", "list")["jobs"] if j["name"] == "left-alone"
+            ]
             status = named[-1] if named else {}
             if status.get("state") == "running":
                 break
@@ -258,7 +280,9 @@ def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, server
                 pytest.fail(f"the job never ran: {status}")
             time.sleep(0.05)
         assert process.stderr is not None
-        assert "warning" in process.stderr.readline()  # it has the answer, and follows the job
+        assert (
+            "warning" in process.stderr.readline()
+        )  # it has the answer, and follows the job
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=90)
@@ -269,7 +293,9 @@ def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, server
     document("job", "abort", status["job"])
 
 
-def test_an_invalid_script_is_refused_with_positions(flexdt: Flexdt, script: Path) -> None:
+def test_an_invalid_script_is_refused_with_positions(
+    flexdt: Flexdt, script: Path
+) -> None:
     script.write_bytes(b"camera set exposure fast ACK\r\ntra_obj move sideways 3 ACK\r\n")
     code, out, err = flexdt("run", str(script))
     assert (code, out) == (1, "")
@@ -283,7 +309,9 @@ def test_an_invalid_script_is_refused_with_positions(flexdt: Flexdt, script: Pat
 def test_run_and_check_leave_with_the_same_code(
     flexdt: Flexdt, script: Path, volts: str, code: int
 ) -> None:
-    script.write_bytes(SCRIPT.replace("tube\txrayon\t", f"tube\tset kV\t{volts}").encode())
+    script.write_bytes(
+        SCRIPT.replace("tube\txrayon\t", f"tube\tset kV\t{volts}").encode()
+    )
     assert flexdt("run", str(script))[0] == code
     assert run(["check", str(script)]) == code
 
@@ -298,7 +326,9 @@ def test_a_parameter_that_does_not_fit_is_one_line(flexdt: Flexdt) -> None:
     ]
 
 
-def test_names_that_cannot_be_say_what_can(flexdt: Flexdt, script: Path, data_dir: Path) -> None:
+def test_names_that_cannot_be_say_what_can(
+    flexdt: Flexdt, script: Path, data_dir: Path
+) -> None:
     for words in (("sample", "../x"), ("run", str(script), "--out", "a/b")):
         code, _, err = flexdt(*words)
         assert code == 1
@@ -336,7 +366,10 @@ def test_tube_and_camera_are_set_and_shown(flexdt: Flexdt, document: Document) -
     assert document("camera", "--roi", "40 8 1943 1527")["roi"] == [40, 8, 1943, 1527]
     whole = ("--roi", "32", "8", "1943", "1527")
     assert document("camera", "--mode", "HW2SW2High", *whole)["shape"] == [380, 478]
-    assert document("camera", "--mode", "HW2SW1High", "--exposure", "100")["shape"] == [760, 956]
+    assert document("camera", "--mode", "HW2SW1High", "--exposure", "100")["shape"] == [
+        760,
+        956,
+    ]
     assert flexdt("camera", "--mode", "best")[0] == 3
 
 
@@ -407,7 +440,9 @@ def test_a_snapshot_shows_in_colour_what_is_wrong_with_the_exposure(
 
 def test_a_warning_is_called_one_once(flexdt: Flexdt, tmp_path: Path) -> None:
     script = tmp_path / "far.txt"
-    script.write_bytes(SCRIPT.replace("set ROI\t900 700 999 779", "set exposure\t20").encode())
+    script.write_bytes(
+        SCRIPT.replace("set ROI\t900 700 999 779", "set exposure\t20").encode()
+    )
     flexdt("run", str(script), "--speed-up", "max", "--out", "warned")
     _, out, err = flexdt("job", "status")
     told = [line for line in err.splitlines() if line.startswith("warning: ")]
@@ -434,12 +469,16 @@ def test_a_jog_lasts_so_many_seconds_of_the_twins_clock(
         assert 0.5 * 5 * seconds <= turned <= 5 * max(1.5 * seconds, passed * float(pace))
 
 
-def test_a_jog_into_the_end_of_the_travel_ends(flexdt: Flexdt, document: Document) -> None:
+def test_a_jog_into_the_end_of_the_travel_ends(
+    flexdt: Flexdt, document: Document
+) -> None:
     flexdt("clock", "max")
     limit = document("state")["axes"]["ver_det"]["limits"][1]
     flexdt("move", f"ver_det={limit - 20}")
     assert flexdt("jog", "ver_det", "5", "--for", "60")[0] == 0
-    assert document("state")["axes"]["ver_det"]["position"] == pytest.approx(limit, abs=1e-6)
+    assert document("state")["axes"]["ver_det"]["position"] == pytest.approx(
+        limit, abs=1e-6
+    )
     flexdt("move", "ver_det=20")
 
 
@@ -481,7 +520,9 @@ def test_phantom_and_scene_files_stand_on_the_stage(
     flexdt: Callable[..., Answer], document: Callable[..., Any], tmp_path: Path
 ) -> None:
     """What `phantom make` writes, a bead file, and a scene with a mesh beside it."""
-    made, beads, scene = (tmp_path / n for n in ("made.json", "beads.toml", "assembly.toml"))
+    made, beads, scene = (
+        tmp_path / n for n in ("made.json", "beads.toml", "assembly.toml")
+    )
     assert run(["phantom", "make", str(made), "--like", "tall", "--beads", "3"]) == 0
     beads.write_text(BEAD_FILE)
     trimesh.creation.box(extents=(2, 3, 4)).export(tmp_path / "handle.stl")
@@ -490,7 +531,10 @@ def test_phantom_and_scene_files_stand_on_the_stage(
         now = document("sample", str(file))
         assert now["sample"]["name"] == file.stem
         listed = {one["name"]: one for one in document("sample")["samples"]}
-        assert (listed[file.stem]["kind"], listed[file.stem]["uploaded"]) == ("scene", True)
+        assert (listed[file.stem]["kind"], listed[file.stem]["uploaded"]) == (
+            "scene",
+            True,
+        )
         assert document("state")["sample"]["name"] == file.stem
         assert flexdt("snap", str(tmp_path / f"{file.stem}.tif"))[0] == 0
     scene.write_text(SCENE_FILE.replace("handle.stl", "gone.stl"))

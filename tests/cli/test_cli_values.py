@@ -15,7 +15,9 @@ from flexdt.runtime import process_settings
 
 
 def test_assignments_keep_order_and_signs() -> None:
-    assert option_values.assignments(["tra_obj=-12.5", "rot_obj=+3e1", " ver_tube = 40"]) == {
+    assert option_values.assignments(
+        ["tra_obj=-12.5", "rot_obj=+3e1", " ver_tube = 40"]
+    ) == {
         "tra_obj": -12.5,
         "rot_obj": 30.0,
         "ver_tube": 40.0,
@@ -58,7 +60,9 @@ def test_server_addresses(word: str, expected: tuple[str, int]) -> None:
     assert twin_connection.server_address(word) == expected
 
 
-@pytest.mark.parametrize("word", ["host:0", "host:65536", "host:abc", "[::1", "[::1]x", "host:-1"])
+@pytest.mark.parametrize(
+    "word", ["host:0", "host:65536", "host:abc", "[::1", "[::1]x", "host:-1"]
+)
 def test_bad_server_addresses(word: str) -> None:
     with pytest.raises(typer.BadParameter):
         twin_connection.server_address(word)
@@ -89,7 +93,9 @@ def test_plain_progress_counts_and_estimates(capsys: pytest.CaptureFixture[str])
     ]
 
 
-def test_terminal_progress_stays_off_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+def test_terminal_progress_stays_off_standard_output(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with ProgressBar("scanning", terminal=True) as bar:
         bar.update(3, 10)
     captured = capsys.readouterr()
@@ -100,7 +106,9 @@ def test_terminal_progress_stays_off_standard_output(capsys: pytest.CaptureFixtu
 def test_plain_json_has_no_nan_and_no_arrays() -> None:
     import numpy as np
 
-    text = console.as_json({"a": float("nan"), 1: (np.float32(2), np.arange(2)), "b": True})
+    text = console.as_json(
+        {"a": float("nan"), 1: (np.float32(2), np.arange(2)), "b": True}
+    )
     assert json.loads(text) == {
         "a": None,
         "1": [2.0, [0, 1]],

@@ -1,4 +1,5 @@
-"""Ctrl-C ends a command at once, at whatever moment: `tests/studies/interrupts.py`, in short."""
+"""Ctrl-C ends a command at once, at whatever moment: `tests/studies/interrupts.py`, in
+short."""
 
 from __future__ import annotations
 
@@ -52,7 +53,9 @@ console_script.main()
 
 
 @pytest.mark.parametrize("where", STUCK)
-def test_the_main_thread_is_interrupted_wherever_it_is(where: str, tmp_path: Path) -> None:
+def test_the_main_thread_is_interrupted_wherever_it_is(
+    where: str, tmp_path: Path
+) -> None:
     (tmp_path / "swallowing.py").write_text(SWALLOWING)
     program = PROGRAM.format(code=STUCK[where])
     with subprocess.Popen(

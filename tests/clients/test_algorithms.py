@@ -1,4 +1,5 @@
-"""One list of algorithms: one that is added there is found at every door, and its page lacks it."""
+"""One list of algorithms: one that is added there is found at every door, and its page lacks
+it."""
 
 from __future__ import annotations
 
@@ -29,7 +30,12 @@ sys.exit(run(sys.argv[1:]))
 
 
 def half_everywhere(
-    projections: np.ndarray, cone_vec: fx.ConeVec, like: fx.Volume, *, watch: object, **options: int
+    projections: np.ndarray,
+    cone_vec: fx.ConeVec,
+    like: fx.Volume,
+    *,
+    watch: object,
+    **options: int,
 ) -> fx.Volume:
     """An algorithm that looks at nothing."""
     assert len(projections) == len(cone_vec)
@@ -85,7 +91,9 @@ def in_the_table() -> set[str]:
     """Names in the first column of the page's table of algorithms."""
     table = PAGE.read_text("utf-8").split("| algorithm |", 1)[1].split("\n\n", 1)[0]
     return {
-        name for row in table.splitlines() for name in re.findall(r"`(\w+)`", row.split("|")[1])
+        name
+        for row in table.splitlines()
+        for name in re.findall(r"`(\w+)`", row.split("|")[1])
     }
 
 

@@ -1,5 +1,5 @@
-"""`flexdt align`: the axis of scans without a phantom, against ellipsoids whose line integrals and
-kinematics are written out here, with scanners drawn by a seed."""
+"""`flexdt align`: the axis of scans without a phantom, against ellipsoids whose line integrals
+and kinematics are written out here, with scanners drawn by a seed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ class Scanner:
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Scanner:
         roll, pitch, yaw = np.radians(rng.normal(0, (0.7, 0.3, 0.3)))
-        return cls(rng.uniform(-3, 3), rng.normal(0, 0.25), rng.uniform(-4, 4), roll, pitch, yaw)
+        return cls(
+            rng.uniform(-3, 3), rng.normal(0, 0.25), rng.uniform(-4, 4), roll, pitch, yaw
+        )
 
     def panel(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centre, u and v: turned by yaw about -z, pitch about u, roll about u x v."""
@@ -55,7 +57,8 @@ class Scanner:
         return np.array([self.panel_x, SDD, self.panel_z]), PITCH * u, PITCH * v
 
     def axis(self) -> tuple[float, float]:
-        """The column where the axis crosses the middle row, and the columns it moves each row."""
+        """The column where the axis crosses the middle row, and the columns it moves each
+        row."""
         centre, u, v = self.panel()
         seen = []
         for z in (-9.0, 9.0):
@@ -69,7 +72,9 @@ class Scanner:
         """The row in which the source sees the point of the axis at its own height."""
         centre, u, v = self.panel()
         ray = np.array([self.axis_x, SOD, 0.0])
-        return float(np.linalg.solve(np.array([u, v, -ray]).T, -centre)[1] + (SHAPE[0] - 1) / 2)
+        return float(
+            np.linalg.solve(np.array([u, v, -ray]).T, -centre)[1] + (SHAPE[0] - 1) / 2
+        )
 
     def lines(
         self, bodies: np.ndarray, angles: np.ndarray, aside: np.ndarray | None = None
@@ -168,7 +173,9 @@ def test_column_and_roll_are_where_they_are(k: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("photons", "column", "roll"), [(1e4, 0.04, 0.06), (100, 0.15, 0.3)])
+@pytest.mark.parametrize(
+    ("photons", "column", "roll"), [(1e4, 0.04, 0.06), (100, 0.15, 0.3)]
+)
 @pytest.mark.campaign
 def test_column_and_roll_are_where_they_are_within_their_sigmas(
     photons: float, column: float, roll: float
@@ -226,7 +233,9 @@ def test_the_row_is_right_above_and_below_the_panel_and_refused_beside_it(
 )  # fmt: skip
 @pytest.mark.slow
 @pytest.mark.campaign(1)
-def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photons: float) -> None:
+def test_shifts_of_single_frames_are_found_with_their_sigmas(
+    size: float, photons: float
+) -> None:
     rng, degrees = np.random.default_rng(7), np.arange(120) * 3.0
     scanner = Scanner.drawn(rng)
     aside = rng.normal(0, size, (120, 2))
@@ -234,7 +243,9 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
     data = data_set(lines, degrees, photons, rng)
     found = data.align(per_frame=True)
     place = [[0.0, 0.0, 0.0]]
-    seen = found.dataset.geometry.project_points(place) - data.geometry.project_points(place)
+    seen = found.dataset.geometry.project_points(place) - data.geometry.project_points(
+        place
+    )
     turn = np.radians(degrees)
     # The geometry takes up what all frames have in common, the object what turns with it.
     modes = np.column_stack([np.ones(120), np.cos(turn), np.sin(turn)])
@@ -258,7 +269,9 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
 @pytest.mark.parametrize("k", range(2))
 @pytest.mark.parametrize("spoilt", ["ramp", "missing frames", "missed step"])
 @pytest.mark.campaign(2)
-def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(spoilt: str, k: int) -> None:
+def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
+    spoilt: str, k: int
+) -> None:
     scanner, lines = scan(k)
     frames = {
         "ramp": np.arange(48),
@@ -267,7 +280,9 @@ def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(spoilt: str,
     }[spoilt]
     degrees = DEGREES if spoilt == "missed step" else DEGREES[frames]
     ramp = 0.01 if spoilt == "ramp" else 0.0
-    found = data_set(lines[frames], degrees, 1e4, np.random.default_rng(k), ramp=ramp).align()
+    found = data_set(
+        lines[frames], degrees, 1e4, np.random.default_rng(k), ramp=ramp
+    ).align()
     assert np.abs(pulls(found, scanner)).max() < 4
 
 
@@ -309,8 +324,11 @@ def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
     assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
 
 
-def box_lines(scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int) -> np.ndarray:
-    """Line integrals of a box of 0.02 1/mm; the mean over rays x rays a pixel, (n, rows, cols)."""
+def box_lines(
+    scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int
+) -> np.ndarray:
+    """Line integrals of a box of 0.02 1/mm; the mean over rays x rays a pixel, (n, rows,
+    cols)."""
     centre, u, v = scanner.panel()
     fine = [(np.arange(n * rays) + 0.5) / rays - n / 2 for n in SHAPE[::-1]]
     c, r = np.meshgrid(*fine)
@@ -330,7 +348,9 @@ def box_lines(scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int) ->
 @pytest.mark.slow
 @pytest.mark.campaign
 def test_what_spoils_scans_misleads_nobody(capsys: pytest.CaptureFixture[str]) -> None:
-    assert align_faults.main(["--count", "8", "--seed", "4"]) == 0, capsys.readouterr().out
+    assert align_faults.main(["--count", "8", "--seed", "4"]) == 0, (
+        capsys.readouterr().out
+    )
     assert re.search(r"^all +8 +[5-8] ", capsys.readouterr().out, re.MULTILINE)
 
 
@@ -350,7 +370,9 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
     data = data_set(lines, DEGREES, 1e4, np.random.default_rng(1))
     counts = data.counts().copy()
     counts[31] = counts[30]
-    found = fx.DataSet.from_arrays(counts, data.geometry, dark=data.dark, flat=data.flat).align()
+    found = fx.DataSet.from_arrays(
+        counts, data.geometry, dark=data.dark, flat=data.flat
+    ).align()
     assert "[31] repeat" in " ".join(found.warnings)
     assert np.abs(pulls(found, scanner)).max() < 4
 
@@ -358,7 +380,9 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
 def apart(true: np.ndarray, column: int, width: int) -> np.ndarray:
     """Images whose right tile shows what lies `width` columns further to the right."""
     there = np.arange(SHAPE[1])
-    return true[..., np.minimum(there + np.where(there >= column, width, 0), SHAPE[1] - 1)]
+    return true[
+        ..., np.minimum(there + np.where(there >= column, width, 0), SHAPE[1] - 1)
+    ]
 
 
 @pytest.mark.slow
@@ -398,7 +422,9 @@ def test_a_gap_between_tiles_is_closed_whether_it_is_found_or_given(seed: int) -
         [0, -2.0], abs=0.1
     )
     assert found.correction.panel == panel
-    given = data.with_correction(dataclasses.replace(found.correction, parameters=NOMINAL)).align()
+    given = data.with_correction(
+        dataclasses.replace(found.correction, parameters=NOMINAL)
+    ).align()
     assert "between two tiles" not in " ".join(given.warnings)
     assert given.document["panel"] == found.document["panel"]
     assert np.abs(pulls(given, scanner)).max() < 4
@@ -441,11 +467,15 @@ def test_lag_of_a_calibration_is_undone() -> None:
     undone = data.with_correction(NamedCorrection("a", "", NOMINAL, panel=panel))
 
     def off(one: fx.DataSet, first: int = 0) -> float:
-        return float(np.sqrt(np.mean((one.stack()[2:] - true[first + 2 : first + len(one)]) ** 2)))
+        return float(
+            np.sqrt(np.mean((one.stack()[2:] - true[first + 2 : first + len(one)]) ** 2))
+        )
 
     assert off(undone) < 0.1 * off(data)
     assert off(undone[10:20], 10) < 0.1 * off(data)
-    assert np.array_equal(undone[::2].stack(), data[::2].stack())  # none after the one before
+    assert np.array_equal(
+        undone[::2].stack(), data[::2].stack()
+    )  # none after the one before
     assert np.array_equal(undone.line_integrals(0), data.line_integrals(0))
     assert np.array_equal(undone.line_integrals(-1), undone.line_integrals(len(data) - 1))
     whole = fx.DataSet.from_arrays(true, geometry)
@@ -489,7 +519,9 @@ def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:
     still = lines + 0.3 * np.exp(-np.square(np.arange(SHAPE[1]) - 80.0) / 50)
     fixed = data_set(still, DEGREES, 1e4, rng).align()
     assert "symmetr" in fixed.document["refused"]["axis_column_px"]
-    moving = fx.ConeVec.helical(sod=SOD, sdd=SDD, rise=8, angles=48, shape=SHAPE, pixel=PITCH)
+    moving = fx.ConeVec.helical(
+        sod=SOD, sdd=SDD, rise=8, angles=48, shape=SHAPE, pixel=PITCH
+    )
     counts = good.counts()
     helix = fx.DataSet.from_arrays(counts, moving, dark=good.dark, flat=good.flat).align()
     assert "one circle" in helix.document["refused"]["axis_column_px"]

@@ -1,5 +1,6 @@
 """`align` of one row and of half a turn: drawn ellipses with line integrals in closed form and
-kinematics of their own (tests/studies/row_align.py), and one row from `simulate` to a volume."""
+kinematics of their own (tests/studies/row_align.py), and one row from `simulate` to a
+volume."""
 
 from __future__ import annotations
 
@@ -63,7 +64,9 @@ def test_one_row_says_what_it_cannot_tell_and_its_correction_keeps_that() -> Non
 def test_too_short_a_scan_says_how_long_it_must_be() -> None:
     short, rng = scan(180.0)
     why = short.data(rng).align().alignment.refused["axis_column_px"]
-    assert "the views span 179 deg; half a turn and the fan, 187.7 deg in small steps" in why
+    assert (
+        "the views span 179 deg; half a turn and the fan, 187.7 deg in small steps" in why
+    )
 
 
 def test_rows_far_from_the_plane_of_the_source_are_refused() -> None:
@@ -77,7 +80,9 @@ def test_rows_far_from_the_plane_of_the_source_are_refused() -> None:
     assert "lean too much" in high.align().alignment.refused["axis_column_px"]
 
 
-@pytest.mark.filterwarnings("ignore:no accuracy is claimed")  # rightly, of the panel aside
+@pytest.mark.filterwarnings(
+    "ignore:no accuracy is claimed"
+)  # rightly, of the panel aside
 @pytest.mark.parametrize("turn", [360.0, 200.0])
 def test_one_row_from_simulate_over_align_to_a_volume(turn: float) -> None:
     """The axis stands 2.3 px beside its place; the slice is that of the true geometry."""
@@ -87,10 +92,14 @@ def test_one_row_from_simulate_over_align_to_a_volume(turn: float) -> None:
         {"kind": "sphere", "center": [-7, -4, 0], "radius": 3, "material": "aluminium"},
     ]
     nominal, true = (
-        fx.ConeVec.circular(sod=300, sdd=450, angles=angles, shape=shape, pixel=0.5, offset=(by, 0))
+        fx.ConeVec.circular(
+            sod=300, sdd=450, angles=angles, shape=shape, pixel=0.5, offset=(by, 0)
+        )
         for by in (0.0, 2.3 * 0.5)
     )
-    seen = fx.simulate(balls, true, noise=1, rays=3, tube=fx.Tube(mono_keV=60, power_W=40))
+    seen = fx.simulate(
+        balls, true, noise=1, rays=3, tube=fx.Tube(mono_keV=60, power_W=40)
+    )
     data = fx.DataSet.from_arrays(seen.counts(), nominal, dark=seen.dark, flat=seen.flat)
     found = fx.align(data)
     told = found.parameters["axis_column_px"]

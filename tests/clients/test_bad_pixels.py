@@ -16,17 +16,23 @@ from flexdt.twin.reconstruction.consistency.pixels import bad_pixels
 
 SHAPE = (24, 64)
 OPEN = 30_000.0
-SCAN = ConeVec.circular(sod=200.0, sdd=400.0, angles=np.arange(90) * 4.0, shape=SHAPE, pixel=1.6)
+SCAN = ConeVec.circular(
+    sod=200.0, sdd=400.0, angles=np.arange(90) * 4.0, shape=SHAPE, pixel=1.6
+)
 
 
 def counts_of(seed: int) -> np.ndarray:
     """Counts of a cylinder with two rods off the axis, with noise, (n, rows, cols)."""
     solids = [
-        bias_bound.Solid("cylinder", np.zeros(3), np.array([17.0, 17.0, 90.0]), 0.0, 0.03),
+        bias_bound.Solid(
+            "cylinder", np.zeros(3), np.array([17.0, 17.0, 90.0]), 0.0, 0.03
+        ),
         bias_bound.Solid(
             "cylinder", np.array([9.0, 4.0, 0.0]), np.array([2.0, 2.0, 90.0]), 0.0, 0.05
         ),
-        bias_bound.Solid("box", np.array([-7.0, 6.0, 0.0]), np.array([2.0, 3.0, 5.0]), 0.4, -0.03),
+        bias_bound.Solid(
+            "box", np.array([-7.0, 6.0, 0.0]), np.array([2.0, 3.0, 5.0]), 0.4, -0.03
+        ),
     ]
     integrals = bias_bound.Scan("", SCAN, SHAPE, solids, 0.0, 0.0, 0).images()
     light = np.random.default_rng(seed).poisson(OPEN * np.exp(-integrals))
@@ -58,7 +64,9 @@ def reconstructed(counts: np.ndarray, **options: bool) -> tuple[Volume, list[str
     data = DataSet.from_arrays(counts, SCAN, flat=flat, dark=np.zeros(SHAPE))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        volume = data.reconstruct("fdk", voxel=0.8, shape=(12, 60, 60), errors=False, **options)
+        volume = data.reconstruct(
+            "fdk", voxel=0.8, shape=(12, 60, 60), errors=False, **options
+        )
     return volume, [str(one.message) for one in said]
 
 
@@ -92,7 +100,9 @@ def test_rings_are_corrected_where_there_are_some_and_nowhere_else() -> None:
     clean = body(reconstructed(counts)[0]).std()
     gain = np.random.default_rng(1).normal(1.0, 0.01, SHAPE)
     ringed = np.clip(counts * gain, 0, 65535).astype(np.uint16)
-    with_rings, without = (body(reconstructed(ringed, rings=on)[0]).std() for on in (False, True))
+    with_rings, without = (
+        body(reconstructed(ringed, rings=on)[0]).std() for on in (False, True)
+    )
     assert without**2 - clean**2 < 0.5 * (with_rings**2 - clean**2)
     assert body(reconstructed(counts, rings=True)[0]).std() < 1.02 * clean
 

@@ -1,7 +1,7 @@
 """Calibration of anybody's data: markers of unknown positions, marked by hand, foreign frames.
 
-Images and annotations come from the rays and planes of `examples/research/prior_coverage.py`, which
-share nothing with the fit.
+Images and annotations come from the rays and planes of `examples/research/prior_coverage.py`,
+which share nothing with the fit.
 """
 
 from __future__ import annotations
@@ -48,7 +48,15 @@ def test_unknown_markers_are_found_in_foreign_float_images(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames, geometry = str(written / "frames"), str(written / "geometry.json")
-    words = ["calibrate", "--frames", frames, "--geometry", geometry, "--phantom", "unknown"]
+    words = [
+        "calibrate",
+        "--frames",
+        frames,
+        "--geometry",
+        geometry,
+        "--phantom",
+        "unknown",
+    ]
     assert run([*words, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["rms_px"] < 0.05
@@ -71,7 +79,13 @@ def test_unknown_markers_are_found_in_foreign_float_images(
 def test_annotations_by_hand_are_fitted_by_one_command(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["calibrate", "--geometry", str(written / "geometry.json"), "--phantom", "unknown"]
+    words = [
+        "calibrate",
+        "--geometry",
+        str(written / "geometry.json"),
+        "--phantom",
+        "unknown",
+    ]
     words += ["--markers", str(written / "markers.csv")]
     truth, _, beads, _ = study.marked(3, 16, 12, study.HAND_PX, 0.2)
     mm = np.linalg.norm(beads[0] - beads[5])
@@ -89,7 +103,9 @@ def test_annotations_by_hand_are_fitted_by_one_command(
 
 
 def test_the_example_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "calibrate-any-scanner.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "calibrate-any-scanner.md").read_text(
+        "utf-8"
+    )
     block = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
@@ -103,7 +119,14 @@ def test_the_example_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_annotated_beads_of_a_known_phantom(tmp_path: Path) -> None:
     beads = load_phantom("lego").beads
     angles = 36.0 * np.arange(10)
-    truth = {"dO_x": 3.0, "dO_y": -2.0, "dO_z": 5.0, "alpha": 130.0, "tau_x": 0.5, "tau_z": -0.3}
+    truth = {
+        "dO_x": 3.0,
+        "dO_y": -2.0,
+        "dO_z": 5.0,
+        "alpha": 130.0,
+        "tau_x": 0.5,
+        "tau_z": -0.3,
+    }
     tracks = pixels(beads, angles, SOD, truth)
     tracks += 0.1 * np.random.default_rng(1).normal(size=tracks.shape)
     tracks[2, 1] = np.nan
@@ -116,16 +139,30 @@ def test_annotated_beads_of_a_known_phantom(tmp_path: Path) -> None:
         assert abs(p["value"] - true) < 4 * p["sigma"]  # type: ignore[operator]
     assert found.document["detections"] == 49
     rows = [
-        (i, str(k), *tracks[i, k].tolist(), None) for i, k in np.ndindex(10, 5) if (i, k) != (2, 1)
+        (i, str(k), *tracks[i, k].tolist(), None)
+        for i, k in np.ndindex(10, 5)
+        if (i, k) != (2, 1)
     ]
     same = fx.calibrate(None, "lego", geometry=scan, markers=rows)
     assert same.parameters == found.parameters
     numbered = [(i, int(k), *rest) for i, k, *rest in rows]
-    assert fx.calibrate(None, "lego", geometry=scan, markers=numbered).parameters == same.parameters
-    for bad in (7, (0, "1", 3.0, 4.0), (0.5, "1", 3.0, 4.0, None), (0, "1", "left", 4.0, None)):
-        with pytest.raises(TwinError, match=r"mark 1 is .* allowed: \(frame, marker, column, row"):
+    assert (
+        fx.calibrate(None, "lego", geometry=scan, markers=numbered).parameters
+        == same.parameters
+    )
+    for bad in (
+        7,
+        (0, "1", 3.0, 4.0),
+        (0.5, "1", 3.0, 4.0, None),
+        (0, "1", "left", 4.0, None),
+    ):
+        with pytest.raises(
+            TwinError, match=r"mark 1 is .* allowed: \(frame, marker, column, row"
+        ):
             fx.calibrate(None, "lego", geometry=scan, markers=[rows[0], bad])
-    with pytest.raises(TwinError, match="marker '4' is no bead of 'normal-4'; allowed: 0 to 3"):
+    with pytest.raises(
+        TwinError, match="marker '4' is no bead of 'normal-4'; allowed: 0 to 3"
+    ):
         fx.calibrate(None, "normal-4", geometry=scan, markers=tmp_path / "seen.npy")
     with pytest.raises(TwinError, match="no data: allowed with geometry and markers"):
         fx.calibrate(None, "lego", geometry=scan)
@@ -138,7 +175,10 @@ def test_any_program_s_geometry_goes_with_marked_beads(
     angles = 36.0 * np.arange(10)
     truth = {"dO_x": 1.5, "dO_y": 0.7, "alpha": 20.0}
     tracks = pixels(load_phantom("lego").beads, angles, SOD, truth)
-    np.save(tmp_path / "seen.npy", tracks + 0.05 * np.random.default_rng(2).normal(size=(10, 5, 2)))
+    np.save(
+        tmp_path / "seen.npy",
+        tracks + 0.05 * np.random.default_rng(2).normal(size=(10, 5, 2)),
+    )
     study.geometry(angles).save(tmp_path / f"scan.{ending}")
     words = ["calibrate", "--markers", str(tmp_path / "seen.npy"), "--phantom", "lego", "--json",
              "--geometry", str(tmp_path / f"scan.{ending}")]  # fmt: skip
@@ -153,7 +193,8 @@ def test_any_program_s_geometry_goes_with_marked_beads(
 
 
 @pytest.mark.parametrize(
-    ("columns", "named"), [(slice(9, 12), "rows upwards"), (slice(6, 9), "from right to left")]
+    ("columns", "named"),
+    [(slice(9, 12), "rows upwards"), (slice(6, 9), "from right to left")],
 )
 def test_a_panel_counted_the_other_way_is_named(
     columns: slice, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -177,7 +218,9 @@ def test_compressed_images_of_another_writer_are_read(tmp_path: Path) -> None:
         packed = [cv2.IMWRITE_TIFF_COMPRESSION, how]
         assert cv2.imwrite(str(tmp_path / f"p{i}.tif"), image, packed)
     for name in ("di0.tif", "io0.tif"):
-        cv2.imwrite(str(tmp_path / name), np.full((40, 50), 1000 * (name[0] == "i"), np.uint16))
+        cv2.imwrite(
+            str(tmp_path / name), np.full((40, 50), 1000 * (name[0] == "i"), np.uint16)
+        )
     scan = fx.ConeVec.circular(sod=100, sdd=200, angles=3, pixel=1)
     np.testing.assert_array_equal(fx.read_tiffs(tmp_path, scan).counts(), images)
     short = (tmp_path / "p1.tif").read_bytes()[:600]
@@ -214,7 +257,9 @@ def test_linking_finds_what_turns(seen: tuple[fx.DataSet, list[Detections]]) -> 
 
 
 @pytest.mark.slow
-def test_linking_refuses_what_does_not_turn(seen: tuple[fx.DataSet, list[Detections]]) -> None:
+def test_linking_refuses_what_does_not_turn(
+    seen: tuple[fx.DataSet, list[Detections]],
+) -> None:
     """All spots are there, but the angles are not those of the images."""
     data, spots = seen
     wrong = np.random.default_rng(0).permutation(16)
@@ -236,12 +281,16 @@ def test_points_seen_from_one_direction_are_nowhere() -> None:
 def test_spots_of_two_pixels_and_more_need_no_option(radius_mm: float) -> None:
     rng = np.random.default_rng(4)
     beads = np.array([[-9.0, 4, 15], [8, -5, 6], [0, 9, -3], [-6, -8, -14], [10, 3, -22]])
-    (image,) = radiographs(rng, beads, np.array([20.0]), SOD, {}, radius_mm, 0.5 / radius_mm)
+    (image,) = radiographs(
+        rng, beads, np.array([20.0]), SOD, {}, radius_mm, 0.5 / radius_mm
+    )
     seen = detect_beads(image)
     true = pixels(beads, np.array([20.0]), SOD, {})[0]
     assert len(seen) == 5
     assert np.linalg.norm(seen.centers[:, None] - true, axis=2).min(axis=1).max() < 0.15
-    assert np.median(seen.radii_px) == pytest.approx(radius_mm * SDD / SOD / PIXEL, rel=0.1)
+    assert np.median(seen.radii_px) == pytest.approx(
+        radius_mm * SDD / SOD / PIXEL, rel=0.1
+    )
 
 
 def test_nothing_detected_says_what_was_looked_for(tmp_path: Path) -> None:
@@ -251,7 +300,10 @@ def test_nothing_detected_says_what_was_looked_for(tmp_path: Path) -> None:
     scan = study.geometry(120.0 * np.arange(3))
     found = fx.calibrate(tmp_path, "lego", geometry=scan)
     (said,) = [f.text for f in found.calibration.errors]
-    assert "looked for were round spots, darker than what is round them, of 7.7 to 17.7 px" in said
+    assert (
+        "looked for were round spots, darker than what is round them, of 7.7 to 17.7 px"
+        in said
+    )
     found = fx.calibrate(tmp_path, "lego", geometry=scan, radius=3)
     assert "of 2.0 to 4.5 px radius" in found.calibration.errors[0].text
     with pytest.raises(TwinError, match=r"radius 0.2 px; allowed: 1.5 to 60"):
@@ -273,7 +325,9 @@ def test_float_images_are_counts_or_line_integrals(tmp_path: Path) -> None:
         data = fx.read_tiffs(folder, scan)
         assert data.line_integrals() == pytest.approx(integrals, abs=3e-4)
     tifffile.imwrite(folder / "p1.tif", np.zeros((3, 5), np.float32))
-    with pytest.raises(TwinError, match=r"p1.tif has 5 x 3 pixels, the data set has 5 x 4"):
+    with pytest.raises(
+        TwinError, match=r"p1.tif has 5 x 3 pixels, the data set has 5 x 4"
+    ):
         fx.read_tiffs(folder, scan)
     tifffile.imwrite(folder / "p1.tif", np.full((4, 5), np.nan, np.float32))
     with pytest.raises(TwinError, match=r"p1.tif has pixels that are no numbers"):
@@ -290,12 +344,17 @@ def test_float_images_are_counts_or_line_integrals(tmp_path: Path) -> None:
         ("view,point,u,v,sigma\n9,a,1,2,0.5\n", "allowed: frames 0 to 3"),
         ("view,point,u,v,sigma\n0,a,1,2,0\n", "sigma above 0"),
         ("view,point,u,v,sigma\n0,a,1,2,inf\n", "sigma above 0 to 10000"),
-        ("frame,marker,x,y\n0,a,inf,2\n", "line 2: pixel (inf, 2); allowed: up to 100000"),
+        (
+            "frame,marker,x,y\n0,a,inf,2\n",
+            "line 2: pixel (inf, 2); allowed: up to 100000",
+        ),
         ("frame,marker,x,y\n0,a,1,-1e12\n", "allowed: up to 100000"),
         ("frame,marker\r,x,y\n0,a,1,2\n", "cannot read"),
     ],
 )
-def test_files_of_markers_that_do_not_hold_say_where(tmp_path: Path, text: str, says: str) -> None:
+def test_files_of_markers_that_do_not_hold_say_where(
+    tmp_path: Path, text: str, says: str
+) -> None:
     file = tmp_path / "markers.csv"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(TwinError, match=r"markers.csv") as caught:
@@ -305,7 +364,9 @@ def test_files_of_markers_that_do_not_hold_say_where(tmp_path: Path, text: str, 
 
 def test_files_of_markers(tmp_path: Path) -> None:
     file = tmp_path / "markers.csv"
-    file.write_text("row,Column,id,frame,sigma\n2,1,10,0,.3\n\n4,3,9,1,.2\n,,9,0,1\n", "utf-8")
+    file.write_text(
+        "row,Column,id,frame,sigma\n2,1,10,0,.3\n\n4,3,9,1,.2\n,,9,0,1\n", "utf-8"
+    )
     found = read_markers(file, 2)
     assert found.names == ("9", "10")
     assert found.tracks[0, 1].tolist() == [1.0, 2.0]
@@ -313,7 +374,9 @@ def test_files_of_markers(tmp_path: Path) -> None:
     assert np.isnan(found.tracks[0, 0]).all()
     assert found.sigma[1, 0] == 0.2
     np.save(tmp_path / "flat.npy", np.zeros((2, 3)))
-    with pytest.raises(TwinError, match=r"shape \(2, 3\); allowed: \(2 frames, markers, 2\)"):
+    with pytest.raises(
+        TwinError, match=r"shape \(2, 3\); allowed: \(2 frames, markers, 2\)"
+    ):
         read_markers(tmp_path / "flat.npy", 2)
     np.save(tmp_path / "complex.npy", np.zeros((2, 3, 2), np.complex128))
     np.save(tmp_path / "far.npy", np.full((2, 3, 2), np.inf))
@@ -334,8 +397,11 @@ def test_files_of_markers(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.daily(1)
-def test_what_is_wrong_with_unknown_markers_is_named(change: Any, code: str | None) -> None:
-    """And where nothing is, nothing is said: the markers' own frame is no value held exactly."""
+def test_what_is_wrong_with_unknown_markers_is_named(
+    change: Any, code: str | None
+) -> None:
+    """And where nothing is, nothing is said: the markers' own frame is no value held
+    exactly."""
     _, angles, _, markers = study.marked(1, 12, 8, 0.1, 0.0)
     data = markers_alone(study.geometry(angles), "marks")
     marked = replace(markers, tracks=np.array(change(markers.tracks)))
@@ -354,15 +420,25 @@ def test_scales_of_another_form_are_refused(text: str) -> None:
         Scale.of(text)
 
 
-def test_options_that_do_not_go_together(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_that_do_not_go_together(
+    written: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     geometry, markers = str(written / "geometry.json"), str(written / "markers.csv")
     words = ["calibrate", "--geometry", geometry, "--phantom"]
     for more, code, says in (
         (["unknown"], 2, "no data set; allowed: --frames DIR or --markers FILE"),
         (["lego", "--markers", markers], 1, "is no bead of 'lego'; allowed: 0 to 4"),
         (["lego", "--markers", markers, "--scale", "0-1=5"], 1, "states its own size"),
-        (["unknown", "--markers", markers, "--scale", "0-99=5"], 1, "no marker '99'; allowed: 0"),
-        (["unknown", "--markers", markers, "--scale", "0-0=5"], 1, "allowed: two markers"),
+        (
+            ["unknown", "--markers", markers, "--scale", "0-99=5"],
+            1,
+            "no marker '99'; allowed: 0",
+        ),
+        (
+            ["unknown", "--markers", markers, "--scale", "0-0=5"],
+            1,
+            "allowed: two markers",
+        ),
         (["unknown", "--markers", str(written / "none.csv")], 1, "none.csv"),
     ):
         assert run([*words, *more]) == code
@@ -370,14 +446,17 @@ def test_options_that_do_not_go_together(written: Path, capsys: pytest.CaptureFi
 
 
 def test_poses_do_not_matter() -> None:
-    """The machine's own poses and those told from the vectors give the same marker positions."""
+    """The machine's own poses and those told from the vectors give the same marker
+    positions."""
     truth, angles, _, markers = study.marked(1, 12, 6, 0.1, 0.0)
     told = markers_alone(study.geometry(angles), "vectors")
     u, v = [PIXEL, 0, 0], [0, 0, -PIXEL]
     own = Poses([0, 0, 0], [0, SOD, 0], [0, SDD, 0], u, v, np.radians(angles))
     found = []
     for data in (told, replace(told, nominal=own)):
-        result, _ = calibrate_unknown(data, None, markers, CalibrationRequest(free=("dO_x",)))
+        result, _ = calibrate_unknown(
+            data, None, markers, CalibrationRequest(free=("dO_x",))
+        )
         assert result.fit is not None
         found.append(result.fit)
     assert found[0].beads == pytest.approx(found[1].beads, abs=1e-3)

@@ -1,4 +1,5 @@
-"""Calibration and comparison of folders: from TIFFs and texts alone, damaged ones, the report."""
+"""Calibration and comparison of folders: from TIFFs and texts alone, damaged ones, the
+report."""
 
 from __future__ import annotations
 
@@ -57,7 +58,9 @@ def copy(folder: Path, tmp_path: Path) -> Path:
     return target
 
 
-def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_path: Path) -> None:
+def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(
+    copy: Path, tmp_path: Path
+) -> None:
     outcome = calibrate_datasets([load_dataset(copy)], "lego")
     document = outcome.document
     assert document["identifiable"] is True
@@ -72,7 +75,9 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
         assert found["sigma"] < SIGMA_MOST.get(name, 0.5)
     (seen,) = document["image_space"]  # type: ignore[misc]
     assert seen["axis_column"]["sigma"] < 0.002
-    assert seen["magnification"]["sigma"] < 1.5e-3 * seen["magnification"]["value"], "its scale's"
+    assert seen["magnification"]["sigma"] < 1.5e-3 * seen["magnification"]["value"], (
+        "its scale's"
+    )
     exact = CalibrationRequest(free=SIX, bead_tolerance_mm=0.0)
     found = calibrate_datasets([load_dataset(copy)], "lego", exact).document
     (seen,) = found["image_space"]  # type: ignore[misc]
@@ -85,7 +90,9 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
         )
     )
     assert not inside_95(outcome, TRUTH | {"dO_x": 2.0})
-    assert not inside_95(outcome, TRUTH | {"det_roll": 1.0})  # not estimated, so assumed absent
+    assert not inside_95(
+        outcome, TRUTH | {"det_roll": 1.0}
+    )  # not estimated, so assumed absent
     json.dumps(document, allow_nan=False)
     write_report(outcome, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
@@ -95,7 +102,9 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
     used = outcome.calibration.fit.certificate.used.sum()  # type: ignore[union-attr]
     groups = dict(
         re.findall(
-            r'<g id="[^"]*residuals-over-the-detector[^"]*-bead-(.+?)">(.*?)</g>', page, re.S
+            r'<g id="[^"]*residuals-over-the-detector[^"]*-bead-(.+?)">(.*?)</g>',
+            page,
+            re.S,
         )
     )
     lines, dots = (
@@ -113,8 +122,8 @@ def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(copy: Path, tmp_pat
 
 
 def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
-    """Calibration reads a folder; nothing in it tells the truth it was made with: none of the six
-    values, in mm, degrees or radians, in figures or as the bytes of a float."""
+    """Calibration reads a folder; nothing in it tells the truth it was made with: none of the
+    six values, in mm, degrees or radians, in figures or as the bytes of a float."""
     values = [*TRUTH.values(), math.radians(TRUTH["alpha"])]
     digits = [f"{abs(v):.9f}".lstrip("0").removeprefix(".")[:7].encode() for v in values]
     packed = [struct.pack(order, v) for v in values for order in ("<d", ">d")]
@@ -167,7 +176,9 @@ def test_the_command_knows_readings_scans_and_what_is_held(
     assert mount["dO_y"] == pytest.approx(printed["dO_y"], abs=1e-6)
     assert set(values("--per-scan", "alpha")) == set(printed)  # one scan: the same
     assert run([*words, "--per-scan", "alpha", "--free", "dO_x"]) == 1
-    assert "alpha is to have a value in each scan but is not free" in capsys.readouterr().err
+    assert (
+        "alpha is to have a value in each scan but is not free" in capsys.readouterr().err
+    )
     four = ("--free", "dO_x,dO_y,dO_z,alpha")
     assert values(*four)["tau_x"] == pytest.approx(printed["tau_x"], abs=1e-3)
     assert run([*words, *four, "--prior", "none"]) == 5
@@ -183,19 +194,25 @@ def test_some_of_the_same_images_are_no_second_scan(
     for file in copy.glob("scan_*.tif"):
         if int(file.stem[-6:]) % 5:
             file.unlink()
-    with pytest.raises(TwinError, match=r"same images \(8 of 37 frames\); give each image once"):
+    with pytest.raises(
+        TwinError, match=r"same images \(8 of 37 frames\); give each image once"
+    ):
         calibrate_datasets([load_dataset(folder), load_dataset(copy)], "lego")
 
 
 def test_what_cannot_be_asked_for(folder: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown parameter 'foo'; allowed: dO_x"):
-        calibrate_datasets([load_dataset(folder)], "lego", CalibrationRequest(free=("dO_x", "foo")))
+        calibrate_datasets(
+            [load_dataset(folder)], "lego", CalibrationRequest(free=("dO_x", "foo"))
+        )
     with pytest.raises(TwinError, match="no parameter is free"):
         CalibrationRequest(free=())
     for tolerance in (-1.0, float("nan"), float("inf")):
         with pytest.raises(TwinError, match="bead tolerance"):
             CalibrationRequest(bead_tolerance_mm=tolerance)
-    with pytest.raises(TwinError, match="tau_x is to have a value in each scan but is not free"):
+    with pytest.raises(
+        TwinError, match="tau_x is to have a value in each scan but is not free"
+    ):
         CalibrationRequest(free=("dO_x",), per_scan=("tau_x",))
 
 
@@ -251,7 +268,9 @@ def test_a_phantom_must_exist_and_have_beads(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_path: Path) -> None:
+def test_compare_shows_the_correction_removing_the_difference(
+    copy: Path, tmp_path: Path
+) -> None:
     comparison = compare_folder(copy, "lego", 0.5)
     document = comparison.document
     assert comparison.within
@@ -269,7 +288,9 @@ def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_pa
 
 
 @pytest.mark.slow
-def test_tracks_tell_where_the_beads_are_before_and_after(folder: Path, tmp_path: Path) -> None:
+def test_tracks_tell_where_the_beads_are_before_and_after(
+    folder: Path, tmp_path: Path
+) -> None:
     outcome = calibrate_datasets([load_dataset(folder)], "lego")
     write_tracks(outcome, tmp_path / "tracks.json")
     (scan,) = json.loads((tmp_path / "tracks.json").read_text())["datasets"]
@@ -279,7 +300,8 @@ def test_tracks_tell_where_the_beads_are_before_and_after(folder: Path, tmp_path
     for when in ("before", "after"):
         rms = compared[when]["rms_px"]  # type: ignore[index]
         assert scan[f"rms_{when}_px"] == pytest.approx(rms, rel=1e-6)
-    # The truth's own projection of the beads, by the geometry alone: sizes bias shadows by < 0.1.
+    # The truth's own projection of the beads, by the geometry alone: sizes bias shadows by <
+    # 0.1.
     dataset = load_dataset(folder)
     true = dataset.poses.cone_vec(Offsets.from_edge(TRUTH))
     wanted = true.project_points(load_phantom("lego").beads, dataset.shape)

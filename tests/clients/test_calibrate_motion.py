@@ -49,14 +49,20 @@ def test_a_screw_is_followed_from_calibration_to_volume(
     assert any("--per-frame" in p["text"] for p in told["problems"])
     assert run([*words, "--per-frame", "dO_y,alpha", "--report", str(report)]) == 0
     said = capsys.readouterr().out
-    assert "dO_y moves by 0.98" in said or "dO_y moves by 0.99" in said or "dO_y moves by 1" in said
+    assert (
+        "dO_y moves by 0.98" in said
+        or "dO_y moves by 0.99" in said
+        or "dO_y moves by 1" in said
+    )
     page = tmp_path / "report.html"
     assert run([*words, "--per-frame", "dO_y", "--report", str(page)]) == 0
     assert "rising: dO_y during the scan" in page.read_text("utf-8")
     document = json.loads(report.read_text("utf-8"))
     assert document["rms_px"] < 0.05
     motion = Motion.from_dict(document["motion"][0])
-    np.testing.assert_allclose(motion.values[:, 0], np.linspace(-0.5, 0.5, VIEWS), atol=0.003)
+    np.testing.assert_allclose(
+        motion.values[:, 0], np.linspace(-0.5, 0.5, VIEWS), atol=0.003
+    )
 
     beads = np.asarray(fx.phantoms.lego().beads)
     for format, ending in (("csv", "csv"), ("rtk", "xml"), ("ctsimu", "json")):
@@ -64,7 +70,16 @@ def test_a_screw_is_followed_from_calibration_to_volume(
         words = ["export", str(folder), "--format", format, "--out", str(out)]
         assert run([*words, "--correction", str(report)]) == 0
         back = tmp_path / f"{format}.json"
-        words = ["import", str(out), "--format", format, "--out", str(back), "--like", str(folder)]
+        words = [
+            "import",
+            str(out),
+            "--format",
+            format,
+            "--out",
+            str(back),
+            "--like",
+            str(folder),
+        ]
         assert run(words) == 0
         written = fx.ConeVec.load(back)
         off = written.project_points(beads, SHAPE) - true.project_points(beads, SHAPE)
@@ -99,11 +114,15 @@ def test_what_is_held_is_not_taken_for_motion(tmp_path: Path) -> None:
     truth, frames, deviation = study.truths(rng, "jitter", turn)
     for one in (truth, *frames):
         one["tau_x"] = one["tau_z"] = 0.0
-    tracks = [pixels(beads, 360.0 * turn[i : i + 1], SOD, one) for i, one in enumerate(frames)]
+    tracks = [
+        pixels(beads, 360.0 * turn[i : i + 1], SOD, one) for i, one in enumerate(frames)
+    ]
     seen = np.concatenate(tracks) + 0.02 * rng.normal(size=(60, len(beads), 2))
     np.save(tmp_path / "seen.npy", seen)
     angles = np.degrees(2 * np.pi * turn)
-    scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=angles, shape=STUDY_SHAPE, pixel=PIXEL)
+    scan = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=angles, shape=STUDY_SHAPE, pixel=PIXEL
+    )
     exact = dict.fromkeys(set(NAMES) - {"dO_x", "dO_y", "dO_z", "alpha"}, 0.0)
     found = fx.calibrate(
         None, "lego", geometry=scan, markers=tmp_path / "seen.npy", priors=exact,
@@ -126,5 +145,11 @@ def test_what_is_held_is_not_taken_for_motion(tmp_path: Path) -> None:
 def test_motion_on_the_command_line_is_checked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["calibrate", str(tmp_path), "--phantom", "lego", "--per-frame", "tau_x"]) == 1
-    assert "'tau_x' cannot differ from frame to frame; allowed: dO_x" in capsys.readouterr().err
+    assert (
+        run(["calibrate", str(tmp_path), "--phantom", "lego", "--per-frame", "tau_x"])
+        == 1
+    )
+    assert (
+        "'tau_x' cannot differ from frame to frame; allowed: dO_x"
+        in capsys.readouterr().err
+    )

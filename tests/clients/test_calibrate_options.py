@@ -1,4 +1,5 @@
-"""A calibration has the same options in Python and on the command line, and each has its effect."""
+"""A calibration has the same options in Python and on the command line, and each has its
+effect."""
 
 from __future__ import annotations
 
@@ -43,7 +44,12 @@ def named(function: Any) -> set[str]:
 def test_python_and_the_command_have_the_same_options() -> None:
     declared = set(CalibrationOptions.__annotations__)
     assert named(fx.calibrate) == declared | {"data", "phantom", "geometry", "progress"}
-    assert named(fx.DataSet.calibrate) == declared | {"self", "phantom", "geometry", "progress"}
+    assert named(fx.DataSet.calibrate) == declared | {
+        "self",
+        "phantom",
+        "geometry",
+        "progress",
+    }
     command = {RENAMED.get(n, n) for n in named(calibrate_commands.calibrate)}
     settings = {f.name for f in fields(CalibrateSettings)} - {"command"}
     assert (command | settings) - OF_FILES - OF_THE_TWIN == declared | {"phantom"}
@@ -67,7 +73,9 @@ def test_an_option_that_is_none_has_its_default() -> None:
 
 def test_the_options_reach_the_calibration() -> None:
     scan = fx.ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-    data = fx.DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
+    data = fx.DataSet.from_arrays(
+        np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000)
+    )
     for calibrate in (data.calibrate, lambda *a, **o: fx.calibrate(data, *a, **o)):
         with pytest.raises(TwinError, match="dO_w"):
             calibrate("lego", per_scan=["dO_w"])

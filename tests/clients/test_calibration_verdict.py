@@ -42,16 +42,24 @@ def test_a_good_calibration_says_what_it_is_good_for(data: fx.DataSet) -> None:
     assert document["verdict"].startswith(
         f"Safe to reconstruct: the rotation axis is known to {sigma} px. Absolute position: to "
     )
-    asked = {n: p for n, p in document["parameters"].items() if p["asked"] and p["unit"] == "mm"}
+    asked = {
+        n: p
+        for n, p in document["parameters"].items()
+        if p["asked"] and p["unit"] == "mm"
+    }
     widest = max(asked, key=lambda name: asked[name]["sigma"])
-    assert f"{asked[widest]['sigma']:.2g} mm ({widest}), limited by" in document["verdict"]
+    assert (
+        f"{asked[widest]['sigma']:.2g} mm ({widest}), limited by" in document["verdict"]
+    )
     assert document["next"]
     for line in document["next"]:
         known(line)
 
 
 @pytest.mark.slow
-def test_what_forbids_a_calibration_is_said_first_with_what_to_type(data: fx.DataSet) -> None:
+def test_what_forbids_a_calibration_is_said_first_with_what_to_type(
+    data: fx.DataSet,
+) -> None:
     document: Any = data.calibrate("normal").document
     assert document["verdict"].startswith("Not to be used: ")
     assert document["problems"][0]["text"] in document["verdict"]
@@ -110,7 +118,9 @@ def test_ranges_hold_the_numbers(seed: int) -> None:
     rng = np.random.default_rng(seed)
     numbers = set(rng.integers(0, 30, 12).tolist())
     words = [word.split("-") for word in ranges(numbers).split(", ")]
-    assert {n for a, *b in words for n in range(int(a), int(b[0] if b else a) + 1)} == numbers
+    assert {
+        n for a, *b in words for n in range(int(a), int(b[0] if b else a) + 1)
+    } == numbers
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -39,7 +39,13 @@ from flexdt.protocol.rpc_errors import parse_error
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import serve
 
-AXIS = {"position": 1.0, "target": 1.0, "velocity": 0.0, "limits": [0, 2], "moving": False}
+AXIS = {
+    "position": 1.0,
+    "target": 1.0,
+    "velocity": 0.0,
+    "limits": [0, 2],
+    "moving": False,
+}
 STATE: dict[str, Any] = {
     "time": 1.5,
     "axes": {"mag_obj": AXIS},
@@ -183,7 +189,9 @@ def test_uploads_go_in_chunks_below_a_frame(fake: tuple[Fake, TwinClient]) -> No
     served, client = fake
     data = np.random.default_rng(0).bytes(9 * 2**20 + 3)
     seen: list[tuple[int, int]] = []
-    done = client.upload_mesh(data, "part", format="stl", progress=lambda *sent: seen.append(sent))
+    done = client.upload_mesh(
+        data, "part", format="stl", progress=lambda *sent: seen.append(sent)
+    )
     assert done.complete
     assert seen[-1] == (len(data), len(data))
     chunks = [p for name, p in served.calls if name == "sample.upload"]
@@ -197,7 +205,9 @@ def test_uploads_go_in_chunks_below_a_frame(fake: tuple[Fake, TwinClient]) -> No
         client.upload_mesh(b"x", "part")
 
 
-def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClient]) -> None:
+def test_every_method_of_the_wire_has_a_client_method(
+    fake: tuple[Fake, TwinClient],
+) -> None:
     served, client = fake
     calls: list[Callable[[], object]] = [
         lambda: client.control("acquire"),
@@ -274,7 +284,9 @@ def test_a_name_that_is_no_text_is_refused_before_it_is_sent(
     fake: tuple[Fake, TwinClient],
 ) -> None:
     served, client = fake
-    with pytest.raises(TypeError, match=r"axes\.move\.targets: the name 3 must be text, not int"):
+    with pytest.raises(
+        TypeError, match=r"axes\.move\.targets: the name 3 must be text, not int"
+    ):
         client.move({3: 1.0})  # type: ignore[dict-item]
     with pytest.raises(TypeError, match="the name b'x' must be text, not bytes"):
         client.submit_trajectory([{b"x": 1.0}])  # type: ignore[dict-item]
@@ -304,7 +316,9 @@ def test_reads_are_repeated_after_a_lost_connection_and_moves_are_not(
     served.lose_next = "state.get"
     assert client.state().time == 1.5
     served.lose_next = "axes.move"
-    with pytest.raises(ConnectionLost, match="not known whether it was carried out") as caught:
+    with pytest.raises(
+        ConnectionLost, match="not known whether it was carried out"
+    ) as caught:
         client.move({"mag_obj": 1})
     assert caught.value.sent
     assert [name for name, _ in served.calls].count("axes.move") == 1
@@ -348,7 +362,9 @@ def test_one_rate_and_view_a_topic(fake: tuple[Fake, TwinClient]) -> None:
     served, client = fake
     with client.subscribe("projection", "state", projection_binning=8):
         asked = len(served.calls)
-        with pytest.raises(ValueError, match=r"projection with projection_binning 32.* 8 already"):
+        with pytest.raises(
+            ValueError, match=r"projection with projection_binning 32.* 8 already"
+        ):
             client.subscribe("projection", projection_binning=32)
         with pytest.raises(ValueError, match="state with max_rate_hz 5"):
             client.subscribe("state", max_rate_hz=5.0)
@@ -378,7 +394,9 @@ def test_wait_job_reports_progress_until_the_end() -> None:
         assert isinstance(message, Request)
         if message.method == "job.status":
             return [Response(message.id, {"job": "job-1", "state": next(states)})]
-        return [Response(message.id, answer(message.method, Hello(protocol="1", client="x")))]
+        return [
+            Response(message.id, answer(message.method, Hello(protocol="1", client="x")))
+        ]
 
     seen: list[str] = []
     with TwinClient(transport=InProcessTransport(handler)) as client:
@@ -465,7 +483,9 @@ def served(port: int = 0, token: str | None = None) -> Iterator[_Served]:
 def test_over_a_real_socket(codec: Codec) -> None:
     with (
         served() as server,
-        TwinClient(transport=TcpTransport("127.0.0.1", server.port, codec=codec)) as client,
+        TwinClient(
+            transport=TcpTransport("127.0.0.1", server.port, codec=codec)
+        ) as client,
     ):
         assert_array_equal(client.projection().image, PIXELS)
         with client.subscribe("state") as events:
@@ -509,7 +529,8 @@ def test_a_wrong_token_is_refused_with_its_code() -> None:
 
 
 def broken_server(last: bytes) -> Iterable[tuple[int, list[str]]]:
-    """A server that greets, then answers every further request with `last` and ends the stream."""
+    """A server that greets, then answers every further request with `last` and ends the
+    stream."""
     listening = socket.create_server(("127.0.0.1", 0))
     asked: list[str] = []
 
@@ -534,12 +555,20 @@ def _serve_broken(connected: socket.socket, last: bytes, asked: list[str]) -> No
             if request.method != "session.hello":
                 connected.sendall(last)
                 return
-            connected.sendall(wire.send(Response(request.id, answer(request.method, Empty()))))
+            connected.sendall(
+                wire.send(Response(request.id, answer(request.method, Empty())))
+            )
 
 
 BROKEN = {
-    "half a frame": (Connection(Codec.MSGPACK).send(Response(2, {}))[:-3], "inside a message"),
-    "an answer nobody asked for": (Connection(Codec.MSGPACK).send(Response(77, {})), "not open"),
+    "half a frame": (
+        Connection(Codec.MSGPACK).send(Response(2, {}))[:-3],
+        "inside a message",
+    ),
+    "an answer nobody asked for": (
+        Connection(Codec.MSGPACK).send(Response(77, {})),
+        "not open",
+    ),
 }
 
 
@@ -549,7 +578,9 @@ def test_a_server_that_breaks_the_protocol_is_left(kind: str) -> None:
     with contextmanager(broken_server)(last) as (port, asked):
         with (
             TwinClient("127.0.0.1", port, timeout_s=60.0) as client,
-            pytest.raises(ConnectionLost, match=f"broke the protocol.*{why}.*not known whether"),
+            pytest.raises(
+                ConnectionLost, match=f"broke the protocol.*{why}.*not known whether"
+            ),
         ):
             client.stop()
 

@@ -65,7 +65,8 @@ endsolid corner
 
 
 class Shell:
-    """Calls either client's methods; an event loop runs only while one of its calls is awaited."""
+    """Calls either client's methods; an event loop runs only while one of its calls is
+    awaited."""
 
     def __init__(self, kind: str, address: tuple[str, int], codec: Codec) -> None:
         self.sent: set[str] = set()
@@ -156,7 +157,9 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert taken.image.max() > 0.1
     np.testing.assert_allclose(taken.cone_vec[:6], twin.geometry().cone_vec[:6])
 
-    assert 0.0 < twin.predict_exposure(frames=3, detail="void:0.1").transmission.least < 1.0
+    assert (
+        0.0 < twin.predict_exposure(frames=3, detail="void:0.1").transmission.least < 1.0
+    )
 
     poses = [{"rot_obj": float(a)} for a in (0, 5, 10)]
     assert twin.check_trajectory(poses, 50.0).frames == 3
@@ -197,22 +200,34 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert twin.forget_job(long).jobs == [long]
 
     name = f"mine-{twin.ping():.6f}"
-    assert twin.apply_calibration({"dD_x": 0.1}, name, comment="a test").correction.name == name
+    assert (
+        twin.apply_calibration({"dD_x": 0.1}, name, comment="a test").correction.name
+        == name
+    )
     assert twin.calibration().parameters["dD_x"] == 0.1
     assert name in {c.name for c in twin.calibrations().corrections}
     twin.revert_calibration()
     assert twin.delete_calibration(name).name == name
     for asked in (
         lambda: twin.fit_calibration(["gone"], "lego"),
-        lambda: twin.fit_calibration(["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None)]),
+        lambda: twin.fit_calibration(
+            ["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None)]
+        ),
         lambda: twin.align_dataset("gone"),
     ):
         with pytest.raises(RpcError, match="no data set 'gone'"):
             asked()
-    with pytest.raises(ValueError, match=r"mark 1 is \(0, '1', 3.0\); allowed: \(frame, marker, "):
-        twin.fit_calibration(["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None), (0, "1", 3.0)])  # type: ignore[list-item]
+    with pytest.raises(
+        ValueError, match=r"mark 1 is \(0, '1', 3.0\); allowed: \(frame, marker, "
+    ):
+        twin.fit_calibration(
+            ["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None), (0, "1", 3.0)]
+        )  # type: ignore[list-item]
     document = twin.save_scene("all of it")
-    assert twin.load_scene(json.loads(json.dumps(document))).axes["mag_obj"].position == 585.0
+    assert (
+        twin.load_scene(json.loads(json.dumps(document))).axes["mag_obj"].position
+        == 585.0
+    )
     assert twin.estop().safety.estop
     assert not twin.reset().safety.estop
     assert not twin.control("release").yours
@@ -234,13 +249,18 @@ def test_the_two_clients_have_the_same_methods_and_signatures() -> None:
     ]  # fmt: skip
     assert len(made) > 30
     for name in made:
-        theirs = [inspect.signature(getattr(c, name)) for c in (TwinClient, AsyncTwinClient)]
+        theirs = [
+            inspect.signature(getattr(c, name)) for c in (TwinClient, AsyncTwinClient)
+        ]
         assert theirs[0] == theirs[1], name
         assert next(iter(theirs[0].parameters)) == "self"
         assert "Flow" not in str(theirs[0].return_annotation), name
         assert inspect.iscoroutinefunction(getattr(AsyncTwinClient, name)), name
         assert getattr(TwinClient, name).__doc__ == getattr(methods, name).__doc__
-    public = [{n for n in vars(c) if not n.startswith("_")} for c in (TwinClient, AsyncTwinClient)]
+    public = [
+        {n for n in vars(c) if not n.startswith("_")}
+        for c in (TwinClient, AsyncTwinClient)
+    ]
     assert public[1] - public[0] == {"connect"}
     assert public[0] <= public[1]
 
@@ -254,9 +274,13 @@ def test_progress_may_be_a_coroutine_function(servers: Servers) -> None:
 
     async def main() -> None:
         async with AsyncTwinClient(*servers.address) as twin:
-            await twin.upload_mesh(CUBE, "told", format="stl", material="abs", progress=told)
+            await twin.upload_mesh(
+                CUBE, "told", format="stl", material="abs", progress=told
+            )
             poses = [{"rot_obj": float(a)} for a in range(3)]
-            job = (await twin.submit_trajectory(poses, 50.0, f"told-{await twin.ping():.6f}")).job
+            job = (
+                await twin.submit_trajectory(poses, 50.0, f"told-{await twin.ping():.6f}")
+            ).job
             assert (await twin.wait_job(job, told, poll_s=0.02)).state == "done"
 
     asyncio.run(main())
@@ -272,7 +296,9 @@ def test_hundreds_of_awaits_share_one_connection(servers: Servers) -> None:
             await twin.set_clock(20.0)
             # A motion that is waited for, and all the others beside it.
             await twin.set_axis("rot_obj", speed=30.0)
-            moving = asyncio.create_task(twin.move({"rot_obj": 90.0}, relative=True, wait=True))
+            moving = asyncio.create_task(
+                twin.move({"rot_obj": 90.0}, relative=True, wait=True)
+            )
             asked = [twin.ping() if i % 2 else twin.geometry() for i in range(300)]
             pictures = [twin.projection(binning=b) for b in (1, 2, 4, 8)]
             answers = await asyncio.gather(*asked)
@@ -288,7 +314,8 @@ def test_hundreds_of_awaits_share_one_connection(servers: Servers) -> None:
 
 
 async def until_moving(address: tuple[str, int], moving: asyncio.Task[Any]) -> None:
-    """Seen over a connection of its own: the server answers one connection's requests in order."""
+    """Seen over a connection of its own: the server answers one connection's requests in
+    order."""
     async with AsyncTwinClient(*address) as watcher:
         while not (await watcher.state()).axes["rot_obj"].moving:
             assert not moving.done(), moving.result()
@@ -299,7 +326,9 @@ def test_a_cancelled_call_leaves_the_connection_in_order(servers: Servers) -> No
     async def main() -> None:
         async with AsyncTwinClient(*servers.address) as twin:
             await twin.set_clock(1.0)
-            moving = asyncio.create_task(twin.move({"rot_obj": 30.0}, relative=True, wait=True))
+            moving = asyncio.create_task(
+                twin.move({"rot_obj": 30.0}, relative=True, wait=True)
+            )
             await until_moving(servers.address, moving)
             moving.cancel()
             with pytest.raises(asyncio.CancelledError):
@@ -355,8 +384,12 @@ def test_a_notebook_uses_both_clients(servers: Servers) -> None:
         "position",
         "twin.close()",
     ]
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(c) for c in cells])
-    NotebookClient(notebook, timeout=240, startup_timeout=240, kernel_name="python3").execute()
+    notebook = nbformat.v4.new_notebook(
+        cells=[nbformat.v4.new_code_cell(c) for c in cells]
+    )
+    NotebookClient(
+        notebook, timeout=240, startup_timeout=240, kernel_name="python3"
+    ).execute()
     picture, position, _ = (cell.outputs for cell in notebook.cells)
     assert picture[0].data["image/png"]
     assert picture[0].data["text/plain"].startswith("<Projection ")
@@ -491,8 +524,12 @@ def test_errors_arrive_where_a_flow_may_catch_them(shell: Shell) -> None:
 # -- the page ------------------------------------------------------------------------------------
 
 
-def test_the_pages_programmes_run(servers: Servers, capsys: pytest.CaptureFixture[str]) -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "clients.md").read_text("utf-8")
+def test_the_pages_programmes_run(
+    servers: Servers, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "clients.md").read_text(
+        "utf-8"
+    )
     blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len(blocks) == 2
     for block in blocks:
@@ -519,7 +556,9 @@ def test_the_asynchronous_client_brings_token_and_certificate(tmp_path: Path) ->
         async with AsyncTwinClient("localhost", server.port, token, ssl=trusted) as twin:
             assert (await twin.state()).time >= 0
         with pytest.raises(RpcError) as caught:
-            await AsyncTwinClient("localhost", server.port, "wrong", ssl=trusted).connect()
+            await AsyncTwinClient(
+                "localhost", server.port, "wrong", ssl=trusted
+            ).connect()
         assert caught.value.code == -32004
         strict = ssl.create_default_context()
         with pytest.raises(ConnectionLost, match="certificate"):

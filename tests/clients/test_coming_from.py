@@ -41,9 +41,13 @@ def test_our_side_of_a_page_runs(
     assert made.shape == (40, 38, 48)
     if page == "astra":
         paired = float(np.vdot(names["projections"], names["A"] @ names["array"]))
-        assert paired == pytest.approx(float(np.vdot(names["spread"], names["array"])), rel=1e-4)
+        assert paired == pytest.approx(
+            float(np.vdot(names["spread"], names["array"])), rel=1e-4
+        )
     if page != "gvxr":
-        assert names["found"].data[11:14, 7:12, 8:14].mean() == pytest.approx(0.05, rel=0.05)
+        assert names["found"].data[11:14, 7:12, 8:14].mean() == pytest.approx(
+            0.05, rel=0.05
+        )
 
 
 @pytest.mark.filterwarnings("default")  # theirs
@@ -68,11 +72,17 @@ def test_the_side_of_each_peer_that_is_installed_runs(example: ModuleType) -> No
         for caption, found in example.page(page).items():
             assert not found.get("geometry_mm", 0.0) > 1e-3, caption
             assert not found.get("mean_difference_part", 0.0) > 0.02, caption
-            if caption.split(",")[0] in installed & {"gVXR", "diffdrr", "CIL with flexdt"}:
+            if caption.split(",")[0] in installed & {
+                "gVXR",
+                "diffdrr",
+                "CIL with flexdt",
+            }:
                 assert found["error"] is None, caption
 
 
-def test_a_statement_that_fails_does_not_keep_the_others_from_running(example: ModuleType) -> None:
+def test_a_statement_that_fails_does_not_keep_the_others_from_running(
+    example: ModuleType,
+) -> None:
     names: dict[str, object] = {}
     found = example.run("a = 1\nimport no_such_peer\nb = a + 1\n", names)
     assert (found["ran"], names["b"]) == (2, 2)
@@ -84,9 +94,13 @@ def test_a_statement_that_fails_does_not_keep_the_others_from_running(example: M
 def test_the_lines_of_the_table_are_those_of_the_blocks(example: ModuleType) -> None:
     text = (example.PAGES / "five-tasks.md").read_text(encoding="utf-8")
     rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("|")]
-    header, *tasks = ([cell.strip() for cell in row] for row in rows if "---" not in row[0])
+    header, *tasks = (
+        [cell.strip() for cell in row] for row in rows if "---" not in row[0]
+    )
     library = (ROOT / "docs/library.md").read_text(encoding="utf-8")
-    ours = re.findall(r"^## (?!Geometry)[^\n]+\n+```python\n(.*?)```", library, re.M | re.S)
+    ours = re.findall(
+        r"^## (?!Geometry)[^\n]+\n+```python\n(.*?)```", library, re.M | re.S
+    )
     assert [int(row[1]) for row in tasks] == [len(_lines(block)) for block in ours[:5]]
     five = example.blocks("five-tasks")
     for caption, code in {**five, "gVXR, task 1": example.blocks("gvxr")["gVXR"]}.items():

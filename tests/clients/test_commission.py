@@ -1,5 +1,5 @@
-"""`flexdt commission` against laboratories whose hidden machine, texts, images and logs are made by
-`past_laboratory.py`, which uses nothing of flexdt, and against the one public log."""
+"""`flexdt commission` against laboratories whose hidden machine, texts, images and logs are
+made by `past_laboratory.py`, which uses nothing of flexdt, and against the one public log."""
 
 from __future__ import annotations
 
@@ -76,12 +76,17 @@ def test_the_command_writes_a_machine_a_profile_and_a_report(
     made, folders = lab
     out = tmp_path / "lab"
     words = [*map(str, folders), "--out", str(out)]
-    # The laboratory's limits are drawn without its bodies: its stage would go behind the source.
+    # The laboratory's limits are drawn without its bodies: its stage would go behind the
+    # source.
     assert run(["commission", *words, "--json"]) == 1
     said = capsys.readouterr()
     assert "machine.toml: `flexdt machine check` refuses it: " in said.err
     assert run(["machine", "check", str(out / "machine.toml")]) == 1
-    assert capsys.readouterr().err.count("SOD goes from") == said.err.count("SOD goes from") == 1
+    assert (
+        capsys.readouterr().err.count("SOD goes from")
+        == said.err.count("SOD goes from")
+        == 1
+    )
     document = json.loads(said.out)
     assert document["disagreements"][0]["about"] == "machine.toml"
     assert document == json.loads((out / "commission.json").read_text())
@@ -113,7 +118,8 @@ def test_the_scans_that_it_proposes_can_be_made(
     lab: tuple[Laboratory, list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """On a machine that keeps its shipped limits: the laboratory's are drawn without its bodies."""
+    """On a machine that keeps its shipped limits: the laboratory's are drawn without its
+    bodies."""
     folder = tmp_path / "past"
     shutil.copytree(lab[1][1], folder)
     (folder / "script_executed.txt").unlink()
@@ -121,7 +127,9 @@ def test_the_scans_that_it_proposes_can_be_made(
     assert run(["commission", "past", "--out", "lab", "--json"]) == 0
     proposed = json.loads(capsys.readouterr().out)["next"]
     assert 1 <= len(proposed) <= 3
-    assert [p["settles"] for p in proposed] == sorted(p["settles"] for p in proposed)[::-1]
+    assert [p["settles"] for p in proposed] == sorted(p["settles"] for p in proposed)[
+        ::-1
+    ]
     for scan in proposed:
         name, *words = scan["command"].split()
         assert name == "flexdt"
@@ -131,7 +139,9 @@ def test_the_scans_that_it_proposes_can_be_made(
 
 
 @pytest.mark.slow
-def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(tmp_path: Path) -> None:
+def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(
+    tmp_path: Path,
+) -> None:
     folder = bead_scan(tmp_path, {"dO_x": 0.31}, 31)
     found = commission([folder], None, read_log_file)
     assert list(found.findings) == []
@@ -141,7 +151,9 @@ def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(tmp_pa
     assert line.sigma is not None
     assert abs(line.value - usual.axs_tan - 0.31) < max(4 * line.sigma, 0.02)
     for name in ("src_ort", "c_obj", "c_det"):
-        assert found.offsets.lines[name].value == pytest.approx(getattr(usual, name), abs=1e-5)
+        assert found.offsets.lines[name].value == pytest.approx(
+            getattr(usual, name), abs=1e-5
+        )
     assert found.machine == builtin_machine()
 
 
@@ -156,7 +168,9 @@ def test_the_public_log_alone_and_the_same_as_traffic(tmp_path: Path) -> None:
     assert len(alone.fit.lines.rows) == len(twice.fit.lines.rows) == 57
     axis = alone.machine.axes["tra_obj"]
     assert (axis.lower, axis.upper, axis.max_speed) == (12.0, 319.0, 50.0)
-    assert any("unitom_xl is taken by the motors' limits" in q.why for q in alone.questions)
+    assert any(
+        "unitom_xl is taken by the motors' limits" in q.why for q in alone.questions
+    )
     assert alone.machine.name == "unitom_xl"
 
 
@@ -173,9 +187,12 @@ def test_folders_of_two_scanners_are_refused_with_the_folders_of_each(
     assert run(["commission", str(log), *words]) == 1
     said = capsys.readouterr().err
     assert (
-        f"unitom_xl (by the motors' limits in its executed script), no serial number: {log}" in said
+        f"unitom_xl (by the motors' limits in its executed script), no serial number: {log}"
+        in said
     )
-    assert f"flexray (by its settings text), serial number 042_0001: {folders[0]}, " in said
+    assert (
+        f"flexray (by its settings text), serial number 042_0001: {folders[0]}, " in said
+    )
     assert run(["commission", *words, "--traffic", str(LOG)]) == 1
     assert str(LOG) in capsys.readouterr().err
     text = (folders[1] / "scan settings.txt").read_text()
@@ -188,7 +205,8 @@ def test_folders_of_two_scanners_are_refused_with_the_folders_of_each(
 
 
 def saved(count: int, single: bool) -> bytes:
-    """A script of so many projections: one sequence, or single images, besides a dark and flats."""
+    """A script of so many projections: one sequence, or single images, besides a dark and
+    flats."""
     single_images = "".join(
         f"camera\ttake image\t\t\tACK\ncamera\tsave image\tE:\\a\\scan_{k:06d}.tif\t\tACK\n"
         for k in range(count)

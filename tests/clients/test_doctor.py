@@ -1,4 +1,5 @@
-"""`flexdt doctor`: what it looks at follows from the installation, not from a list of its own."""
+"""`flexdt doctor`: what it looks at follows from the installation, not from a list of its
+own."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from flexdt.clients.launch import doctor
 
 
 def test_it_looks_for_every_package_that_flexdt_declares_and_for_no_extra() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())[
+        "project"
+    ]
     assert set(doctor.needed()) == {Requirement(r).name for r in project["dependencies"]}
     finding = doctor.packages()
     assert finding.verdict == "ok"
@@ -32,7 +35,12 @@ def test_a_package_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_lines_of_metadata_with_markers(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = ["a-b>=1", "c_d[extra]<3 ; python_version < '4'", "e ; extra == 'lab'", "f.g(>=1)"]
+    lines = [
+        "a-b>=1",
+        "c_d[extra]<3 ; python_version < '4'",
+        "e ; extra == 'lab'",
+        "f.g(>=1)",
+    ]
     monkeypatch.setattr(doctor, "requires", lambda name: lines)
     assert doctor.needed() == ("a-b", "c_d", "f.g")
     monkeypatch.setattr(doctor, "requires", lambda name: None)

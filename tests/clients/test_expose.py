@@ -1,4 +1,5 @@
-"""Forecasts of image quality beside images that were made, and beside published coefficients."""
+"""Forecasts of image quality beside images that were made, and beside published
+coefficients."""
 
 from __future__ import annotations
 
@@ -23,11 +24,15 @@ def rod(radius: float, material: str = "pmma") -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def forecast() -> Any:
-    return fx.expose(rod(15.0), kV=70, power_W=40, exposure_ms=150, images=100, detail="void:0.5")
+    return fx.expose(
+        rod(15.0), kV=70, power_W=40, exposure_ms=150, images=100, detail="void:0.5"
+    )
 
 
 def scan(radius: float, seed: int) -> fx.DataSet:
-    geometry = fx.ConeVec.circular(sod=600, sdd=1059, angles=2, shape=(760, 956), pixel=0.1496)
+    geometry = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=2, shape=(760, 956), pixel=0.1496
+    )
     return fx.simulate(
         rod(radius), geometry, tube=fx.Tube(kV=70, power_W=40), noise=seed,
         detector=fx.Detector(exposure_ms=150), material=None,
@@ -35,7 +40,8 @@ def scan(radius: float, seed: int) -> fx.DataSet:
 
 
 def test_contrast_and_noise_are_those_of_noisy_images(forecast: Any) -> None:
-    """A rod thinner by a quarter of a millimetre is the same ray with half a millimetre less."""
+    """A rod thinner by a quarter of a millimetre is the same ray with half a millimetre
+    less."""
     strip = np.s_[100:660, 470:486]
     thick, thin = scan(15.0, 1), scan(14.75, 2)
     signal = [np.mean([one.counts(i)[strip] - one.dark[strip] for i in (0, 1)])
@@ -69,7 +75,9 @@ def test_saturated_and_starved_pixels_are_foreseen() -> None:
     dark = fx.expose(rod(20.0, "steel"), kV=40, exposure_ms=20)
     assert dark.saturated == 0.0
     share = 2 * 20 * 1059 / 600 / (956 * 0.1496)
-    assert dark.starved == pytest.approx(share * 0.93, rel=0.1)  # 60 of 64 mm in the picture
+    assert dark.starved == pytest.approx(
+        share * 0.93, rel=0.1
+    )  # 60 of 64 mm in the picture
 
 
 @pytest.mark.parametrize("bits", [10, 14])
@@ -78,15 +86,21 @@ def test_saturation_is_known_of_a_saved_scan_and_else_unknown(
 ) -> None:
     geometry = fx.ConeVec.circular(sod=600, sdd=700, angles=3, shape=(20, 30), pixel=1.0)
     with pytest.warns(UserWarning, match="are saturated"):
-        scan = fx.simulate(rod(2.0), geometry, detector=fx.Detector(bits=bits), exposure_ms=200.0)
+        scan = fx.simulate(
+            rod(2.0), geometry, detector=fx.Detector(bits=bits), exposure_ms=200.0
+        )
     share = float((scan.counts() == 2**bits - 1).mean())
     assert share > 0.5
     scan.save(tmp_path / "whole")
     back = fx.open(tmp_path / "whole")
-    assert exposure_of(scan).saturated == exposure_of(back).saturated == pytest.approx(share)
+    assert (
+        exposure_of(scan).saturated == exposure_of(back).saturated == pytest.approx(share)
+    )
     assert scan.warnings
     assert set(back.warnings) == set(scan.warnings)
-    plain = fx.DataSet.from_arrays(scan.counts(), geometry, dark=scan.dark, flat=scan.flat)
+    plain = fx.DataSet.from_arrays(
+        scan.counts(), geometry, dark=scan.dark, flat=scan.flat
+    )
     assert exposure_of(plain).saturated is None
     assert run(["expose", str(tmp_path / "whole")]) == 0
     told = capsys.readouterr().err
@@ -110,7 +124,9 @@ def test_numbers_that_no_scan_has_are_refused(words: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("none", [[], (), np.zeros(0)])
 def test_no_voltage_at_all_is_refused(none: Any) -> None:
-    with pytest.raises(fx.TwinError, match=r"kV is .*, no voltage; allowed with .*: one or more"):
+    with pytest.raises(
+        fx.TwinError, match=r"kV is .*, no voltage; allowed with .*: one or more"
+    ):
         fx.expose(rod(5.0), kV=none)
 
 
@@ -171,8 +187,12 @@ def test_what_cannot_be_is_an_error_with_what_is_allowed(
 
 
 @pytest.mark.slow
-def test_the_command_says_the_same(forecast: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["expose", "--sample", "chiral", "--kV", "60", "--kV", "90", "--json"]) == 0
+def test_the_command_says_the_same(
+    forecast: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run(["expose", "--sample", "chiral", "--kV", "60", "--kV", "90", "--json"]) == 0
+    )
     document = json.loads(capsys.readouterr().out)
     assert {one["kV"] for one in document["best"]} == {60.0, 90.0}
     assert document["asked"]["kV"] == 60.0
@@ -183,22 +203,30 @@ def test_the_command_says_the_same(forecast: Any, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_choice_of_tube_and_detector_saturates_unless_the_exposure_is_given(seed: int) -> None:
-    """An ordinary geometry and the default tube saturated all pixels, and the volume was zero."""
+def test_no_choice_of_tube_and_detector_saturates_unless_the_exposure_is_given(
+    seed: int,
+) -> None:
+    """An ordinary geometry and the default tube saturated all pixels, and the volume was
+    zero."""
     rng = np.random.default_rng(seed)
     sod = float(rng.uniform(60, 300))
     cone = fx.ConeVec.circular(
         sod=sod, sdd=sod * float(rng.uniform(1.2, 4)), angles=24, shape=(24, 40),
         pixel=float(rng.uniform(0.3, 1.0)),
     )  # fmt: skip
-    tube = fx.Tube(kV=float(rng.uniform(40, 200)), power_W=float(rng.uniform(2, 90)), spot_mm=0.0)
+    tube = fx.Tube(
+        kV=float(rng.uniform(40, 200)), power_W=float(rng.uniform(2, 90)), spot_mm=0.0
+    )
     panel = fx.Detector(bits=int(rng.integers(10, 17)), dead_fraction=0.0)
     ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 2.0, "material": "pmma"}
     scan = fx.simulate(ball, cone, tube=tube, detector=panel, noise=seed)
     assert not scan.warnings
     assert 0.7 < scan.flat.max() / panel.full_scale < 0.95
     steps: list[float] = []
-    longer = {"exposure_ms": 30.0 * scan.truth.exposure.exposure_ms, "progress": steps.append}
+    longer = {
+        "exposure_ms": 30.0 * scan.truth.exposure.exposure_ms,
+        "progress": steps.append,
+    }
     with pytest.warns(UserWarning, match="100 % of the pixels of the .* saturated"):
         bright = fx.simulate(ball, cone, tube=tube, detector=panel, noise=seed, **longer)
     assert steps == pytest.approx(np.arange(1, 25) / 24)

@@ -26,7 +26,11 @@ from flexdt.clients.following.session import FollowSession, executed_script
 from flexdt.phantoms import load_phantom
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
-from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
+from flexdt.twin.machine.description import (
+    builtin_machine,
+    builtin_profile,
+    parse_machine,
+)
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.projection import project_scene
 from flexdt.twin.script.executed_log import read_log
@@ -54,7 +58,10 @@ def session(tmp_path: Path | None = None) -> tuple[FollowSession, list[Alarm]]:
 def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> None:
     async def work() -> None:
         made, alarms = session()
-        with zmq.asyncio.Context() as context, (tmp_path / "log").open("wb") as made.record:
+        with (
+            zmq.asyncio.Context() as context,
+            (tmp_path / "log").open("wb") as made.record,
+        ):
             out = context.socket(zmq.XPUB)  # an XPUB socket hears what subscribers send
             port = out.bind_to_random_port("tcp://127.0.0.1")
             task = asyncio.create_task(made.run(f"tcp://127.0.0.1:{port}"))
@@ -73,7 +80,9 @@ def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> 
             await until(lambda: made.mirror.connected)
             assert await again.recv() == b"\x01"
             await again.send(event(2, ("tra_obj", "move absolute", "9999")))
-            await until(lambda: ("limit", "tra_obj") in [(a.kind, a.about) for a in alarms])
+            await until(
+                lambda: ("limit", "tra_obj") in [(a.kind, a.about) for a in alarms]
+            )
             assert not await again.poll(50), "nothing is ever sent to the scanner"
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
@@ -86,8 +95,11 @@ def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> 
     asyncio.run(work())
 
 
-def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(tmp_path: Path) -> None:
-    """The frame is of a machine whose axis is aside, which no motor tells; its figure says so."""
+def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(
+    tmp_path: Path,
+) -> None:
+    """The frame is of a machine whose axis is aside, which no motor tells; its figure says
+    so."""
     made, alarms = session()
     phantom = load_phantom("lego")
     frames, out = tmp_path / "frames", tmp_path / "out"
@@ -163,23 +175,34 @@ def test_a_recording_is_heard_again_byte_for_byte(tmp_path: Path) -> None:
     assert again.mirror.positions == made.mirror.positions
 
 
-def test_a_machine_is_fitted_to_a_recording_as_to_the_log_of_the_same_scan(tmp_path: Path) -> None:
+def test_a_machine_is_fitted_to_a_recording_as_to_the_log_of_the_same_scan(
+    tmp_path: Path,
+) -> None:
     lines, _ = read_log(LOG.read_bytes())
     with (tmp_path / "traffic").open("wb") as out:
         for at, data in replay(LOG.read_bytes(), lines):
             hours, seconds = divmod(at, 3600.0)
-            clock = f"[{int(hours):02d}:{int(seconds // 60):02d}:{seconds % 60:09.6f} 0.0] "
+            clock = (
+                f"[{int(hours):02d}:{int(seconds // 60):02d}:{seconds % 60:09.6f} 0.0] "
+            )
             out.write(clock.encode() + data + b"\n")
     fitted = {}
     for name, source in (("log", LOG), ("traffic", tmp_path / "traffic")):
         made = tmp_path / f"{name}.toml"
-        assert run(["machine", "fit", str(source), "--base", "unitom_xl", "--out", str(made)]) == 0
+        assert (
+            run(
+                ["machine", "fit", str(source), "--base", "unitom_xl", "--out", str(made)]
+            )
+            == 0
+        )
         fitted[name] = parse_machine(made.read_text("utf-8"), str(made))
     log, traffic = fitted["log"], fitted["traffic"]
     for name in ("tra_obj", "mag_det", "rot_obj"):
         assert traffic.axes[name].lower == log.axes[name].lower
         assert traffic.axes[name].max_speed == log.axes[name].max_speed
-    assert traffic.timing.xray_ready_s == pytest.approx(log.timing.xray_ready_s, abs=0.002)
+    assert traffic.timing.xray_ready_s == pytest.approx(
+        log.timing.xray_ready_s, abs=0.002
+    )
     assert traffic.timing.move_s == pytest.approx(log.timing.move_s, abs=0.002)
 
 
@@ -256,7 +279,9 @@ def test_the_example_has_its_three_faults() -> None:
 
     asyncio.run(work())
     errors = [(a.kind, a.about) for a in alarms if a.severity == "error"]
-    assert {("slow", "mag_obj"), ("offset", "tra_obj"), ("limits", "tra_obj")} <= set(errors)
+    assert {("slow", "mag_obj"), ("offset", "tra_obj"), ("limits", "tra_obj")} <= set(
+        errors
+    )
     assert not {k for k, _ in errors} & {"rates", "moved", "off_path", "limit", "failed"}
 
 
@@ -266,7 +291,11 @@ def test_the_command_says_that_nobody_is_there_and_refuses_what_is_no_address(
     assert run(["follow", "tcp://127.0.0.1:9", "--for", "0.3", "--json"]) == 4
     told = capsys.readouterr()
     document = json.loads(told.out)
-    assert (document["connected"], document["age_s"], document["raised"]) == (False, None, 0)
+    assert (document["connected"], document["age_s"], document["raised"]) == (
+        False,
+        None,
+        0,
+    )
     assert "there has been no connection" in told.err
     assert run(["follow", "tcp://nowhere:99999"]) == 2
     assert "allowed: tcp://HOST[:PORT]" in capsys.readouterr().err

@@ -63,7 +63,9 @@ class Fake:
         Fake.ended += 1
 
 
-def test_a_client_that_cannot_connect_leaves_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_cannot_connect_leaves_no_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def fails(*_: object) -> None:
         raise ConnectionError("no")
 

@@ -22,7 +22,9 @@ METHODS = {
 
 def test_each_method_has_an_example() -> None:
     assert len(METHODS) > 35
-    assert [name for name, found in METHODS.items() if ">>>" not in (found.__doc__ or "")] == []
+    assert [
+        name for name, found in METHODS.items() if ">>>" not in (found.__doc__ or "")
+    ] == []
 
 
 @pytest.mark.slow
@@ -30,7 +32,10 @@ def test_each_method_has_an_example() -> None:
 @pytest.mark.campaign(1)
 def test_the_examples_hold(place: str, request: pytest.FixtureRequest) -> None:
     """Of a server, and of a twin in this process."""
-    finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner(verbose=False)
+    finder, runner = (
+        doctest.DocTestFinder(recurse=False),
+        doctest.DocTestRunner(verbose=False),
+    )
     with ExitStack() as stack:
         if place == "server":
             address = request.getfixturevalue("servers").address
@@ -38,7 +43,9 @@ def test_the_examples_hold(place: str, request: pytest.FixtureRequest) -> None:
         else:
             twin = stack.enter_context(testing.twin(sample="lego", speed_up="max")).client
         # In the order of the page: an example finds the twin as those before it left it.
-        for name, found in sorted(METHODS.items(), key=lambda m: m[1].__code__.co_firstlineno):
+        for name, found in sorted(
+            METHODS.items(), key=lambda m: m[1].__code__.co_firstlineno
+        ):
             given = {**vars(twin_methods), "fx": fx, "twin": twin}
             for test in finder.find(found, name, globs=given):
                 runner.run(test)

@@ -1,4 +1,5 @@
-"""What `show` gives in a notebook: pages with a slider, whose pictures are those of the values."""
+"""What `show` gives in a notebook: pages with a slider, whose pictures are those of the
+values."""
 
 from __future__ import annotations
 
@@ -36,22 +37,32 @@ def test_layers_of_a_volume_are_its_values(tmp_path: Path) -> None:
     page = volume.show(window=(0.25, 0.75))
     shown = pictures(page)
     assert len(shown) == 7 + 9 + 11
-    grey = np.clip(255.0 * (np.nan_to_num(values, nan=0.0) - 0.25) / 0.5, 0, 255).astype(np.uint8)
+    grey = np.clip(255.0 * (np.nan_to_num(values, nan=0.0) - 0.25) / 0.5, 0, 255).astype(
+        np.uint8
+    )
     layers = [grey[i, ::-1] for i in range(7)]
     layers += [grey[::-1, i] for i in range(9)]
     layers += [grey[::-1, :, i] for i in range(11)]
     for (_, _, pixels, _), layer in zip(shown, layers, strict=True):
         assert np.abs(pixels.astype(int) - layer).max() <= 1
-    assert [name for name, _, _, seen in shown if seen] == ["z = 0 mm", "y = 0 mm", "x = 0 mm"]
+    assert [name for name, _, _, seen in shown if seen] == [
+        "z = 0 mm",
+        "y = 0 mm",
+        "x = 0 mm",
+    ]
     rows, cols = next(size for name, size, _, _ in shown if name == "y = 0 mm")
-    assert rows / cols == pytest.approx(7 * 2.0 / 11, rel=0.02)  # a voxel is twice as high
+    assert rows / cols == pytest.approx(
+        7 * 2.0 / 11, rel=0.02
+    )  # a voxel is twice as high
     page.save(tmp_path / "volume.html")
     assert page.html in (tmp_path / "volume.html").read_text()
 
 
 @pytest.mark.parametrize("window", [(1.0,), (0.5, 0.5), (0.7, 0.2)])
 def test_a_window_that_is_none_is_refused(window: tuple[float, ...]) -> None:
-    with pytest.raises(fx.TwinError, match=r"window .*; allowed: \(black, white\), black first"):
+    with pytest.raises(
+        fx.TwinError, match=r"window .*; allowed: \(black, white\), black first"
+    ):
         fx.Volume(np.zeros((2, 3, 4), np.float32), 1.0).show(window=window)
 
 
@@ -80,7 +91,9 @@ def test_frames_and_sinogram_of_a_data_set() -> None:
 
 def test_a_geometry_is_drawn_with_one_scale() -> None:
     """Width of the panel, and its distance along x, in the same millimetres."""
-    scan = fx.ConeVec.circular(sod=100, sdd=300, angles=[0.0, 90.0], shape=(40, 50), pixel=2.0)
+    scan = fx.ConeVec.circular(
+        sod=100, sdd=300, angles=[0.0, 90.0], shape=(40, 50), pixel=2.0
+    )
     page = scan.show()
     per_mm = 420 / float(re.search(r"([\d.]+) mm across", page.html)[1])  # type: ignore[index]
     views = re.findall(
@@ -113,8 +126,12 @@ def test_widgets_show_any_layer_and_window() -> None:
         before = [one.children[0].value for one in columns.children]
         slider.value = 0
         after = [one.children[0].value for one in columns.children]
-        assert all(a != b for a, b in zip(after, before, strict=True))  # the lines move, too
-        assert bytes(picture.value).startswith(b"\x89PNG")  # newer ipywidgets hold a view of bytes
+        assert all(
+            a != b for a, b in zip(after, before, strict=True)
+        )  # the lines move, too
+        assert bytes(picture.value).startswith(
+            b"\x89PNG"
+        )  # newer ipywidgets hold a view of bytes
     before = columns.children[0].children[0].value
     window.value = (0.0, 0.1)
     assert columns.children[0].children[0].value != before

@@ -36,10 +36,14 @@ class Page(HTMLParser):
 
 
 def test_a_data_set_shows_its_facts_its_warnings_and_its_first_image() -> None:
-    geometry = fx.ConeVec.circular(sod=600, sdd=1059, angles=3, shape=(300, 500), pixel=0.3)
+    geometry = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=3, shape=(300, 500), pixel=0.3
+    )
     images = np.full((3, 300, 500), 9000, np.uint16)
     images[0, :, 250:] = 3000
-    data = fx.DataSet.from_arrays(images, geometry, flat=np.full((300, 500), 9500), name="<b>one")
+    data = fx.DataSet.from_arrays(
+        images, geometry, flat=np.full((300, 500), 9500), name="<b>one"
+    )
     page = Page(data._repr_html_())
     assert "DataSet <b>one" in page.text, "names are escaped"
     assert "3 of 300 x 500 pixels" in page.cells
@@ -54,7 +58,9 @@ def test_a_data_set_shows_its_facts_its_warnings_and_its_first_image() -> None:
 
 @pytest.mark.slow
 def test_a_calibration_shows_its_verdict_and_what_was_asked() -> None:
-    geometry = fx.ConeVec.circular(sod=600, sdd=1059, angles=12, shape=(380, 478), pixel=0.2992)
+    geometry = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=12, shape=(380, 478), pixel=0.2992
+    )
     scan = fx.simulate("lego", geometry, noise=1)
     found = fx.calibrate(scan, "lego")
     assert found.verdict == found.document["verdict"]

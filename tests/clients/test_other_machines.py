@@ -68,8 +68,11 @@ def micro(b: np.ndarray, m: Motors, o: Mapping[str, float]) -> np.ndarray:
     return cabinet(on_table, {"R": m["R"], "X": 0.0, "Z": 150.0, "Y": m["Y"]}, o)
 
 
-def pixel(place: np.ndarray, sdd: float, pitch: tuple[float, float], roi: Roi) -> np.ndarray:
-    """(column, row) of a point on a panel that faces the source, unbinned, from the ROI's pixel 0.
+def pixel(
+    place: np.ndarray, sdd: float, pitch: tuple[float, float], roi: Roi
+) -> np.ndarray:
+    """(column, row) of a point on a panel that faces the source, unbinned, from the ROI's pixel
+    0.
 
     Rows grow downwards. The beam meets the middle of the whole panel, whose edges are at
     -0.5 and its number of pixels - 0.5.
@@ -102,7 +105,9 @@ def test_points_are_projected_where_own_kinematics_puts_them(
         at = {n: float(rng.uniform(a.lower, a.upper)) for n, a in machine.axes.items()}
         at |= {"Z": float(rng.uniform(200, 800))} if "Z" in at else {}
         offsets = {n: float(rng.uniform(-1, 1)) for n in TRUTH}
-        roi = Roi(*(int(v) for v in (*rng.integers(0, 300, 2), *rng.integers(900, 1900, 2))))
+        roi = Roi(
+            *(int(v) for v in (*rng.integers(0, 300, 2), *rng.integers(900, 1900, 2)))
+        )
         mode, binning = [("1x1", 1), ("2x2", 2)][int(rng.integers(2))]
         mode = mode if name == "xyzr_cabinet" else {"1x1": "full", "2x2": "binned"}[mode]
         camera = machine.detector.camera
@@ -110,7 +115,9 @@ def test_points_are_projected_where_own_kinematics_puts_them(
         assert camera.binning == binning
         cone = poses(machine, profile_of(machine), camera, at)
         points = rng.uniform(-20, 20, (5, 3))
-        found = cone.cone_vec(Offsets.from_edge(offsets)).project_points(points, camera.shape)[0]
+        found = cone.cone_vec(Offsets.from_edge(offsets)).project_points(
+            points, camera.shape
+        )[0]
         for b, got in zip(points, found, strict=True):
             fine = pixel(place(b, at, offsets), sdd, (pitch, row_pitch or pitch), roi)
             fine += [(cols - 1) / 2, (rows - 1) / 2]
@@ -133,7 +140,9 @@ def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) 
     machine = builtin_machine(name)
     folder, plan = bead_scan_on(machine, REQUESTS[name], tmp_path, TRUTH)
     text = (folder / "scan settings.txt").read_text(encoding="latin-1")
-    flat_axis = next(row for row in text.splitlines() if "Axis for flat field movement" in row)
+    flat_axis = next(
+        row for row in text.splitlines() if "Axis for flat field movement" in row
+    )
     assert flat_axis.split()[-1] == ("X" if "X" in machine.axes else "Y")
     outcome = calibrate_datasets([load_dataset(folder)], "lego")
     assert outcome.document["identifiable"] is True
@@ -150,7 +159,9 @@ def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) 
     off = []
     for image, spots in zip(images, seen, strict=True):
         for b, spot in zip(BEADS, spots, strict=True):
-            fine = pixel(place(b, image.positions, TRUTH), sdd, (pitch, pitch), camera.roi)
+            fine = pixel(
+                place(b, image.positions, TRUTH), sdd, (pitch, pitch), camera.roi
+            )
             fine += [(cols - 1) / 2, (rows - 1) / 2]
             off.append(spot - (fine - (camera.binning - 1) / 2) / camera.binning)
     assert np.abs(off).max() < 0.05
@@ -166,11 +177,15 @@ def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) 
 
 @pytest.mark.parametrize(("name", "turning"), [("xyzr_cabinet", "R"), ("micro_ct", "R")])
 @pytest.mark.parametrize("kind", ["fly", "step", "tiled", "helical", "calibration"])
-def test_every_kind_of_script_plans_or_says_why_not(name: str, turning: str, kind: Kind) -> None:
+def test_every_kind_of_script_plans_or_says_why_not(
+    name: str, turning: str, kind: Kind
+) -> None:
     machine = builtin_machine(name)
     request = ScanRequest(kind=kind, frames=61, exposure_ms=1000.0)
     if kind == "tiled":
-        with pytest.raises(LimitError, match=rf"{name} has no motor for the detector sideways"):
+        with pytest.raises(
+            LimitError, match=rf"{name} has no motor for the detector sideways"
+        ):
             compose_script(request, machine, profile_of(machine))
         return
     script = compose_script(request, machine, profile_of(machine))
@@ -179,7 +194,9 @@ def test_every_kind_of_script_plans_or_says_why_not(name: str, turning: str, kin
     images = [e for e in plan.exposures if e.kind == "projection"]
     angles = np.array([e.positions[turning] for e in images])
     heights = np.array([e.positions["Y"] for e in images])
-    if kind == "helical":  # as the source would rise by 20 mm in three turns, the sample sinks
+    if (
+        kind == "helical"
+    ):  # as the source would rise by 20 mm in three turns, the sample sinks
         np.testing.assert_allclose(np.diff(heights), -20.0 / 60, atol=1e-3)
         assert heights.mean() == pytest.approx(0.0, abs=1e-3)
         assert angles[-1] == pytest.approx(3 * 360.0, abs=1e-3)
@@ -193,8 +210,14 @@ def test_every_kind_of_script_plans_or_says_why_not(name: str, turning: str, kin
 def test_what_no_motor_does_is_said() -> None:
     machine = builtin_machine("micro_ct")
     cases = {
-        "sod_mm": (200.0, r"no motor for the source-object distance.*200 mm \(150 mm is all"),
-        "sdd_mm": (500.0, r"no motor for the source-detector distance.*500 mm \(300 mm is all"),
+        "sod_mm": (
+            200.0,
+            r"no motor for the source-object distance.*200 mm \(150 mm is all",
+        ),
+        "sdd_mm": (
+            500.0,
+            r"no motor for the source-detector distance.*500 mm \(300 mm is all",
+        ),
         "height_mm": (20.0, r"no motor for the height of the beam.*20 mm \(0 mm is all"),
     }
     for key, (value, said) in cases.items():
@@ -203,7 +226,9 @@ def test_what_no_motor_does_is_said() -> None:
     bare = parse_machine(
         'base = "micro_ct"\nwithout = ["Y"]\n[[components]]\nname = "lift"\nparent = "floor"\n'
     )
-    with pytest.raises(LimitError, match="no motor that takes the sample out of the beam"):
+    with pytest.raises(
+        LimitError, match="no motor that takes the sample out of the beam"
+    ):
         compose_script(ScanRequest(), bare, profile_of(bare))
     lateral = parse_machine('base = "xyzr_cabinet"\nwithout = ["Y"]\n')
     request = ScanRequest(kind="helical", frames=61, exposure_ms=1000.0)
@@ -216,7 +241,9 @@ def test_servers_run_a_machine_with_a_fixed_detector(tmp_path: Path) -> None:
     """A fixed detector passed `check` and ended `flexdt up` in a KeyError."""
     name = "micro_ct"
     machine = tmp_path / "mine.toml"
-    machine.write_text(builtin_machine_text(name).replace(f'name = "{name}"', 'name = "mine"', 1))
+    machine.write_text(
+        builtin_machine_text(name).replace(f'name = "{name}"', 'name = "mine"', 1)
+    )
     with LocalTwin(machine=machine, sample="lego") as twin:
         state = twin.state()
         assert state.geometry is not None

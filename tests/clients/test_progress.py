@@ -1,4 +1,5 @@
-"""One `progress=` for every long call: a bar after a while, silence, or the caller's function."""
+"""One `progress=` for every long call: a bar after a while, silence, or the caller's
+function."""
 
 from __future__ import annotations
 
@@ -37,7 +38,9 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     """A terminal; nobody handles the log; what takes 50 ms is long."""
     shown = Terminal()
     seen = types.SimpleNamespace(stderr=shown, modules=sys.modules)
-    monkeypatch.setattr(progress_bars, "sys", seen)  # pytest sets its own in `sys` once more
+    monkeypatch.setattr(
+        progress_bars, "sys", seen
+    )  # pytest sets its own in `sys` once more
     monkeypatch.setattr(progress_lines, "SILENT_S", 0.05)
     monkeypatch.setattr(progress_lines, "DRAWN_S", 0.02)
     monkeypatch.setattr(progress_lines, "_last", {})
@@ -77,7 +80,9 @@ def test_a_bar_is_drawn_after_a_while_and_goes(screen: Terminal) -> None:
     assert screen.getvalue() == drawn
 
 
-def test_short_work_shows_nothing(screen: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_short_work_shows_nothing(
+    screen: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(progress_lines, "SILENT_S", 30.0)
     with long_work.during("measuring") as advance:
         advance(0.5)
@@ -86,7 +91,9 @@ def test_short_work_shows_nothing(screen: Terminal, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("progress", [False, "function", "level"])
-def test_silence(screen: Terminal, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence(
+    screen: Terminal, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[float] = []
     if progress == "level":
         monkeypatch.setattr(progress_lines.LOG, "level", logging.ERROR)

@@ -44,19 +44,26 @@ def rolled(roll: float) -> ConeVec:
     """A circle about z whose panel is rolled by an angle [rad], written out by hand."""
     turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False)
     c, s, o = np.cos(turn), np.sin(turn), np.zeros(VIEWS)
-    across, away, up = np.stack([c, s, o], 1), np.stack([-s, c, o], 1), np.array([0.0, 0.0, 1.0])
+    across, away, up = (
+        np.stack([c, s, o], 1),
+        np.stack([-s, c, o], 1),
+        np.array([0.0, 0.0, 1.0]),
+    )
     u = np.cos(roll) * across - np.sin(roll) * up
     v = -np.sin(roll) * across - np.cos(roll) * up
     return ConeVec.from_vectors(-SOD * away, (SDD - SOD) * away, PIXEL * u, PIXEL * v)
 
 
 def counts_of(radius: float, scan: ConeVec, rng: np.random.Generator) -> np.ndarray:
-    """Counts of a cylinder beside the axis, denser above than below; noise, so that rows differ."""
+    """Counts of a cylinder beside the axis, denser above than below; noise, so that rows
+    differ."""
     column = (np.arange(COLS) - (COLS - 1) / 2)[:, None]
     row = (np.arange(ROWS) - (ROWS - 1) / 2)[:, None, None]
     source = scan.source[:, None, None] - (2.0, 0.0, 0.0)
     u, v = scan.u[:, None, None], scan.v[:, None, None]
-    along = scan.detector[:, None, None] + column * u + row * v - scan.source[:, None, None]
+    along = (
+        scan.detector[:, None, None] + column * u + row * v - scan.source[:, None, None]
+    )
     squared = (along[..., :2] ** 2).sum(axis=-1)
     middle = -(source[..., :2] * along[..., :2]).sum(axis=-1) / squared
     inside = middle**2 - ((source[..., :2] ** 2).sum(axis=-1) - radius**2) / squared
@@ -66,7 +73,9 @@ def counts_of(radius: float, scan: ConeVec, rng: np.random.Generator) -> np.ndar
     return np.round(light).astype(np.uint16)
 
 
-def written(folder: Path, *, radius: float = 7.0, roll: float = 0.0, seed: int = 5) -> Path:
+def written(
+    folder: Path, *, radius: float = 7.0, roll: float = 0.0, seed: int = 5
+) -> Path:
     flat, scan = np.full((ROWS, COLS), OPEN, np.uint16), rolled(roll)
     images = counts_of(radius, scan, np.random.default_rng(seed))
     fx.DataSet.from_arrays(images, scan, flat=flat, dark=0 * flat).save(folder)
@@ -114,7 +123,9 @@ def with_lag(data: fx.DataSet) -> fx.DataSet:
 
 
 AS_IT_IS: Callable[[fx.DataSet], fx.DataSet] = lambda data: data  # noqa: E731
-CASES: dict[str, tuple[dict[str, float], dict[str, Any], Callable[[fx.DataSet], fx.DataSet]]] = {
+CASES: dict[
+    str, tuple[dict[str, float], dict[str, Any], Callable[[fx.DataSet], fx.DataSet]]
+] = {
     "whole": ({}, {}, AS_IT_IS),
     "cut off": ({"radius": 24.0}, {}, AS_IT_IS),
     "rings": ({}, {"rings": True}, AS_IT_IS),
@@ -158,12 +169,16 @@ def test_each_image_is_read_once_whatever_the_slabs(
         assert np.all(np.diff(told) > 0)
         volumes.append(np.array(read_volume(out).data))
     # Of plain arrays, in one piece.
-    integrals = np.stack([data.line_integrals(i) for i in data.present[:: asked.get("every", 1)]])
+    integrals = np.stack(
+        [data.line_integrals(i) for i in data.present[:: asked.get("every", 1)]]
+    )
     if not asked.get("rings"):
         scan = data.geometry[:: asked.get("every", 1)]
         volumes.append(fx.fdk(integrals, scan, GRID, errors=False).data)
     for volume in volumes[1:]:
-        np.testing.assert_allclose(volume, volumes[0], atol=3e-6 * np.nanmax(volumes[0]), rtol=0.0)
+        np.testing.assert_allclose(
+            volume, volumes[0], atol=3e-6 * np.nanmax(volumes[0]), rtol=0.0
+        )
     assert np.nanmax(volumes[0]) > 0.015
 
 
@@ -199,7 +214,10 @@ def test_a_volume_in_memory_reads_each_image_once(
     assert dict(reads) == {frame.file: 1 for frame in data.frames}
     plain = fx.fdk(data.line_integrals(), data.geometry, GRID, errors=errors)
     np.testing.assert_allclose(volume.data, plain.data, atol=1e-7)
-    for told, expected in ((volume.sigma, plain.sigma), (volume.bias_bound, plain.bias_bound)):
+    for told, expected in (
+        (volume.sigma, plain.sigma),
+        (volume.bias_bound, plain.bias_bound),
+    ):
         assert (told is None) == (expected is None) == (not errors)
         if errors:
             np.testing.assert_allclose(told, expected, rtol=1e-3)
@@ -217,7 +235,9 @@ def test_a_volume_larger_than_the_memory_lies_in_a_file_without_a_name(
     monkeypatch.setattr(reconstruct, "memory_bytes", lambda: 2 * GRID.bytes)
     monkeypatch.setattr(reconstruct, "free_memory_bytes", lambda: GRID.bytes // 2)
     reads.clear()
-    volume = reconstruct_volume(data, VolumeRequest(shape=GRID.shape, voxel_mm=GRID.voxel_mm))
+    volume = reconstruct_volume(
+        data, VolumeRequest(shape=GRID.shape, voxel_mm=GRID.voxel_mm)
+    )
     assert set(reads.values()) == {1}
     assert not list(temporary.iterdir())
     np.testing.assert_allclose(volume.data, here.data, atol=3e-6 * np.nanmax(here.data))
@@ -265,7 +285,11 @@ def test_scatter_correction_reads_each_image_once(
     data = fx.open(written(tmp_path / "scan"))
     reads.clear()
     request = VolumeRequest(
-        shape=GRID.shape, voxel_mm=GRID.voxel_mm, rings=True, scatter_correction=("abs",), kV=60.0
+        shape=GRID.shape,
+        voxel_mm=GRID.voxel_mm,
+        rings=True,
+        scatter_correction=("abs",),
+        kV=60.0,
     )
     reconstruct_dataset(data, tmp_path / "v.mha", request, memory=memory_for(slabs))
     assert dict(reads) == {frame.file: 1 for frame in data.frames}
@@ -286,9 +310,12 @@ class Stop(Exception):
     """What no code expects."""
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="lists open files by /proc")
+@pytest.mark.skipif(
+    not Path("/proc/self/fd").is_dir(), reason="lists open files by /proc"
+)
 @pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=[pytest.mark.slow] * (seed > 1)) for seed in range(8)]
+    "seed",
+    [pytest.param(seed, marks=[pytest.mark.slow] * (seed > 1)) for seed in range(8)],
 )
 def test_no_file_stays_behind_whatever_fails_and_when(
     seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -322,7 +349,9 @@ def test_no_file_stays_behind_whatever_fails_and_when(
         "slab": ("flexdt.library.reconstruction.slab_fdk.fdk_parts", None, 3),
         "write": ("flexdt.library.reconstruction.volume_formats._blocks", None, 3),
     }
-    request = VolumeRequest(shape=GRID.shape, voxel_mm=GRID.voxel_mm, rings=bool(seed % 2))
+    request = VolumeRequest(
+        shape=GRID.shape, voxel_mm=GRID.voxel_mm, rings=bool(seed % 2)
+    )
     for stage, (owner, name, most) in stages.items():
         error = (Stop("now"), KeyboardInterrupt(), OSError(errno.EIO, "bad disk"))[
             int(rng.integers(3))
@@ -366,7 +395,9 @@ def test_kept_images_do_not_outlive_a_killed_process(tmp_path: Path) -> None:
     folder.mkdir()
     scan = written(tmp_path / "scan")
     done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(scan), str(folder), "17"], capture_output=True, text=True
+        [sys.executable, "-c", KILLED, str(scan), str(folder), "17"],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == -9, done.stderr
     assert {p.name for p in folder.iterdir()} <= {".v.mha.part.mha"}
@@ -385,14 +416,19 @@ def test_room_for_kept_images_is_checked_before_the_work(
     text = str(told.value)
     for part in (f"{VIEWS} images", f"free in {tmp_path}", f"{images / 2**30:.3g} GiB"):
         assert part in text
-    assert told.value.data == {"asked": GRID.bytes + images, "allowed": GRID.bytes + images - 1}
+    assert told.value.data == {
+        "asked": GRID.bytes + images,
+        "allowed": GRID.bytes + images - 1,
+    }
     assert sum(reads.values()) <= 32  # looked at for their exposure
     assert not (tmp_path / "v.mha").exists()
     monkeypatch.setattr(reconstruct, "free_bytes", lambda folder: GRID.bytes + images)
     reconstruct_dataset(data, tmp_path / "v.mha", request, memory=memory_for(3))
 
 
-def test_a_disk_that_fills_up_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fills_up_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = kept_images.ImagesOnDisk(tmp_path, 12)
 
     class Full:
@@ -416,7 +452,9 @@ def test_images_on_disk_come_back_by_rows(tmp_path: Path) -> None:
         store.put(number, image)
     for number, image in images.items():
         first, last = sorted(rng.integers(0, 8, 2).tolist())
-        np.testing.assert_array_equal(store.get(number, slice(first, last)), image[first:last])
+        np.testing.assert_array_equal(
+            store.get(number, slice(first, last)), image[first:last]
+        )
     store.close()
 
 
@@ -435,7 +473,10 @@ def test_a_plan_fits_the_memory_and_says_what_is_too_little(
             with pytest.raises(LimitError, match="takes") as told:
                 plan_memory(grid, images, again, pixels, memory)
             assert told.value.data["allowed"] == work + layer
-            assert len(plan_memory(grid, images, again, pixels, memory, least=True).slabs) == nz
+            assert (
+                len(plan_memory(grid, images, again, pixels, memory, least=True).slabs)
+                == nz
+            )
             continue
         plan = plan_memory(grid, images, again, pixels, memory)
         tallest = max(last - first for first, last in plan.slabs)

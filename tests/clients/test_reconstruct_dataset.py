@@ -54,7 +54,9 @@ SHAPE = (132, 68, 68)
 
 def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str) -> Path:
     """A turn of 41 coarse images (the last repeats the first) of the LEGO phantom."""
-    script = compose_script(ScanRequest("fly", frames=41, mode="HW4SW1High"), M, P).encode()
+    script = compose_script(
+        ScanRequest("fly", frames=41, mode="HW4SW1High"), M, P
+    ).encode()
     plan = plan_script(parse_script(script), M, P)
     assert not plan.errors
     imaging = Imaging(
@@ -103,7 +105,9 @@ def bead_errors(volume: Volume) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path: Path) -> None:
+def test_beads_are_where_the_phantom_has_them(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
     told: list[float] = []
     made = reconstruct_dataset(
         load_dataset(folders["plain"]),
@@ -119,7 +123,9 @@ def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path
 
 
 @pytest.mark.slow
-def test_the_correction_in_force_is_used(folders: dict[str, Path], tmp_path: Path) -> None:
+def test_the_correction_in_force_is_used(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
     data = load_dataset(folders["corrected"])
     request = Request(voxel_mm=VOXEL, shape=SHAPE)
     made = reconstruct_dataset(data, tmp_path / "c.tif", request)
@@ -159,8 +165,12 @@ def test_formats_hold_the_same_values(
     reconstruct_dataset(data, tmp_path / name, request, memory=7 * 24 * 28 * 4)
     values = read_volume(tmp_path / name).data
     assert values.shape == (20, 24, 28)
-    np.testing.assert_allclose(values, read_volume(tmp_path / "whole.mha").data, atol=1e-5)
-    assert len(list(tmp_path.glob("*.png"))) == 6  # those of one file do not replace the other's
+    np.testing.assert_allclose(
+        values, read_volume(tmp_path / "whole.mha").data, atol=1e-5
+    )
+    assert (
+        len(list(tmp_path.glob("*.png"))) == 6
+    )  # those of one file do not replace the other's
     assert sorted(Path(str(f)).name for f in _list(made["slices"])) == [
         "whole.mha_xy.png", "whole.mha_xz.png", "whole.mha_yz.png"]  # fmt: skip
     assert not list(tmp_path.glob(".*"))
@@ -179,7 +189,9 @@ def test_iterative_corrections_and_what_is_refused(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
     data = load_dataset(folders["plain"])
-    request = Request("cgls", voxel_mm=1.2, shape=(48, 24, 24), binning=2, every=3, iterations=6)
+    request = Request(
+        "cgls", voxel_mm=1.2, shape=(48, 24, 24), binning=2, every=3, iterations=6
+    )
     reconstruct_dataset(data, tmp_path / "cgls.mha", request)
     few = dataclasses.replace(request, algorithm="tv", iterations=4, weight=0.02)
     smooth = reconstruct_dataset(data, tmp_path / "tv.mha", few)
@@ -187,19 +199,28 @@ def test_iterative_corrections_and_what_is_refused(
     assert (read_volume(tmp_path / "tv.mha").data >= 0).all()
     heavy = dataclasses.replace(few, weight=2.0)
     reconstruct_dataset(data, tmp_path / "heavy.mha", heavy)
-    spread = [float(np.std(read_volume(tmp_path / f"{n}.mha").data)) for n in ("tv", "heavy")]
+    spread = [
+        float(np.std(read_volume(tmp_path / f"{n}.mha").data)) for n in ("tv", "heavy")
+    ]
     assert spread[1] < 0.5 * spread[0]
     values = read_volume(tmp_path / "cgls.mha").data
     # the iterative one sees the same object as FDK, rings and beam hardening corrected
-    other = Request(voxel_mm=1.2, shape=(48, 24, 24), binning=2, rings=True, material="abs")
+    other = Request(
+        voxel_mm=1.2, shape=(48, 24, 24), binning=2, rings=True, material="abs"
+    )
     reconstruct_dataset(data, tmp_path / "fdk.mha", other)
-    assert np.corrcoef(values.ravel(), read_volume(tmp_path / "fdk.mha").data.ravel())[0, 1] > 0.6
+    assert (
+        np.corrcoef(values.ravel(), read_volume(tmp_path / "fdk.mha").data.ravel())[0, 1]
+        > 0.6
+    )
     with pytest.raises(UnknownNameError, match="cgls"):
         reconstruct_dataset(data, tmp_path / "x.mha", Request("art"))
     with pytest.raises(LimitError, match="ending"):
         reconstruct_dataset(data, tmp_path / "x.jpg", request)
     with pytest.raises(LimitError, match="GiB"):
-        reconstruct_dataset(data, tmp_path / "x.mha", Request("sirt", shape=(9000, 9000, 900)))
+        reconstruct_dataset(
+            data, tmp_path / "x.mha", Request("sirt", shape=(9000, 9000, 900))
+        )
     with pytest.raises(LimitError, match="folder"):
         reconstruct_dataset(data, tmp_path / "nowhere" / "x.mha")
     for voxel in (0.0, -1.0, math.nan, math.inf):
@@ -229,29 +250,46 @@ def test_hardening_is_corrected_where_there_is_some(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
     data = load_dataset(folders["plain"])
-    request = Request(voxel_mm=1.2, shape=(48, 24, 24), binning=4, every=3, material="abs")
+    request = Request(
+        voxel_mm=1.2, shape=(48, 24, 24), binning=4, every=3, material="abs"
+    )
     for straight in ({"physics_mono": 1.0}, {"i0_counts": 12_000.0}):
         with pytest.raises(TwinError, match="straight"):
             reconstruct_dataset(made_by(data, **straight), tmp_path / "x.mha", request)
     assert not (tmp_path / "x.mha").exists()
-    copper = TubeModel((*TubeModel().filters, Filter(Substance.parse("Cu@8.96"), 0.5))).figures()
+    copper = TubeModel(
+        (*TubeModel().filters, Filter(Substance.parse("Cu@8.96"), 0.5))
+    ).figures()
     values = []
     for figures in ({}, TubeModel().figures(), copper):
-        reconstruct_dataset(made_by(data, physics_poly=1.0, **figures), tmp_path / "y.mha", request)
+        reconstruct_dataset(
+            made_by(data, physics_poly=1.0, **figures), tmp_path / "y.mha", request
+        )
         values.append(np.array(read_volume(tmp_path / "y.mha").data))
     np.testing.assert_array_equal(values[0], values[1])
     # A harder beam is weakened less, so the same line integrals stand for more plastic.
     assert values[2].max() > 1.02 * values[0].max()
 
 
-COARSE = ["--voxel", "1.2", "--shape", "8,24,24", "--binning", "8", "--every", "6", "--texts"]
+COARSE = [
+    "--voxel",
+    "1.2",
+    "--shape",
+    "8,24,24",
+    "--binning",
+    "8",
+    "--every",
+    "6",
+    "--texts",
+]
 
 
 @pytest.mark.slow
 def test_scatter_is_subtracted_from_what_a_scanner_wrote(
     folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Less signal is more attenuation, everywhere in the plastic; texts alone are a scanner's."""
+    """Less signal is more attenuation, everywhere in the plastic; texts alone are a
+    scanner's."""
     monkeypatch.setattr("flexdt.twin.physics.scatter.MAX_HISTORIES", 16)
     words = ["reconstruct", str(folders["plain"]), *COARSE, "--out"]
     ways = {"raw": [], "less": ["--scatter-correction", "abs,steel"]}
@@ -271,7 +309,13 @@ def test_a_scatter_correction_that_cannot_be(
     request = Request(scatter_correction=("abs",))
     with pytest.raises(TwinError, match="without scatter"):
         reconstruct_dataset(made_by(made, physics_poly=1.0), tmp_path / "x.mha", request)
-    words = ["reconstruct", str(folders["plain"]), *COARSE, "--out", str(tmp_path / "x.mha")]
+    words = [
+        "reconstruct",
+        str(folders["plain"]),
+        *COARSE,
+        "--out",
+        str(tmp_path / "x.mha"),
+    ]
     for names, code, why in (
         ("cheese", 1, "unknown material 'cheese'"),
         (" , ", 3, "no material"),
@@ -316,7 +360,9 @@ def test_slices_of_slabs_are_those_of_the_volume() -> None:
             taken.take(volume[first:last])
         np.testing.assert_array_equal(taken.images["xy"], np.flip(volume[nz // 2], 0))
         np.testing.assert_array_equal(taken.images["xz"], np.flip(volume[:, ny // 2], 0))
-        np.testing.assert_array_equal(taken.images["yz"], np.flip(volume[:, :, nx // 2], 0))
+        np.testing.assert_array_equal(
+            taken.images["yz"], np.flip(volume[:, :, nx // 2], 0)
+        )
 
 
 def run(words: list[str]) -> int:
@@ -339,9 +385,22 @@ def test_the_command(
     assert len(document["slices"]) == 3
     assert read_volume(out).shape == (40, 20, 24)
     for name in ("c.gif", "c.npy", "c.gz", "c"):
-        assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / name)]) == 2
+        assert (
+            run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / name)])
+            == 2
+        )
         assert "ending" in capsys.readouterr().err
-    assert run(["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "no" / "c.tif")]) == 1
+    assert (
+        run(
+            [
+                "reconstruct",
+                str(folders["plain"]),
+                "--out",
+                str(tmp_path / "no" / "c.tif"),
+            ]
+        )
+        == 1
+    )
     assert "folder" in capsys.readouterr().err
     base = ["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "d.mha")]
     for extra, about in (

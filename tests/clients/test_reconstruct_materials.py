@@ -22,7 +22,9 @@ WORDS = ("pmma", "steel")
 @pytest.fixture(scope="module")
 def data() -> fx.DataSet:
     y, x = np.mgrid[:8, :8] - 3.5
-    layer = np.where(x**2 + y**2 < 12, 0.02, 0.0) + np.where((x == 1.5) & (y == 0.5), 0.6, 0.0)
+    layer = np.where(x**2 + y**2 < 12, 0.02, 0.0) + np.where(
+        (x == 1.5) & (y == 0.5), 0.6, 0.0
+    )
     lines = fx.forward(fx.Volume(np.repeat(layer[None], 3, 0), 0.75), SCAN)
     counts = np.rint(40000 * np.exp(-lines)).astype(np.uint16)
     return fx.DataSet.from_arrays(counts, SCAN, flat=np.full((4, 12), 40000), name="pins")
@@ -38,22 +40,32 @@ def test_materials_reach_the_iterations(data: fx.DataSet) -> None:
     plain = data.reconstruct("sirt", **given).data
     assert np.abs(found.data - plain).max() > 0.02
     one = data.reconstruct("sirt", material=["pmma"], **given).data
-    np.testing.assert_array_equal(one, data.reconstruct("sirt", material="pmma", **given).data)
+    np.testing.assert_array_equal(
+        one, data.reconstruct("sirt", material="pmma", **given).data
+    )
     single = {**given, "tube": fx.Tube(kV=90, mono_keV=50)}
-    np.testing.assert_array_equal(data.reconstruct("sirt", material=WORDS, **single).data, plain)
+    np.testing.assert_array_equal(
+        data.reconstruct("sirt", material=WORDS, **single).data, plain
+    )
 
 
 @pytest.mark.parametrize(
     ("algorithm", "names", "said"),
     [
-        ("fdk", WORDS, "materials pmma, steel with fdk; allowed: one, or several with sirt or"),
+        (
+            "fdk",
+            WORDS,
+            "materials pmma, steel with fdk; allowed: one, or several with sirt or",
+        ),
         ("tv", WORDS, "with tv"),
         ("sirt", (), "no material"),
         ("sirt", ("pmma", "pmma"), "attenuate alike"),
         ("sirt", ("pmma", "stel"), "unknown material 'stel'"),
     ],
 )
-def test_what_is_refused(data: fx.DataSet, algorithm: str, names: tuple[str], said: str) -> None:
+def test_what_is_refused(
+    data: fx.DataSet, algorithm: str, names: tuple[str], said: str
+) -> None:
     with pytest.raises(fx.TwinError, match=said):
         data.reconstruct(algorithm, material=names, tube=fx.Tube(kV=90), voxel=0.75)
 

@@ -27,7 +27,17 @@ NO_PAGES = {
 }
 """Modules with markup that is not a page's."""
 VOID = ("meta",)
-NASTY = ("<b>", "&lt;", "a & b", "</p>", "'\"", "<script>x</script>", "{title}", "é·", "  ")
+NASTY = (
+    "<b>",
+    "&lt;",
+    "a & b",
+    "</p>",
+    "'\"",
+    "<script>x</script>",
+    "{title}",
+    "é·",
+    "  ",
+)
 
 
 class Parsed(HTMLParser):
@@ -81,7 +91,12 @@ def test_every_part_says_its_text_and_nothing_else(tags: str) -> None:
 
 
 def test_a_page_has_its_title_and_its_parts() -> None:
-    body = [r.heading("a<b"), "", r.figure("<svg><g></g></svg>"), "<i>of another distribution</i>"]
+    body = [
+        r.heading("a<b"),
+        "",
+        r.figure("<svg><g></g></svg>"),
+        "<i>of another distribution</i>",
+    ]
     found = Parsed(r.page("x & <y>", body).removeprefix("<!doctype html>"))
     assert found.tags == ["html", "head", "meta", "title", "style", "body", "h1", "figure", "svg",
                           "g", "i"]  # fmt: skip
@@ -89,7 +104,9 @@ def test_a_page_has_its_title_and_its_parts() -> None:
 
 
 def test_rows_and_columns_have_their_classes() -> None:
-    found = Parsed(r.table(["n", "what"], [[1, "a"], [2, "b"]], kinds=["error"], text=["what"]))
+    found = Parsed(
+        r.table(["n", "what"], [[1, "a"], [2, "b"]], kinds=["error"], text=["what"])
+    )
     assert found.classes == ["text", "error", "text", "text"]
 
 
@@ -129,12 +146,20 @@ def test_a_plot_of_clearance_is_to_scale() -> None:
     svg = dry_run_page.clearance_plot(Clearance(hits, -3.0, None, trace))
     curve = places(group(svg, "Smallest-clearance-"))
     across = np.polyfit([0.0, 2.5, 7.5, 10.0], curve[:, 0], 1)
-    up = np.polyfit([40.0, 0.0, 10.0, 0.0], curve[:, 1], 1)  # parts that overlap are 0 apart
-    np.testing.assert_allclose(np.polyval(across, [t for t, _ in trace]), curve[:, 0], atol=1e-3)
-    np.testing.assert_allclose(np.polyval(up, [40.0, 0.0, 10.0, 0.0]), curve[:, 1], atol=1e-3)
+    up = np.polyfit(
+        [40.0, 0.0, 10.0, 0.0], curve[:, 1], 1
+    )  # parts that overlap are 0 apart
+    np.testing.assert_allclose(
+        np.polyval(across, [t for t, _ in trace]), curve[:, 0], atol=1e-3
+    )
+    np.testing.assert_allclose(
+        np.polyval(up, [40.0, 0.0, 10.0, 0.0]), curve[:, 1], atol=1e-3
+    )
     assert across[0] > 60.0
     assert up[0] < -3.0
-    for k, (hit, title) in enumerate(zip(hits, ("a&lt;b and panel", "x and y"), strict=True)):
+    for k, (hit, title) in enumerate(
+        zip(hits, ("a&lt;b and panel", "x and y"), strict=True)
+    ):
         mark = group(svg, f"Smallest-clearance-mark-{k}")
         assert f"<title>line {hit.line}: {title}</title>" in mark
         x, y = places(mark).T

@@ -17,15 +17,15 @@ from flexdt.clients.client import twin_methods as m
 from flexdt.protocol.methods.job_messages import SubmitResult
 
 FILE = Path(client.__file__)
-HEAD = (
-    '    """The methods of the wire; how they wait is the client\'s. Written by `make web`."""\n\n'
-)
+HEAD = '    """The methods of the wire; how they wait is the client\'s. Written by `make web`."""\n\n'  # noqa: E501
 
 
 def lines() -> str:
     functions = inspect.getmembers(twin_methods, inspect.isfunction)
     own = [
-        f for _, f in functions if f.__module__ == twin_methods.__name__ and f.__name__[0] != "_"
+        f
+        for _, f in functions
+        if f.__module__ == twin_methods.__name__ and f.__name__[0] != "_"
     ]
     own.sort(key=lambda f: f.__code__.co_firstlineno)
     return "".join(f"    {f.__name__} = ClientMethod(m.{f.__name__})\n" for f in own)
@@ -45,7 +45,15 @@ def test_the_list_of_methods_is_current() -> None:
 
 @pytest.mark.parametrize(
     "method",
-    [m.job_status, m.pause_job, m.resume_job, m.step_job, m.abort_job, m.forget_job, m.wait_job],
+    [
+        m.job_status,
+        m.pause_job,
+        m.resume_job,
+        m.step_job,
+        m.abort_job,
+        m.forget_job,
+        m.wait_job,
+    ],
 )
 def test_a_job_is_named_or_is_what_submitted_it(method: Callable[..., Any]) -> None:
     """`wait_job(submit_script(...))` is the natural first try."""

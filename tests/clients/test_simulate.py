@@ -1,4 +1,5 @@
-"""`simulate` against Beer and Lambert, the sum over the spectrum, photon statistics and the twin.
+"""`simulate` against Beer and Lambert, the sum over the spectrum, photon statistics and the
+twin.
 
 Path lengths, shadows, spectra and variances are written out here in plain numpy.
 """
@@ -91,11 +92,20 @@ def test_one_energy_through_a_ball_is_beer_lambert(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cone = view(rng)
     centre, radius = rng.uniform(-2, 2, 3), rng.uniform(2, 5)
-    ball = {"kind": "sphere", "center": centre.tolist(), "radius": radius, "material": "Al@2.70"}
+    ball = {
+        "kind": "sphere",
+        "center": centre.tolist(),
+        "radius": radius,
+        "material": "Al@2.70",
+    }
     tube = Tube(kV=90, mono_keV=60.25, spot_mm=0.0)
     scan = simulate(ball, cone, tube=tube, detector=SHARP, shape=SHAPE)
-    mu = Substance.of("Al", "Al", 2.70).attenuation()[np.searchsorted(tables().energy_keV, 60.2)]
-    assert mu == pytest.approx(0.2778 * 2.70 / 10, rel=0.01)  # NIST XCOM, with coherent scattering
+    mu = Substance.of("Al", "Al", 2.70).attenuation()[
+        np.searchsorted(tables().energy_keV, 60.2)
+    ]
+    assert mu == pytest.approx(
+        0.2778 * 2.70 / 10, rel=0.01
+    )  # NIST XCOM, with coherent scattering
     depth = mu * chord(cone.rows[0], centre, radius)
     np.testing.assert_allclose(transmission(scan)[0], np.exp(-depth), atol=6e-5)
     np.testing.assert_allclose(scan.truth.line_integrals()[0], depth, atol=2e-4)
@@ -105,10 +115,17 @@ def test_a_pixel_averages_the_signals_of_its_rays() -> None:
     rng = np.random.default_rng(12)
     cone = ConeVec(np.concatenate([view(rng).rows for _ in range(2)]))
     centre, radius = rng.uniform(-1.5, 1.5, 3), rng.uniform(4.0, 6.0)
-    ball = {"kind": "sphere", "center": centre.tolist(), "radius": radius, "material": "Al@2.70"}
+    ball = {
+        "kind": "sphere",
+        "center": centre.tolist(),
+        "radius": radius,
+        "material": "Al@2.70",
+    }
     scan = simulate(ball, cone, tube=Tube(kV=90, mono_keV=60.25, spot_mm=0.0), detector=SHARP,
                     shape=SHAPE, rays=3)  # fmt: skip
-    mu = Substance.of("Al", "Al", 2.70).attenuation()[np.searchsorted(tables().energy_keV, 60.2)]
+    mu = Substance.of("Al", "Al", 2.70).attenuation()[
+        np.searchsorted(tables().energy_keV, 60.2)
+    ]
     for image, row in zip(transmission(scan), cone.rows, strict=True):
         expected = np.zeros(SHAPE)
         for j in (-1, 0, 1):
@@ -127,7 +144,9 @@ def test_a_pixel_averages_the_signals_of_its_rays() -> None:
             simulate(ball, cone, shape=SHAPE, **{name: 4.0})
 
 
-@pytest.mark.parametrize(("metal", "keV"), [("Cu@8.96", 50.0), ("Gd@7.9", 50.2), ("Gd@7.9", 50.3)])
+@pytest.mark.parametrize(
+    ("metal", "keV"), [("Cu@8.96", 50.0), ("Gd@7.9", 50.2), ("Gd@7.9", 50.3)]
+)
 def test_one_energy_attenuates_as_the_material_says(metal: str, keV: float) -> None:
     box = {"kind": "box", "center": [0, 0, 0], "size": [300, 0.1, 300], "material": metal}
     cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
@@ -152,7 +171,9 @@ def test_the_flat_images_doubt_looks_at_all_views(views: int) -> None:
 
 def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -> None:
     cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
-    tube = Tube(kV=80, power_W=40, filters=[("Al@2.70", 0.5), ("Cu@8.96", 0.1)], spot_mm=0.0)
+    tube = Tube(
+        kV=80, power_W=40, filters=[("Al@2.70", 0.5), ("Cu@8.96", 0.1)], spot_mm=0.0
+    )
     scan = simulate(SCENE, cone, tube=tube, detector=replace(SHARP, electrons_per_count=300.0),
                     exposure_ms=100.0, shape=SHAPE)  # fmt: skip
     table = tables()
@@ -164,7 +185,9 @@ def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -
     pmma = 2 * np.sqrt(np.maximum(36.0 * (d[..., 0] ** 2 + d[..., 1] ** 2) - (300 * d[..., 0]) ** 2,
                                   0.0)) / (d[..., 0] ** 2 + d[..., 1] ** 2)  # fmt: skip
     bead = chord(cone.rows[0], np.zeros(3), 1.5)
-    depth = (pmma - bead)[..., None] * mu("C5H8O2", 1.19) + bead[..., None] * mu("Al", 2.70)
+    depth = (pmma - bead)[..., None] * mu("C5H8O2", 1.19) + bead[..., None] * mu(
+        "Al", 2.70
+    )
     expected = np.exp(-depth) @ weight / weight.sum()
     np.testing.assert_allclose(transmission(scan)[0], expected, rtol=1.5e-3)
     # mAs times the solid angle of a pixel, from a fluence per cm2 and mAs at 1 m
@@ -179,7 +202,11 @@ def mu(formula: str, density: float) -> np.ndarray:
     table = tables()
     mass = {s: n * table.molar_mass[table.elements[s]] for s, n in atoms.items()}
     total = sum(mass.values())
-    return sum(m / total * table.total[table.elements[s]] for s, m in mass.items()) * density / 10
+    return (
+        sum(m / total * table.total[table.elements[s]] for s, m in mass.items())
+        * density
+        / 10
+    )
 
 
 @pytest.mark.parametrize("ideal", [True, False])
@@ -197,7 +224,9 @@ def test_noise_has_the_variance_of_a_compound_poisson_process(ideal: bool) -> No
                     shape=SHAPE)  # fmt: skip
     table = tables()
     energy = table.energy_keV
-    photons = table.fluence[int(np.flatnonzero(table.kV == 60)[0])] * np.exp(-0.5 * mu("Al", 2.7))
+    photons = table.fluence[int(np.flatnonzero(table.kV == 60)[0])] * np.exp(
+        -0.5 * mu("Al", 2.7)
+    )
     d = directions(one.rows[0])[..., 1]
     behind = np.exp(-4.0 / d[..., None] * mu("C5H8O2", 1.19))
     flux = PIXEL**2 / 100 * (1000.0 * d / 500.0) ** 2 * d * (50 / 60 * 0.02)
@@ -208,9 +237,13 @@ def test_noise_has_the_variance_of_a_compound_poisson_process(ideal: bool) -> No
     variance = there @ (square * charge**2 + part * charge) / 2 + 3e4**2 / 2
     in_counts = variance / gain**2 + 1.0 / 12.0
     measured = scan.counts().astype(float).var(axis=0, ddof=1)
-    assert (measured / in_counts).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / 119 / 3072))
+    assert (measured / in_counts).mean() == pytest.approx(
+        1.0, abs=5 * np.sqrt(2 / 119 / 3072)
+    )
     mean = scan.counts().mean(axis=0) - 100.0
-    assert (mean / (there @ (part * charge) / gain)).mean() == pytest.approx(1.0, abs=1e-3)
+    assert (mean / (there @ (part * charge) / gain)).mean() == pytest.approx(
+        1.0, abs=1e-3
+    )
     again = simulate(slab, cone[:3], tube=Tube(kV=60, spot_mm=0.0), detector=detector, noise=5,
                      shape=SHAPE)  # fmt: skip
     # No view depends on the others.
@@ -222,26 +255,47 @@ def test_noise_has_the_variance_of_a_compound_poisson_process(ideal: bool) -> No
 def test_points_of_the_spot_blur_each_depth_as_it_is(seed: int) -> None:
     """Two knives at two depths: the width of each edge's shadow by similar triangles."""
     rng = np.random.default_rng(seed)
-    sod, sdd, pixel, spot = rng.uniform(40, 60), rng.uniform(300, 400), 0.1, rng.uniform(0.08, 0.12)
-    depths = rng.uniform(8, 15), -rng.uniform(8, 15)  # upper knife, towards the source, and lower
+    sod, sdd, pixel, spot = (
+        rng.uniform(40, 60),
+        rng.uniform(300, 400),
+        0.1,
+        rng.uniform(0.08, 0.12),
+    )
+    depths = (
+        rng.uniform(8, 15),
+        -rng.uniform(8, 15),
+    )  # upper knife, towards the source, and lower
     knives = [
         {"kind": "box", "center": [-15.0, -at, side * 9.52], "size": [30.0, 0.02, 19.0],
          "material": "W@19.25"}
         for at, side in zip(depths, (1, -1), strict=True)
     ]  # fmt: skip
-    cone = ConeVec.from_vectors([0, -sod, 0], [0, sdd - sod, 0], [pixel, 0, 0], [0, 0, -pixel])
+    cone = ConeVec.from_vectors(
+        [0, -sod, 0], [0, sdd - sod, 0], [pixel, 0, 0], [0, 0, -pixel]
+    )
     ideal = Detector.ideal(bits=16)
     tube = Tube(kV=60, power_W=20, spot_mm=spot)
 
     def widths(points: int, rays: int = 1) -> list[float]:
         scan = simulate(
-            knives, cone, tube=tube, detector=ideal, shape=(61, 121), spot_points=points, rays=rays
+            knives,
+            cone,
+            tube=tube,
+            detector=ideal,
+            shape=(61, 121),
+            spot_points=points,
+            rays=rays,
         )
         assert ("spot_points" in " ".join(scan.warnings)) == (points == 1)
         found = []
         for row in (5, 55):
-            spread = np.diff(np.exp(-scan.truth.line_integrals()[0, row, 36:85].astype(float)))
-            x = np.arange(len(spread)) - (spread * np.arange(len(spread))).sum() / spread.sum()
+            spread = np.diff(
+                np.exp(-scan.truth.line_integrals()[0, row, 36:85].astype(float))
+            )
+            x = (
+                np.arange(len(spread))
+                - (spread * np.arange(len(spread))).sum() / spread.sum()
+            )
             found.append(float((spread * x**2).sum() / spread.sum()))
         return found
 
@@ -262,12 +316,19 @@ def test_no_axis_is_mirrored(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cone = view(rng)
     for place in np.diag([4.0, 3.0, 5.0]):
-        ball = {"kind": "sphere", "center": place.tolist(), "radius": 0.8, "material": "steel"}
+        ball = {
+            "kind": "sphere",
+            "center": place.tolist(),
+            "radius": 0.8,
+            "material": "steel",
+        }
         scan = simulate(ball, cone, detector=SHARP, shape=SHAPE)
         dark = 1.0 - transmission(scan)[0]
         rows, cols = np.indices(SHAPE)
         source, centre, u, v = cone.rows[0].reshape(4, 3)
-        lands = np.linalg.solve(np.column_stack([place - source, -u, -v]), centre - source)
+        lands = np.linalg.solve(
+            np.column_stack([place - source, -u, -v]), centre - source
+        )
         assert (cols * dark).sum() / dark.sum() == pytest.approx(
             lands[1] + 31.5, abs=0.15
         )  # edges fall between pixels
@@ -277,7 +338,10 @@ def test_no_axis_is_mirrored(seed: int) -> None:
 
 
 def test_two_boxes_of_one_mesh_are_exact_without_voxels(tmp_path: Path) -> None:
-    boxes = [trimesh.creation.box(extents=(4, 6, 8)), trimesh.creation.box(extents=(3, 2, 8))]
+    boxes = [
+        trimesh.creation.box(extents=(4, 6, 8)),
+        trimesh.creation.box(extents=(3, 2, 8)),
+    ]
     boxes[1].apply_translation((6, 0, 0))
     file = tmp_path / "two.stl"
     trimesh.util.concatenate(boxes).export(file)
@@ -291,7 +355,8 @@ def test_two_boxes_of_one_mesh_are_exact_without_voxels(tmp_path: Path) -> None:
 
 
 def test_line_integrals_of_a_ball_a_mesh_and_voxels_add_up() -> None:
-    """Aluminium at 50 keV has 0.3681 cm2/g (NIST), which is where phantoms state attenuation."""
+    """Aluminium at 50 keV has 0.3681 cm2/g (NIST), which is where phantoms state
+    attenuation."""
     cone = view(np.random.default_rng(7))
     ball = {"kind": "sphere", "center": [1, 2, -3], "radius": 4, "material": "Al@2.70"}
     cubes = [trimesh.creation.box(extents=(3, 3, 3)) for _ in range(2)]
@@ -306,7 +371,9 @@ def test_line_integrals_of_a_ball_a_mesh_and_voxels_add_up() -> None:
     grid = np.zeros((48, 12, 12), np.float32)  # the same cubes as voxels of 0.25 mm
     grid[:12] = grid[36:] = 1.0
     volume = Volume(grid * np.float32(material("water").mu_per_mm), 0.25, (0.0, 0.0, 4.5))
-    np.testing.assert_allclose(both - alone, project(volume, cone, shape=SHAPE)[0], atol=2e-4)
+    np.testing.assert_allclose(
+        both - alone, project(volume, cone, shape=SHAPE)[0], atol=2e-4
+    )
 
 
 # -- the same chain as the twin's ------------------------------------------------------------------
@@ -319,7 +386,10 @@ def test_the_twin_makes_the_same_counts(tmp_path: Path, physics: str) -> None:
     places = poses(machine, builtin_profile(machine.default_profile), camera,
                    {"rot_obj": [0.0, 25.0]})  # fmt: skip
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), machine.detector.pixels
+        DirectProjector(),
+        TrueGeometry(),
+        SampleStore(open_data(tmp_path)),
+        machine.detector.pixels,
     )
     twin = Radiography.of(imaging, machine, physics)  # type: ignore[arg-type]
     exposure = ExposureSettings(70.0, 20.0, 80.0)
@@ -367,7 +437,12 @@ def test_every_form_of_a_sample(tmp_path: Path) -> None:
         "toml": (20.0, 20.0, 44.0), "list": (12.0, 12.0, 40.0),
     }  # fmt: skip
     assembly = as_phantom(tmp_path / "scene.toml")
-    assert [s.material for s in assembly.scene.solids] == ["pmma", "pmma", "Al@2.70", "steel"]
+    assert [s.material for s in assembly.scene.solids] == [
+        "pmma",
+        "pmma",
+        "Al@2.70",
+        "steel",
+    ]
     assert Phantom.from_dict(json.loads(json.dumps(assembly.to_dict()))) == assembly
 
 
@@ -391,7 +466,10 @@ LINE = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PI
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"scatter": "lots"}, "scatter is 'lots'; allowed: 'off', 'mc' or a ScatterSettings"),
+        (
+            {"scatter": "lots"},
+            "scatter is 'lots'; allowed: 'off', 'mc' or a ScatterSettings",
+        ),
         ({"scatter": "first"}, "'first' has been removed, use 'mc'"),
         ({"noise": -1}, "seed >= 0"),
         ({"shape": (0, 3)}, "both positive"),
@@ -400,20 +478,30 @@ LINE = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PI
         ({"sample": {1, 2}}, "a sample cannot be set"),
         ({"sample": "lego", "material": "steel"}, "its own materials"),
         ({"sample": [Volume(BLOCK, 1.0), "lego"]}, "cannot be put"),
-        ({"sample": [{"kind": "sphere", "center": [0, 0, 0], "material": "pmma"}]}, "radius is"),
+        (
+            {"sample": [{"kind": "sphere", "center": [0, 0, 0], "material": "pmma"}]},
+            "radius is",
+        ),
         ({"detector": Detector(pixel_mm=0.1)}, "the geometry's 0.4 mm"),
         ({"machine": "flexray"}, "whole number times 0.0748"),
         ({"machine": "nowhere"}, "nowhere"),
     ],
 )
-def test_what_does_not_hold_says_what_is_allowed(wrong: dict[str, object], message: str) -> None:
+def test_what_does_not_hold_says_what_is_allowed(
+    wrong: dict[str, object], message: str
+) -> None:
     with pytest.raises(TwinError, match=message):
         simulate(**{"sample": "normal-2", "geometry": LINE, "shape": SHAPE, **wrong})  # type: ignore[arg-type]
 
 
 @pytest.mark.filterwarnings("ignore:the flat image is that")
 def test_a_detector_or_tube_that_cannot_be() -> None:
-    for figures in ({"bits": 17}, {"averages": 1.5}, {"swank": 0.0}, {"exposure_ms": float("nan")}):
+    for figures in (
+        {"bits": 17},
+        {"averages": 1.5},
+        {"swank": 0.0},
+        {"exposure_ms": float("nan")},
+    ):
         with pytest.raises(LimitError, match="allowed"):
             Detector(**figures)  # type: ignore[arg-type]
     with pytest.raises(
@@ -436,7 +524,8 @@ def test_a_detector_or_tube_that_cannot_be() -> None:
 
 
 def test_scatter_is_added_to_what_comes_straight() -> None:
-    """Transmission with scatter less transmission without is the scatter that `truth` states."""
+    """Transmission with scatter less transmission without is the scatter that `truth`
+    states."""
     cone = ConeVec.circular(sod=300, sdd=500, angles=[0, 3, 90], shape=SHAPE, pixel=PIXEL)
     given = {"tube": Tube(kV=80, mono_keV=60), "detector": SHARP, "noise": 4}
     plain = simulate(SCENE, cone, **given)  # type: ignore[arg-type]
@@ -454,7 +543,9 @@ def test_scatter_is_added_to_what_comes_straight() -> None:
     np.testing.assert_allclose(lost.mean() / open_beam.mean(), stated.mean(), rtol=0.02)
     again = simulate(SCENE, cone, scatter="mc", **given)  # type: ignore[arg-type]
     np.testing.assert_array_equal(again.counts(), scan.counts())
-    assert all(one.error.mean() < 0.03 * one.mean.mean() for one in scan.truth.scatter.images)
+    assert all(
+        one.error.mean() < 0.03 * one.mean.mean() for one in scan.truth.scatter.images
+    )
 
 
 RODS = [
@@ -488,7 +579,8 @@ def test_scatter_is_subtracted_from_a_scan_of_two_materials() -> None:
     }
     for where in places.values():
         truth, before, after = (
-            float(volume.data[1][where].mean()) for volume in (plain, scattered, corrected)
+            float(volume.data[1][where].mean())
+            for volume in (plain, scattered, corrected)
         )
         assert abs(before / truth - 1) > 0.02
         assert after == pytest.approx(truth, rel=0.006)
@@ -496,10 +588,18 @@ def test_scatter_is_subtracted_from_a_scan_of_two_materials() -> None:
 
 def test_a_scatter_grid_keeps_the_mass_of_solids_meshes_and_voxels() -> None:
     """A ball, the mesh of a box and voxels, off the coarse planes, against their volumes."""
-    ball = as_phantom({"kind": "sphere", "center": [1, 0, 2], "radius": 3, "material": "pmma"})
+    ball = as_phantom(
+        {"kind": "sphere", "center": [1, 0, 2], "radius": 3, "material": "pmma"}
+    )
     mesh = as_phantom(trimesh.creation.box((4.0, 5.0, 7.0)), material="aluminium")
-    voxels = as_phantom(np.full((7, 10, 8), 0.5, np.float32), voxel_mm=0.7, material="pmma")
-    for phantom, volume in ((ball, 36 * np.pi), (mesh, 140.0), (voxels, 560 * 0.5 * 0.7**3)):
+    voxels = as_phantom(
+        np.full((7, 10, 8), 0.5, np.float32), voxel_mm=0.7, material="pmma"
+    )
+    for phantom, volume in (
+        (ball, 36 * np.pi),
+        (mesh, 140.0),
+        (voxels, 560 * 0.5 * 0.7**3),
+    ):
         grid = scatter_object(channels(phantom), phantom.size_mm, 900)
         found = grid.amounts.sum(dtype=float) * np.prod(grid.voxel_mm)
         assert found == pytest.approx(volume, rel=0.02)
@@ -510,8 +610,8 @@ BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
 
 
 def _by_the_texts(folder: Path, count: int, shape: tuple[int, int]) -> np.ndarray:
-    """(n, 12) rows from `scan settings.txt` alone, by the meaning of its keys: HC, VC and COR from
-    the edge of the corner pixel, angles growing clockwise seen from above.
+    """(n, 12) rows from `scan settings.txt` alone, by the meaning of its keys: HC, VC and COR
+    from the edge of the corner pixel, angles growing clockwise seen from above.
     """
     lines = (folder / "scan settings.txt").read_text().splitlines()
     said = dict(re.split(r"\s*:\s*", line, maxsplit=1) for line in lines if ":" in line)
@@ -522,7 +622,9 @@ def _by_the_texts(folder: Path, count: int, shape: tuple[int, int]) -> np.ndarra
     found = []
     for phi in np.linspace(float(said["Start angle"]), float(said["Last angle"]), count):
         c, s = np.cos(np.radians(phi)), np.sin(np.radians(phi))
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # the object clockwise, its scanner not
+        turn = np.array(
+            [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        )  # the object clockwise, its scanner not
         places = [(-axis, -sod, 0), (panel[0] - axis, panel[1] - sod, panel[2])]
         found.append([turn @ p for p in (*places, (pixel, 0, 0), (0, 0, -pixel))])
     return np.reshape(found, (count, 12))
@@ -531,7 +633,10 @@ def _by_the_texts(folder: Path, count: int, shape: tuple[int, int]) -> np.ndarra
 @pytest.mark.parametrize("seed", range(3))
 def test_a_saved_simulation_has_the_texts_of_a_scanner(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)
-    count, shape = int(rng.integers(2, 6)), (int(rng.integers(8, 12)), int(rng.integers(8, 14)))
+    count, shape = (
+        int(rng.integers(2, 6)),
+        (int(rng.integers(8, 12)), int(rng.integers(8, 14))),
+    )
     scan = ConeVec.circular(
         sod=rng.uniform(100, 600), sdd=rng.uniform(700, 1100), shape=shape, pixel=rng.uniform(1, 3),
         angles=rng.uniform(-300, 300) + rng.uniform(-90, 90) * np.arange(count),
@@ -555,7 +660,14 @@ def test_a_saved_simulation_has_the_texts_of_a_scanner(seed: int, tmp_path: Path
 def test_texts_that_would_say_another_geometry_are_not_written(
     wrong: dict[str, object], tmp_path: Path
 ) -> None:
-    options = {"sod": 200, "sdd": 400, "angles": 3, "shape": (8, 9), "pixel": 2.0, **wrong}
+    options = {
+        "sod": 200,
+        "sdd": 400,
+        "angles": 3,
+        "shape": (8, 9),
+        "pixel": 2.0,
+        **wrong,
+    }
     scan = ConeVec.circular(**options)  # type: ignore[arg-type]
     simulate(BALL, scan, noise=1).save(tmp_path / "made")
     assert not list((tmp_path / "made").glob("*settings*"))
@@ -566,7 +678,9 @@ def test_texts_that_would_say_another_geometry_are_not_written(
 def test_pixels_need_not_be_square() -> None:
     """Place and size by hand; area and blur are those of the pixels, in mm alike both ways."""
     pitch = (0.2, 0.5)
-    view = ConeVec.from_vectors([0, -400, 0], [0, 400, 0], [pitch[0], 0, 0], [0, 0, -pitch[1]])
+    view = ConeVec.from_vectors(
+        [0, -400, 0], [0, 400, 0], [pitch[0], 0, 0], [0, 0, -pitch[1]]
+    )
     ball = {"kind": "sphere", "center": [3, 0, -5], "radius": 4, "material": "aluminium"}
     panel = Detector.ideal(bits=16, electrons_per_count=400.0, blur_mm=1.0)
     tube = Tube(kV=60, spot_mm=1.5)
@@ -581,7 +695,9 @@ def test_pixels_need_not_be_square() -> None:
     down = (weight * (rows - centre[1]) ** 2).sum() * pitch[1] ** 2
     assert across == pytest.approx(down, rel=0.01)
     fine = Detector.ideal(bits=16, electrons_per_count=400.0, blur_mm=0.0)
-    sharp = simulate(ball, view, tube=Tube(kV=60, spot_mm=0.0), detector=fine, shape=shape)
+    sharp = simulate(
+        ball, view, tube=Tube(kV=60, spot_mm=0.0), detector=fine, shape=shape
+    )
     edge = 1.0 - sharp.counts(0) / sharp.flat
     before = (edge / edge.sum() * (rows - centre[1]) ** 2).sum() * pitch[1] ** 2
     # Variances add: 1 mm of light, and the spot's at magnification 2.
@@ -589,9 +705,13 @@ def test_pixels_need_not_be_square() -> None:
     square = replace_rows(view, 0.2)
     alike = {"tube": tube, "exposure_ms": scan.truth.exposure.exposure_ms}
     less = simulate(ball, square, detector=panel, shape=shape, **alike).flat
-    assert (scan.flat[45, 100] - 100) / (less[45, 100] - 100) == pytest.approx(2.5, rel=0.01)
+    assert (scan.flat[45, 100] - 100) / (less[45, 100] - 100) == pytest.approx(
+        2.5, rel=0.01
+    )
     # The panel of a machine has the file's pitches, and no others.
-    with pytest.raises(LimitError, match=r"0.2 x 0.5 mm; allowed .* one whole number times"):
+    with pytest.raises(
+        LimitError, match=r"0.2 x 0.5 mm; allowed .* one whole number times"
+    ):
         simulate(ball, view, machine="xyzr_cabinet", shape=shape)
     uneven = ConeVec(np.concatenate([view.rows, square.rows]), shape)
     with pytest.raises(GeometryError, match=r"0.2 to 0.5 mm along v; allowed: alike"):

@@ -14,8 +14,8 @@ from flexdt.twin.geometry.poses import Poses
 
 @pytest.mark.parametrize("pitch", [(0.31, 0.2), (0.2, 0.31), (0.2, 0.5)])
 def test_rows_are_where_the_panel_has_them(pitch: tuple[float, float]) -> None:
-    """An image that grows evenly with height reads the same at the same height, and all light is
-    kept."""
+    """An image that grows evenly with height reads the same at the same height, and all light
+    is kept."""
     cone = fx.ConeVec.circular(sod=100, sdd=200, angles=3, shape=(60, 40), pixel=pitch)
     height = -np.arange(60) * np.linalg.norm(cone.v[0])
     image = np.rint(20_000 + 400 * (height - height.mean()))[:, None] + np.zeros(40)

@@ -1,4 +1,5 @@
-"""The TIFF reader: every uint16 image that tifffile can read, and a typed error for the rest."""
+"""The TIFF reader: every uint16 image that tifffile can read, and a typed error for the
+rest."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def test_plain_images_of_either_byte_order_and_any_strips(
         {"bigtiff": True},
     ],
 )
-def test_other_forms_of_the_same_image(tmp_path: Path, options: dict[str, object]) -> None:
+def test_other_forms_of_the_same_image(
+    tmp_path: Path, options: dict[str, object]
+) -> None:
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, IMAGE, **options)
     assert np.array_equal(read_image(path), IMAGE)
@@ -65,7 +68,9 @@ def test_other_pixels_other_counts_of_images_and_broken_files(tmp_path: Path) ->
         read_image(tmp_path / "missing.tif")
 
 
-def test_pixels_begin_at_byte_8_where_the_scanners_readers_look_for_them(tmp_path: Path) -> None:
+def test_pixels_begin_at_byte_8_where_the_scanners_readers_look_for_them(
+    tmp_path: Path,
+) -> None:
     rng = np.random.default_rng(8)
     for rows, cols in ((1, 1), (5, 7), (760, 956)):
         image = rng.integers(0, 65536, (rows, cols), dtype=np.uint16)

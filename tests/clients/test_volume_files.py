@@ -54,8 +54,8 @@ for name in sys.argv[1:]:
 
 @pytest.mark.slow
 def test_itk_sees_one_place_in_all_formats(tmp_path: Path) -> None:
-    """ITK's axes point left, back and up: x and y of ours with the other sign. It runs in a process
-    of its own, because its HDF5 and h5py's cannot live in one."""
+    """ITK's axes point left, back and up: x and y of ours with the other sign. It runs in a
+    process of its own, because its HDF5 and h5py's cannot live in one."""
     if importlib.util.find_spec("itk") is None:
         pytest.skip("itk is an optional peer")
     endings = [".nrrd", ".mha"]
@@ -97,7 +97,10 @@ def test_slabs_one_after_the_other_are_the_whole(ending: str, tmp_path: Path) ->
 
 
 def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), volume_writer(tmp_path / "v.mha", fx.Grid((2, 2, 2), 1.0)):
+    with (
+        pytest.raises(RuntimeError),
+        volume_writer(tmp_path / "v.mha", fx.Grid((2, 2, 2), 1.0)),
+    ):
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
 
@@ -111,7 +114,9 @@ def test_what_cannot_be_written_or_read_is_said(
         fx.Volume(DATA, (1, 1, 2)).save(tmp_path / "v.tif")
     np.save(tmp_path / "v.npy", DATA)
     for use in (VOLUME.save, fx.Volume.load):
-        with pytest.raises(fx.TwinError, match=r"one of \.tif, .*\. NumPy's files have no room"):
+        with pytest.raises(
+            fx.TwinError, match=r"one of \.tif, .*\. NumPy's files have no room"
+        ):
             use(tmp_path / "v.npy")
     (tmp_path / "bad.mha").write_bytes(b"nothing")
     with pytest.raises(fx.TwinError, match="not a volume"):
@@ -161,6 +166,8 @@ def test_other_formats_say_which_hold_three_edges(tmp_path: Path, ending: str) -
     volume = fx.Volume(np.zeros((3, 4, 5), np.float32), (0.5, 0.25, 1.5))
     if ending == ".h5":
         pytest.importorskip("h5py")
-    with pytest.raises(fx.TwinError, match=r"allowed: cubes, or \.nrrd, \.mha, \.nii\.gz"):
+    with pytest.raises(
+        fx.TwinError, match=r"allowed: cubes, or \.nrrd, \.mha, \.nii\.gz"
+    ):
         volume.save(tmp_path / f"oblong{ending}")
     assert list(tmp_path.iterdir()) == []

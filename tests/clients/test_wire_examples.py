@@ -1,4 +1,5 @@
-"""The examples of the wire in other languages: bash and C++ are run, MATLAB's lines are sent."""
+"""The examples of the wire in other languages: bash and C++ are run, MATLAB's lines are
+sent."""
 
 from __future__ import annotations
 
@@ -37,7 +38,9 @@ def test_the_shell_example_gets_the_projection(servers: Servers, tmp_path: Path)
         cwd=tmp_path, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    rows, columns = map(int, re.findall(r"rows x columns = (\d+) x (\d+)", done.stdout)[0])
+    rows, columns = map(
+        int, re.findall(r"rows x columns = (\d+) x (\d+)", done.stdout)[0]
+    )
     assert float(re.findall(r"took ([\d.]+) s", done.stdout)[0]) > 1.0
     pixels = np.fromfile(tmp_path / "projection.raw", "<f4").reshape(rows, columns)
     with TwinClient(*servers.address) as twin:
@@ -46,7 +49,9 @@ def test_the_shell_example_gets_the_projection(servers: Servers, tmp_path: Path)
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
-def test_the_shell_example_says_what_the_server_refused(tmp_path: Path, servers: Servers) -> None:
+def test_the_shell_example_says_what_the_server_refused(
+    tmp_path: Path, servers: Servers
+) -> None:
     text = (WIRE / "client.sh").read_text("utf-8").replace("normal-5", "no such thing")
     (tmp_path / "wrong.sh").write_text(text, "utf-8")
     done = subprocess.run(
@@ -57,8 +62,12 @@ def test_the_shell_example_says_what_the_server_refused(tmp_path: Path, servers:
     assert "no such thing" in done.stderr
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here to compile the example with")
-def test_the_cpp_example_compiles_and_gets_the_projection(servers: Servers, tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    shutil.which("g++") is None, reason="no g++ here to compile the example with"
+)
+def test_the_cpp_example_compiles_and_gets_the_projection(
+    servers: Servers, tmp_path: Path
+) -> None:
     program = tmp_path / "client"
     subprocess.run(
         ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-o", program, WIRE / "client.cpp"],
@@ -76,7 +85,9 @@ def test_the_cpp_example_compiles_and_gets_the_projection(servers: Servers, tmp_
     assert float(shown[3]) == pytest.approx(float(image.mean(dtype=np.float64)), rel=1e-4)
     assert float(shown[4]) == pytest.approx(float(image.max()), rel=1e-4)
 
-    nobody = subprocess.run([program, "127.0.0.1", "1"], capture_output=True, text=True, timeout=60)
+    nobody = subprocess.run(
+        [program, "127.0.0.1", "1"], capture_output=True, text=True, timeout=60
+    )
     assert (nobody.returncode, nobody.stderr) == (1, "no server at 127.0.0.1:1\n")
 
 
@@ -94,7 +105,10 @@ def test_what_the_matlab_example_sends_is_understood(servers: Servers) -> None:
         {"kind": "line_integral", "binning": 4},
     ]
     results = []
-    with socket.create_connection(servers.address, timeout=60) as link, link.makefile("rwb") as io:
+    with (
+        socket.create_connection(servers.address, timeout=60) as link,
+        link.makefile("rwb") as io,
+    ):
         for i, (method, given) in enumerate(zip(calls, params, strict=True), 1):
             line = {"jsonrpc": "2.0", "id": i, "method": method, "params": given}
             io.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
@@ -130,7 +144,9 @@ def read_reference(folder: Path) -> None:
     )
     assert flat.min() > dark.max()
     assert flat.max() < 2**14 - 1
-    assert (first - dark).min() < 0.9 * (flat - dark).min()  # the sample is in the projections only
+    assert (first - dark).min() < 0.9 * (
+        flat - dark
+    ).min()  # the sample is in the projections only
 
 
 def test_the_python_example_ends_in_a_volume(servers: Servers, tmp_path: Path) -> None:
@@ -141,7 +157,9 @@ def test_the_python_example_ends_in_a_volume(servers: Servers, tmp_path: Path) -
     scanned(done, tmp_path / "volume.tif")
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here to compile the example with")
+@pytest.mark.skipif(
+    shutil.which("g++") is None, reason="no g++ here to compile the example with"
+)
 def test_the_cpp_trajectory_ends_in_a_volume(servers: Servers, tmp_path: Path) -> None:
     program, source = tmp_path / "trajectory", WIRE / "trajectory.cpp"
     flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror"]

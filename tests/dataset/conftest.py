@@ -10,7 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flexdt.twin.dataset.flexdt_json import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import (
+    FrameBlock,
+    NoiseRecord,
+    SampleRecord,
+    ScanRecord,
+)
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -27,7 +32,9 @@ def make_record(name: str = "scan", frames: int = 5, **changes: object) -> ScanR
     camera = CameraSettings("HW2SW1High", ROI, 80.0, 2, frames)
     still = CameraSettings("HW2SW1High", ROI, 80.0, 10, 1)
 
-    def block(kind: str, files: list[str], camera: CameraSettings, **moved: object) -> FrameBlock:
+    def block(
+        kind: str, files: list[str], camera: CameraSettings, **moved: object
+    ) -> FrameBlock:
         at = {**AT, **moved}
         n = len(files)
         positions = {a: np.broadcast_to(np.asarray(v, dtype=float), (n,)).copy()
@@ -49,7 +56,10 @@ def make_record(name: str = "scan", frames: int = 5, **changes: object) -> ScanR
             block("dark", ["di000000.tif"], still, tra_obj=-100.0),
             block("flat", ["io000000.tif"], still, tra_obj=-100.0),
             block(
-                "projection", [f"scan_{i:06d}.tif" for i in range(frames)], camera, rot_obj=turns
+                "projection",
+                [f"scan_{i:06d}.tif" for i in range(frames)],
+                camera,
+                rot_obj=turns,
             ),
             block("flat", ["io000001.tif"], still, tra_obj=-100.0),
         ),
@@ -59,7 +69,9 @@ def make_record(name: str = "scan", frames: int = 5, **changes: object) -> ScanR
         "complete": True,
         "sample": SampleRecord("bricks", "Ada", diameter_mm=30.0),
         "noise": NoiseRecord(7, {"i0_counts": 12000.0}),
-        "correction": NamedCorrection("c1", "2026-03-13", Offsets.from_edge({"dO_x": 0.5})),
+        "correction": NamedCorrection(
+            "c1", "2026-03-13", Offsets.from_edge({"dO_x": 0.5})
+        ),
         "flat_axis": "tra_obj",
         "version": "0.1",
     }
@@ -72,7 +84,9 @@ def make_images(record: ScanRecord) -> dict[str, Image]:
     slope = np.linspace(0, 50, rows * cols).reshape(rows, cols)
     out = {}
     for name in record.files:
-        level = {"d": 100.0, "i": 1100.0 if name == "io000000.tif" else 3100.0}.get(name[0])
+        level = {"d": 100.0, "i": 1100.0 if name == "io000000.tif" else 3100.0}.get(
+            name[0]
+        )
         if level is None:
             level = 100.0 + 2000.0 * np.exp(-int(name[5:11]) / 4)
         out[name] = (level + slope).astype(np.uint16)

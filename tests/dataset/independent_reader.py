@@ -13,7 +13,14 @@ import sys
 from pathlib import Path
 
 # Profile 2023-08-21 and the axis offsets of 2026 data; the sample's reference height.
-DET_TAN, SRC_ORT, AXS_TAN, C_OBJ, C_DET, HEIGHT = 24.1215, -6.2917, -0.5405, 14.9192, 40.0008, 20.0
+DET_TAN, SRC_ORT, AXS_TAN, C_OBJ, C_DET, HEIGHT = (
+    24.1215,
+    -6.2917,
+    -0.5405,
+    14.9192,
+    40.0008,
+    20.0,
+)
 PITCH, MIDDLE_COLUMN, MIDDLE_ROW = 0.0748, 971, 767
 
 
@@ -66,11 +73,15 @@ def main(folder):
     angles = [math.radians(i * 360.0 / (n - 1)) for i in range(n)]
     document = {
         "motors": [row(source, axis, detector, pixel, a) for a in angles],
-        "printed": [row(source, printed_axis, printed_detector, pixel, a) for a in angles],
+        "printed": [
+            row(source, printed_axis, printed_detector, pixel, a) for a in angles
+        ],
         "shape": [round(rows), round(cols)],
         "voxel_um": number("voxel size"),
         "magnification": number("magnification"),
-        "imported": sorted(m for m in sys.modules if m.split(".")[0] in ("flexdt", "numpy")),
+        "imported": sorted(
+            m for m in sys.modules if m.split(".")[0] in ("flexdt", "numpy")
+        ),
     }
     print(json.dumps(document))
 

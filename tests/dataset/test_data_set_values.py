@@ -20,7 +20,9 @@ from flexdt.twin.dataset.dataset_errors import (
 )
 from flexdt.twin.geometry.offsets import Offsets
 
-SCAN = fx.ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(20, 24), pixel=1.0, offset=(1, 0.5))
+SCAN = fx.ConeVec.circular(
+    sod=600, sdd=1000, angles=12, shape=(20, 24), pixel=1.0, offset=(1, 0.5)
+)
 BALL = [{"kind": "sphere", "center": [3, 0, 0], "radius": 4, "material": "pmma"}]
 
 
@@ -45,7 +47,10 @@ def test_images_are_line_integrals_by_number_and_in_order(data: fx.DataSet) -> N
     assert_allclose(data[np.int64(-1)], expected[-1], atol=1e-5)
     with pytest.raises(IndexError):
         data[12]
-    assert repr(data) == "<DataSet 'scene': 12 projections of 20 x 24 (rows x columns), complete>"
+    assert (
+        repr(data)
+        == "<DataSet 'scene': 12 projections of 20 x 24 (rows x columns), complete>"
+    )
 
 
 def test_slices_are_data_sets(data: fx.DataSet) -> None:
@@ -97,14 +102,18 @@ def test_a_scan_of_the_twin_keeps_its_document_and_a_new_correction(
 
 
 def test_frames_of_others_follow_the_numbers_in_their_names(tmp_path: Path) -> None:
-    images = np.arange(11, dtype=np.uint16)[:, None, None] + np.full((2, 3), 500, np.uint16)
+    images = np.arange(11, dtype=np.uint16)[:, None, None] + np.full(
+        (2, 3), 500, np.uint16
+    )
     for i, image in enumerate(images):
         tifffile.imwrite(tmp_path / f"proj_{i}.tiff", image)
     for name, value in (("dark1.tif", 100), ("white1.tif", 1000), ("white2.tif", 1002)):
         tifffile.imwrite(tmp_path / name, np.full((2, 3), value, np.uint16))
     scan = fx.ConeVec.circular(sod=60, sdd=100, angles=11, pixel=1.0)
     scan.save(tmp_path / "scan.json")
-    read = fx.read_tiffs(str(tmp_path), tmp_path / "scan.json", dark="dark*", flat="white*")
+    read = fx.read_tiffs(
+        str(tmp_path), tmp_path / "scan.json", dark="dark*", flat="white*"
+    )
     assert_array_equal(read.counts(), images)
     assert_allclose(read.line_integrals(), beer(images, 100, 1001), atol=1e-5)
     assert read.geometry == scan.with_shape((2, 3))
@@ -120,7 +129,9 @@ def test_what_the_patterns_took_is_said(tmp_path: Path) -> None:
     for name in ("diamond_0.tif", "iodine_0.tif"):
         tifffile.imwrite(tmp_path / name, np.full((2, 3), 7, np.uint16))
     scan = fx.ConeVec.circular(sod=60, sdd=100, angles=2, pixel=1.0)
-    with pytest.raises(DatasetMissingError, match=r"dark='di\*' and flat='io\*' took diamond_0"):
+    with pytest.raises(
+        DatasetMissingError, match=r"dark='di\*' and flat='io\*' took diamond_0"
+    ):
         fx.read_tiffs(tmp_path, scan)
     assert len(fx.read_tiffs(tmp_path, scan, dark="", flat="")) == 2
 
@@ -147,10 +158,14 @@ def test_the_truth_of_some_views_is_theirs() -> None:
     data = fx.simulate(ball, scan, scatter="mc")
     for chosen in (slice(4, 6), [5, 1]):
         part = data[chosen]
-        assert_array_equal(part.truth.line_integrals(), data.truth.line_integrals()[chosen])
+        assert_array_equal(
+            part.truth.line_integrals(), data.truth.line_integrals()[chosen]
+        )
         assert_array_equal(part.truth.geometry.rows, part.cone_vec.rows)
         views = np.arange(6)[chosen]
-        assert_array_equal(part.truth.scatter[1].signal, data.truth.scatter[views[1]].signal)
+        assert_array_equal(
+            part.truth.scatter[1].signal, data.truth.scatter[views[1]].signal
+        )
 
 
 @pytest.mark.parametrize(
@@ -165,7 +180,9 @@ def test_the_truth_of_some_views_is_theirs() -> None:
         (np.full((12, 20, 24), 1), {"flat": np.ones((2, 2))}, "flat images of shape"),
     ],
 )
-def test_arrays_that_are_no_data_set(counts: object, more: dict[str, object], said: str) -> None:
+def test_arrays_that_are_no_data_set(
+    counts: object, more: dict[str, object], said: str
+) -> None:
     with pytest.raises(fx.TwinError, match=said):
         fx.DataSet.from_arrays(counts, SCAN, **more)  # type: ignore[arg-type]
 
@@ -200,12 +217,16 @@ def test_a_data_set_reconstructs_in_memory(data: fx.DataSet) -> None:
 def test_calibration_corrects_a_data_set_in_memory() -> None:
     """A detector that stands 0.8 mm off is found from the beads alone."""
     beads = fx.phantoms.load_phantom("normal-5")
-    nominal = fx.ConeVec.circular(sod=600, sdd=1059, angles=24, shape=(190, 239), pixel=0.5984)
+    nominal = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=24, shape=(190, 239), pixel=0.5984
+    )
     true = fx.ConeVec.circular(
         sod=600, sdd=1059, angles=24, shape=(190, 239), pixel=0.5984, offset=(0.8, 0.0)
     )
     counts = fx.simulate(beads, true, noise=3)
-    data = fx.DataSet.from_arrays(counts.counts(), nominal, dark=counts.dark, flat=counts.flat)
+    data = fx.DataSet.from_arrays(
+        counts.counts(), nominal, dark=counts.dark, flat=counts.flat
+    )
     found = data.calibrate(beads, free=("dD_x",), priors=exact(("dD_x",)))
     assert "1 parameters from 24 frames" in repr(found)
     corrected = data.with_correction(found.correction).geometry
@@ -236,7 +257,9 @@ NXTOMO_LINKS = {
 }
 
 
-def test_nxtomo_has_all_that_its_definition_requires(data: fx.DataSet, tmp_path: Path) -> None:
+def test_nxtomo_has_all_that_its_definition_requires(
+    data: fx.DataSet, tmp_path: Path
+) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra `io`")
     data.to_nxtomo(str(tmp_path / "scan.nxs"))
     with h5py.File(tmp_path / "scan.nxs") as file:
@@ -281,7 +304,10 @@ def test_nxtomo_says_exposure_energy_and_field_of_view(
     made = fx.simulate("chiral", scan, tube=fx.Tube(kV=90, power_W=45), exposure_ms=12.0)
     made.to_nxtomo(str(tmp_path / "scan.nxs"))
     with h5py.File(tmp_path / "scan.nxs") as file:
-        instrument, keys = file["entry/instrument"], file["entry/instrument/detector/image_key"][:]
+        instrument, keys = (
+            file["entry/instrument"],
+            file["entry/instrument/detector/image_key"][:],
+        )
         detector = instrument["detector"]
         assert detector["field_of_view"].asstr()[()] == view
         assert_allclose(detector["count_time"][:], np.full(len(keys), 0.012))
@@ -327,7 +353,9 @@ def test_a_package_that_is_not_there_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setitem(__import__("sys").modules, package, None)
-    with pytest.raises(fx.TwinError, match=rf"{package}.* not installed: pip install 'flexdt\["):
+    with pytest.raises(
+        fx.TwinError, match=rf"{package}.* not installed: pip install 'flexdt\["
+    ):
         use(data)
 
 

@@ -26,7 +26,10 @@ POINTS = np.array([[0, 0, 0], [12, -8, 24.9], [-12, 8, -24.9], [9.5, 5.5, 10.0]]
 
 def independent(folder: Path) -> dict[str, object]:
     done = subprocess.run(
-        [sys.executable, "-I", str(READER), str(folder)], capture_output=True, text=True, check=True
+        [sys.executable, "-I", str(READER), str(folder)],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     document: dict[str, object] = json.loads(done.stdout)
     assert document["imported"] == []
@@ -45,7 +48,9 @@ def shadows(rows: npt.ArrayLike, shape: tuple[int, int]) -> npt.NDArray[np.float
 
 
 def compare(folder: Path, shape: tuple[int, int]) -> None:
-    ours = shadows(parse_document((folder / "flexdt.json").read_text()).cone_vec().rows, shape)
+    ours = shadows(
+        parse_document((folder / "flexdt.json").read_text()).cone_vec().rows, shape
+    )
     theirs = independent(folder)
     assert theirs["shape"] == list(shape)
     for source in ("motors", "printed"):
@@ -53,7 +58,9 @@ def compare(folder: Path, shape: tuple[int, int]) -> None:
         assert np.abs(ours - other).max() < 0.01, source
 
 
-def test_a_hand_made_scan(written: Callable[..., Path], record: Callable[..., ScanRecord]) -> None:
+def test_a_hand_made_scan(
+    written: Callable[..., Path], record: Callable[..., ScanRecord]
+) -> None:
     compare(written(record(frames=13)), (24, 30))
 
 
@@ -61,12 +68,16 @@ def test_a_hand_made_scan(written: Callable[..., Path], record: Callable[..., Sc
 def test_a_planned_script(tmp_path: Path, script: str) -> None:
     """The example script's plan, written by the formatters, down to the run-up position."""
     machine = builtin_machine()
-    plan = plan_script((EXAMPLES / script).read_bytes(), machine, builtin_profile("cwi-2023-08-21"))
+    plan = plan_script(
+        (EXAMPLES / script).read_bytes(), machine, builtin_profile("cwi-2023-08-21")
+    )
     record = ScanRecord.from_plan(plan, name="lego", started=datetime(2026, 1, 1))
     text = format_scan_settings(record)
     (tmp_path / "scan settings.txt").write_text(text, encoding="utf-8", newline="")
     (tmp_path / "data settings XRE.txt").write_text(format_xre(record), newline="")
-    (tmp_path / "flexdt.json").write_text(DatasetDocument.of(record).to_json(), encoding="utf-8")
+    (tmp_path / "flexdt.json").write_text(
+        DatasetDocument.of(record).to_json(), encoding="utf-8"
+    )
     compare(tmp_path, (760, 956))
     # Image 0 is not where the motor stood when the text was written.
     assert "rot_obj : -6.245762 ; speed : 10.027855 ; acceleration : 22.500000" in text

@@ -18,7 +18,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexdt.library.reading.folders import load_dataset
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetError,
+    DatasetFormatError,
+    DatasetMissingError,
+)
 from flexdt.twin.dataset.flexdt_json import (
     DatasetDocument,
     NoiseRecord,
@@ -35,12 +39,16 @@ Written = Callable[..., Path]
 Images = Callable[[ScanRecord], dict[str, npt.NDArray[np.uint16]]]
 
 
-def test_an_own_data_set_comes_back(written: Written, record: Make, images: Images) -> None:
+def test_an_own_data_set_comes_back(
+    written: Written, record: Make, images: Images
+) -> None:
     r = record()
     d = load_dataset(written())
     assert (d.name, len(d), d.shape) == ("scan", 5, (24, 30))
     assert d.complete
-    assert repr(d) == "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns), complete>"
+    assert (
+        repr(d) == "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns), complete>"
+    )
     assert d.require_complete() is d
     assert (d.reason, d.missing, d.warnings) == ("", (), ())
     assert [f.file for f in d.frames] == [f"scan_{i:06d}.tif" for i in range(5)]
@@ -126,7 +134,9 @@ def test_the_texts_alone_give_the_same_geometry(
 
 
 @pytest.mark.parametrize("name", builtin_profiles("flexray"))
-def test_every_profile_is_found_from_its_figures(written: Written, record: Make, name: str) -> None:
+def test_every_profile_is_found_from_its_figures(
+    written: Written, record: Make, name: str
+) -> None:
     """The rolled detectors of 2020 and 2022 too; two profiles may not be told apart if equal."""
     r = record(profile=builtin_profile(name))
     d = load_dataset(written(r), ignore_document=True)
@@ -186,7 +196,9 @@ def test_unfinished_and_cancelled_scans_say_so(written: Written, record: Make) -
     assert not d.complete
     assert d.reason == "projector gone"
     text = folder / "scan settings.txt"
-    text.write_text(text.read_text().replace("Script summary", "SCRIPT CANCELLED!\nScript summary"))
+    text.write_text(
+        text.read_text().replace("Script summary", "SCRIPT CANCELLED!\nScript summary")
+    )
     d = load_dataset(folder, ignore_document=True)
     assert not d.complete
     assert "CANCELLED" in d.reason
@@ -227,12 +239,16 @@ def test_images_that_do_not_fit_the_text_are_an_error(written: Written) -> None:
     folder = written()
     for path in folder.glob("*.tif"):
         path.write_bytes(image((24, 31)))
-    with pytest.raises(DatasetFormatError, match=r"gives images of 30 x 24 pixels, but .* 31 x 24"):
+    with pytest.raises(
+        DatasetFormatError, match=r"gives images of 30 x 24 pixels, but .* 31 x 24"
+    ):
         load_dataset(folder, ignore_document=True)
 
 
 def test_folders_that_are_none(tmp_path: Path, written: Written) -> None:
-    with pytest.raises(DatasetMissingError, match=r"cannot read folder .*nowhere: No such file"):
+    with pytest.raises(
+        DatasetMissingError, match=r"cannot read folder .*nowhere: No such file"
+    ):
         load_dataset(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetMissingError, match="no projections"):
@@ -257,7 +273,9 @@ def test_one_broken_text_is_replaced_by_the_other(written: Written) -> None:
 
 def test_a_scanners_own_folder(tmp_path: Path, data: Path) -> None:
     """Files as the scanner leaves them: three of 361 projections, texts in its code page."""
-    shutil.copy(data / "flexray_data_settings_XRE.txt", tmp_path / "Data Settings XRE.txt")
+    shutil.copy(
+        data / "flexray_data_settings_XRE.txt", tmp_path / "Data Settings XRE.txt"
+    )
     text = (data / "flexray_scan_settings.txt").read_bytes().replace(b"Ada", b"Ren\xe9e")
     (tmp_path / "Scan Settings.txt").write_bytes(text)
     for name in ("di000000.TIF", "io000000.tif", "io000001.tif", "scan_000000.tif",
@@ -273,12 +291,16 @@ def test_a_scanners_own_folder(tmp_path: Path, data: Path) -> None:
     assert len(d.missing) == 358
     assert "and 353 more are missing" in d.reason
     assert d.angles_deg[[0, 90, 360]] == pytest.approx([0.0, 90.0, 360.0])
-    np.testing.assert_allclose(d.line_integrals(90), np.full((760, 956), np.log(2)), atol=1e-6)
+    np.testing.assert_allclose(
+        d.line_integrals(90), np.full((760, 956), np.log(2)), atol=1e-6
+    )
     assert d.poses.axis[0] == pytest.approx([0.0137, 600.000003, 20.0])
     assert "cwi-2023-08-21" in d.warnings[0]
 
 
-def test_a_tiled_scan_without_its_document_is_refused(written: Written, record: Make) -> None:
+def test_a_tiled_scan_without_its_document_is_refused(
+    written: Written, record: Make
+) -> None:
     r = record()
     block = r.blocks[2]
     second = replace(
@@ -338,7 +360,9 @@ def test_wrong_documents_name_file_key_and_value(
     assert str(path) in caught.value.message
 
 
-@pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "C:\\x.tif", "a\0.tif", ""])
+@pytest.mark.parametrize(
+    "name", ["../../etc/passwd", "/etc/passwd", "C:\\x.tif", "a\0.tif", ""]
+)
 def test_a_document_cannot_name_files_elsewhere(written: Written, name: str) -> None:
     path = written() / "flexdt.json"
     content = json.loads(path.read_text())
@@ -353,7 +377,10 @@ def test_a_document_whose_cone_vec_was_changed_is_noticed(written: Written) -> N
     content = json.loads(path.read_text())
     content["frames"][3]["cone_vec"][0] += 0.01
     path.write_text(json.dumps(content))
-    assert "does not follow from its motor positions" in load_dataset(path.parent).warnings[0]
+    assert (
+        "does not follow from its motor positions"
+        in load_dataset(path.parent).warnings[0]
+    )
 
 
 def test_documents_come_back_equal(record: Make) -> None:
@@ -371,7 +398,11 @@ def test_what_a_document_leaves_out_is_what_older_ones_meant(record: Make) -> No
     doc = parse_document(json.dumps(content))
     assert (doc.flexdt, doc.operator, doc.reason) == ("", "", "")
     assert (doc.smooth, doc.complete, doc.correction) == (True, False, None)
-    assert (doc.sample, doc.noise, doc.settings_positions) == (SampleRecord(), NoiseRecord(), {})
+    assert (doc.sample, doc.noise, doc.settings_positions) == (
+        SampleRecord(),
+        NoiseRecord(),
+        {},
+    )
     assert vars(SampleRecord()) == {
         "name": "", "owner": "", "project": "", "comment": "", "diameter_mm": 0.0, "height_mm": 0.0,
     }  # fmt: skip
@@ -382,7 +413,8 @@ def test_what_a_document_leaves_out_is_what_older_ones_meant(record: Make) -> No
 JSON = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8),
     lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.text(max_size=8), inner, max_size=3)
     ),
     max_leaves=8,
 )
@@ -390,7 +422,9 @@ JSON = st.recursive(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(key=st.sampled_from(sorted(DatasetDocument.model_fields)), value=JSON)
-def test_garbage_in_a_document_is_a_format_error(record: Make, key: str, value: object) -> None:
+def test_garbage_in_a_document_is_a_format_error(
+    record: Make, key: str, value: object
+) -> None:
     content = json.loads(DatasetDocument.of(record()).to_json())
     content["schema" if key == "schema_version" else key] = value
     with suppress(DatasetFormatError):

@@ -20,7 +20,10 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, SampleRecord, ScanRecord
 from flexdt.twin.dataset.rebuild import angles_deg, rebuild
 from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings, settings_of
-from flexdt.twin.dataset.scan_settings_text import format_scan_settings, parse_scan_settings
+from flexdt.twin.dataset.scan_settings_text import (
+    format_scan_settings,
+    parse_scan_settings,
+)
 from flexdt.twin.dataset.stated_geometry import Figures, figures_of, poses_of
 from flexdt.twin.dataset.xre import format_sections, format_xre
 from flexdt.twin.dataset.xre_reading import parse_xre
@@ -47,7 +50,11 @@ def test_every_line_of_a_file_in_the_real_format_is_read(data: Path) -> None:
     assert (s.sod_mm, s.sdd_mm) == (600.000003, 1058.999997)
     assert (s.hc_px, s.vc_px, s.cor_px) == (477.989305, 380.0, 478.150939)
     assert (s.voxel_um, s.magnification) == (84.759207, 1.765)
-    assert (s.scanner_name, s.scanner_type, s.serial) == ("FleX-ray", "FleX-ray", "042_0001")
+    assert (s.scanner_name, s.scanner_type, s.serial) == (
+        "FleX-ray",
+        "FleX-ray",
+        "042_0001",
+    )
     assert (s.kV, s.power_W, s.vacuum) == (90.0, 49.5, "512.000000E-9")
     assert (s.exposure_ms, s.averages, s.mode) == (99.998, 3.0, "HW2SW1High")
     assert (s.original_pixel_mm, s.binning, s.binned_pixel_mm) == (0.0748, 2, 0.1496)
@@ -74,7 +81,9 @@ def test_the_other_text_says_the_same(data: Path) -> None:
     assert a.figures is not None
     assert b.figures is not None
     assert vars(a.figures) == pytest.approx(vars(b.figures), abs=1e-5)
-    assert {n: m.value for n, m in a.motors.items()} == {n: m.value for n, m in b.motors.items()}
+    assert {n: m.value for n, m in a.motors.items()} == {
+        n: m.value for n, m in b.motors.items()
+    }
     for name in ("projections", "start_angle_deg", "last_angle_deg", "roi", "mode", "exposure_ms",
                  "averages", "kV", "power_W", "darks", "pre_flats", "post_flats", "scan_type",
                  "scanner_name", "serial", "flat_axis"):  # fmt: skip
@@ -118,7 +127,9 @@ def test_unknown_scanners_get_the_printed_figures(data: Path) -> None:
         rebuild(replace(s, hc_px=None), 361, (760, 956), [], [])
 
 
-def test_without_a_region_the_figures_count_and_heights_come_from_the_motors(data: Path) -> None:
+def test_without_a_region_the_figures_count_and_heights_come_from_the_motors(
+    data: Path,
+) -> None:
     """Older texts do not state the region; a shifted figure is believed, not the profile."""
     s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
     profiles = [builtin_profile(n) for n in builtin_profiles()]
@@ -149,7 +160,10 @@ def test_reading_bears_the_variations_of_real_files() -> None:
     s = parse_scan_settings(VARIANT)
     assert (s.scan_id, s.sod_mm, s.sdd_mm, s.hc_px) == ("1", 600.5, 1059.0, 478.5)
     assert s.roi == Roi(32, 8, 1943, 1527)
-    assert s.motors == {"tra_obj": MotorLine(0.5), "tra_det": MotorLine(-25.3, 50.0, 100.0)}
+    assert s.motors == {
+        "tra_obj": MotorLine(0.5),
+        "tra_det": MotorLine(-25.3, 50.0, 100.0),
+    }
     assert s.sample_name == "a : b = c"
     assert s.cancelled
     assert s.projections == 12
@@ -179,7 +193,9 @@ def test_wrong_figures_are_named_with_their_line(text: str, message: str) -> Non
     assert caught.value.data["path"] == "my.txt"
 
 
-def test_a_cancelled_scan_says_so_before_the_summary(record: Callable[..., ScanRecord]) -> None:
+def test_a_cancelled_scan_says_so_before_the_summary(
+    record: Callable[..., ScanRecord],
+) -> None:
     text = format_scan_settings(record(complete=False, reason="aborted"))
     assert text.index("SCRIPT CANCELLED!") < text.index("Script summary:")
     assert parse_scan_settings(text).cancelled
@@ -189,10 +205,14 @@ def test_a_cancelled_scan_says_so_before_the_summary(record: Callable[..., ScanR
     assert xre.text("Scan info", "Error") == "aborted"
 
 
-def test_names_cannot_smuggle_lines_into_the_texts(record: Callable[..., ScanRecord]) -> None:
+def test_names_cannot_smuggle_lines_into_the_texts(
+    record: Callable[..., ScanRecord],
+) -> None:
     evil = 'x"\r\nSOD : 1\r\n[motor positions]\r\ntra_obj = 5'
     r = record()
-    r = replace(r, name="n", operator=evil, sample=replace(r.sample, name=evil, comment=evil))
+    r = replace(
+        r, name="n", operator=evil, sample=replace(r.sample, name=evil, comment=evil)
+    )
     s = parse_scan_settings(format_scan_settings(r))
     assert s.sod_mm == pytest.approx(514.9192)
     x = parse_xre(format_xre(r))
@@ -205,7 +225,10 @@ def test_the_document_ignores_nothing_that_is_said_of_an_image(
 ) -> None:
     scan = record()
     document = DatasetDocument.of(scan)
-    cameras = [scan.camera, *(block.camera for block in scan.blocks for _ in range(len(block)))]
+    cameras = [
+        scan.camera,
+        *(block.camera for block in scan.blocks for _ in range(len(block))),
+    ]
     for entry, camera in zip((document.detector, *document.frames), cameras, strict=True):
         said = camera.of_image
         assert {name: getattr(entry, name) for name in said} == said
@@ -218,7 +241,9 @@ def test_both_texts_of_a_scan_agree(record: Callable[..., ScanRecord]) -> None:
         ours, theirs = getattr(a, f.name), getattr(b, f.name)
         if theirs is not None and f.name != "motors":
             assert ours == theirs, f.name
-    assert {n: m.value for n, m in a.motors.items()} == {n: m.value for n, m in b.motors.items()}
+    assert {n: m.value for n, m in a.motors.items()} == {
+        n: m.value for n, m in b.motors.items()
+    }
 
 
 def test_the_xre_has_voxels_in_mm_and_the_turntable_s_rates(
@@ -230,14 +255,16 @@ def test_the_xre_has_voxels_in_mm_and_the_turntable_s_rates(
     for rates in (20.0, 0.0):
         rated = dict.fromkeys(record().positions, rates)
         xre = parse_xre(format_xre(record(speeds=rated, accelerations=rated)))
-        assert float(xre.sections["CT-parameters IN"]["Voxel size"]) * 1e3 == pytest.approx(
-            um, 1e-3
-        )
+        assert float(
+            xre.sections["CT-parameters IN"]["Voxel size"]
+        ) * 1e3 == pytest.approx(um, 1e-3)
         last = xre.sections["Acquisition settings"]
         assert [float(last[f"rotation {key}"]) for key in ("speed", "acc")] == [rates] * 2
 
 
-def test_dates_with_a_zone_are_written_in_universal_time(record: Callable[..., ScanRecord]) -> None:
+def test_dates_with_a_zone_are_written_in_universal_time(
+    record: Callable[..., ScanRecord],
+) -> None:
     zone = timezone(timedelta(hours=2))
     xre = parse_xre(format_xre(record(started=datetime(2026, 3, 14, 1, 5, 9, 250, zone))))
     assert xre.text("Scan info", "Start") == "2026-03-13 23:05:09.0002500 UTC"
@@ -265,7 +292,9 @@ FIGURES = st.builds(
 )  # fmt: skip
 
 
-@given(FIGURES, st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50), st.floats(-7, 7))
+@given(
+    FIGURES, st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50), st.floats(-7, 7)
+)
 def test_figures_are_edges_and_poses_have_them(
     f: Figures, across: float, up: float, axis_up: float, angle: float
 ) -> None:
@@ -312,7 +341,10 @@ def test_machines_are_found_by_name_or_by_their_motors(data: Path) -> None:
     assert found.name == "flexray"
     twice = [builtin_machine(), builtin_machine().model_copy(update={"name": "other"})]
     other = replace(s, scanner_name="Nix", scanner_type=None)
-    for known, said in ((nameless, "'(unnamed)' is not known"), (other, "'Nix' is not known")):
+    for known, said in (
+        (nameless, "'(unnamed)' is not known"),
+        (other, "'Nix' is not known"),
+    ):
         r = rebuild(known, 361, (760, 956), twice, [])
         assert r.machine is None
         assert said in r.notes[0]
@@ -322,7 +354,13 @@ def test_without_a_profile_places_are_those_of_the_motors(data: Path) -> None:
     s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
     motors = {**s.motors, "tra_tube": MotorLine(1.25), "ver_tube": MotorLine(30.0)}
     for count in (1, 3):
-        r = rebuild(replace(s, roi=None, motors=motors), count, (760, 956), [builtin_machine()], [])
+        r = rebuild(
+            replace(s, roi=None, motors=motors),
+            count,
+            (760, 956),
+            [builtin_machine()],
+            [],
+        )
         assert r.profile is None
         assert r.poses.source[0] == pytest.approx([1.25, 0.0, 30.0])
         assert r.poses.axis[:, 2] == pytest.approx([20.0] * count)
@@ -330,7 +368,12 @@ def test_without_a_profile_places_are_those_of_the_motors(data: Path) -> None:
 
 @pytest.mark.parametrize(
     ("projections", "count", "angles"),
-    [(5, 3, [10, 100, 190]), (None, 3, [10, 190, 370]), (1, 2, [10, 10]), (2, 2, [10, 370])],
+    [
+        (5, 3, [10, 100, 190]),
+        (None, 3, [10, 190, 370]),
+        (1, 2, [10, 10]),
+        (2, 2, [10, 370]),
+    ],
 )
 def test_angles_follow_the_rule_of_the_stated_number(
     projections: int | None, count: int, angles: list[float]
@@ -342,7 +385,9 @@ def test_angles_follow_the_rule_of_the_stated_number(
             angles_deg(replace(s, **{gone: None}), count, "a.txt")
 
 
-def test_exposures_before_and_after_are_counted(record: Callable[..., ScanRecord]) -> None:
+def test_exposures_before_and_after_are_counted(
+    record: Callable[..., ScanRecord],
+) -> None:
     """Darks and flats of ten averages; three flats of four more at the end."""
     r = record()
     dark, flat, scan, _ = r.blocks
@@ -357,7 +402,9 @@ def test_exposures_before_and_after_are_counted(record: Callable[..., ScanRecord
     none = settings_of(replace(r, blocks=(dark, flat)))
     assert (none.start_angle_deg, none.last_angle_deg, none.projections) == (0.0, 0.0, 0)
     off = parse_xre(format_xre(replace(r, kV=0.0))).sections["Tube settings"]
-    assert (off["Current set value"], off["Target current actual value"]) == ("0.000000",) * 2
+    assert (off["Current set value"], off["Target current actual value"]) == (
+        "0.000000",
+    ) * 2
     assert off["Filament status"] == "OK"
 
 
@@ -371,14 +418,21 @@ def test_what_the_xre_says_of_turn_and_volume(
 ) -> None:
     r = record(frames=len(turns))
     dark, flat, scan, _ = r.blocks
-    moved = replace(scan, positions={**scan.positions, "rot_obj": np.array(turns, dtype=float)})
+    moved = replace(
+        scan, positions={**scan.positions, "rot_obj": np.array(turns, dtype=float)}
+    )
     sections = parse_xre(format_xre(replace(r, blocks=(dark, flat, moved)))).sections
     acquisition, ct = sections["Acquisition settings"], sections["CT-parameters IN"]
     assert acquisition["projs_per_360"] == str(projections)
     assert [float(acquisition[f"CT {end} angle"]) for end in ("start", "stop")] == [
         turns[0], turns[-1],
     ]  # fmt: skip
-    assert [float(ct[key]) for key in ("x_end", "y_end", "z_end", "zmax")] == [29, 29, 23, 23]
+    assert [float(ct[key]) for key in ("x_end", "y_end", "z_end", "zmax")] == [
+        29,
+        29,
+        23,
+        23,
+    ]
 
 
 def test_places_of_the_scan_by_hand(record: Callable[..., ScanRecord]) -> None:
@@ -411,7 +465,9 @@ def test_places_of_the_scan_by_hand(record: Callable[..., ScanRecord]) -> None:
             assert found[name][key] == pytest.approx(value, abs=6e-5), (name, key)
     for name, entry in points.items():
         height = {"TMV": 0.0, "bricks$ample": 2000.0}.get(name, -1.0)
-        assert f"height[{height:f}]track[{'TRUE' if 'ample' in name else 'FALSE'}]" in entry
+        assert (
+            f"height[{height:f}]track[{'TRUE' if 'ample' in name else 'FALSE'}]" in entry
+        )
 
 
 def test_the_axis_of_the_flat_field_is_the_linear_one_that_moved_most() -> None:
@@ -438,7 +494,9 @@ def test_a_scan_is_smooth_where_its_projections_are(moving: str) -> None:
     shot = "camera take image\ncamera save image {}.tif\n"
     text = go.get("flat", "").format(90) + shot.format("io0")
     text += (
-        "rot_obj move absolute 90 ACK\n" + go.get("projection", "").format(180) + shot.format("s0")
+        "rot_obj move absolute 90 ACK\n"
+        + go.get("projection", "").format(180)
+        + shot.format("s0")
     )
     r = ScanRecord.from_plan(plan_script(text), name="a", started=datetime(2026, 3, 14))
     assert r.smooth == (moving == "projection")
@@ -447,18 +505,24 @@ def test_a_scan_is_smooth_where_its_projections_are(moving: str) -> None:
 def test_every_place_of_the_panel_is_a_section(record: Callable[..., ScanRecord]) -> None:
     r = record()
     block = r.blocks[2]
-    places = [{**block.positions, "ver_det": block.positions["ver_det"] + k} for k in range(4)]
+    places = [
+        {**block.positions, "ver_det": block.positions["ver_det"] + k} for k in range(4)
+    ]
     for n in range(1, 5):
         tiles = tuple(replace(block, positions=place) for place in places[:n])
         assert replace(r, blocks=tiles).sections() == n
     uneven = {**block.positions, "rot_obj": np.array([0.0, 90.0, 180.0, 271.0, 360.0])}
     assert replace(r, blocks=(replace(block, positions=uneven),)).sections() == 2
-    tail = {**block.positions, "ver_tube": block.positions["ver_tube"] + [0, 0, 0, 0, 1.0]}
+    tail = {
+        **block.positions,
+        "ver_tube": block.positions["ver_tube"] + [0, 0, 0, 0, 1.0],
+    }
     assert replace(r, blocks=(replace(block, positions=tail),)).sections() == 2
 
 
 @pytest.mark.parametrize(
-    "line", ["1abc : 5 ; speed : 3", "(x) : 5", "plain : 5", "tra_obj : about 5", "a_b : 5 mm"]
+    "line",
+    ["1abc : 5 ; speed : 3", "(x) : 5", "plain : 5", "tra_obj : about 5", "a_b : 5 mm"],
 )
 def test_lines_that_are_no_motors_are_left_out(line: str) -> None:
     assert parse_scan_settings(f"SOD : 1\n{line}").motors == {}
@@ -470,7 +534,9 @@ def test_lines_that_are_no_motors_are_left_out(line: str) -> None:
      ("scan type: step scan", "step scan"), ("SOD : 1\nscan type:\n\n\nsmooth scan", "smooth scan"),
      ("SOD : 1\nscan type:", "")],
 )  # fmt: skip
-def test_the_scan_s_type_stands_on_its_line_or_on_the_next(text: str, kind: str | None) -> None:
+def test_the_scan_s_type_stands_on_its_line_or_on_the_next(
+    text: str, kind: str | None
+) -> None:
     assert parse_scan_settings(text).scan_type == kind
 
 
@@ -485,7 +551,8 @@ MOMENT = st.datetimes(datetime(1990, 1, 1), datetime(2090, 1, 1)).map(
 ROI = st.builds(Roi, *[st.integers(0, 9999)] * 4)
 MOTORS = st.dictionaries(
     st.from_regex(r"(mag|rot|tra|ver)_[a-z]{3,6}", fullmatch=True),
-    st.builds(MotorLine, NUMBER, NUMBER, NUMBER) | st.builds(MotorLine, NUMBER, st.none() | NUMBER),
+    st.builds(MotorLine, NUMBER, NUMBER, NUMBER)
+    | st.builds(MotorLine, NUMBER, st.none() | NUMBER),
     max_size=9,
 )
 
@@ -529,9 +596,13 @@ VALUE = st.booleans() | st.integers(-(10**9), 10**9) | NUMBER | TEXT
 KEY = st.from_regex(r"[A-Za-z][A-Za-z0-9_()#. ]{0,20}[a-z]", fullmatch=True)
 
 
-@given(st.dictionaries(KEY, st.dictionaries(KEY, VALUE, max_size=5), min_size=1, max_size=4))
+@given(
+    st.dictionaries(KEY, st.dictionaries(KEY, VALUE, max_size=5), min_size=1, max_size=4)
+)
 @pytest.mark.slow
-def test_sections_come_back_equal(sections: dict[str, dict[str, bool | int | float | str]]) -> None:
+def test_sections_come_back_equal(
+    sections: dict[str, dict[str, bool | int | float | str]],
+) -> None:
     back = parse_xre(format_sections(sections)).sections
     assert set(back) == set(sections)
     for name, entries in sections.items():
@@ -560,27 +631,37 @@ def test_a_detector_that_physically_stands_elsewhere(data: Path) -> None:
     figures = rebuild(s, 361, (760, 956), [], [])
     assert known.profile is not None
     assert known.profile.name == "cwi-2023-08-21"
-    assert known.positions["mag_det"][0] == pytest.approx(plain.motors["mag_det"].value + 10.0)
+    assert known.positions["mag_det"][0] == pytest.approx(
+        plain.motors["mag_det"].value + 10.0
+    )
     for r in (known, figures):
         assert r.poses.sdd[0] == pytest.approx(1068.999997, abs=1e-5)
         longer = r.poses.sdd[0] / r.poses.sod[0] / plain.magnification
         assert longer == pytest.approx(1.00944, abs=1e-5)
-        assert r.poses.axis[0, 0] - r.poses.source[0, 0] == pytest.approx(0.0137, abs=1e-6)
+        assert r.poses.axis[0, 0] - r.poses.source[0, 0] == pytest.approx(
+            0.0137, abs=1e-6
+        )
         assert any("mag_det_phys" in note and "+10 mm" in note for note in r.notes)
     assert rebuild(plain, 361, (760, 956), [builtin_machine()], profiles).notes == tuple(
         note for note in known.notes if "mag_det_phys" not in note
     )
     motors = {**plain.motors, "mag_det_phys": MotorLine(-90.0)}
     with pytest.raises(DatasetFormatError, match="behind the source"):
-        rebuild(replace(plain, motors=motors), 361, (760, 956), [builtin_machine()], profiles)
+        rebuild(
+            replace(plain, motors=motors), 361, (760, 956), [builtin_machine()], profiles
+        )
 
 
-def test_places_of_sample_and_turntable_are_written(record: Callable[..., ScanRecord]) -> None:
+def test_places_of_sample_and_turntable_are_written(
+    record: Callable[..., ScanRecord],
+) -> None:
     """Names and members as in the published file of a UniTOM XL; there 15 is half of 30 mm."""
     text = format_xre(record(sample=SampleRecord('b[r]i="cks', diameter_mm=30.0)))
     points = parse_xre(text).sections["POIs"]
     assert "radius[15.000000]height[2000.000000]track[TRUE]" in points["bricks$ample"]
-    assert points["TMV"].endswith("safe range?[FALSE]minimal[-Inf;-Inf;-Inf]maximal[Inf;Inf;Inf]")
+    assert points["TMV"].endswith(
+        "safe range?[FALSE]minimal[-Inf;-Inf;-Inf]maximal[Inf;Inf;Inf]"
+    )
     assert "height[0.000000]" in points["TMV"]
     assert points["TMV"].split("dirX")[0] == points["COT"].split("dirX")[0]
     settings = parse_xre(text).sections["Acquisition settings"]

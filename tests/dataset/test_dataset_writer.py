@@ -57,7 +57,13 @@ def test_a_finished_data_set_holds_what_the_interface_names(
         writer.put(name, image)
     writer.finish(duration_s=150.0)
     assert sorted(os.listdir(writer.folder)) == sorted(
-        [*r.files, "scan settings.txt", "data settings XRE.txt", "script.txt", "flexdt.json"]
+        [
+            *r.files,
+            "scan settings.txt",
+            "data settings XRE.txt",
+            "script.txt",
+            "flexdt.json",
+        ]
     )
     assert (writer.folder / "script.txt").read_bytes() == b"tube\txrayon\r\n\x00\xff"
     document = read_document(writer.folder)
@@ -77,7 +83,9 @@ def test_the_document_states_only_nominal_geometry(
     """cone_vec is the uncorrected one; the correction stands beside it."""
     r = record()
     document = parse_document(
-        (DatasetWriter(open_data(tmp_path), r).folder / "flexdt.json").read_text(encoding="utf-8")
+        (DatasetWriter(open_data(tmp_path), r).folder / "flexdt.json").read_text(
+            encoding="utf-8"
+        )
     )
     assert document.correction is not None
     assert document.correction.parameters["dO_x"] == 0.5
@@ -110,7 +118,9 @@ class FullDisk:
 @pytest.mark.parametrize("room", [0, 1, 699, 1500])
 def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, room: int) -> None:
     with Directory(tmp_path, write=FullDisk(room)) as folder:
-        with pytest.raises(DiskFullError, match=r"no room for .*a.tif: 2000 bytes asked") as caught:
+        with pytest.raises(
+            DiskFullError, match=r"no room for .*a.tif: 2000 bytes asked"
+        ) as caught:
             folder.put("a.tif", bytes(2000))
         assert os.listdir(tmp_path) == []
     assert caught.value.data["errno"] == errno.ENOSPC
@@ -130,7 +140,9 @@ def test_a_full_disk_keeps_the_file_that_was_there(tmp_path: Path) -> None:
     assert (tmp_path / "a.txt").read_text() == "old"
 
 
-def test_a_closed_folder_refuses_and_waits_for_files_in_the_making(tmp_path: Path) -> None:
+def test_a_closed_folder_refuses_and_waits_for_files_in_the_making(
+    tmp_path: Path,
+) -> None:
     started, go = threading.Event(), threading.Event()
 
     def slow(fd: int, data: memoryview) -> int:
@@ -188,8 +200,12 @@ def test_a_scan_survives_a_disk_that_fills_up_and_is_emptied(
 def test_room_is_checked_before_the_scan(
     tmp_path: Path, record: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexdt.server.storage.dataset_writer.free_bytes", lambda path: 1000)
-    with pytest.raises(DiskFullError, match=r"8 images need .* bytes, 1000 bytes are free"):
+    monkeypatch.setattr(
+        "flexdt.server.storage.dataset_writer.free_bytes", lambda path: 1000
+    )
+    with pytest.raises(
+        DiskFullError, match=r"8 images need .* bytes, 1000 bytes are free"
+    ):
         DatasetWriter(open_data(tmp_path), record())
 
 
@@ -242,7 +258,9 @@ def test_a_killed_writer_leaves_whole_files_and_can_be_resumed(
     assert read_document(folder)["complete"] is True
 
 
-def test_two_threads_put_the_same_file_each_through_its_own_folder(tmp_path: Path) -> None:
+def test_two_threads_put_the_same_file_each_through_its_own_folder(
+    tmp_path: Path,
+) -> None:
     """As when a server ends while its last document is still being written."""
     both = threading.Barrier(2, timeout=30)
 
@@ -299,11 +317,14 @@ def test_a_resumed_scan_keeps_the_date_and_correction_it_began_with(
     assert resumed.record.started == began.started
     assert resumed.record.correction == began.correction
     assert (
-        "date: 3/14/2026; time: 12:05:09 AM" in (resumed.folder / "scan settings.txt").read_text()
+        "date: 3/14/2026; time: 12:05:09 AM"
+        in (resumed.folder / "scan settings.txt").read_text()
     )
 
 
-def test_many_threads_write_one_data_set(tmp_path: Path, record: Make, images: Images) -> None:
+def test_many_threads_write_one_data_set(
+    tmp_path: Path, record: Make, images: Images
+) -> None:
     r = record(frames=60)
     writer = DatasetWriter(open_data(tmp_path), r, sync=False)
     work = list(images(r).items()) * 2
@@ -322,7 +343,9 @@ HOSTILE = ["", ".", "..", "../x.tif", "/etc/passwd", "a/b.tif", "a\\b.tif", "C:\
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_names_are_refused_everywhere(tmp_path: Path, record: Make, name: str) -> None:
+def test_hostile_names_are_refused_everywhere(
+    tmp_path: Path, record: Make, name: str
+) -> None:
     root = tmp_path / "data"
     image = np.zeros((24, 30), np.uint16)
     with pytest.raises(DatasetNameError, match="allowed: a plain name"):

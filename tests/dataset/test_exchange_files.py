@@ -30,7 +30,9 @@ from flexdt.twin.dataset.flexdt_json import FrameBlock, ScanRecord
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume
 
-THERE_AND_BACK = [form for form in FORMATS.values() if form.read and (form.write or form.export)]
+THERE_AND_BACK = [
+    form for form in FORMATS.values() if form.read and (form.write or form.export)
+]
 ENDINGS = {form.name: form.endings[0].strip(".") for form in THERE_AND_BACK}
 TILTED = Offsets.from_edge({"dO_x": 0.4, "det_roll": 1.0, "det_pitch": -2.0, "axis_tilt_x": 0.3,
                                "tau_x": 0.5, "dS_y": -0.2})  # fmt: skip
@@ -65,10 +67,14 @@ def test_there_and_back(
 ) -> None:
     file, back = tmp_path / f"g.{ending}", tmp_path / "back.json"
     which = ("--nominal",) if nominal else ()
-    code, out, err = flexdt("export", folder, "--format", format, "--out", file, *which, "--json")
+    code, out, err = flexdt(
+        "export", folder, "--format", format, "--out", file, *which, "--json"
+    )
     assert code == 0, err
     assert json.loads(out)["views"] == 9
-    code, _, err = flexdt("import", file, "--format", format, "--like", folder, "--out", back)
+    code, _, err = flexdt(
+        "import", file, "--format", format, "--like", folder, "--out", back
+    )
     assert code == 0, err
     data = load_dataset(folder)
     expected = data.corrected(NOMINAL if nominal else TILTED)
@@ -89,15 +95,21 @@ def test_the_tables_of_before_are_deprecated(folder: Path, tmp_path: Path) -> No
         _ = exchange.READERS
 
 
-@pytest.mark.parametrize("format", ["rtk", "astra", "csv", "tomosipo", "cil", "tigre", "leap"])
-def test_images_upside_down(format: str, folder: Path, tmp_path: Path, flexdt: Run) -> None:
+@pytest.mark.parametrize(
+    "format", ["rtk", "astra", "csv", "tomosipo", "cil", "tigre", "leap"]
+)
+def test_images_upside_down(
+    format: str, folder: Path, tmp_path: Path, flexdt: Run
+) -> None:
     up, back = tmp_path / f"up.{ENDINGS[format]}", tmp_path / "back.npy"
     words = ("--format", format, "--rows", "up")
     assert flexdt("export", folder, *words, "--out", up)[0] == 0
     assert flexdt("import", up, *words, "--like", folder, "--out", back)[0] == 0
     assert np.abs(np.load(back) - load_dataset(folder).corrected().rows).max() < 1e-9
     wrong = tmp_path / "wrong.npy"
-    code, _, _ = flexdt("import", up, "--format", format, "--like", folder, "--out", wrong)
+    code, _, _ = flexdt(
+        "import", up, "--format", format, "--like", folder, "--out", wrong
+    )
     assert code == 0
     assert np.abs(np.load(wrong) - np.load(back)).max() > 0.2
 
@@ -141,7 +153,9 @@ def test_a_data_set_takes_an_imported_geometry(folder: Path, tmp_path: Path) -> 
     assert np.abs(other.corrected().rows - data.corrected().rows).max() < 1e-9
     assert np.abs(other.cone_vec.rows - data.corrected().rows).max() < 1e-9
     with pytest.raises(ExchangeError, match="9 projections, the geometry 4 views"):
-        with_geometry(data, replace(load_geometry(file), cone_vec=data.cone_vec[:4], files=()))
+        with_geometry(
+            data, replace(load_geometry(file), cone_vec=data.cone_vec[:4], files=())
+        )
     with pytest.raises(ExchangeError, match="images of"):
         with_geometry(data, replace(load_geometry(file), shape=(5, 5)))
 
@@ -151,11 +165,16 @@ def test_reconstruct_takes_an_imported_geometry(
 ) -> None:  # fmt: skip
     file, geometry = tmp_path / "g.xml", tmp_path / "g.json"
     assert flexdt("export", folder, "--format", "rtk", "--out", file)[0] == 0
-    assert flexdt("import", file, "--format", "rtk", "--like", folder, "--out", geometry)[0] == 0
+    assert (
+        flexdt("import", file, "--format", "rtk", "--like", folder, "--out", geometry)[0]
+        == 0
+    )
     words = ("--algorithm", "sirt", "--iterations", 2, "--voxel", 0.3, "--shape", "4,8,8")
     volumes = []
     for name, more in (("a.mha", ()), ("b.mha", ("--geometry", geometry))):
-        code, _, err = flexdt("reconstruct", folder, "--out", tmp_path / name, *words, *more)
+        code, _, err = flexdt(
+            "reconstruct", folder, "--out", tmp_path / name, *words, *more
+        )
         assert code == 0, err
         volumes.append(Volume.load(tmp_path / name).data)
     assert np.abs(volumes[0] - volumes[1]).max() < 1e-5 * np.abs(volumes[0]).max()
@@ -199,7 +218,9 @@ def test_nxtomo_holds_images_and_the_geometry_asked_for(
     h5py = pytest.importorskip("h5py", reason="the extra `io`")
     file = tmp_path / "scan.nxs"
     which = ("--nominal",) if nominal else ()
-    code, out, err = flexdt("export", folder, "--format", "nxtomo", "--out", file, *which, "--json")
+    code, out, err = flexdt(
+        "export", folder, "--format", "nxtomo", "--out", file, *which, "--json"
+    )
     assert code == 0, err
     assert json.loads(out)["views"] == 9
     data = load_dataset(folder)
@@ -216,30 +237,89 @@ def test_nxtomo_holds_images_and_the_geometry_asked_for(
     ("words", "code", "says"),
     [
         (("export", "DATA", "--format", "nxtomo", "--out", "g.tif"), 1, "ends with .nxs"),
-        (("export", "DATA", "--format", "nxtomo", "--out", "g.nxs", "--rows", "up"), 1, "rows"),
+        (
+            ("export", "DATA", "--format", "nxtomo", "--out", "g.nxs", "--rows", "up"),
+            1,
+            "rows",
+        ),
         (("import", "good.csv", "--format", "nxtomo", "--out", "g.json"), 2, "nxtomo"),
-        (("export", "DATA", "--format", "rtk", "--out", "g.txt"), 1, "ends with .xml or .rtk"),
+        (
+            ("export", "DATA", "--format", "rtk", "--out", "g.txt"),
+            1,
+            "ends with .xml or .rtk",
+        ),
         (("export", "nowhere", "--format", "rtk", "--out", "g.xml"), 1, "nowhere"),
         (("export", "DATA", "--format", "flexray", "--out", "g.xml"), 2, "flexray"),
-        (("export", "DATA", "--format", "ctsimu", "--out", "g.json", "--rows", "up"), 1, "rows"),
-        (("export", "DATA", "--format", "csv", "--out", "g.csv", "--unknown", "t.toml"), 1, "csv"),
+        (
+            ("export", "DATA", "--format", "ctsimu", "--out", "g.json", "--rows", "up"),
+            1,
+            "rows",
+        ),
+        (
+            (
+                "export",
+                "DATA",
+                "--format",
+                "csv",
+                "--out",
+                "g.csv",
+                "--unknown",
+                "t.toml",
+            ),
+            1,
+            "csv",
+        ),
         (("import", "none.xml", "--format", "rtk", "--out", "g.json"), 1, "none.xml"),
         (("import", "good.xml", "--format", "rtk", "--out", "g.json"), 1, "pixel size"),
         (("import", "bad.txt", "--format", "rtk", "--out", "g.json"), 1, "not valid XML"),
         (("import", "bad.txt", "--format", "astra", "--out", "g.json"), 1, "bad.txt:1"),
-        (("import", "bad.txt", "--format", "ctsimu", "--out", "g.json"), 1, "not valid JSON"),
-        (("import", "bad.npz", "--format", "tomosipo", "--out", "g.json"), 1, "no NumPy file"),
+        (
+            ("import", "bad.txt", "--format", "ctsimu", "--out", "g.json"),
+            1,
+            "not valid JSON",
+        ),
+        (
+            ("import", "bad.npz", "--format", "tomosipo", "--out", "g.json"),
+            1,
+            "no NumPy file",
+        ),
         (("import", "bad.npy", "--format", "astra", "--out", "g.json"), 1, "(n, 12)"),
         (("import", "good.csv", "--format", "csv", "--out", "g.txt"), 1, ".json or .npy"),
-        (("import", "good.csv", "--format", "csv", "--out", "g.json", "--shape", "9"), 2, "shape"),
         (
-            ("import", "good.csv", "--format", "csv", "--out", "g.json", "--shape", "9,9"),
+            ("import", "good.csv", "--format", "csv", "--out", "g.json", "--shape", "9"),
+            2,
+            "shape",
+        ),
+        (
+            (
+                "import",
+                "good.csv",
+                "--format",
+                "csv",
+                "--out",
+                "g.json",
+                "--shape",
+                "9,9",
+            ),
             1,
             "not (9, 9)",
         ),
-        (("import", "good.csv", "--format", "csv", "--out", "g.json", "--views", "4"), 1, "not 4"),
         (
-            ("import", "good.csv", "--format", "csv", "--out", "g.json", "--pixel", "0.3"),
+            ("import", "good.csv", "--format", "csv", "--out", "g.json", "--views", "4"),
+            1,
+            "not 4",
+        ),
+        (
+            (
+                "import",
+                "good.csv",
+                "--format",
+                "csv",
+                "--out",
+                "g.json",
+                "--pixel",
+                "0.3",
+            ),
             1,
             "not 0.3 x 0.3",
         ),
@@ -283,7 +363,9 @@ def test_the_example_shows_that_nothing_is_lost(folder: Path, tmp_path: Path) ->
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()[1:]
     readable = [name for name, format in FORMATS.items() if format.read is not None]
-    assert len(lines) == len(readable) + 1  # ASTRA has a line for each of two kinds of file
+    assert (
+        len(lines) == len(readable) + 1
+    )  # ASTRA has a line for each of two kinds of file
     losses = [float(re.search(r"([\d.e+-]+) mm", line)[1]) for line in lines]  # type: ignore[index]
     assert max(losses) < 1e-9
 
@@ -300,7 +382,9 @@ def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> No
     assert np.abs(own.cone_vec.rows - imported.cone_vec.rows).max() < 1e-9
     # A correction means the same on top of either, but for alpha: a panel that the profile rolls
     # tells the stage's angle from its rows.
-    moved = Offsets.from_edge({"dO_x": 0.3, "det_pitch": 1.0, "tau_z": 0.2, "axis_tilt_x": 0.1})
+    moved = Offsets.from_edge(
+        {"dO_x": 0.3, "det_pitch": 1.0, "tau_z": 0.2, "axis_tilt_x": 0.1}
+    )
     difference = own.corrected(moved).rows - imported.corrected(moved).rows
     assert np.abs(difference).max() < 1e-9
     with pytest.raises(BadParameter, match="1 geometries for 2"):

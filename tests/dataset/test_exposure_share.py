@@ -18,9 +18,12 @@ from .conftest import make_record
 def share_of(between_s: float, smooth: bool = True, told: bool = True) -> float | None:
     record = make_record(smooth=smooth)
     blocks = tuple(
-        replace(block, times_s=np.arange(len(block)) * between_s) for block in record.blocks
+        replace(block, times_s=np.arange(len(block)) * between_s)
+        for block in record.blocks
     )
-    document = DatasetDocument.of(replace(record, blocks=blocks)).model_dump(by_alias=True)
+    document = DatasetDocument.of(replace(record, blocks=blocks)).model_dump(
+        by_alias=True
+    )
     if not told:
         del document["smooth"]
     data: Any = SimpleNamespace(document=DatasetDocument(**document), settings=None)

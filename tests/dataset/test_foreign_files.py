@@ -105,7 +105,9 @@ def test_another_geometry_takes_the_place_of_nikons(tmp_path: Path) -> None:
 
 def test_nxtomo_comes_back(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
-    scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=24, shape=(ROWS, COLS), pixel=PIXEL)
+    scan = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=24, shape=(ROWS, COLS), pixel=PIXEL
+    )
     data = fx.simulate("lego", scan, noise=1)
     data.to_nxtomo(tmp_path / "scan.nx")
     again = fx.open(tmp_path / "scan.nx")

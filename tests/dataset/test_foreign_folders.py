@@ -36,7 +36,9 @@ def test_counts_below_zero_are_refused(tmp_path: Path) -> None:
     low[0, 2, 3] = -5
     for i, image in enumerate(low):
         tifffile.imwrite(tmp_path / f"p{i}.tif", image)
-    with pytest.raises(DatasetError, match=r"holds counts down to -5; allowed: 0 or more"):
+    with pytest.raises(
+        DatasetError, match=r"holds counts down to -5; allowed: 0 or more"
+    ):
         fx.read_tiffs(tmp_path, SCAN)
 
 
@@ -76,5 +78,7 @@ def test_a_folder_with_one_scan_of_another_program_is_opened(tmp_path: Path) -> 
         fx.open(tmp_path)
     for file in tmp_path.glob("*.xtekct"):
         file.unlink()
-    with pytest.raises(DatasetError, match=r"of 3 other TIFFs: fx\.read_tiffs\(FOLDER, geometry\)"):
+    with pytest.raises(
+        DatasetError, match=r"of 3 other TIFFs: fx\.read_tiffs\(FOLDER, geometry\)"
+    ):
         fx.open(tmp_path)

@@ -22,7 +22,9 @@ def rtk(folder, **changed):
     text = path.read_text()
     for name, value in changed.items():
         parts = text.split(f"<{name}>")
-        text = f"<{name}>{value}<".join([parts[0], *(p.split("<", 1)[1] for p in parts[1:])])
+        text = f"<{name}>{value}<".join(
+            [parts[0], *(p.split("<", 1)[1] for p in parts[1:])]
+        )
     path.write_text(text)
     return path
 
@@ -48,7 +50,9 @@ def test_distances_of_rtk(tmp_path, changed):
 def test_distances_of_flexdata(tmp_path, changed):
     path = tmp_path / "scan.toml"
     SCAN.save(path)
-    lines = [line for line in path.read_text().splitlines() if line.split()[0] not in changed]
+    lines = [
+        line for line in path.read_text().splitlines() if line.split()[0] not in changed
+    ]
     path.write_text("\n".join([*lines, *(f"{k} = {v}" for k, v in changed.items())]))
     with pytest.raises(TwinError, match=r"scan\.toml"):
         ConeVec.load(path)
@@ -82,7 +86,9 @@ def test_right_rows_and_virtual_panels_are_read(tmp_path, ending):
 
 
 def test_radians_in_a_table_are_among_the_notes(tmp_path):
-    scan = ConeVec.circular(sod=100, sdd=200, angles=np.linspace(0, 6.28, 40), shape=SHAPE, pixel=1)
+    scan = ConeVec.circular(
+        sod=100, sdd=200, angles=np.linspace(0, 6.28, 40), shape=SHAPE, pixel=1
+    )
     scan.save(tmp_path / "scan.csv")
     found = import_geometry(tmp_path / "scan.csv", "csv", Given(SHAPE))
     assert any("radians" in note for note in found.notes)
@@ -100,7 +106,9 @@ def test_a_document_with_a_mark_and_one_of_nothing(tmp_path):
 
 @pytest.mark.parametrize("voxel", [500.0, 30.0])
 def test_voxels_larger_than_the_field_of_view_are_refused(voxel):
-    data = fx.DataSet.from_arrays(np.full((12, *SHAPE), 500), SCAN, flat=np.full(SHAPE, 1000))
+    data = fx.DataSet.from_arrays(
+        np.full((12, *SHAPE), 500), SCAN, flat=np.full(SHAPE, 1000)
+    )
     with pytest.raises(TwinError, match="is the voxel in mm"):
         data.reconstruct("fdk", voxel=voxel)
 

@@ -21,7 +21,9 @@ SCAN = fx.ConeVec.circular(sod=100, sdd=200, angles=VIEWS, pixel=0.2)
 
 
 def data_set(seed: int = 1) -> fx.DataSet:
-    counts = np.random.default_rng(seed).integers(100, 900, (VIEWS, *SHAPE)).astype(np.uint16)
+    counts = (
+        np.random.default_rng(seed).integers(100, 900, (VIEWS, *SHAPE)).astype(np.uint16)
+    )
     return fx.DataSet.from_arrays(counts, SCAN, flat=np.full(SHAPE, 1000), name="bolt")
 
 
@@ -38,7 +40,9 @@ class Interrupted(fx.DataSet):
 def half(tmp_path: Path) -> Path:
     """A folder in which saving was interrupted before projection 4."""
     whole = data_set()
-    cut = Interrupted(**{name: getattr(whole, name) for name in whole.__dataclass_fields__})
+    cut = Interrupted(
+        **{name: getattr(whole, name) for name in whole.__dataclass_fields__}
+    )
     with pytest.raises(KeyboardInterrupt):
         cut.save(tmp_path / "half")
     return tmp_path / "half"
@@ -50,11 +54,17 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def test_a_half_saved_folder_says_what_it_is(half: Path) -> None:
     said = r"half is half-saved: 4 of 6 projections of 'bolt'"
-    with pytest.raises(DatasetError, match=f"{said}; save it once more with resume=True, or"):
+    with pytest.raises(
+        DatasetError, match=f"{said}; save it once more with resume=True, or"
+    ):
         fx.open(half)
-    with pytest.raises(DatasetError, match=f"{said}; allowed: resume=True, or an empty folder"):
+    with pytest.raises(
+        DatasetError, match=f"{said}; allowed: resume=True, or an empty folder"
+    ):
         data_set().save(half)
-    with pytest.raises(DatasetError, match=f"{said}, which is another data set than 'bolt'"):
+    with pytest.raises(
+        DatasetError, match=f"{said}, which is another data set than 'bolt'"
+    ):
         data_set(seed=2).save(half, resume=True)
     assert len(list(half.glob("scan*"))) == 4
     (half / "scan settings.txt").write_text("no projection")
@@ -70,7 +80,9 @@ def test_saving_goes_on_where_it_was_interrupted(half: Path, tmp_path: Path) -> 
     assert content(half) == content(tmp_path / "whole")
     assert {name: (half / name).stat().st_mtime_ns for name in before} == before
     np.testing.assert_array_equal(fx.open(half).counts(), data_set().counts())
-    with pytest.raises(DatasetError, match="is not empty; allowed: a new or an empty folder"):
+    with pytest.raises(
+        DatasetError, match="is not empty; allowed: a new or an empty folder"
+    ):
         data_set().save(half, resume=True)
 
 
@@ -115,9 +127,15 @@ def test_what_is_larger_than_the_free_room_is_not_begun(
 
 def test_hdf5_s_words_for_a_full_disk_are_known(tmp_path: Path) -> None:
     said = "Can't write data (file write failed: file descriptor = 12, errno = 28, error message"
-    with pytest.raises(OSError, match="bytes are free") as told, room_named(tmp_path / "a.h5"):
+    with (
+        pytest.raises(OSError, match="bytes are free") as told,
+        room_named(tmp_path / "a.h5"),
+    ):
         raise OSError(said)
-    assert (told.value.filename, told.value.errno) == (str(tmp_path / "a.h5"), errno.ENOSPC)
+    assert (told.value.filename, told.value.errno) == (
+        str(tmp_path / "a.h5"),
+        errno.ENOSPC,
+    )
     with pytest.raises(OSError, match=r"^other$"), room_named(tmp_path / "a.h5"):
         raise OSError("other")
     with pytest.raises(FileNotFoundError) as read, room_named(tmp_path / "a.h5"):

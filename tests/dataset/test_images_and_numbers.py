@@ -26,7 +26,9 @@ def written(folder, names):
 
 def saved(folder):
     counts = np.full((VIEWS, *SHAPE), 50) + np.arange(VIEWS)[:, None, None]
-    data = fx.DataSet.from_arrays(counts, scan(), flat=np.full(SHAPE, 100), dark=np.ones(SHAPE))
+    data = fx.DataSet.from_arrays(
+        counts, scan(), flat=np.full(SHAPE, 100), dark=np.ones(SHAPE)
+    )
     data.save(folder)
 
 
@@ -37,7 +39,9 @@ def test_numbers_of_every_kind_are_read_in_order(tmp_path):
     assert [int(data.counts(i)[0, 0]) for i in range(VIEWS)] == [*range(1, VIEWS + 1)]
 
 
-@pytest.mark.parametrize("twin", ["scan_000003.tiff", "scan_3.tif", "SCAN_0003.TIF", "io_0.tif"])
+@pytest.mark.parametrize(
+    "twin", ["scan_000003.tiff", "scan_3.tif", "SCAN_0003.TIF", "io_0.tif"]
+)
 @pytest.mark.parametrize("texts", [True, False])
 def test_two_files_of_one_number_are_refused(tmp_path, twin, texts):
     folder = tmp_path / "scan"
@@ -68,7 +72,9 @@ def test_an_image_of_another_name_is_left_out_or_said(tmp_path):
 def test_a_gap_in_the_numbers_is_said(tmp_path):
     written(tmp_path, [f"scan_{i}.tif" for i in range(VIEWS + 1) if i != 4])
     data = fx.read_tiffs(tmp_path, scan())
-    assert any("1 image is missing between scan_3.tif and scan_5.tif" in d for d in data.warnings)
+    assert any(
+        "1 image is missing between scan_3.tif and scan_5.tif" in d for d in data.warnings
+    )
 
 
 @pytest.mark.parametrize("blank", [1, 3, VIEWS])

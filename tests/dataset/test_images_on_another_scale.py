@@ -28,7 +28,9 @@ def seen(data: fx.DataSet) -> npt.NDArray[np.float64]:
 
 @pytest.mark.parametrize("scale", [1.0, 1e-4, 40.0])
 @pytest.mark.parametrize("subtracted", [False, True])
-def test_floats_with_a_flat_image_are_line_integrals(scale: float, subtracted: bool) -> None:
+def test_floats_with_a_flat_image_are_line_integrals(
+    scale: float, subtracted: bool
+) -> None:
     truth = integrals(np.random.default_rng([1, int(scale), subtracted]))
     below = DARK if subtracted else 0.0
     images = (DARK - below + (FLAT - DARK) * np.exp(-truth)) * scale
@@ -43,7 +45,9 @@ def test_arrays_and_files_say_the_same(tmp_path: Path, kind: type) -> None:
     rng = np.random.default_rng(2)
     images = 20_000 * np.exp(-integrals(rng)) + rng.normal(0, 3, (4, *SHAPE))
     images[0, 0, 0] = -4.0 if kind is not np.uint32 else 70_000.0
-    values = np.rint(images).astype(kind) if kind is not np.float32 else images.astype(kind)
+    values = (
+        np.rint(images).astype(kind) if kind is not np.float32 else images.astype(kind)
+    )
     flat = np.full(SHAPE, 20_000, dtype=np.float32)
     data = fx.DataSet.from_arrays(values, SCAN, flat=flat)
     for i, image in enumerate(values):
@@ -57,13 +61,17 @@ def test_arrays_and_files_say_the_same(tmp_path: Path, kind: type) -> None:
 def test_counts_stay_counts() -> None:
     values = np.arange(4 * 42).reshape(4, *SHAPE)
     for kind in (np.int64, np.float32, np.uint16):
-        data = fx.DataSet.from_arrays(values.astype(kind), SCAN, flat=np.full(SHAPE, 1000))
+        data = fx.DataSet.from_arrays(
+            values.astype(kind), SCAN, flat=np.full(SHAPE, 1000)
+        )
         assert np.array_equal(data.counts(), values)
         assert data.counts().dtype == np.uint16
 
 
 def test_negative_whole_numbers_without_a_flat_image_are_refused() -> None:
-    with pytest.raises(DatasetFormatError, match="from -1 to 40; allowed: whole numbers from 0"):
+    with pytest.raises(
+        DatasetFormatError, match="from -1 to 40; allowed: whole numbers from 0"
+    ):
         fx.DataSet.from_arrays(np.arange(-1, 41).reshape(1, *SHAPE), SCAN[:1])
     with pytest.raises(DatasetFormatError, match="not finite"):
         fx.DataSet.from_arrays(np.full((4, *SHAPE), np.nan), SCAN, flat=np.ones(SHAPE))

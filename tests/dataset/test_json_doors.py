@@ -13,8 +13,14 @@ from flexdt.twin.exchange.number_tables import geometry_text, read_geometry_text
 from flexdt.twin.geometry.cone_vec import ConeVec
 
 MARK = "\ufeff"
-DOORS = {"document": parse_document, "geometry": read_geometry_text, "phantom": load_phantom_file}
-SCAN = ScanGeometry(ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1), (4, 5))
+DOORS = {
+    "document": parse_document,
+    "geometry": read_geometry_text,
+    "phantom": load_phantom_file,
+}
+SCAN = ScanGeometry(
+    ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1), (4, 5)
+)
 
 
 @pytest.mark.parametrize("door", DOORS)

@@ -55,7 +55,9 @@ def test_transmission_is_said(integrals, tmp_path):
     assert any("transmission" in doubt for doubt in data.warnings)
     for i, image in enumerate(transmission):
         tifffile.imwrite(tmp_path / f"p{i}.tif", image)
-    assert any("transmission" in doubt for doubt in fx.read_tiffs(tmp_path, SCAN).warnings)
+    assert any(
+        "transmission" in doubt for doubt in fx.read_tiffs(tmp_path, SCAN).warnings
+    )
 
 
 def test_whole_line_integrals_are_said(integrals):
@@ -75,7 +77,9 @@ def exposed(integrals, flats, beam=1.0, seed=0, noise=True):
 
 @pytest.mark.parametrize("flats", [(1, 1.05), (1, 1.5), (1, 1, 1, 0.9), (0.7, 1.1)])
 def test_flats_that_disagree_are_said(integrals, flats):
-    assert any("flat images differ" in doubt for doubt in image_doubts(exposed(integrals, flats)))
+    assert any(
+        "flat images differ" in doubt for doubt in image_doubts(exposed(integrals, flats))
+    )
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,11 @@ from flexdt.clients.client import events, twin_methods
 from flexdt.clients.launch import random_truth
 from flexdt.library import plots
 from flexdt.library.datasets import exchange_formats as geometry
-from flexdt.library.datasets.exchange import ExchangeError, export_dataset, import_geometry
+from flexdt.library.datasets.exchange import (
+    ExchangeError,
+    export_dataset,
+    import_geometry,
+)
 from flexdt.library.reading import foreign_files
 from flexdt.library.reading.folders import load_dataset
 from flexdt.library.reconstruction import reconstruct, volume_formats
@@ -57,7 +61,9 @@ def endings(text: str) -> set[str]:
 def argument(of: object, name: str) -> str:
     """What a docstring says of one argument."""
     found = re.search(
-        rf"^ *{name}: (.*?)(?=^ *[\w, ]+: |\n\n|\Z)", inspect.getdoc(of) or "", re.M | re.S
+        rf"^ *{name}: (.*?)(?=^ *[\w, ]+: |\n\n|\Z)",
+        inspect.getdoc(of) or "",
+        re.M | re.S,
     )
     assert found is not None, (of, name)
     return found[1]
@@ -65,7 +71,9 @@ def argument(of: object, name: str) -> str:
 
 def words(text: str) -> list[str]:
     """The words of `a, b or c` up to the end of the clause."""
-    return re.split(r", (?:and |or )?| or | and ", re.split(r"[.;]\s|\.$|; ", text.strip())[0])
+    return re.split(
+        r", (?:and |or )?| or | and ", re.split(r"[.;]\s|\.$|; ", text.strip())[0]
+    )
 
 
 def difference(found: Iterable[object], expected: Iterable[object]) -> object:
@@ -104,25 +112,35 @@ def geometry_docstring_endings() -> object:
 
 
 def volume_page() -> object:
-    sentence = page("reconstruction.md", "The ending of `--out` chooses the format:", "All hold")
-    return difference(endings(sentence), {f.endings[0] for f in volume_formats.VOLUME_FORMATS})
+    sentence = page(
+        "reconstruction.md", "The ending of `--out` chooses the format:", "All hold"
+    )
+    return difference(
+        endings(sentence), {f.endings[0] for f in volume_formats.VOLUME_FORMATS}
+    )
 
 
 def volume_docstring() -> object:
     said = (inspect.getdoc(fx.Volume.save) or "").splitlines()[0]
-    return difference(endings(said), {f.endings[0] for f in volume_formats.VOLUME_FORMATS})
+    return difference(
+        endings(said), {f.endings[0] for f in volume_formats.VOLUME_FORMATS}
+    )
 
 
 def reconstruction_docstring() -> object:
     said = argument(reconstruct.reconstruct_dataset, "out")
-    return difference(endings(said), {f.endings[0] for f in volume_formats.VOLUME_FORMATS})
+    return difference(
+        endings(said), {f.endings[0] for f in volume_formats.VOLUME_FORMATS}
+    )
 
 
 def scan_page() -> object:
     table = page("other-scanners.md", "| scan | needs | not said by the file |\n")
     rows = re.findall(r"^\| (\w+) ([^|]*) \|", table, re.MULTILINE)
     stated = {(name, ending) for name, cell in rows for ending in endings(cell)}
-    return difference(stated, {(f.name, e) for f in foreign_files.SCAN_FORMATS for e in f.endings})
+    return difference(
+        stated, {(f.name, e) for f in foreign_files.SCAN_FORMATS for e in f.endings}
+    )
 
 
 def scan_docstring() -> object:
@@ -303,7 +321,9 @@ def test_a_format_that_is_only_read_or_only_written_is_at_those_doors_alone(
 
 def test_endings_choose_one_format() -> None:
     for use in ("write", "read"):
-        found = [e for f in geometry.FORMATS.values() if getattr(f, use) for e in f.endings]
+        found = [
+            e for f in geometry.FORMATS.values() if getattr(f, use) for e in f.endings
+        ]
         assert len(set(found)) == len(found)
     for forms in (volume_formats.VOLUME_FORMATS, foreign_files.SCAN_FORMATS):
         found = [ending for form in forms for ending in form.endings]  # type: ignore[attr-defined]
@@ -338,9 +358,9 @@ def test_a_volume_format_that_is_added_is_at_every_door(
     assert ".vol.gz" in capsys.readouterr().err
     out = tmp_path / "made.vol.gz"
     seen = fx.ConeVec.circular(sod=100, sdd=200, angles=3, shape=(8, 9), pixel=1.0)
-    fx.DataSet.from_arrays(np.full((3, 8, 9), 900), seen, flat=np.full((8, 9), 1000)).save(
-        tmp_path / "seen"
-    )
+    fx.DataSet.from_arrays(
+        np.full((3, 8, 9), 900), seen, flat=np.full((8, 9), 1000)
+    ).save(tmp_path / "seen")
     sirt = ("--shape", "4,4,4", "--algorithm", "sirt", "--iterations", "1")
     assert run(["reconstruct", str(tmp_path / "seen"), *sirt, "--out", str(out)]) == 0
     assert fx.Volume.load(out).shape == (4, 4, 4)
@@ -381,12 +401,16 @@ def test_a_unit_that_is_added_is_at_every_door(
     assert all(differs() for differs in UNITS)
 
 
-def test_a_mesh_format_that_is_added_is_read_and_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_format_that_is_added_is_read_and_listed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     import trimesh
 
     add(monkeypatch, mesh_files.FORMATS, "dae")
     with pytest.raises(fx.TwinError, match="off, dae"):
         fx.phantoms.mesh_phantom(b"0", file_type="none")
     with pytest.raises(fx.TwinError, match="DAE"):
-        fx.phantoms.mesh_phantom(trimesh.creation.box().export(file_type="stl"), file_type="dae")
+        fx.phantoms.mesh_phantom(
+            trimesh.creation.box().export(file_type="stl"), file_type="dae"
+        )
     assert all(differs() for differs in MESHES)

@@ -76,7 +76,9 @@ def test_of_several_entries_the_one_that_is_read_is_said(path):
     with h5py.File(path, "w") as file:
         entry(file, "entry0000")
         entry(file, "entry0001")
-    assert any("entry0000 is read, not entry0001" in doubt for doubt in opened(path).warnings)
+    assert any(
+        "entry0000 is read, not entry0001" in doubt for doubt in opened(path).warnings
+    )
 
 
 @pytest.mark.parametrize("keys", [[2, 1] + [0] * (VIEWS - 1), [2, 1] + [0] * (VIEWS + 4), [0] * 6,
@@ -104,7 +106,11 @@ def test_links_that_lead_nowhere_are_named(path, kind, part):
         entry(file)
         at = file["entry/instrument/detector"]
         del at[part]
-        at[part] = h5py.ExternalLink("raw.h5", "/x") if kind == "external" else h5py.SoftLink("/x")
+        at[part] = (
+            h5py.ExternalLink("raw.h5", "/x")
+            if kind == "external"
+            else h5py.SoftLink("/x")
+        )
     with pytest.raises(DatasetError, match="which is not there"):
         opened(path)
 
@@ -146,7 +152,9 @@ def test_frames_without_anything_recorded_are_said(path):
     assert "3 of 12 images are zero" in data.reason
 
 
-@pytest.mark.parametrize("junk", [b"", b"\x89HDF\r\n\x1a\n" + b"\x00" * 100, b"not HDF5" * 40])
+@pytest.mark.parametrize(
+    "junk", [b"", b"\x89HDF\r\n\x1a\n" + b"\x00" * 100, b"not HDF5" * 40]
+)
 def test_other_bytes_are_the_files_error(path, junk):
     path.write_bytes(junk)
     with pytest.raises(DatasetError, match=r"scan\.nx"):

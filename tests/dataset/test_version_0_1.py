@@ -22,7 +22,10 @@ OLD = Path(__file__).parents[1] / "data" / "v0.1"
 
 
 def digests(folder: Path) -> dict[str, str]:
-    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in sorted(folder.iterdir())}
+    return {
+        f.name: hashlib.sha256(f.read_bytes()).hexdigest()
+        for f in sorted(folder.iterdir())
+    }
 
 
 def test_a_data_set_of_version_0_1_opens_unchanged() -> None:

@@ -88,9 +88,14 @@ def balls(
     if wrong in ("columns", "mirrored"):
         pictures = pictures[:, :, ::-1]
     said: dict[str, bytes | None] = {
-        "ReconSettings/CenterShift": numbers(-center if wrong == "CenterShift" else center)
+        "ReconSettings/CenterShift": numbers(
+            -center if wrong == "CenterShift" else center
+        )
     }
-    shifts = shifts * [-1.0 if wrong == "X-Shifts" else 1.0, -1.0 if wrong == "Y-Shifts" else 1.0]
+    shifts = shifts * [
+        -1.0 if wrong == "X-Shifts" else 1.0,
+        -1.0 if wrong == "Y-Shifts" else 1.0,
+    ]
     degrees = -degrees if wrong in ("Angles", "mirrored") else degrees
     return txrm(path, pictures, degrees, kind=kind, said=said, shifts=shifts), center
 
@@ -105,7 +110,9 @@ def test_what_the_tests_write_is_an_ole2_file(seed: int, tmp_path: Path) -> None
     }
     (tmp_path / "file").write_bytes(compound_file(streams))
     olefile = required("olefile")
-    with olefile.OleFileIO(tmp_path / "file", raise_defects=olefile.DEFECT_POTENTIAL) as file:
+    with olefile.OleFileIO(
+        tmp_path / "file", raise_defects=olefile.DEFECT_POTENTIAL
+    ) as file:
         assert {"/".join(parts) for parts in file.listdir()} == set(streams)
         for name, content in streams.items():
             assert file.openstream(name).read() == content
@@ -118,15 +125,22 @@ def test_zeiss_scans_come_back_as_they_are(seed: int, kind: int, tmp_path: Path)
     data = fx.open(path)
     assert (len(data), data.shape, data.name) == (VIEWS, (ROWS, COLS), "tooth")
     assert data.complete
-    assert [w.startswith(f"CenterShift of {center:.4g}"[:18]) for w in data.warnings] == [True]
-    np.testing.assert_allclose(np.linalg.norm(data.geometry.source, axis=1), SOD, rtol=1e-6)
-    np.testing.assert_allclose(np.abs(data.geometry.source_detector_distance), SDD, rtol=1e-6)
+    assert [w.startswith(f"CenterShift of {center:.4g}"[:18]) for w in data.warnings] == [
+        True
+    ]
+    np.testing.assert_allclose(
+        np.linalg.norm(data.geometry.source, axis=1), SOD, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.abs(data.geometry.source_detector_distance), SDD, rtol=1e-6
+    )
     volume = data.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60), errors=False)
     np.testing.assert_allclose(found(volume), 1.0, atol=0.04)
 
 
 @pytest.mark.parametrize(
-    "wrong", ["Angles", "X-Shifts", "Y-Shifts", "CenterShift", "rows", "columns", "mirrored"]
+    "wrong",
+    ["Angles", "X-Shifts", "Y-Shifts", "CenterShift", "rows", "columns", "mirrored"],
 )
 @pytest.mark.daily(1)
 def test_the_phantom_would_show_a_wrong_sign(wrong: str, tmp_path: Path) -> None:
@@ -148,7 +162,10 @@ def test_align_finds_the_axis_of_a_panel_that_steps_about(tmp_path: Path) -> Non
     ("said", "sentence"),
     [
         ({"ImageInfo/StoRADistance": None}, "StoRADistance is missing.*geometry=ConeVec"),
-        ({"ImageInfo/DtoRADistance": numbers([1.0])}, "DtoRADistance has 4 bytes; allowed: 24 to"),
+        (
+            {"ImageInfo/DtoRADistance": numbers([1.0])},
+            "DtoRADistance has 4 bytes; allowed: 24 to",
+        ),
         ({"ImageInfo/DtoRADistance": numbers([np.nan] * 6)}, "DtoRADistance is nan"),
         ({"ImageInfo/PixelSize": numbers(0.0)}, "PixelSize is 0; allowed: above 0"),
         ({"ImageInfo/Angles": None}, "Angles is missing.*geometry=ConeVec"),
@@ -157,10 +174,16 @@ def test_align_finds_the_axis_of_a_panel_that_steps_about(tmp_path: Path) -> Non
         ({"ImageInfo/DataType": numbers(7, "<u4")}, "DataType is 7; allowed: 3, 5, 10"),
         ({"ImageInfo/ImageWidth": None}, "ImageWidth is missing"),
         ({"ImageInfo/ImageWidth": numbers(11, "<u4")}, "ImageData1/Image1 has 160 bytes"),
-        ({"ImageInfo/ImageWidth": numbers(2**32 - 1, "<u4")}, "4294967295 x 8 pixels are claimed"),
+        (
+            {"ImageInfo/ImageWidth": numbers(2**32 - 1, "<u4")},
+            "4294967295 x 8 pixels are claimed",
+        ),
         ({"ImageInfo/NoOfImages": numbers(0, "<u4")}, "0 images"),
         ({"ImageData1/Image4": None}, "ImageData1/Image4 is missing"),
-        ({"ReferenceData/Image": b"12"}, "ReferenceData/Image has 2 bytes; allowed: 160 to"),
+        (
+            {"ReferenceData/Image": b"12"},
+            "ReferenceData/Image has 2 bytes; allowed: 160 to",
+        ),
     ],
 )
 def test_what_a_zeiss_file_lacks_is_named(
@@ -182,11 +205,18 @@ def test_a_geometry_that_is_given_replaces_the_files(tmp_path: Path) -> None:
 def test_a_scan_that_was_stopped_says_so(tmp_path: Path) -> None:
     path = small(tmp_path / "s.txrm", said={"ImageInfo/ImagesTaken": numbers(4, "<u4")})
     data = fx.open(path)
-    assert (len(data), data.complete, data.reason) == (4, False, "4 of 6 images were taken")
+    assert (len(data), data.complete, data.reason) == (
+        4,
+        False,
+        "4 of 6 images were taken",
+    )
 
 
 def test_several_references_are_averaged_and_none_is_asked_for(tmp_path: Path) -> None:
-    several: dict[str, bytes | None] = {"ReferenceData/Image": None, "ReferenceData/DataType": None}
+    several: dict[str, bytes | None] = {
+        "ReferenceData/Image": None,
+        "ReferenceData/DataType": None,
+    }
     path = small(tmp_path / "none.txrm", said=several)
     data = fx.open(path)
     assert "from_arrays(data.counts(), data.geometry, flat=FLAT)" in data.warnings[0]
@@ -212,7 +242,9 @@ def spoilt(whole: bytes, seed: int) -> bytes:
         return whole[: int(rng.integers(0, len(whole)))]
     content = bytearray(whole)
     end = {1: len(whole), 2: 96, 3: len(whole)}[seed % 4]
-    begin = len(whole) - 6 * 512 if seed % 4 == 3 else 0  # directory, mini sectors' list, list
+    begin = (
+        len(whole) - 6 * 512 if seed % 4 == 3 else 0
+    )  # directory, mini sectors' list, list
     for at in rng.integers(begin, end, int(rng.integers(1, 9))):
         content[at] ^= 1 << int(rng.integers(8))
     return bytes(content)

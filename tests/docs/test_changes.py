@@ -1,4 +1,5 @@
-"""Fragments of the changelog: read by their names and texts, and built by towncrier on a copy."""
+"""Fragments of the changelog: read by their names and texts, and built by towncrier on a
+copy."""
 
 from __future__ import annotations
 
@@ -39,7 +40,11 @@ def problems(fragments: Iterable[tuple[str, str]], known: set[str]) -> list[str]
         names[name.lower()] += 1
         if not topic or kind not in known:
             found.append(f"{name}: no type of {', '.join(sorted(known))}")
-        elif end[-1:] != ["md"] or not all(part.isdecimal() for part in end[:-1]) or len(end) > 2:
+        elif (
+            end[-1:] != ["md"]
+            or not all(part.isdecimal() for part in end[:-1])
+            or len(end) > 2
+        ):
             found.append(f"{name}: not TOPIC.{kind}.md or TOPIC.{kind}.1.md")
         if not text.strip():
             found.append(f"{name}: no text")
@@ -79,7 +84,10 @@ def test_every_fragment_has_a_known_type_and_a_text() -> None:
 )
 def test_a_wrong_fragment_is_found(name: str, text: str, said: str | None) -> None:
     found = problems([(name, text)], types())
-    assert (len(found), said is None or said in found[0]) == (0 if said is None else 1, True)
+    assert (len(found), said is None or said in found[0]) == (
+        0 if said is None else 1,
+        True,
+    )
 
 
 def test_a_fragment_named_twice_is_found() -> None:

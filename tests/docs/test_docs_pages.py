@@ -12,7 +12,9 @@ from loaded_script import load
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-PAGES = sorted(p for p in DOCS.rglob("*.md") if not p.relative_to(DOCS).parts[0].startswith("_"))
+PAGES = sorted(
+    p for p in DOCS.rglob("*.md") if not p.relative_to(DOCS).parts[0].startswith("_")
+)
 
 
 LINKS = load(DOCS / "_ext" / "links_outside.py")
@@ -81,7 +83,9 @@ def test_every_claim_on_the_peers_page_has_its_command_or_source() -> None:
     assert used <= set(re.findall(r"^\| ([A-Z])\d* \|", sources, re.MULTILINE))
     for path in re.findall(r"(?:pytest|python) ([\w/.]+)", commands):
         assert (ROOT / path).exists(), path
-    columns = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines() if row[:1] == "|"}
+    columns = {
+        len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines() if row[:1] == "|"
+    }
     assert len(columns) == 1
 
 

@@ -1,4 +1,5 @@
-"""The whole site is built once, as `make docs` does: warnings are errors, notebooks executed."""
+"""The whole site is built once, as `make docs` does: warnings are errors, notebooks
+executed."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ MOST_WORDS = 600
 """Of a page that answers one question."""
 
 
-@pytest.mark.parametrize("page", [p for p in QUESTIONS if p.stem != "index"], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "page", [p for p in QUESTIONS if p.stem != "index"], ids=lambda p: p.stem
+)
 def test_a_question_has_a_short_answer_with_code_and_a_picture(page: Path) -> None:
     text = page.read_text()
     assert len(text.split()) <= MOST_WORDS
@@ -29,7 +32,16 @@ def test_a_question_has_a_short_answer_with_code_and_a_picture(page: Path) -> No
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_site_builds_without_a_warning(tmp_path: Path) -> None:
-    words = ["-b", "html", "-n", "-W", "--keep-going", "-q", "-d", str(tmp_path / "doctrees")]
+    words = [
+        "-b",
+        "html",
+        "-n",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-d",
+        str(tmp_path / "doctrees"),
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", *words, str(DOCS), str(tmp_path / "html")],
         capture_output=True, text=True, timeout=880, check=False,
@@ -51,10 +63,16 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert found is not None
     assert abs(float(found[1]) + 1.1) < 5 * float(found[2])
     assert "state.get" in (html / "_generated" / "wire.html").read_text()
-    assert 'id="flexdt-phantom-design"' in (html / "_generated" / "commands.html").read_text()
+    assert (
+        'id="flexdt-phantom-design"'
+        in (html / "_generated" / "commands.html").read_text()
+    )
     cone_vec = html / "_generated" / "python" / "flexdt.twin.geometry.cone_vec.html"
     assert "project_points" in cone_vec.read_text()
-    assert "flexdt.twin.geometry.cone_vec.html" in (html / "reference" / "python.html").read_text()
+    assert (
+        "flexdt.twin.geometry.cone_vec.html"
+        in (html / "reference" / "python.html").read_text()
+    )
     # Evidence is rendered, old addresses forward, and the figures are made anew.
     coverage = (html / "_generated" / "evidence" / "calibration.html").read_text()
     assert 'id="coverage-of-the-joint-95-ellipsoid"' in coverage

@@ -15,11 +15,17 @@ import flexdt as fx
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
-BLOCKS = dict(re.findall(r"^## ([^\n]+)\n(?:(?!^## ).)*?```python\n(.*?)```", PAGE, re.M | re.S))
+BLOCKS = dict(
+    re.findall(r"^## ([^\n]+)\n(?:(?!^## ).)*?```python\n(.*?)```", PAGE, re.M | re.S)
+)
 TASKS = [name for name in BLOCKS if name != "Geometry as a value"]
 MADE = {
     "An STL file to counts": ["part-scan/geometry.json", "part-scan/scan_000035.tif"],
-    "An array and ASTRA's vectors to FDK, SIRT and TV": ["fdk.nrrd", "sirt.nrrd", "tv.nrrd"],
+    "An array and ASTRA's vectors to FDK, SIRT and TV": [
+        "fdk.nrrd",
+        "sirt.nrrd",
+        "tv.nrrd",
+    ],
     "A folder to calibrated slices": [],
     "A scan script with its timeline": ["timeline.png"],
     "A hundred misalignments for training": ["training.npz"],
@@ -75,7 +81,8 @@ def test_the_block_runs(name: str, there: Path) -> None:
         beads = fx.phantoms.lego().beads
         found = space["data"].with_correction(space["found"].correction).geometry  # type: ignore[attr-defined]
         miss = [
-            np.abs(g.project_points(beads) - TRUE.project_points(beads)) for g in (found, NOMINAL)
+            np.abs(g.project_points(beads) - TRUE.project_points(beads))
+            for g in (found, NOMINAL)
         ]
         assert miss[0].max() < 0.05
         assert miss[1].max() > 1.0
@@ -84,10 +91,14 @@ def test_the_block_runs(name: str, there: Path) -> None:
 @pytest.mark.slow
 def test_the_readmes_lines_run(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (block,) = [b for b in re.findall(r"```python\n(.*?)```", readme, re.S) if "flexdt as fx" in b]
+    (block,) = [
+        b for b in re.findall(r"```python\n(.*?)```", readme, re.S) if "flexdt as fx" in b
+    ]
     assert len([line for line in block.splitlines() if line.strip()]) <= 10
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of biased values, too: it is a newcomer's first volume
+        warnings.simplefilter(
+            "error"
+        )  # of biased values, too: it is a newcomer's first volume
         exec(compile(block.replace("lego-scan", "readme-scan"), "README.md", "exec"), {})
     assert (there / "lego.nrrd").stat().st_size > 0
     assert "6 parameters from 90 frames" in capsys.readouterr().out
@@ -102,7 +113,8 @@ def test_every_name_of_the_face_is_on_the_page() -> None:
 def test_a_stranger_needs_one_import_and_finds_every_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The notebook itself is executed when the site is built; here without the cell of servers."""
+    """The notebook itself is executed when the site is built; here without the cell of
+    servers."""
     pytest.importorskip("matplotlib", reason="the extra `plots`").use("Agg")
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "docs" / "tutorials" / "by-completion.md").read_text(encoding="utf-8")

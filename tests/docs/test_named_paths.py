@@ -23,7 +23,9 @@ PROSE = sorted(
 EVIDENCE = evidence()
 # Not files of the repository: a secret that its reader makes, and what `make docs` makes.
 ELSEWHERE = re.compile(r"docker/token\b|docs/_build\b")
-PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./*<>-]*[\w/*>])")
+PATH = re.compile(
+    rf"(?<![\w./-])((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./*<>-]*[\w/*>])"
+)
 BARE = re.compile(r"`(\w+\.py)`")
 MODULE = re.compile(r"(?<![\w.])flexdt((?:\.[a-z_][a-z_0-9]*)+)")
 FILES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
@@ -50,15 +52,23 @@ def is_module(path: str) -> bool:
         if file.is_file() or (whole / "__init__.py").is_file():
             rest = parts[count:]
             source = (file if file.is_file() else whole / "__init__.py").read_text()
-            return not rest or (len(rest) <= 2 and re.search(rf"\b{rest[0]}\b", source) is not None)
+            return not rest or (
+                len(rest) <= 2 and re.search(rf"\b{rest[0]}\b", source) is not None
+            )
     return False
 
 
-@pytest.mark.parametrize("page", [*PROSE, *EVIDENCE], ids=lambda p: p.name.removesuffix(".md"))
+@pytest.mark.parametrize(
+    "page", [*PROSE, *EVIDENCE], ids=lambda p: p.name.removesuffix(".md")
+)
 def test_named_paths_and_modules_exist(page: Path) -> None:
     text = EVIDENCE[page] if page in EVIDENCE else page.read_text()
     places = ROOT, page.parent
-    paths = {p for p in named_paths(text) if not any(list(o.glob(p.rstrip("/"))) for o in places)}
+    paths = {
+        p
+        for p in named_paths(text)
+        if not any(list(o.glob(p.rstrip("/"))) for o in places)
+    }
     assert paths == set(), f"{page.relative_to(ROOT)} names what is not in the repository"
     bare = {name for name in BARE.findall(text) if name not in FILES}
     assert bare == set(), f"{page.relative_to(ROOT)} names files that are nowhere"
@@ -79,7 +89,8 @@ def test_architecture_names_every_room() -> None:
 
 
 def test_processes_started_by_name_are_in_the_table() -> None:
-    """Modules named as strings are invisible to import-linter, so the page lists who names them."""
+    """Modules named as strings are invisible to import-linter, so the page lists who names
+    them."""
     text = (ROOT / "ARCHITECTURE.md").read_text()
     started = re.compile(r"[\"']flexdt\.(?:runtime|server|clients)\.(?:[\w.]*\.main|launch\.up|cli"
                          r"|server|bench|child|worker)[\"']")  # fmt: skip

@@ -1,5 +1,5 @@
-"""Scans of other scanners, and scans to other programs: the blocks of the page run, and the balls
-are where each program's own geometry puts them.
+"""Scans of other scanners, and scans to other programs: the blocks of the page run, and the
+balls are where each program's own geometry puts them.
 
 The balls' radiographs are closed forms. A pixel that looks through the middle of a ball has at
 least its diameter on the way; with an axis, a sign or an order turned, it does not.
@@ -25,7 +25,9 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "other-scanners.md").read_text(encoding="utf-8")
-BLOCKS = dict(re.findall(r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S))
+BLOCKS = dict(
+    re.findall(r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S)
+)
 START = 0.4
 """Stage angle of the first view [rad]."""
 RTK = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n{}'
@@ -58,7 +60,9 @@ def rtk(folder: Path) -> None:
     required("itk")
     angles = np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS)
     views = "".join(VIEW.format(angle % 360.0, SOD, SDD) for angle in angles)
-    (folder / "geometry.xml").write_text(RTK.format(views) + "</RTKThreeDCircularGeometry>\n")
+    (folder / "geometry.xml").write_text(
+        RTK.format(views) + "</RTKThreeDCircularGeometry>\n"
+    )
     lines = -np.log(images(0.0, START))[:, ::-1].astype("<f4")
     origin = -(COLS - 1) / 2 * PIXEL, -(ROWS - 1) / 2 * PIXEL, 0.0
     head = (
@@ -87,9 +91,15 @@ def test_every_block_has_ten_lines_and_two_imports() -> None:
         assert imports <= 2, name
 
 
-@pytest.mark.filterwarnings("ignore:. of .. layers of the grid")  # the panel moved up and down
+@pytest.mark.filterwarnings(
+    "ignore:. of .. layers of the grid"
+)  # the panel moved up and down
 @pytest.mark.parametrize(
-    "name", ["NXtomo", *(pytest.param(n, marks=pytest.mark.slow) for n in MAKERS if n != "NXtomo")]
+    "name",
+    [
+        "NXtomo",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in MAKERS if n != "NXtomo"),
+    ],
 )
 @pytest.mark.campaign(1)
 def test_a_scan_becomes_a_volume(
@@ -106,7 +116,9 @@ def test_a_scan_becomes_a_volume(
 
 
 @pytest.mark.slow
-def test_a_ctsimu_set_becomes_a_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ctsimu_set_becomes_a_volume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("flexdt_extensions")
     monkeypatch.chdir(tmp_path)
     here = ROOT / "extensions" / "examples" / "ctsimu"
@@ -117,9 +129,15 @@ def test_a_ctsimu_set_becomes_a_volume(tmp_path: Path, monkeypatch: pytest.Monke
     subprocess.run(command, check=True, capture_output=True, timeout=250)
     space = ran(BLOCKS["CTSimU"])
     lines = space["data"].line_integrals()
-    assert (len(space["data"]), len(space["data"].flats), len(space["data"].darks)) == (24, 2, 1)
+    assert (len(space["data"]), len(space["data"].flats), len(space["data"].darks)) == (
+        24,
+        2,
+        1,
+    )
     assert abs(float(np.median(lines[:, :, [0, -1]]))) < 0.02 < 0.2 < float(lines.max())
-    assert 0.0 < float(space["found"].parameters["axis_column_px"]["value"]) < lines.shape[2]
+    assert (
+        0.0 < float(space["found"].parameters["axis_column_px"]["value"]) < lines.shape[2]
+    )
     assert float(np.nanmax(space["volume"].data)) > 0.0
 
 
@@ -140,7 +158,9 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fx.DataSet]:
     }
 
 
-def crossed(source: FloatArray, corner: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+def crossed(
+    source: FloatArray, corner: FloatArray, u: FloatArray, v: FloatArray
+) -> FloatArray:
     """Columns and rows (n, balls, 2) where rays through the balls meet panels (n, 3)."""
     out = np.empty((len(source), len(BALLS), 2))
     for n in range(len(source)):
@@ -173,7 +193,11 @@ def test_astra_sees_the_balls_where_they_are(
     monkeypatch.setitem(sys.modules, "astra", astra)
     kind, geometry, sino = ran(BLOCKS["To ASTRA"], {"data": scans[scan]})["number"]
     rows, cols = geometry["DetectorRowCount"], geometry["DetectorColCount"]
-    assert (kind, geometry["type"], sino.shape) == ("-sino", "cone_vec", (rows, VIEWS, cols))
+    assert (kind, geometry["type"], sino.shape) == (
+        "-sino",
+        "cone_vec",
+        (rows, VIEWS, cols),
+    )
     pictures = sino.transpose(1, 0, 2)
     places = of_vectors(geometry["Vectors"], (rows, cols))
     assert through_the_balls(pictures, places)
@@ -222,8 +246,8 @@ def test_cil_sees_the_balls_where_they_are(
 def test_tigre_sees_the_balls_where_they_are(
     scan: str, scans: dict[str, fx.DataSet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The source stands on +x and turns anticlockwise by the angle, together with the panel: its
-    columns go to +y, its rows, from the lowest, to +z.
+    """The source stands on +x and turns anticlockwise by the angle, together with the panel:
+    its columns go to +y, its rows, from the lowest, to +z.
     """
     tigre = ModuleType("tigre")
     tigre.geometry = lambda mode: SimpleNamespace(mode=mode)  # type: ignore[attr-defined]
@@ -232,7 +256,11 @@ def test_tigre_sees_the_balls_where_they_are(
     geo, angles = space["geo"], space["angles"]
     zero, one = np.zeros(VIEWS), np.ones(VIEWS)
     low, left = -(geo.nDetector - 1) / 2 * geo.dDetector
-    corner = [geo.DSO - geo.DSD, left + geo.offDetector[:, 1], low + geo.offDetector[:, 0]]
+    corner = [
+        geo.DSO - geo.DSD,
+        left + geo.offDetector[:, 1],
+        low + geo.offDetector[:, 0],
+    ]
     standing = np.array([
         [geo.DSO * one, zero, zero], corner, [zero, geo.dDetector[1] * one, zero],
         [zero, zero, geo.dDetector[0] * one],
@@ -262,7 +290,8 @@ def test_rtk_sees_the_balls_where_they_are(
         "seen = reader.GetOutputObject()\n"
         "back = itk.imread('scan.mha')\n"
         "matrices = [itk.array_from_matrix(seen.GetMatrix(i)) for i in range(len(data))]\n"
-        "np.savez('seen.npz', images=itk.array_from_image(back), first=list(back.GetOrigin()),\n"
+        "np.savez('seen.npz', images=itk.array_from_image(back), "
+        "first=list(back.GetOrigin()),\n"
         "         step=list(back.GetSpacing()), matrices=matrices)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=250)
@@ -270,4 +299,6 @@ def test_rtk_sees_the_balls_where_they_are(
     balls = BALLS[:, [0, 2, 1]] * [1.0, 1.0, -1.0]  # RTK's x, y, z
     shown = seen["matrices"] @ np.c_[balls, np.ones(len(balls))].T
     places = (shown[:, :2] / shown[:, 2:]).transpose(0, 2, 1)
-    assert through_the_balls(seen["images"], (places - seen["first"][:2]) / seen["step"][:2])
+    assert through_the_balls(
+        seen["images"], (places - seen["first"][:2]) / seen["step"][:2]
+    )

@@ -11,6 +11,10 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "phantoms.md"
 
 
 def test_every_shipped_phantom_has_a_row() -> None:
-    table = PAGE.read_text(encoding="utf-8").split("| name | what |", 1)[1].split("\n\n", 1)[0]
+    table = (
+        PAGE.read_text(encoding="utf-8")
+        .split("| name | what |", 1)[1]
+        .split("\n\n", 1)[0]
+    )
     rows = re.findall(r"^\| `([a-z0-9 -]+)` \|", table, re.MULTILINE)
     assert sorted(name for row in rows for name in row.split()) == sorted(phantom_names())

@@ -21,7 +21,9 @@ FOLDERS = (
 )  # fmt: skip
 PAGES = ("docs/phantoms.md", "docs/exchange.md", "docs/command-line.md", "docs/reconstruction.md",
          "docs/other-scanners.md", "docs/tutorials/own-sample.md")  # fmt: skip
-ROW = re.compile(r"^\| (?!file \|)(?P<file>[^|]*)\| (?P<change>[^|]*)\| (?P<test>[^|]*)\|$", re.M)
+ROW = re.compile(
+    r"^\| (?!file \|)(?P<file>[^|]*)\| (?P<change>[^|]*)\| (?P<test>[^|]*)\|$", re.M
+)
 
 
 def recipes() -> dict[str, list[dict[str, str]]]:
@@ -32,7 +34,9 @@ def recipes() -> dict[str, list[dict[str, str]]]:
         name: [m.groupdict() for m in ROW.finditer(body)]
         for name, body in zip(parts[::2], parts[1::2], strict=True)
     }
-    return {name: [r for r in rows if "---" not in r["file"]] for name, rows in found.items()}
+    return {
+        name: [r for r in rows if "---" not in r["file"]] for name, rows in found.items()
+    }
 
 
 def files_to_run(rows: list[dict[str, str]]) -> list[str]:
@@ -120,7 +124,9 @@ def test_a_machine_is_added_by_its_recipe(copy: Path) -> None:
     rows = recipes()["A machine"]
     machines, profiles = copy / "twin/data/machines", copy / "twin/data/profiles"
     text = (machines / "micro_ct.toml").read_text()
-    named = text.replace('name = "micro_ct"', 'name = "added"\ndefault_profile = "added-2030"', 1)
+    named = text.replace(
+        'name = "micro_ct"', 'name = "added"\ndefault_profile = "added-2030"', 1
+    )
     named = named.replace('scanner_name = "micro-CT"', 'scanner_name = "Added"')
     assert named.count("added") == 2
     (machines / "added.toml").write_text(named)
@@ -146,14 +152,19 @@ def test_a_phantom_is_added_by_its_recipe(copy: Path) -> None:
         '    """Return a ball of water of 10 mm."""\n'
         "    water = material_of('water').mu_per_mm\n"
         "    ball = Solid(Ellipsoid((0.0, 0.0, 0.0), (5.0, 5.0, 5.0)), 'water', water)\n"
-        "    return Phantom('added', 'a ball of water', Scene((ball,)), (10.0, 10.0, 10.0))\n\n\n"
+        "    return Phantom('added', 'a ball of water', Scene((ball,)), (10.0, 10.0, "
+        "10.0))\n\n\n"
     )
     before = "_MAKERS: Final[Mapping[str, Callable[[], Phantom]]] = {\n"
     assert text.count(before) == 1
-    samples.write_text(text.replace(before, maker + before + '    "added": added_phantom,\n'))
+    samples.write_text(
+        text.replace(before, maker + before + '    "added": added_phantom,\n')
+    )
     page = copy / "docs" / "phantoms.md"
     row = "| `chiral` |"
-    page.write_text(page.read_text().replace(row, f"| `added` | a ball of water |\n{row}"))
+    page.write_text(
+        page.read_text().replace(row, f"| `added` | a ball of water |\n{row}")
+    )
     listed = run(copy, "-m", "flexdt.clients.cli", "phantom", "list")
     assert "added" in listed.stdout, listed.stderr
     assert passed(copy, files_to_run(rows), "added or every or row") >= 3

@@ -63,11 +63,20 @@ def test_every_page_stands_on_a_shelf() -> None:
         for path in SHELVES["other"]
         if path.relative_to(DOCS).parts[0] not in FREE
     }
-    assert loose == {"command-line.md", "gallery.md", "index.md", "stability.md", "why.md"}
+    assert loose == {
+        "command-line.md",
+        "gallery.md",
+        "index.md",
+        "stability.md",
+        "why.md",
+    }
 
 
 def test_the_documentation_is_short() -> None:
-    assert sum(COUNTS.words(path) for paths in SHELVES.values() for path in paths) <= MAX_WORDS
+    assert (
+        sum(COUNTS.words(path) for paths in SHELVES.values() for path in paths)
+        <= MAX_WORDS
+    )
 
 
 TASKS = [p for p in SHELVES["use"] if p.parent == DOCS and p.name not in INDEXES]

@@ -53,7 +53,9 @@ def test_the_table_and_the_imports_for_type_checkers_agree() -> None:
     for name, (module, attribute) in imported.items():
         assert module is not None
         home = importlib.import_module(module)
-        wanted = getattr(home, attribute, None) or importlib.import_module(f"{module}.{attribute}")
+        wanted = getattr(home, attribute, None) or importlib.import_module(
+            f"{module}.{attribute}"
+        )
         assert getattr(fx, name) is wanted, name
 
 
@@ -65,7 +67,10 @@ def test_each_name_is_documented_with_an_example_that_holds(name: str) -> None:
     assert ">>>" in text, f"flexdt.{name} has no example"
     home = found if isinstance(found, ModuleType) else sys.modules[found.__module__]
     # Own globals, as doctest.testmod has them; `fx` so that examples may be a user's.
-    finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner(verbose=False)
+    finder, runner = (
+        doctest.DocTestFinder(recurse=False),
+        doctest.DocTestRunner(verbose=False),
+    )
     for test in finder.find(found, name, globs={**vars(home), "fx": fx}):
         runner.run(test)
     assert runner.summarize(verbose=False).failed == 0

@@ -1,4 +1,5 @@
-"""Each method of a value that `import flexdt as fx` gives has an example, and the example holds."""
+"""Each method of a value that `import flexdt as fx` gives has an example, and the example
+holds."""
 
 from __future__ import annotations
 
@@ -36,14 +37,18 @@ def classes() -> Iterator[type]:
 
 def methods(of: type) -> Iterator[tuple[str, Any]]:
     for name, found in inspect.getmembers(of, inspect.isroutine):
-        if not name.startswith("_") and str(getattr(found, "__module__", "")).startswith("flexdt"):
+        if not name.startswith("_") and str(getattr(found, "__module__", "")).startswith(
+            "flexdt"
+        ):
             yield f"{of.__name__}.{name}", found
 
 
 def test_each_method_has_an_example_but_those_that_say_why_not() -> None:
     every = dict(pair for of in classes() for pair in methods(of))
     assert len(every) > 50
-    without = {name for name, found in every.items() if ">>>" not in (found.__doc__ or "")}
+    without = {
+        name for name, found in every.items() if ">>>" not in (found.__doc__ or "")
+    }
     assert without == set(WITHOUT)
 
 

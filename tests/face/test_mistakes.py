@@ -1,8 +1,9 @@
-"""150 mistakes drawn over the signatures of the public face: each gets a sentence, not a traceback.
+"""150 mistakes drawn over the signatures of the public face: each gets a sentence, not a
+traceback.
 
-What counts as a mistake comes from the text of the signatures and from right calls, not from what
-checks them: a value of another type, an array of another shape, a number in another unit or
-of none, two arguments in the wrong order, a misspelt name.
+What counts as a mistake comes from the text of the signatures and from right calls, not from
+what checks them: a value of another type, an array of another shape, a number in another unit
+or of none, two arguments in the wrong order, a misspelt name.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ IMAGES = np.full((4, 6, 8), 0.1, np.float32)
 COUNTS = np.full((4, 6, 8), 500)
 VOLUME = fx.Volume(np.full((4, 4, 4), 0.02), 0.5)
 BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 1, "material": "pmma"}
-DATA = fx.DataSet.from_arrays(COUNTS, SCAN, dark=np.zeros((6, 8)), flat=np.full((6, 8), 1000))
+DATA = fx.DataSet.from_arrays(
+    COUNTS, SCAN, dark=np.zeros((6, 8)), flat=np.full((6, 8), 1000)
+)
 BENCH = {"sod": 100.0, "sdd": 200.0, "angles": 4, "pixel": 0.5, "shape": (6, 8)}
 SOLVER = {"projections": IMAGES, "cone_vec": SCAN, "like": GRID}
 RIGHT: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
@@ -121,7 +124,9 @@ def _types() -> Iterator[Mistake]:
             if name in right:
                 for other in _others(str(parameter.annotation), right[name]):
                     wrong = {**right, name: other}
-                    yield Mistake(where, "another type", f"{name}={other!r}"[:60], (), wrong)
+                    yield Mistake(
+                        where, "another type", f"{name}={other!r}"[:60], (), wrong
+                    )
 
 
 def _shapes() -> Iterator[Mistake]:
@@ -131,7 +136,9 @@ def _shapes() -> Iterator[Mistake]:
             if isinstance(value, tuple):
                 wrong = [value[:-1], (*value, 1)]
             elif isinstance(value, np.ndarray) and value.shape[-1] == 12:
-                wrong = [value[:, :-1], value[None], np.zeros((3, 12))][: 3 - (where == "ConeVec")]
+                wrong = [value[:, :-1], value[None], np.zeros((3, 12))][
+                    : 3 - (where == "ConeVec")
+                ]
             elif isinstance(value, np.ndarray):
                 wrong = [value[None, None], value[..., :0]]
             for other in wrong:
@@ -149,7 +156,9 @@ def _units() -> Iterator[Mistake]:
                     wrong = {**right, name: other}
                     yield Mistake(where, "another unit", f"{name}={other:g}", (), wrong)
     metres = fx.ConeVec(SCAN.rows / 1000, (6, 8))
-    aside = fx.ConeVec.circular(sod=100, sdd=200, angles=4, shape=(6, 8), pixel=0.5, offset=(90, 0))
+    aside = fx.ConeVec.circular(
+        sod=100, sdd=200, angles=4, shape=(6, 8), pixel=0.5, offset=(90, 0)
+    )
     near = fx.ConeVec.circular(sod=1.5, sdd=2000, angles=4, shape=(6, 8), pixel=0.5)
     small = {**BALL, "radius": 1e-3}
     for where in ("simulate", "project"):
@@ -219,7 +228,9 @@ def _answer(mistake: Mistake) -> str:
 
 
 def test_the_right_calls_cover_every_name() -> None:
-    missing = {name for name in fx.__all__ if not any(r.split(".")[0] == name for r in RIGHT)}
+    missing = {
+        name for name in fx.__all__ if not any(r.split(".")[0] == name for r in RIGHT)
+    }
     assert missing == NO_CALLS
 
 
@@ -236,7 +247,9 @@ def test_mistakes_drawn_over_the_signatures_get_a_sentence(
 
 
 def test_numpy_s_scalars_are_taken_as_python_s() -> None:
-    def given(yes: bool, whole: int, number: float, none: bool | None = None) -> tuple[Any, ...]:
+    def given(
+        yes: bool, whole: int, number: float, none: bool | None = None
+    ) -> tuple[Any, ...]:
         return yes, whole, number, none
 
     told: Callable[..., tuple[Any, ...]] = public(given)

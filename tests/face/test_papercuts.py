@@ -20,7 +20,11 @@ from flexdt.clients.cli.commands.calibrate_commands import show
 from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
+from flexdt.twin.machine.description import (
+    builtin_machine,
+    builtin_profile,
+    parse_machine,
+)
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
@@ -91,7 +95,9 @@ def test_nothing_at_all_is_refused(call: Callable[[], object], told: str) -> Non
          "iterations is '9'; allowed: a whole number"),
     ],
 )  # fmt: skip
-def test_values_of_another_kind_get_a_sentence(call: Callable[[], object], told: str) -> None:
+def test_values_of_another_kind_get_a_sentence(
+    call: Callable[[], object], told: str
+) -> None:
     with pytest.raises(fx.TwinError, match=told):
         call()
 
@@ -143,7 +149,9 @@ def test_a_calibration_without_a_fit_prints_no_figures() -> None:
     assert "12 frames, 3 of 60 beads seen: no fit" in out
 
 
-def test_calibrate_without_a_phantom_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_without_a_phantom_lists_them(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["calibrate", "nowhere"])
     assert ended.value.code == 2
@@ -154,7 +162,10 @@ def test_calibrate_without_a_phantom_lists_them(capsys: pytest.CaptureFixture[st
 
 def test_a_volume_file_may_be_named_by_text(tmp_path: Path) -> None:
     data = fx.DataSet.from_arrays(
-        np.full((16, 16, 16), 500), SCAN, dark=np.zeros((16, 16)), flat=np.full((16, 16), 900)
+        np.full((16, 16, 16), 500),
+        SCAN,
+        dark=np.zeros((16, 16)),
+        flat=np.full((16, 16), 900),
     )
     out = str(tmp_path / "v.mha")
     assert reconstruct_dataset(data, out, VolumeRequest(shape=(4, 4, 4)))["file"] == out
@@ -167,7 +178,9 @@ def test_a_framework_that_is_not_there_is_named_with_its_command(
 ) -> None:
     operator = fx.Operator(SCAN, fx.Grid((4, 4, 4), 1.0))
     monkeypatch.setitem(sys.modules, name, None)  # type: ignore[arg-type]
-    with pytest.raises(fx.TwinError, match=rf"{name} is not installed .*: (pip|conda) install"):
+    with pytest.raises(
+        fx.TwinError, match=rf"{name} is not installed .*: (pip|conda) install"
+    ):
         getattr(operator, name)()
 
 
@@ -205,14 +218,18 @@ def test_a_volume_is_given_to_other_libraries_by_dlpack() -> None:
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1"])
 def test_a_seed_is_a_whole_number(seed: object) -> None:
-    with pytest.raises(fx.TwinError, match=r"noise is .*; allowed: .*seed,? >= 0[;,] .*None"):
+    with pytest.raises(
+        fx.TwinError, match=r"noise is .*; allowed: .*seed,? >= 0[;,] .*None"
+    ):
         fx.simulate("lego", SCAN, noise=seed)  # type: ignore[arg-type]
 
 
 def test_line_integrals_in_memory_are_a_data_set() -> None:
     integrals = np.random.default_rng(3).uniform(-0.05, 3.0, (16, 16, 16))
     data = fx.DataSet.from_arrays(integrals, SCAN)
-    assert np.abs(data.line_integrals() - integrals).max() < 4e-4  # half a count of exp(-3) 60000
+    assert (
+        np.abs(data.line_integrals() - integrals).max() < 4e-4
+    )  # half a count of exp(-3) 60000
     assert data.warnings == ()
     beyond = fx.DataSet.from_arrays(integrals + 20.0 * (integrals > 2.5), SCAN)
     assert any("they are cut" in doubt for doubt in beyond.warnings)
@@ -239,7 +256,9 @@ def test_beads_stand_where_their_positions_say() -> None:
     assert phantom.size_mm == (17.0, 7.0, 11.0)
     assert len(phantom.scene.solids) == 2
     for wrong in (np.zeros((3, 2)), np.zeros((0, 3)), np.zeros((1, 1, 3)), [1.0, 2.0]):
-        with pytest.raises(fx.TwinError, match=r"of shape .*; allowed: \(3,\), or \(k, 3\)"):
+        with pytest.raises(
+            fx.TwinError, match=r"of shape .*; allowed: \(3,\), or \(k, 3\)"
+        ):
             fx.phantoms.beads(wrong)
 
 
@@ -277,7 +296,9 @@ def test_what_a_completer_finds_is_public_and_methods_name_their_options() -> No
 
 
 def test_rows_that_point_nowhere_and_rows_that_count_upwards() -> None:
-    with pytest.raises(fx.TwinError, match=r"cone_vec row 0: .*; allowed: pixels that each have"):
+    with pytest.raises(
+        fx.TwinError, match=r"cone_vec row 0: .*; allowed: pixels that each have"
+    ):
         fx.ConeVec.from_astra(np.zeros((3, 12)))
     cone = {"type": "cone", "DetectorRowCount": 6, "DetectorColCount": 8, "DetectorSpacingX": 0.5,
             "DetectorSpacingY": 0.5, "DistanceOriginSource": 400, "DistanceOriginDetector": 200,
@@ -324,15 +345,23 @@ def test_a_scan_of_few_rows_is_aligned_or_told_why_not(rows: int) -> None:
 
 
 def test_another_name_of_the_same_thing_is_deprecated() -> None:
-    with pytest.warns(DeprecationWarning, match="Grid: voxel is called voxel_mm here") as told:
+    with pytest.warns(
+        DeprecationWarning, match="Grid: voxel is called voxel_mm here"
+    ) as told:
         grid = fx.Grid((4, 4, 4), voxel=0.5)  # type: ignore[call-arg]
     assert grid == fx.Grid((4, 4, 4), 0.5)
     assert told[0].filename == __file__
-    with pytest.warns(DeprecationWarning, match="Grid: voxel is called"):  # not once alone
+    with pytest.warns(
+        DeprecationWarning, match="Grid: voxel is called"
+    ):  # not once alone
         assert fx.Grid((4, 4, 4), voxel=0.5) == grid  # type: ignore[call-arg]
     for _ in range(2):
         with pytest.warns(DeprecationWarning, match="voxel_mm here"):
-            assert fx.Volume(np.zeros((2, 3, 4), np.float32), voxel=0.5).shape == (2, 3, 4)  # type: ignore[call-arg]
+            assert fx.Volume(np.zeros((2, 3, 4), np.float32), voxel=0.5).shape == (
+                2,
+                3,
+                4,
+            )  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="Grid has no argument 'voxel'"):
         fx.Grid((4, 4, 4), voxel_mm=0.5, voxel=0.5)  # type: ignore[call-arg]
 
@@ -357,5 +386,7 @@ def test_materials_of_samples_hold_for_filters_of_tubes_too(name: str) -> None:
     text = f'base = "flexray"\nname = "filtered"\n[[tube.filters]]\nmaterial = "{name}"\n'
     spec = parse_machine(f"{text}thickness_mm = 0.3\n").tube
     assert spec.filters[0].material == name
-    with pytest.raises(fx.TwinError, match=r"unknown material 'aluminum'; there are: .*aluminium"):
+    with pytest.raises(
+        fx.TwinError, match=r"unknown material 'aluminum'; there are: .*aluminium"
+    ):
         fx.Tube(filters=[("aluminum", 0.3)])

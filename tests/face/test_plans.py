@@ -23,7 +23,11 @@ def test_text_path_and_script_give_equal_plans() -> None:
     text = FLY.read_text()
     plan = fx.plan(text)
     assert plan == fx.plan(FLY) == fx.plan(str(FLY)) == fx.plan(parse_script(text))
-    assert plan == fx.plan(FLY, machine=fx.machine("flexray")) == fx.plan(FLY, machine="flexray")
+    assert (
+        plan
+        == fx.plan(FLY, machine=fx.machine("flexray"))
+        == fx.plan(FLY, machine="flexray")
+    )
     flexray = fx.machine("flexray")
     assert plan == fx.plan(FLY, profile=builtin_profile(flexray.default_profile))
     thesis = builtin_profile("thesis")

@@ -44,7 +44,9 @@ def test_volumes_and_arrays_are_the_projector() -> None:
     values = np.random.default_rng(5).random((6, 5, 4)).astype(np.float32)
     volume = fx.Volume(values, 0.8)
     assert_allclose(fx.project(volume, SCAN), fx.forward(volume, SCAN))
-    assert_allclose(fx.project(values, SCAN, voxel_mm=0.8), fx.forward(volume, SCAN), atol=1e-6)
+    assert_allclose(
+        fx.project(values, SCAN, voxel_mm=0.8), fx.forward(volume, SCAN), atol=1e-6
+    )
 
 
 def test_what_cannot_be_projected_is_said() -> None:

@@ -20,4 +20,7 @@ def test_the_public_surface_is_the_list_in_the_docs() -> None:
         check=True, capture_output=True, text=True,
     ).stdout  # fmt: skip
     listed = (ROOT / "docs" / "reference" / "surface.txt").read_text()
-    assert "\n".join(difflib.unified_diff(listed.splitlines(), found.splitlines(), n=0)) == ""
+    assert (
+        "\n".join(difflib.unified_diff(listed.splitlines(), found.splitlines(), n=0))
+        == ""
+    )

@@ -36,7 +36,9 @@ __all__ = ["flexdt_twin"]
 ROOT = Path(__file__).resolve().parents[2]
 FAST = 100.0
 """Twin seconds a second of the loop, where nobody looks at what is between."""
-BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/testing.md").read_text("utf-8"), re.S)
+BLOCKS = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs/testing.md").read_text("utf-8"), re.S
+)
 
 
 def block(mark: str) -> dict[str, Any]:
@@ -48,7 +50,8 @@ def block(mark: str) -> dict[str, Any]:
 
 
 def travelled(way: float, speed: float, acceleration: float, t: float) -> float:
-    """Own integral of speed, by trapezoids: up by `acceleration` to `speed` at most, and down."""
+    """Own integral of speed, by trapezoids: up by `acceleration` to `speed` at most, and
+    down."""
     rise = min(speed / acceleration, math.sqrt(way / acceleration))
     whole = way / (acceleration * rise) + rise
     bends = np.clip([rise, whole - rise, whole], 0.0, t)  # between which speed is linear
@@ -79,8 +82,12 @@ def test_the_examples_hold() -> None:
 # Time -------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=15, deadline=None, phases=[Phase.generate], database=None)  # no shrinking
-@given(machine=machines(), draw=st.data(), to=st.floats(0.0, 1.0), part=st.floats(0.0, 1.2))
+@settings(
+    max_examples=15, deadline=None, phases=[Phase.generate], database=None
+)  # no shrinking
+@given(
+    machine=machines(), draw=st.data(), to=st.floats(0.0, 1.0), part=st.floats(0.0, 1.2)
+)
 @pytest.mark.slow
 def test_any_machines_motors_move_as_its_file_says(
     machine: Machine, draw: st.DataObject, to: float, part: float
@@ -103,7 +110,9 @@ def test_any_machines_motors_move_as_its_file_says(
     gone = travelled(way, axis.speed, axis.acceleration, moment)
     assert seen.time == pytest.approx(moment, rel=1e-6, abs=1e-6)
     there = seen.axes[motor]
-    assert abs(there.position - axis.home) == pytest.approx(gone, rel=1e-6, abs=1e-6 * way)
+    assert abs(there.position - axis.home) == pytest.approx(
+        gone, rel=1e-6, abs=1e-6 * way
+    )
     assert there.moving == (part < 1.0)
 
 
@@ -115,7 +124,9 @@ def test_time_passes_in_calls_that_wait_and_at_no_other_time() -> None:
         assert [client.state().time for _ in range(5)] == [0.0] * 5
         assert client.state().axes["rot_obj"].position == 0.0
         client.move({"rot_obj": 7200.0}, wait=True)
-        assert client.state().time == pytest.approx(162.0, abs=0.01)  # 7200 / 45 + 45 / 22.5
+        assert client.state().time == pytest.approx(
+            162.0, abs=0.01
+        )  # 7200 / 45 + 45 / 22.5
         with client.subscribe("state") as events:
             client.move({"rot_obj": 7110.0})
             moving = [False]
@@ -131,7 +142,8 @@ def test_time_passes_in_calls_that_wait_and_at_no_other_time() -> None:
 def test_nothing_sleeps_listens_or_starts_a_thread_or_process(
     speed_up: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And a scan with as many checks as make a server start a process is done to its last file."""
+    """And a scan with as many checks as make a server start a process is done to its last
+    file."""
 
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("a socket, sleep, thread or process")
@@ -162,7 +174,8 @@ def test_the_same_calls_give_the_same_data_set(tmp_path: Path) -> None:
             client.wait_job(client.submit_script(script(3), "one").job)
             folder = scanner.data / "one"
             sums = {
-                f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob("*.tif")
+                f.name: hashlib.sha256(f.read_bytes()).hexdigest()
+                for f in folder.glob("*.tif")
             }
             return client.state().time, sums
 
@@ -182,7 +195,9 @@ def test_a_scan_under_way_ends_with_the_block_and_says_so(tmp_path: Path) -> Non
     with pytest.raises(ZeroDivisionError):
         broken()
     assert json.loads((tmp_path / "one" / "flexdt.json").read_text())["complete"] is False
-    with twin(data=tmp_path) as scanner:  # a new server does not know what the old one did
+    with twin(
+        data=tmp_path
+    ) as scanner:  # a new server does not know what the old one did
         assert scanner.client.jobs().jobs == []
 
 
@@ -194,7 +209,9 @@ def test_clients_are_apart_and_a_stop_overtakes(flexdt_twin: InProcessTwin) -> N
     watcher = flexdt_twin.connect("watcher")
 
     async def stopped() -> Any:
-        async with AsyncTwinClient(transport=flexdt_twin.transport(), name="mover") as mover:
+        async with AsyncTwinClient(
+            transport=flexdt_twin.transport(), name="mover"
+        ) as mover:
             moving = asyncio.create_task(mover.move({"rot_obj": 90.0}, wait=True))
             await asyncio.sleep(1.0)
             await mover.stop()
@@ -204,7 +221,9 @@ def test_clients_are_apart_and_a_stop_overtakes(flexdt_twin: InProcessTwin) -> N
     assert arrived is False
     assert controller == "mover #3"
     at = watcher.state().axes["rot_obj"]
-    assert at.position == pytest.approx(22.5, abs=1e-6)  # 22.5 deg/s^2 for 1 s, and as far to brake
+    assert at.position == pytest.approx(
+        22.5, abs=1e-6
+    )  # 22.5 deg/s^2 for 1 s, and as far to brake
     watcher.move({"rot_obj": 0.0})
     with pytest.raises(RpcError, match="watcher #2 is the controller"):
         flexdt_twin.client.move({"rot_obj": 1.0})
@@ -251,14 +270,18 @@ def test_a_loop_that_a_thread_runs_serves_blocking_clients_and_ends() -> None:
         scanner.client.move({"rot_obj": 90.0}, wait=True)
         assert scanner.client.state().axes["rot_obj"].position == 90.0
         rest = scanner.loop.time()
-        while (now := scanner.loop.time()) != rest or scanner.client.state().axes["rot_obj"].moving:
+        while (now := scanner.loop.time()) != rest or scanner.client.state().axes[
+            "rot_obj"
+        ].moving:
             rest = now
     assert threading.active_count() == before
     assert scanner.loop.is_closed()
 
 
 @pytest.mark.parametrize(
-    "flexdt_twin", [{"machine": "micro_ct", "physics": "mono", "seed": None}], indirect=True
+    "flexdt_twin",
+    [{"machine": "micro_ct", "physics": "mono", "seed": None}],
+    indirect=True,
 )
 def test_the_fixture_takes_the_arguments_of_a_twin(
     flexdt_twin: InProcessTwin, tmp_path: Path
@@ -270,9 +293,15 @@ def test_the_fixture_takes_the_arguments_of_a_twin(
 
 
 def test_what_does_not_exist_is_said() -> None:
-    with pytest.raises(fx.TwinError, match="no machine called 'flexrey'"), twin(machine="flexrey"):
+    with (
+        pytest.raises(fx.TwinError, match="no machine called 'flexrey'"),
+        twin(machine="flexrey"),
+    ):
         pass
-    with pytest.raises(fx.TwinError, match="no sample called 'legi'"), twin(sample="legi"):
+    with (
+        pytest.raises(fx.TwinError, match="no sample called 'legi'"),
+        twin(sample="legi"),
+    ):
         pass
 
 
@@ -295,7 +324,9 @@ def test_without_hypothesis_the_command_that_installs_it_is_said(
 ) -> None:
     monkeypatch.setitem(sys.modules, "hypothesis", None)  # type: ignore[arg-type]
     monkeypatch.delitem(sys.modules, "flexdt.testing.strategies")
-    with pytest.raises(fx.TwinError, match=r"needs hypothesis.*: pip install 'flexdt\[testing\]'"):
+    with pytest.raises(
+        fx.TwinError, match=r"needs hypothesis.*: pip install 'flexdt\[testing\]'"
+    ):
         importlib.import_module("flexdt.testing.strategies")
 
 
@@ -303,7 +334,8 @@ def test_without_hypothesis_the_command_that_installs_it_is_said(
 
 
 def test_geometries_are_of_every_kind_and_each_is_a_scanners() -> None:
-    """Worked out from the rows alone: what stands still in every view, and where the panel is."""
+    """Worked out from the rows alone: what stands still in every view, and where the panel
+    is."""
     kinds: set[tuple[bool, bool, bool, bool]] = set()
 
     @settings(max_examples=150, database=None)
@@ -318,7 +350,9 @@ def test_geometries_are_of_every_kind_and_each_is_a_scanners() -> None:
         assert sod[0] >= 1.0
         normal = np.cross(u, v)
         assert (np.abs(np.einsum("ij,ij->i", u, v)) <= 1e-9).all()
-        far = np.einsum("ij,ij->i", centre - source, normal) / np.linalg.norm(normal, axis=1)
+        far = np.einsum("ij,ij->i", centre - source, normal) / np.linalg.norm(
+            normal, axis=1
+        )
         assert (np.abs(far) > sod * 0.9).all()
         assert json.loads(json.dumps(scan.to_dict()))["rows"] == np.asarray(scan).tolist()
         pitch = np.linalg.norm(u[0]), np.linalg.norm(v[0])

@@ -1,7 +1,7 @@
 """The library (not the servers) without what Windows lacks.
 
-A stand-in for a system that is not at hand: modules and functions that Python has on POSIX alone
-are taken away once the third-party libraries are loaded, and folders cannot be opened.
+A stand-in for a system that is not at hand: modules and functions that Python has on POSIX
+alone are taken away once the third-party libraries are loaded, and folders cannot be opened.
 """
 
 from __future__ import annotations

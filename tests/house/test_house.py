@@ -1,4 +1,5 @@
-"""Measures of the source code: each finds what is planted in a small sample, and nothing else."""
+"""Measures of the source code: each finds what is planted in a small sample, and nothing
+else."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def tree(**sources: str) -> list[Module]:
     """Modules by name: `twin__a` is twin/a.py."""
-    return [Module(name.replace("__", "/") + ".py", text) for name, text in sources.items()]
+    return [
+        Module(name.replace("__", "/") + ".py", text) for name, text in sources.items()
+    ]
 
 
 def values(found: Sequence[Measure]) -> dict[str, float]:
@@ -27,7 +30,11 @@ def values(found: Sequence[Measure]) -> dict[str, float]:
 
 
 def test_modules_have_the_names_under_which_they_are_imported(tmp_path: Path) -> None:
-    for path in ("flexdt/__init__.py", "flexdt/library/open.py", "twin/motion/__init__.py"):
+    for path in (
+        "flexdt/__init__.py",
+        "flexdt/library/open.py",
+        "twin/motion/__init__.py",
+    ):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text("")
     (tmp_path / "flexdt" / "twin").symlink_to(tmp_path / "twin")
@@ -37,7 +44,9 @@ def test_modules_have_the_names_under_which_they_are_imported(tmp_path: Path) ->
 
 
 def test_code_lines_are_summed_by_folder() -> None:
-    found = values(rooms.measure(tree(twin__a="x = 1\n", twin__b='"""No code."""\n\ny = 2\n')))
+    found = values(
+        rooms.measure(tree(twin__a="x = 1\n", twin__b='"""No code."""\n\ny = 2\n'))
+    )
     assert found == {"twin": 2, "modules": 2, "code lines": 2}
 
 
@@ -60,13 +69,19 @@ def test_a_circle_of_two_modules_is_found_however_they_import(line: str) -> None
 
 
 def test_a_neighbours_import_is_no_circle_with_the_package() -> None:
-    found = circles.measure(tree(twin____init__="from flexdt.twin.a import x", twin__a="import os"))
+    found = circles.measure(
+        tree(twin____init__="from flexdt.twin.a import x", twin__a="import os")
+    )
     assert [m.value for m in found] == [0, 0]
 
 
 def test_folders_that_import_each_other_are_a_circle_without_one_of_modules() -> None:
     found = circles.measure(
-        tree(twin__a="import flexdt.server.a", server__a="", server__b="import flexdt.twin.a")
+        tree(
+            twin__a="import flexdt.server.a",
+            server__a="",
+            server__b="import flexdt.twin.a",
+        )
     )
     assert [m.findings for m in found] == [(), ("server twin",)]
 
@@ -79,8 +94,12 @@ def test_circles_are_those_of_a_drawn_graph(seed: int) -> None:
     graph = {n: {m for m in nodes if m != n and draw.random() < 0.2} for n in nodes}
     leads = {(n, m) for n in nodes for m in graph[n]}
     for k in nodes:  # Warshall
-        leads |= {(n, m) for n in nodes for m in nodes if (n, k) in leads and (k, m) in leads}
-    together = {(n, m) for n in nodes for m in nodes if n != m and {(n, m), (m, n)} <= leads}
+        leads |= {
+            (n, m) for n in nodes for m in nodes if (n, k) in leads and (k, m) in leads
+        }
+    together = {
+        (n, m) for n in nodes for m in nodes if n != m and {(n, m), (m, n)} <= leads
+    }
     found = circles.circles(graph)
     assert {(n, m) for c in found for n in c for m in c if n != m} == together
 
@@ -103,16 +122,18 @@ def g():
 
 def test_lookups_by_text_are_found_and_other_packages_are_not() -> None:
     found = lookups.measure(tree(clients__b=LOOKUPS, twin__a=""))
-    at = [[finding.split()[0].rpartition(":")[2] for finding in m.findings] for m in found]
+    at = [
+        [finding.split()[0].rpartition(":")[2] for finding in m.findings] for m in found
+    ]
     assert at == [["5", "6"], ["7"], ["5", "8"]]
 
 
 def test_a_list_in_two_modules_is_found_in_any_form_and_order() -> None:
-    one = (
-        'AXES = ("x", "y", "z")\nSHORT = ("x", "y")\nTWICE = ["u", "v", "w"]\nB = ["u", "v", "w"]\n'
-    )
+    one = 'AXES = ("x", "y", "z")\nSHORT = ("x", "y")\nTWICE = ["u", "v", "w"]\nB = ["u", "v", "w"]\n'  # noqa: E501
     two = 'from typing import Literal\nA = Literal["z", "x", "y"]\nSHORT = ("x", "y")\n'
-    (found,) = copied_lists.measure(tree(twin__a=one, server__b=two, clients__c='D = {"x": 1}\n'))
+    (found,) = copied_lists.measure(
+        tree(twin__a=one, server__b=two, clients__c='D = {"x": 1}\n')
+    )
     assert found.findings == ("twin/a.py:1 server/b.py:2 x, y, z",)
 
 
@@ -131,7 +152,9 @@ def part(name: str, lines: int, uses: str = "") -> str:
         (part("one", 60) + part("two", 60) + '__all__ = ["one", "two"]\n', [60, 60]),
     ],
 )
-def test_parts_that_do_not_use_each_other_are_told_apart(source: str, sizes: list[int]) -> None:
+def test_parts_that_do_not_use_each_other_are_told_apart(
+    source: str, sizes: list[int]
+) -> None:
     (module,) = tree(twin__a=source)
     assert glue.large_parts(module) == sizes
 
@@ -178,7 +201,10 @@ def test_dense_lines_are_found() -> None:
         "a, b = 1, 2\nc, d = pair()\ne = 1 if a else 2\nf = [1, 2]  # fmt: skip\n"
         f"g = '{'x' * 90}'\n"
     )
-    at = {m.name: [f.split()[0] for f in m.findings] for m in density.measure(tree(twin__a=source))}
+    at = {
+        m.name: [f.split()[0] for f in m.findings]
+        for m in density.measure(tree(twin__a=source))
+    }
     assert at == {
         "stacked assignments": ["twin/a.py:1"],
         "conditional expressions": ["twin/a.py:3"],
@@ -188,7 +214,9 @@ def test_dense_lines_are_found() -> None:
     assert density.measure(tree(twin__a=source))[0].value == 1000 / 5
 
 
-def test_the_table_sets_figures_beside_those_of_the_newest_release(tmp_path: Path) -> None:
+def test_the_table_sets_figures_beside_those_of_the_newest_release(
+    tmp_path: Path,
+) -> None:
     save([Measure("modules", 9)], tmp_path / "0.9.0.json")
     save([Measure("modules", 10), Measure("gone", 2.25, "%")], tmp_path / "0.10.0.json")
     version, before = last_release(tmp_path)

@@ -34,7 +34,11 @@ class Plain:
     def ask(self, method: str, **params: Any) -> dict[str, Any]:
         """Send a request; returns the whole answer, passing over events."""
         self.id += 1
-        self.send(json.dumps({"jsonrpc": "2.0", "id": self.id, "method": method, "params": params}))
+        self.send(
+            json.dumps(
+                {"jsonrpc": "2.0", "id": self.id, "method": method, "params": params}
+            )
+        )
         while True:
             answer = self.receive()
             if answer.get("id") == self.id:
@@ -50,7 +54,10 @@ class Plain:
         return self.until(job, lambda s: s["state"] in FINAL, seconds)
 
     def until(
-        self, job: str, condition: Callable[[Mapping[str, Any]], bool], seconds: float = 120.0
+        self,
+        job: str,
+        condition: Callable[[Mapping[str, Any]], bool],
+        seconds: float = 120.0,
     ) -> dict[str, Any]:
         deadline = time.monotonic() + seconds
         while True:
@@ -91,7 +98,10 @@ def fly_script() -> Callable[..., str]:
     """A small fly scan: N images of 200 x 160 pixels about the middle of the sensor."""
 
     def make(
-        frames: int = 12, exposure_ms: float = 50.0, roi: str = "800 620 1199 939", **moves: float
+        frames: int = 12,
+        exposure_ms: float = 50.0,
+        roi: str = "800 620 1199 939",
+        **moves: float,
     ) -> str:
         period = exposure_ms / 1000.0
         speed = 360.0 / (frames - 1) / period

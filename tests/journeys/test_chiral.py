@@ -2,8 +2,8 @@
 
 Four unequal beads that no mirror image fits. What the reader says about each frame is compared
 with a point projection written here from the interface's definition of the world frame and the
-published zero offsets of profile cwi-2023-08-21 alone (it uses nothing of flexdt), and the frames
-are backprojected over all 48 signed permutations of the axes: only the identity may fit.
+published zero offsets of profile cwi-2023-08-21 alone (it uses nothing of flexdt), and the
+frames are backprojected over all 48 signed permutations of the axes: only the identity may fit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from flexdt.twin.projection import Volume, back
 Array = npt.NDArray[np.float64]
 
 # Radius 4 along +x, 3 along +y, 2 along +z, 1.5 along -x and below (the phantom's definition).
-BEADS = np.array([[14.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 18.0], [-6.0, 2.0, -9.0]])
+BEADS = np.array(
+    [[14.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 18.0], [-6.0, 2.0, -9.0]]
+)
 RADII = np.array([4.0, 3.0, 2.0, 1.5])
 FRAMES = 13
 MOTORS = {"ver_tube": 26.2917, "ver_det": 24.0, "tra_det": 21.0, "mag_det": 1000.0,
@@ -38,7 +40,8 @@ BINNING = 2
 
 
 def independent_pixels(points: Array, angle_deg: float) -> Array:
-    """(column, row) of world points at a stage angle, from the interface's frames and flexray.md.
+    """(column, row) of world points at a stage angle, from the interface's frames and
+    flexray.md.
 
     World: +x right seen from the source, +y to the detector, +z up. Growing rot_obj turns the
     object clockwise seen from above. Columns grow to +x, rows downwards.
@@ -49,15 +52,23 @@ def independent_pixels(points: Array, angle_deg: float) -> Array:
     phi = math.radians(angle_deg)
     x, y, z = points.T
     turned = np.stack(
-        [x * math.cos(phi) + y * math.sin(phi), -x * math.sin(phi) + y * math.cos(phi), z], axis=1
+        [
+            x * math.cos(phi) + y * math.sin(phi),
+            -x * math.sin(phi) + y * math.cos(phi),
+            z,
+        ],
+        axis=1,
     )
     ray = turned + axis - source
     at_panel = source + ray * ((m["mag_det"] + 40.0008) / ray[:, 1])[:, None]
     panel_x, panel_z = -m["tra_det"] + 24.1215, m["ver_det"]
-    # Unbinned pixel (column, row) counts from the panel's top left corner, pixel centres at + 1/2.
+    # Unbinned pixel (column, row) counts from the panel's top left corner, pixel centres at +
+    # 1/2.
     column = (at_panel[:, 0] - panel_x) / PITCH + 1944 / 2
     row = -(at_panel[:, 2] - panel_z) / PITCH + 1536 / 2
-    return np.stack([(column - LEFT) / BINNING - 0.5, (row - TOP) / BINNING - 0.5], axis=1)
+    return np.stack(
+        [(column - LEFT) / BINNING - 0.5, (row - TOP) / BINNING - 0.5], axis=1
+    )
 
 
 def angles() -> list[float]:
@@ -70,7 +81,9 @@ def folder(servers: Servers, data_dir: Path, fly_script: Callable[..., str]) -> 
     roi = f"{LEFT} {TOP} {RIGHT} {BOTTOM}"
     with TwinClient(*servers.address) as client:
         client.set_sample("chiral")
-        job = client.submit_script(fly_script(FRAMES, roi=roi, **MOTORS), name="chiral").job
+        job = client.submit_script(
+            fly_script(FRAMES, roi=roi, **MOTORS), name="chiral"
+        ).job
         while (status := client.job_status(job)).state in ("queued", "running"):
             time.sleep(0.05)
     assert status.state == "done", status
@@ -82,7 +95,10 @@ def line_integrals(folder: Path) -> Array:
     dark = tifffile.imread(folder / "di000000.tif").astype(np.float64)
     flat = tifffile.imread(folder / "io000000.tif").astype(np.float64)
     frames = np.stack(
-        [tifffile.imread(folder / f"scan_{i:06d}.tif").astype(np.float64) for i in range(FRAMES)]
+        [
+            tifffile.imread(folder / f"scan_{i:06d}.tif").astype(np.float64)
+            for i in range(FRAMES)
+        ]
     )
     return -np.log(np.maximum(frames - dark, 1.0) / (flat - dark))
 
@@ -107,7 +123,8 @@ def test_the_readers_geometry_is_the_independent_one(folder: Path) -> None:
 
 
 def body_chords(shape: tuple[int, int], angle_deg: float) -> Array:
-    """Path length of each pixel's ray in the 40 x 34 x 46 mm body, by slabs, (rows, cols) [mm]."""
+    """Path length of each pixel's ray in the 40 x 34 x 46 mm body, by slabs, (rows, cols)
+    [mm]."""
     m = MOTORS
     rows, cols = np.mgrid[: shape[0], : shape[1]]
     panel = np.stack(
@@ -142,7 +159,9 @@ def test_every_bead_casts_its_shadow_where_it_must(folder: Path) -> None:
         predicted = independent_pixels(BEADS, angle)
         reach = RADII / (PITCH * BINNING) * 1040.0 / 600.0
         for k, (column, row) in enumerate(predicted):
-            gaps = np.linalg.norm(predicted - predicted[k], axis=1) - 1.3 * (reach + reach[k])
+            gaps = np.linalg.norm(predicted - predicted[k], axis=1) - 1.3 * (
+                reach + reach[k]
+            )
             if np.delete(gaps, k).min() < 0:
                 continue  # two shadows overlap
             found = shadow_centre(beads, column, row, 1.3 * reach[k])
@@ -151,17 +170,22 @@ def test_every_bead_casts_its_shadow_where_it_must(folder: Path) -> None:
     assert checked > 2 * FRAMES
 
 
-def shadow_centre(beads: Array, column: float, row: float, radius: float) -> tuple[float, float]:
+def shadow_centre(
+    beads: Array, column: float, row: float, radius: float
+) -> tuple[float, float]:
     """Weighted centre of a disc, above the median of what surrounds it."""
     rows, cols = np.mgrid[: beads.shape[0], : beads.shape[1]]
     distance = np.hypot(cols - column, rows - row)
     disc = distance <= radius
     above = beads[disc] - np.median(beads[(distance > radius) & (distance < radius + 4)])
-    return float(above @ cols[disc] / above.sum()), float(above @ rows[disc] / above.sum())
+    return float(above @ cols[disc] / above.sum()), float(
+        above @ rows[disc] / above.sum()
+    )
 
 
 def test_backprojection_fits_only_the_unmirrored_phantom(folder: Path) -> None:
-    """Value of the backprojection (here: mean over the frames) at the beads, in 48 orientations."""
+    """Value of the backprojection (here: mean over the frames) at the beads, in 48
+    orientations."""
     images = line_integrals(folder)
     scores = {}
     for order in itertools.permutations(range(3)):
@@ -180,7 +204,9 @@ def test_backprojection_fits_only_the_unmirrored_phantom(folder: Path) -> None:
 def test_volume_is_indexed_z_y_x_in_the_object_frame(folder: Path) -> None:
     """The package's own backprojection of the reader's frames, at voxels found by hand."""
     dataset = load_dataset(folder)
-    images = np.stack([dataset.line_integrals(i) for i in range(FRAMES - 1)]).astype(np.float32)
+    images = np.stack([dataset.line_integrals(i) for i in range(FRAMES - 1)]).astype(
+        np.float32
+    )
     voxel = 1.0
     like = Volume(np.zeros((47, 35, 41), np.float32), voxel)
     volume = back(images, dataset.cone_vec[: FRAMES - 1], like).data

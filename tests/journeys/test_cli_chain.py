@@ -13,12 +13,21 @@ from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
 pytestmark = pytest.mark.slow
-TRUTH = {"dO_x": 0.61, "dO_y": -0.37, "dO_z": 1.4, "alpha": -2.3, "tau_x": 0.2, "tau_z": 0.3}
+TRUTH = {
+    "dO_x": 0.61,
+    "dO_y": -0.37,
+    "dO_z": 1.4,
+    "alpha": -2.3,
+    "tau_x": 0.2,
+    "tau_z": 0.3,
+}
 Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
-def misaligned(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Servers, Path]]:
+def misaligned(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[Servers, Path]]:
     folder = tmp_path_factory.mktemp("chain")
     truth = folder / "truth.toml"
     truth.write_text("".join(f"{k} = {v}\n" for k, v in TRUTH.items()))
@@ -48,7 +57,9 @@ def dataset(misaligned: tuple[Servers, Path], flexdt: Run) -> Path:
     if not script.exists():
         words = ["--kind", "fly", "--frames", 24, "--averages", 10, "--out", script]
         assert flexdt("script", "new", *words)[0] == 0
-        code, _, err = flexdt("run", script, "--out", "beads", "--sample", "normal-5", talk=True)
+        code, _, err = flexdt(
+            "run", script, "--out", "beads", "--sample", "normal-5", talk=True
+        )
         assert code == 0, err
     return folder / "data" / "beads"
 
@@ -69,7 +80,9 @@ def test_calibrate_finds_the_truth_and_pushes_it(
         assert abs(found["value"] - true) < 4 * found["sigma"], name
         assert found["images"] < (0.25 if name == "dO_z" else 0.2), name
     state = json.loads(flexdt("state", "--json", talk=True)[1])
-    assert state["correction"]["parameters"]["dO_x"] == pytest.approx(TRUTH["dO_x"], abs=0.02)
+    assert state["correction"]["parameters"]["dO_x"] == pytest.approx(
+        TRUTH["dO_x"], abs=0.02
+    )
 
 
 def test_a_push_to_nobody_is_refused_before_the_work(
@@ -85,7 +98,9 @@ def test_a_push_to_nobody_is_refused_before_the_work(
     assert not report.exists()
 
 
-def test_compare_is_within_after_and_not_before(flexdt: Run, dataset: Path, tmp_path: Path) -> None:
+def test_compare_is_within_after_and_not_before(
+    flexdt: Run, dataset: Path, tmp_path: Path
+) -> None:
     words = ["compare", dataset, "--phantom", "normal-5"]
     code, out, _ = flexdt(*words, "--out", tmp_path, "--json")
     assert code == 0
@@ -104,13 +119,19 @@ def test_compare_is_within_after_and_not_before(flexdt: Run, dataset: Path, tmp_
         (["calibrate", "{data}", "--phantom", "shepp-logan"], 1, "no beads"),
         (["calibrate", "{data}", "--phantom", "nobody"], 1, "nobody"),
         (["calibrate", "{data}", "--phantom", "normal-5", "--free", "warp"], 1, "warp"),
-        (["calibrate", "{data}", "--phantom", "normal-5", "--report", "x.pdf"], 2, ".html"),
+        (
+            ["calibrate", "{data}", "--phantom", "normal-5", "--report", "x.pdf"],
+            2,
+            ".html",
+        ),
         (["calibrate", "/nowhere", "--phantom", "normal-5"], 1, "/nowhere"),
         (["calibrate", "{data}"], 2, "--phantom"),
         (["compare", "/nowhere", "--phantom", "normal-5"], 1, "/nowhere"),
     ],
 )
-def test_refusals(flexdt: Run, dataset: Path, words: list[str], code: int, says: str) -> None:
+def test_refusals(
+    flexdt: Run, dataset: Path, words: list[str], code: int, says: str
+) -> None:
     found, out, err = flexdt(*(word.format(data=dataset) for word in words))
     assert found == code, err
     assert says in err

@@ -1,4 +1,5 @@
-"""`flexdt demo`: the whole main job through the command line, with a truth of the test's own."""
+"""`flexdt demo`: the whole main job through the command line, with a truth of the test's
+own."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ def demo(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
+def done(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[subprocess.CompletedProcess[str], Path]:
     out = tmp_path_factory.mktemp("demo")
     truth = out.parent / "truth.toml"
     truth.write_text("\n".join(f"{k} = {v}" for k, v in TRUTH.items()))
@@ -60,7 +63,8 @@ def test_it_ends_well_and_says_what_it_did(
 
 @pytest.mark.slow
 def test_its_next_commands_are_commands(
-    done: tuple[subprocess.CompletedProcess[str], Path], capsys: pytest.CaptureFixture[str]
+    done: tuple[subprocess.CompletedProcess[str], Path],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     process, out = done
     lines = process.stderr.split("next:\n")[1].splitlines()[:2]
@@ -86,7 +90,8 @@ def test_the_calibration_finds_the_truth(
         assert error < 4 * found[name]["sigma"], name
         # The phantom's scale, known to 0.1 %, is part of what images tell of the distance.
         assert found[name]["images"] < (0.25 if name == "dO_z" else 0.1), name
-    # A prior of the panel's place shares a shift with dO; as a whole the geometry is the true one.
+    # A prior of the panel's place shares a shift with dO; as a whole the geometry is the true
+    # one.
     dataset = load_dataset(document["dataset"])
     poses = dataset.poses
     values = {name: p["value"] for name, p in found.items()}
@@ -106,8 +111,8 @@ def test_the_preview_is_a_volume_with_the_beads_in_it(
     preview = json.loads(process.stdout)["preview"]
     volume = tifffile.imread(out / "preview.tif")
     assert list(volume.shape) == preview["shape"]
-    # Five steel beads of 2 mm in a 24 x 16 x 49.8 mm object: their lateral places from the stack
-    # alone, as the centroid of what is far brighter than plastic.
+    # Five steel beads of 2 mm in a 24 x 16 x 49.8 mm object: their lateral places from the
+    # stack alone, as the centroid of what is far brighter than plastic.
     voxel, centre = preview["voxel_mm"], np.array(preview["center_mm"])
     bright = np.argwhere(volume > 0.5 * volume.max())
     xyz = (bright[:, ::-1] - (np.array(volume.shape[::-1]) - 1) / 2) * voxel + centre
@@ -157,7 +162,9 @@ def test_the_truth_is_nowhere_in_what_the_servers_wrote(
     ],
 )
 @pytest.mark.daily(1)
-def test_a_bad_truth_file_is_refused(content: str | None, says: str, tmp_path: Path) -> None:
+def test_a_bad_truth_file_is_refused(
+    content: str | None, says: str, tmp_path: Path
+) -> None:
     truth = tmp_path / "truth.toml"
     if content is not None:
         truth.write_text(content)
@@ -188,7 +195,9 @@ def test_ctrl_c_ends_the_demo_and_its_servers(tmp_path: Path) -> None:
         for line in process.stdout:
             if "scanning" in line:
                 break
-        started = children(process.pid)  # the supervisor, and what compiles kernels meanwhile
+        started = children(
+            process.pid
+        )  # the supervisor, and what compiles kernels meanwhile
         servers = [pid for parent in started for pid in children(parent)]
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=120)

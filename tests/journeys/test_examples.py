@@ -23,7 +23,9 @@ def run(name: str, *words: object) -> str:
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert [line for line in done.stderr.splitlines() if "flexdt: still " not in line] == []
+    assert [
+        line for line in done.stderr.splitlines() if "flexdt: still " not in line
+    ] == []
     return done.stdout
 
 
@@ -63,14 +65,19 @@ def test_every_study_explains_itself(path: Path) -> None:
     assert "usage:" in run(path.name, "--help")
 
 
-BY_HAND = {"viewer_study.py": "drives a browser for minutes; the viewer's tests do in short"}
+BY_HAND = {
+    "viewer_study.py": "drives a browser for minutes; the viewer's tests do in short"
+}
 """Examples of which a test runs no more than --help, and why."""
 
 
 def named(file: Path) -> set[str]:
-    """Examples that a test file's code names: as `name.py`, or by `run("name")`, `load("name")`."""
+    """Examples that a test file's code names: as `name.py`, or by `run("name")`,
+    `load("name")`."""
     nodes = list(ast.walk(ast.parse(file.read_text())))
-    files = {n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+    files = {
+        n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)
+    }
     stems = {
         f"{n.args[0].value}.py"
         for n in nodes

@@ -19,7 +19,9 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "reconstruct_with_r
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("itk") is None, reason="itk-rtk is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("itk") is None, reason="itk-rtk is not installed"
+)
 @pytest.mark.campaign
 def test_rtk_reconstructs_what_we_export(
     servers: Servers, tmp_path: Path, fly_script: Callable[..., str], data_dir: Path

@@ -1,5 +1,6 @@
-"""What goes wrong in a lab: a killed process, a client that leaves, a full disk. The scan survives
-or is marked incomplete, nothing half-written stands under a final name, and nobody is orphaned."""
+"""What goes wrong in a lab: a killed process, a client that leaves, a full disk. The scan
+survives or is marked incomplete, nothing half-written stands under a final name, and nobody is
+orphaned."""
 
 from __future__ import annotations
 
@@ -23,14 +24,18 @@ from flexdt.clients.launch.processes import Servers
 pytestmark = pytest.mark.slow
 
 Plain = Any
-LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
+LINUX = pytest.mark.skipif(
+    not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc"
+)
 
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Servers, Path]]:
     """Servers that these tests may harm, and their data directory; the last one kills them."""
     data = tmp_path_factory.mktemp("data")
-    with Servers({"data": data, "speed-up": "max"}, data.parent / "failures.log") as servers:
+    with Servers(
+        {"data": data, "speed-up": "max"}, data.parent / "failures.log"
+    ) as servers:
         yield servers, data
 
 
@@ -63,7 +68,11 @@ def whole(folder: Path, shape: tuple[int, int]) -> int:
 
 
 def started(
-    own: tuple[Servers, Path], connect: Callable[..., Plain], script: str, frames: int, name: str
+    own: tuple[Servers, Path],
+    connect: Callable[..., Plain],
+    script: str,
+    frames: int,
+    name: str,
 ) -> tuple[Plain, str]:
     """A scan in progress, `frames` of it done."""
     client = connect(own[0].address)
@@ -75,12 +84,16 @@ def started(
 
 @LINUX
 def test_projector_killed_in_mid_scan(
-    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+    own: tuple[Servers, Path],
+    connect: Callable[..., Plain],
+    fly_script: Callable[..., str],
 ) -> None:
     client, job = started(own, connect, fly_script(181, exposure_ms=100), 5, "killed")
     os.kill(process_of(own[0], "flexdt.server.projector.main"), signal.SIGKILL)
     status = client.until(job, lambda s: s["state"] not in ("queued", "running"))
-    if status["state"] == "paused":  # the projector was away for longer than the twin waits
+    if (
+        status["state"] == "paused"
+    ):  # the projector was away for longer than the twin waits
         assert "projector" in status["error"]["message"]
         client.call("job.resume", job=job)
         status = client.wait(job)
@@ -90,7 +103,9 @@ def test_projector_killed_in_mid_scan(
 
 
 def test_client_gone_in_mid_scan(
-    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+    own: tuple[Servers, Path],
+    connect: Callable[..., Plain],
+    fly_script: Callable[..., str],
 ) -> None:
     client, job = started(own, connect, fly_script(121, exposure_ms=100), 3, "left")
     client.close()
@@ -102,7 +117,9 @@ def test_client_gone_in_mid_scan(
 
 @LINUX
 def test_disk_full_in_mid_scan(
-    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+    own: tuple[Servers, Path],
+    connect: Callable[..., Plain],
+    fly_script: Callable[..., str],
 ) -> None:
     """Files beyond a size cannot be written: what a write error looks like to the twin."""
     import resource
@@ -125,7 +142,9 @@ def test_disk_full_in_mid_scan(
 
 
 def test_abort_marks_the_data_set_incomplete(
-    own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
+    own: tuple[Servers, Path],
+    connect: Callable[..., Plain],
+    fly_script: Callable[..., str],
 ) -> None:
     client, job = started(own, connect, fly_script(361, exposure_ms=100), 3, "aborted")
     client.call("job.abort", job=job)
@@ -133,7 +152,9 @@ def test_abort_marks_the_data_set_incomplete(
     assert status["state"] == "aborted"
     folder = own[1] / "aborted"
     assert whole(folder, (160, 200)) < 363
-    assert "SCRIPT CANCELLED!" in (folder / "scan settings.txt").read_text(errors="replace")
+    assert "SCRIPT CANCELLED!" in (folder / "scan settings.txt").read_text(
+        errors="replace"
+    )
     assert not [p for p in folder.rglob("*") if p.suffix in (".part", ".tmp")]
 
 
@@ -168,7 +189,9 @@ def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
 
 
 @LINUX
-def test_nobody_is_orphaned_when_the_supervisor_is_killed(own: tuple[Servers, Path]) -> None:
+def test_nobody_is_orphaned_when_the_supervisor_is_killed(
+    own: tuple[Servers, Path],
+) -> None:
     pids = children(own[0].pid)
     assert len(pids) == 2
     os.kill(own[0].pid, signal.SIGKILL)
@@ -201,7 +224,11 @@ def test_servers_killed_while_they_start_come_back_on_their_ports(tmp_path: Path
             try:
                 words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
                 module = words[words.index("-m") + 2]
-            except (OSError, IndexError, ValueError):  # it is only being made, or has gone
+            except (
+                OSError,
+                IndexError,
+                ValueError,
+            ):  # it is only being made, or has gone
                 continue
             if left.get(module, 0) and pid not in killed:
                 left[module] -= 1

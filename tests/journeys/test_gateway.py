@@ -60,13 +60,17 @@ class Program:
                 return
         raise AssertionError("the gateway does not answer")
 
-    def event(self, component: str, command: str, *arguments: object, **more: object) -> Any:
+    def event(
+        self, component: str, command: str, *arguments: object, **more: object
+    ) -> Any:
         arg1, arg2 = (*map(str, arguments), "", "")[:2]
         return {"component": component, "comp_phys": "", "command": command, "arg1": arg1,
                 "arg2": arg2, "reply": "", "reply type": "", "comp_type": "other",
                 "tick count": 1234, "UUID": next(UUIDS)} | more  # fmt: skip
 
-    def send(self, component: str, command: str, *arguments: object, **more: object) -> Any:
+    def send(
+        self, component: str, command: str, *arguments: object, **more: object
+    ) -> Any:
         event = self.event(component, command, *arguments, **more)
         self.say.send_string(json.dumps(event))
         return event["UUID"]
@@ -153,12 +157,16 @@ def test_motors_tube_and_camera_obey(program: Program, plain: Any) -> None:
     assert "200 x 160" in program.do("camera", "take image")
     program.do("tube", "xrayoff")
     assert program.do("tube", "status_XReady_get") == "FALSE"
-    assert plain.call("state.get")["controller"] is None, "control goes back when nothing runs"
+    assert plain.call("state.get")["controller"] is None, (
+        "control goes back when nothing runs"
+    )
 
 
 def test_replies_bear_the_commands_uuid_and_tick(program: Program) -> None:
     for uuid in (2**53 + 1, 2**64 + 5, -26481, 1.2345e18, "an-id-of-text"):
-        asked = program.send("tube", "set kV", 80, UUID=uuid, **{"tick count": 1380210404})
+        asked = program.send(
+            "tube", "set kV", 80, UUID=uuid, **{"tick count": 1380210404}
+        )
         events = program.events(asked)
         assert [e["reply type"] for e in events] == ["RCV", "ACK"]
         assert {e["tick count"] for e in events} == {1380210404}
@@ -190,7 +198,9 @@ def test_long_commands_say_how_far_they_are(program: Program, plain: Any) -> Non
 def test_errors_name_what_is_allowed(program: Program) -> None:
     assert "kV 200 is outside [0, 90]" in program.fails("tube", "set kV", 200)
     assert "it knows: xrayon" in program.fails("tube", "explode")
-    assert "no component 'tra_sky'; the twin has" in program.fails("tra_sky", "move absolute", 1)
+    assert "no component 'tra_sky'; the twin has" in program.fails(
+        "tra_sky", "move absolute", 1
+    )
     assert "the twin has: scanner" in program.fails("heater", "set temp", 20)
     program.say.send_string("no json")
     while True:
@@ -212,10 +222,13 @@ def test_a_line_beyond_a_limit_ends_at_the_limit_switch(program: Program) -> Non
 
 
 def test_absurd_events_end_nothing(program: Program, servers: Servers) -> None:
-    """One with a lone surrogate ended the gateway, six of them the twin and the projector, too."""
+    """One with a lone surrogate ended the gateway, six of them the twin and the projector,
+    too."""
     pids = children(servers.pid)
     for _ in range(8):
-        program.say.send_string(json.dumps({"component": "tube\ud800", "command": "xray on"}))
+        program.say.send_string(
+            json.dumps({"component": "tube\ud800", "command": "xray on"})
+        )
     for words in (
         ("mag_obj", "move absolute", "1e300"), ("mag_obj", "set speed", "1e-300"),
         ("mag_obj", "move absolute", -(2**70)),  # the source stands before that limit
@@ -267,7 +280,9 @@ def test_a_scan_in_steps(program: Program, data_dir: Path) -> None:
         do("camera", "take image")
         path = do("camera", "save image", rf"..\..\scan_{i:06d}.tif")
         assert Path(path).parent == data_dir / "steps"
-    assert "has scan_000003.tif already" in program.fails("camera", "save image", "scan_000003.tif")
+    assert "has scan_000003.tif already" in program.fails(
+        "camera", "save image", "scan_000003.tif"
+    )
     data = load_dataset(data_dir / "steps")
     assert data.complete
     assert (len(data), len(data.darks), len(data.flats)) == (4, 1, 1)
@@ -297,7 +312,9 @@ def test_the_example_takes_a_scan_in_motion(
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "19 images in" in done.stdout
-    assert "flexdt" not in EXAMPLE.read_text().split('"""', 2)[2], "a program for the scanner"
+    assert "flexdt" not in EXAMPLE.read_text().split('"""', 2)[2], (
+        "a program for the scanner"
+    )
     data = load_dataset(data_dir / "example")
     texts = load_dataset(data_dir / "example", ignore_document=True)
     assert data.complete
@@ -333,7 +350,9 @@ def test_a_sequence_can_be_aborted(program: Program, plain: Any) -> None:
     assert jobs[-1]["state"] == "aborted"
 
 
-def all_until(program: Program, last: Callable[[dict[str, Any]], bool]) -> list[dict[str, Any]]:
+def all_until(
+    program: Program, last: Callable[[dict[str, Any]], bool]
+) -> list[dict[str, Any]]:
     """Everything that is heard up to an event."""
     out: list[dict[str, Any]] = []
     while program.hear.poll(90_000):
@@ -359,7 +378,9 @@ def test_clients_hear_what_others_command(
         return {"mag_obj", "tra_obj"} <= ends
 
     told = all_until(program, both)
-    sent = [(e["component"], e["command"], e["arg1"]) for e in told if not e["reply type"]]
+    sent = [
+        (e["component"], e["command"], e["arg1"]) for e in told if not e["reply type"]
+    ]
     assert sorted(sent) == [
         ("mag_obj", "move absolute", "610.0000000000"),
         ("tra_obj", "move absolute", "12.0000000000"),
@@ -367,7 +388,9 @@ def test_clients_hear_what_others_command(
     for name, at in (("mag_obj", 610.0), ("tra_obj", 12.0)):
         kinds = [e["reply type"] for e in told if e["component"] == name]
         assert (kinds[0], kinds[1], kinds[-1]) == ("", "RCV", "ACK")
-        reply = next(e for e in told if (e["component"], e["reply type"]) == (name, "ACK"))
+        reply = next(
+            e for e in told if (e["component"], e["reply type"]) == (name, "ACK")
+        )
         assert struct.unpack_from(">d", reply["reply"].encode("latin-1")) == (at,)
     text = fly_script(13)
     job = plain.call("script.submit", text=text, name="heard")["job"]
@@ -377,11 +400,17 @@ def test_clients_hear_what_others_command(
     def over(event: dict[str, Any]) -> bool:
         nonlocal count
         count += not event["reply type"]
-        return count == len(lines) and event["reply type"] == "ACK" and event["command"] == final[1]
+        return (
+            count == len(lines)
+            and event["reply type"] == "ACK"
+            and event["command"] == final[1]
+        )
 
     told = all_until(program, over)
     heard = [
-        (e["component"], e["command"], e["arg1"], e["arg2"]) for e in told if not e["reply type"]
+        (e["component"], e["command"], e["arg1"], e["arg2"])
+        for e in told
+        if not e["reply type"]
     ]
     assert heard == [(*line, "", "")[:4] for line in lines]
     by_key: dict[object, list[str]] = {}
@@ -396,10 +425,16 @@ def test_a_component_of_somebody_else_takes_part_in_a_scripted_scan(
 ) -> None:
     heater = Program(*ports)
     lines = ("heater\tset temp\t20\t\tACK\t\t", "tube\txrayoff\t\t\tACK\t\t")
-    plain.call("script.submit", text="".join(f"{line}\r\n" for line in lines), name="heated")
+    plain.call(
+        "script.submit", text="".join(f"{line}\r\n" for line in lines), name="heated"
+    )
     plain.call("session.control", action="release")
     asked = all_until(heater, lambda e: e["component"] == "heater")[-1]
-    assert (asked["reply type"], asked["command"], asked["arg1"]) == ("", "set temp", "20")
+    assert (asked["reply type"], asked["command"], asked["arg1"]) == (
+        "",
+        "set temp",
+        "20",
+    )
     for kind, reply in (("RCV", ""), ("ACK", "20 C")):
         heater.say.send_string(json.dumps(asked | {"reply type": kind, "reply": reply}))
     told = program.events(asked["UUID"])
@@ -415,7 +450,9 @@ def test_who_follows_the_gateway_sees_where_its_machine_differs(
     tra, mag = flexray.axes["tra_obj"], flexray.axes["mag_obj"]
     known = {
         "tra_obj": tra.model_copy(update={"upper": tra.upper + 40.0}),
-        "mag_obj": mag.model_copy(update={"speed": 3 * mag.speed, "max_speed": 3 * mag.speed}),
+        "mag_obj": mag.model_copy(
+            update={"speed": 3 * mag.speed, "max_speed": 3 * mag.speed}
+        ),
     }
     machine = flexray.model_copy(update={"axes": {**flexray.axes, **known}})
     alarms: list[tuple[str, str]] = []
@@ -430,7 +467,9 @@ def test_who_follows_the_gateway_sees_where_its_machine_differs(
     async def work() -> None:
         task = asyncio.create_task(session.run(f"tcp://127.0.0.1:{ports[0]}"))
         await until(lambda: session.mirror.connected)
-        for at in range(1, 600):  # ZeroMQ drops what is sent before both ends know each other
+        for at in range(
+            1, 600
+        ):  # ZeroMQ drops what is sent before both ends know each other
             await asyncio.to_thread(
                 plain.call, "axes.move", targets={"tra_obj": 0.1 * at}, wait=True
             )
@@ -441,10 +480,14 @@ def test_who_follows_the_gateway_sees_where_its_machine_differs(
         await asyncio.to_thread(plain.call, "clock.set", speed_up=1)
         at = plain.call("state.get")["axes"]["mag_obj"]["position"]
         target = at + (250.0 if at < 600.0 else -250.0)
-        await asyncio.to_thread(plain.call, "axes.move", targets={"mag_obj": target}, wait=True)
+        await asyncio.to_thread(
+            plain.call, "axes.move", targets={"mag_obj": target}, wait=True
+        )
         await until(lambda: abs(session.mirror.positions["mag_obj"] - target) < 1e-6)
         assert ("slow", "mag_obj") in alarms
-        assert session.mirror.axes["mag_obj"].speed == mag.speed, "as the motor's reply says"
+        assert session.mirror.axes["mag_obj"].speed == mag.speed, (
+            "as the motor's reply says"
+        )
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 

@@ -1,5 +1,5 @@
-"""A misalignment learnt back by gradients, on images of an independent renderer: short of the study
-`examples/learn_geometry.py`.
+"""A misalignment learnt back by gradients, on images of an independent renderer: short of the
+study `examples/learn_geometry.py`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def test_shift_roll_and_axis_come_back(study: ModuleType) -> None:
     found = study.learn(task, [0, 1, 2], start)
     assert task.reprojection(start) > 0.3
     assert task.reprojection(found) < 0.01
-    _, sizes, directions = np.linalg.svd(task.jacobian(found, [0, 1, 2]), full_matrices=False)
+    _, sizes, directions = np.linalg.svd(
+        task.jacobian(found, [0, 1, 2]), full_matrices=False
+    )
     # A shift of the panel and one of the axis back again are nearly the same images.
     assert sizes[-1] < 0.05 * sizes[0]
     assert abs(directions[-1] @ np.array([1.0, 0.0, 1.0])) / np.sqrt(2) > 0.99
@@ -60,6 +62,8 @@ def test_the_renderer_draws_ellipsoids(study: ModuleType) -> None:
     middle = np.array([3.0, -2.0, 1.0])
     rows = task.rows(task.truth)
     image = study.render([(middle, np.diag(1 / semi) @ turn, 0.02)], rows, (30, 40), True)
-    solid = Solid(Ellipsoid(tuple(middle), tuple(semi), tuple(map(tuple, turn))), "a", 0.02)
+    solid = Solid(
+        Ellipsoid(tuple(middle), tuple(semi), tuple(map(tuple, turn))), "a", 0.02
+    )
     wanted = project_scene(Scene((solid,)), rows, (30, 40))
     np.testing.assert_allclose(image, wanted, atol=1e-5 * wanted.max())

@@ -1,7 +1,7 @@
 """Every machine at its own defaults: script, check, scan, calibration, volume.
 
-What a machine cannot do is refused before anything is scanned, and images that cannot be used are
-said to be so before they are made and afterwards.
+What a machine cannot do is refused before anything is scanned, and images that cannot be used
+are said to be so before they are made and afterwards.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from flexdt.phantoms.exposure_forecast import exposure_problems
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.machine.description import Machine, builtin_machine, parse_machine, profile_of
+from flexdt.twin.machine.description import (
+    Machine,
+    builtin_machine,
+    parse_machine,
+    profile_of,
+)
 from flexdt.twin.script import check_script
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.planning.open_beam_findings import OPEN_BEAM_CODES
@@ -65,8 +70,8 @@ def through_the_chain(machine: Machine, root: Path) -> str:
     """Take a machine through the chain and say how it ended.
 
     Returns:
-        "right", "refused" (before the scan), "warned" (unusable images, said before the scan) or
-        "not determined" (the calibration says so).
+        "right", "refused" (before the scan), "warned" (unusable images, said before the scan)
+        or "not determined" (the calibration says so).
     """
     profile, request = profile_of(machine), ScanRequest("step", frames=FRAMES)
     try:
@@ -75,7 +80,9 @@ def through_the_chain(machine: Machine, root: Path) -> str:
         return "refused" if error.data.get("allowed") is not None else str(error)
     collisions = collision_check() if machine.components else None
     phantom = load_phantom("lego")
-    report = check_script(text, machine, profile, sample=size_of(phantom), collision=collisions)
+    report = check_script(
+        text, machine, profile, sample=size_of(phantom), collision=collisions
+    )
     if not report.ok:
         assert all(problem.message for problem in report.errors)
         return "refused"
@@ -117,7 +124,9 @@ def assert_beads_in_volume(outcome: Outcome, root: Path) -> None:
     """Reconstruct with the correction; each bead stands where it belongs."""
     correction = Offsets.from_edge(outcome.document["correction"])  # type: ignore[arg-type]
     request = VolumeRequest(voxel_mm=0.5, shape=(110, 60, 60))
-    reconstruct_dataset(outcome.datasets[0], root / "v.tif", request, parameters=correction)
+    reconstruct_dataset(
+        outcome.datasets[0], root / "v.tif", request, parameters=correction
+    )
     volume = read_volume(root / "v.tif")
     for bead in np.asarray(load_phantom("lego").beads):
         place, brightest = bead_in_volume(volume, bead, reach=3)
@@ -136,13 +145,17 @@ def test_a_shipped_machine_goes_through_the_chain_at_its_own_defaults(
 @pytest.mark.slow
 @pytest.mark.campaign(2)
 @pytest.mark.parametrize("seed", range(36))
-def test_a_drawn_machine_goes_through_the_chain_or_is_refused(seed: int, tmp_path: Path) -> None:
+def test_a_drawn_machine_goes_through_the_chain_or_is_refused(
+    seed: int, tmp_path: Path
+) -> None:
     assert through_the_chain(drawn_machine(seed), tmp_path) in {
         "right", "right, and its volume warned of", "refused", "warned", "not determined",
     }  # fmt: skip
 
 
 @pytest.mark.slow
-def test_saturated_images_are_said_to_be_so_before_and_after_the_scan(tmp_path: Path) -> None:
+def test_saturated_images_are_said_to_be_so_before_and_after_the_scan(
+    tmp_path: Path,
+) -> None:
     text = 'base = "xyzr_cabinet"\nname = "bright"\n[detector]\nexposure_ms = 5000.0\n'
     assert through_the_chain(parse_machine(text), tmp_path) == "warned"

@@ -1,4 +1,5 @@
-"""An operator at a running scan: watches, pauses, moves, resumes; the data set does not notice."""
+"""An operator at a running scan: watches, pauses, moves, resumes; the data set does not
+notice."""
 
 from __future__ import annotations
 
@@ -71,7 +72,9 @@ def settled(plain: Plain, job: str) -> int:
 
 
 @pytest.mark.slow
-def test_step_by_step(plain: Plain, fly_script: Callable[..., str], data_dir: Path) -> None:
+def test_step_by_step(
+    plain: Plain, fly_script: Callable[..., str], data_dir: Path
+) -> None:
     text = fly_script(FRAMES, exposure_ms=100)
     job = plain.call("script.submit", text=text, name="stepped", speed_up=4)["job"]
     plain.until(job, lambda s: s["frames_done"] >= 2)
@@ -87,7 +90,10 @@ def test_step_by_step(plain: Plain, fly_script: Callable[..., str], data_dir: Pa
         assert settled(plain, job) == before + k
     plain.call("job.abort", job=job)
     assert plain.wait(job)["state"] == "aborted"
-    assert json.loads((data_dir / "stepped" / "flexdt.json").read_text())["complete"] is False
+    assert (
+        json.loads((data_dir / "stepped" / "flexdt.json").read_text())["complete"]
+        is False
+    )
 
 
 @pytest.mark.slow
@@ -100,11 +106,16 @@ def test_the_same_script_under_the_same_name_takes_up_where_it_stopped(
     plain.call("job.abort", job=job)
     plain.wait(job)
     folder = data_dir / "resumed"
-    kept = {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.glob("scan_*.tif")}
+    kept = {
+        p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.glob("scan_*.tif")
+    }
     assert 10 <= len(kept) < FRAMES
     job = plain.call("script.submit", text=text, name="resumed")["job"]
     assert plain.wait(job)["state"] == "done"
     for name, (when, content) in kept.items():
-        assert ((folder / name).stat().st_mtime_ns, (folder / name).read_bytes()) == (when, content)
+        assert ((folder / name).stat().st_mtime_ns, (folder / name).read_bytes()) == (
+            when,
+            content,
+        )
     assert len(list(folder.glob("scan_*.tif"))) == FRAMES
     assert json.loads((folder / "flexdt.json").read_text())["complete"] is True

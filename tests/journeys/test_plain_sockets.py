@@ -20,7 +20,9 @@ Plain = Any
 def test_move_an_axis_take_a_projection(plain: Plain) -> None:
     plain.call("sample.set", name="normal-5")
     plain.call("camera.set", mode="HW2SW1High", roi=[32, 8, 1943, 1527])
-    plain.call("axes.move", targets={"rot_obj": 0, "tra_obj": 0, "mag_obj": 600}, wait=True)
+    plain.call(
+        "axes.move", targets={"rot_obj": 0, "tra_obj": 0, "mag_obj": 600}, wait=True
+    )
     before = plain.call("projection.get", kind="line_integral", binning=4)
     moved = plain.call("axes.move", targets={"rot_obj": 90}, wait=True)
     assert moved["duration_s"] > 1.0
@@ -44,7 +46,9 @@ def test_cone_vec_turns_with_the_stage_and_comes_back(plain: Plain) -> None:
     quarter = np.array(plain.call("geometry.get")["cone_vec"])
     # The stage turned clockwise from above, so in the object's frame the source went round
     # counter-clockwise by 90 degrees: (x, y) -> (-y, x).
-    np.testing.assert_allclose(quarter[[0, 1, 2]], [-first[1], first[0], first[2]], atol=1e-9)
+    np.testing.assert_allclose(
+        quarter[[0, 1, 2]], [-first[1], first[0], first[2]], atol=1e-9
+    )
     plain.call("axes.move", targets={"rot_obj": 360}, wait=True)
     np.testing.assert_allclose(plain.call("geometry.get")["cone_vec"], first, atol=1e-9)
 
@@ -101,7 +105,9 @@ def test_bad_input_gets_its_code_and_the_connection_lives(plain: Plain) -> None:
     assert error["code"] == -32001
     assert "5000" in error["message"]
     assert plain.ask("axes.move", targets={"warp": 1})["error"]["code"] == -32602
-    error = plain.ask("script.submit", text="\n".join(["tra_obj move sideways ACK"] * 10))["error"]
+    error = plain.ask(
+        "script.submit", text="\n".join(["tra_obj move sideways ACK"] * 10)
+    )["error"]
     assert error["code"] == -32005
     lines = [p["line"] for p in _problems(error["data"])]
     assert sorted(set(lines)) == list(range(1, 11))
@@ -124,7 +130,9 @@ def test_a_watcher_sees_projections_flow_while_an_axis_moves(
     plain.call("clock.set", speed_up=1)
     watcher = connect(servers.address)
     watcher.call("state.subscribe", topics=["projection"], projection_binning=4)
-    plain.call("axes.set", axis="rot_obj", speed=4.0)  # a busy machine projects twice a second
+    plain.call(
+        "axes.set", axis="rot_obj", speed=4.0
+    )  # a busy machine projects twice a second
     moved = plain.call("axes.move", targets={"rot_obj": 96}, wait=False)
     assert moved["duration_s"] > 9.5
     seen: dict[bytes, int] = {}
@@ -142,7 +150,9 @@ def test_a_watcher_sees_projections_flow_while_an_axis_moves(
     plain.call("clock.set", speed_up="max")
 
 
-def test_the_other_encoding_on_the_same_port(servers: Any, connect: Callable[..., Plain]) -> None:
+def test_the_other_encoding_on_the_same_port(
+    servers: Any, connect: Callable[..., Plain]
+) -> None:
     """A first byte of 0x00: length-prefixed MessagePack, images as raw bytes."""
     import msgpack
 

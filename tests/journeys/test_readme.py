@@ -1,4 +1,5 @@
-"""The README's commands, one by one, against real servers; its `nc` lines with plain sockets."""
+"""The README's commands, one by one, against real servers; its `nc` lines with plain
+sockets."""
 
 from __future__ import annotations
 
@@ -58,20 +59,28 @@ def test_the_five_minutes(
     monkeypatch.chdir(here)
     examples = Path(__file__).resolve().parents[2] / "examples"
     (here / "examples").symlink_to(examples)
-    commands = [shlex.split(line)[1:] for line in shell_lines() if line.startswith("flexdt ")]
+    commands = [
+        shlex.split(line)[1:] for line in shell_lines() if line.startswith("flexdt ")
+    ]
     assert len(commands) >= 7
     talking = {"state", "sample", "move", "snap", "run"}
     names = set()
     for words in commands:
         names.add(words[0])
-        server = ["--server", "{}:{}".format(*servers.address)] if words[0] in talking else []
+        server = (
+            ["--server", "{}:{}".format(*servers.address)] if words[0] in talking else []
+        )
         promised = promises().get(shlex.join(words))
         code = run([*words, *server])
         told = capsys.readouterr().err
-        assert code == (COLLISION if promised and "detector-too-near" in words[1] else 0), told
+        assert code == (
+            COLLISION if promised and "detector-too-near" in words[1] else 0
+        ), told
         if promised is not None:
             line, what = promised
-            assert re.search(rf"{re.escape(words[1])}:{line}:\d+: .*{re.escape(what)}", told), told
+            assert re.search(
+                rf"{re.escape(words[1])}:{line}:\d+: .*{re.escape(what)}", told
+            ), told
     assert len(promises()) == 2
     assert talking | {"check", "script"} <= names
     assert (here / "view.png").read_bytes().startswith(b"\x89PNG")
@@ -82,7 +91,11 @@ def test_the_five_minutes(
 
 
 def test_the_netcat_lines(servers: Servers, here: Path) -> None:
-    requests = [json.loads(m) for line in shell_lines() for m in re.findall(r"^echo '(.*?)'", line)]
+    requests = [
+        json.loads(m)
+        for line in shell_lines()
+        for m in re.findall(r"^echo '(.*?)'", line)
+    ]
     assert [r["method"] for r in requests] == ["axes.move", "projection.get"]
     for request in requests:
         (answer,) = netcat(servers.address, json.dumps(request))
@@ -93,17 +106,26 @@ def test_the_netcat_lines(servers: Servers, here: Path) -> None:
     (built,) = re.findall(r"jq -cRs '(.*?)' mine.txt", jq)
     assert built == '{jsonrpc:"2.0",id:3,method:"script.submit",params:{text:.}}'
     text = (here / "mine.txt").read_bytes().decode()
-    request = {"jsonrpc": "2.0", "id": 3, "method": "script.submit", "params": {"text": text}}
+    request = {
+        "jsonrpc": "2.0",
+        "id": 3,
+        "method": "script.submit",
+        "params": {"text": text},
+    }
     (answer,) = netcat(servers.address, json.dumps(request))
     job = answer["result"]["job"]
     (answer,) = netcat(
         servers.address,
-        json.dumps({"jsonrpc": "2.0", "id": 4, "method": "job.abort", "params": {"job": job}}),
+        json.dumps(
+            {"jsonrpc": "2.0", "id": 4, "method": "job.abort", "params": {"job": job}}
+        ),
     )
     assert "error" not in answer
 
 
-def test_the_python_lines(servers: Servers, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_lines(
+    servers: Servers, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Those of a running twin; the others run with the library's page."""
     monkeypatch.chdir(here)
     _, client = re.findall(r"```python\n(.*?)```", README, re.DOTALL)

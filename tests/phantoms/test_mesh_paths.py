@@ -1,4 +1,5 @@
-"""Radiographs of mesh samples have exact paths; bodies that overlap count once, cavities not."""
+"""Radiographs of mesh samples have exact paths; bodies that overlap count once, cavities
+not."""
 
 from __future__ import annotations
 
@@ -37,11 +38,15 @@ def view(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([-200 * ahead, 100 * ahead, u, np.cross(ahead, u)])
 
 
-def lumps(rng: np.random.Generator, at: np.ndarray, turned: bool = False) -> trimesh.Trimesh:
+def lumps(
+    rng: np.random.Generator, at: np.ndarray, turned: bool = False
+) -> trimesh.Trimesh:
     """A ball with a rough surface about `at`, which is not convex."""
     ball = trimesh.creation.icosphere(2, 1.0)
     corners = ball.vertices * rng.uniform(4.0, 7.0, (len(ball.vertices), 1)) + at
-    return trimesh.Trimesh(corners, ball.faces[:, ::-1] if turned else ball.faces, process=False)
+    return trimesh.Trimesh(
+        corners, ball.faces[:, ::-1] if turned else ball.faces, process=False
+    )
 
 
 def drawn(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
@@ -49,9 +54,13 @@ def drawn(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
     if kind == "one":
         return lumps(rng, zero)
     if kind == "apart":
-        return trimesh.util.concatenate([lumps(rng, zero), lumps(rng, np.array([0.0, 15.0, 3.0]))])
+        return trimesh.util.concatenate(
+            [lumps(rng, zero), lumps(rng, np.array([0.0, 15.0, 3.0]))]
+        )
     if kind == "overlapping":
-        return trimesh.util.concatenate([lumps(rng, zero), lumps(rng, rng.uniform(-4, 4, 3))])
+        return trimesh.util.concatenate(
+            [lumps(rng, zero), lumps(rng, rng.uniform(-4, 4, 3))]
+        )
     hole = lumps(rng, zero, turned=True)
     hole.vertices *= 0.4  # a cavity is a shell turned inwards
     return trimesh.util.concatenate([lumps(rng, zero), hole])
@@ -73,7 +82,9 @@ def test_line_integrals_of_drawn_meshes(kind: str, seed: int) -> None:
     assert known.sum() > 360
     assert path[known].max() > 4.0
     error = got[pixels][known] / material("abs").mu_per_mm - path[known]
-    assert np.abs(error).max() < 1e-5 * 14.0 + 2e-6 * got.max() / material("abs").mu_per_mm
+    assert (
+        np.abs(error).max() < 1e-5 * 14.0 + 2e-6 * got.max() / material("abs").mu_per_mm
+    )
     [channel] = channels(phantom)
     assert isinstance(body, TriangleMesh)
     assert isinstance(channel.body, TriangleMesh)
@@ -134,7 +145,9 @@ priority = RANK
     for rank, pmma in (("1", 6.0), ("0", 10.0), ("-1", 10.0)):
         file.write_text(text.replace("RANK", rank))
         parts = {c.material.name: c for c in channels(as_phantom(file))}
-        paths = {n: float(project_body(c.body, row, (1, 1))[0, 0, 0]) for n, c in parts.items()}
+        paths = {
+            n: float(project_body(c.body, row, (1, 1))[0, 0, 0]) for n, c in parts.items()
+        }
         assert paths.pop("pmma") == pytest.approx(pmma, abs=1e-5)
         # Inside another of higher priority there is nothing of it.
         assert paths == ({} if rank == "-1" else {"steel": pytest.approx(4.0, abs=1e-5)})
@@ -148,8 +161,12 @@ priority = RANK
     ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 3, "material": "abs"}
     parts = {c.material.name: c for c in channels(as_phantom([box, (inner, "Fe@7.87")],
                                                              priority=[0, 1]))}  # fmt: skip
-    assert project_body(parts["abs"].body, row, (1, 1))[0, 0, 0] == pytest.approx(4.0, abs=1e-5)
-    with pytest.raises(PhantomError, match=r"a sphere of abs overlaps .* replaces instead"):
+    assert project_body(parts["abs"].body, row, (1, 1))[0, 0, 0] == pytest.approx(
+        4.0, abs=1e-5
+    )
+    with pytest.raises(
+        PhantomError, match=r"a sphere of abs overlaps .* replaces instead"
+    ):
         as_phantom([ball, (inner, "steel")], priority=[0, 1])
     apart = as_phantom([{**ball, "center": [9, 0, 0]}, (inner, "steel")], priority=[0, 1])
     assert apart.scene.solids[0].shape.radius == 3  # type: ignore[union-attr]

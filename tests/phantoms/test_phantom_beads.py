@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexdt.phantoms import bead_phantom, load_phantom, material, phantom_names, spiral_positions
+from flexdt.phantoms import (
+    bead_phantom,
+    load_phantom,
+    material,
+    phantom_names,
+    spiral_positions,
+)
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.projection.analytic_solids import Box, Sphere
 
@@ -25,7 +31,9 @@ TABLE_6_2 = {
 ALL = [(name, k) for name in TABLE_6_2 for k in range(1, 8)]
 
 
-def spiral_by_hand(width: float, breadth: float, height: float, k: int) -> list[list[float]]:
+def spiral_by_hand(
+    width: float, breadth: float, height: float, k: int
+) -> list[list[float]]:
     """Unity's (x, y, z) of each bead, then the world's (x, z, y)."""
     out = []
     for i in range(k):
@@ -44,13 +52,22 @@ def test_beads_lie_on_the_spiral_of_table_6_2(name: str, k: int) -> None:
     assert_allclose(p.bead_radius_mm, 2.0)
     inside = np.asarray(p.size_mm) / 2 - np.abs(p.beads) - 2.0
     assert inside.min() >= -1e-12
-    gap = min((np.linalg.norm(a - b) - 4 for a, b in itertools.combinations(p.beads, 2)), default=9)
-    assert (gap < 0) == any("overlap" in a for a in p.assumed) == ((name, k) == ("compact", 7))
+    gap = min(
+        (np.linalg.norm(a - b) - 4 for a, b in itertools.combinations(p.beads, 2)),
+        default=9,
+    )
+    assert (
+        (gap < 0)
+        == any("overlap" in a for a in p.assumed)
+        == ((name, k) == ("compact", 7))
+    )
 
 
 def test_normal_with_three_beads_in_numbers() -> None:
     h = 18 * math.sqrt(3) / 2
-    assert_allclose(load_phantom("normal-3").beads, [[8, 0, -28], [-4, h, 0], [-4, -h, 28]])
+    assert_allclose(
+        load_phantom("normal-3").beads, [[8, 0, -28], [-4, h, 0], [-4, -h, 28]]
+    )
 
 
 def test_one_bead_is_at_mid_height_angle_0() -> None:
@@ -72,7 +89,9 @@ def test_the_bead_carries_the_difference_to_its_body() -> None:
     assert body.shape.size == (20.0, 40.0, 60.0)
     assert isinstance(first.shape, Sphere)
     assert first.shape.center == tuple(p.beads[0])
-    assert body.mu_per_mm + second.mu_per_mm == pytest.approx(material("aluminium").mu_per_mm)
+    assert body.mu_per_mm + second.mu_per_mm == pytest.approx(
+        material("aluminium").mu_per_mm
+    )
 
 
 def test_names_and_defaults() -> None:
@@ -92,15 +111,17 @@ def test_unknown_names_list_the_known_ones(name: str) -> None:
 
 
 def test_beads_that_do_not_fit_are_refused_with_numbers() -> None:
-    with pytest.raises(LimitError, match=r"radius 6 mm does not fit into 10 x 15 x 20.*at most 5"):
+    with pytest.raises(
+        LimitError, match=r"radius 6 mm does not fit into 10 x 15 x 20.*at most 5"
+    ):
         bead_phantom("compact", 3, bead_radius_mm=6.0)
     with pytest.raises(LimitError, match="0 beads"):
         bead_phantom("normal", 0)
 
 
 def test_no_mirror_image_of_the_chiral_phantom_fits_it() -> None:
-    """Labelled by radius, no rotation maps the beads onto their mirror image: the volume they span
-    changes its sign, and the radii forbid any relabelling."""
+    """Labelled by radius, no rotation maps the beads onto their mirror image: the volume they
+    span changes its sign, and the radii forbid any relabelling."""
     p = load_phantom("chiral")
     assert len(set(p.bead_radius_mm)) == len(p.beads) == 4
     spanned = np.linalg.det(p.beads[1:] - p.beads[0])

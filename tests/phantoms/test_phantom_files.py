@@ -58,7 +58,9 @@ def test_inconsistent_faces_are_turned_the_right_way() -> None:
     mesh = trimesh.creation.icosphere(2, 5.0)
     faces = mesh.faces.copy()
     faces[::3] = faces[::3, ::-1]
-    p = mesh_phantom(stl(trimesh.Trimesh(mesh.vertices, faces, process=False)), file_type="stl")
+    p = mesh_phantom(
+        stl(trimesh.Trimesh(mesh.vertices, faces, process=False)), file_type="stl"
+    )
     assert p.mesh().volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
@@ -69,14 +71,18 @@ def test_each_body_keeps_its_sense_when_faces_are_turned() -> None:
     both = trimesh.util.concatenate([outer, inner])
     faces = both.faces.copy()
     faces[::7] = faces[::7, ::-1]
-    p = mesh_phantom(stl(trimesh.Trimesh(both.vertices, faces, process=False)), file_type="stl")
+    p = mesh_phantom(
+        stl(trimesh.Trimesh(both.vertices, faces, process=False)), file_type="stl"
+    )
     assert p.mesh().volume == pytest.approx(both.volume, rel=1e-5)
     grid = [trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix(at))
             for at in np.ndindex(12, 12, 12) for at in [2.0 * np.array(at)]]  # fmt: skip
     many = trimesh.util.concatenate(grid)
     faces = many.faces.copy()
     faces[::12] = faces[::12, ::-1]
-    p = mesh_phantom(stl(trimesh.Trimesh(many.vertices, faces, process=False)), file_type="stl")
+    p = mesh_phantom(
+        stl(trimesh.Trimesh(many.vertices, faces, process=False)), file_type="stl"
+    )
     assert p.mesh().volume == pytest.approx(12**3)
 
 
@@ -126,7 +132,8 @@ def test_hostile_meshes_are_refused_readably(raw: bytes, kind: str) -> None:
 
 
 def test_an_obj_does_not_make_us_read_other_files(tmp_path: Path) -> None:
-    """Were the material file opened, its bad content would show up; the mesh loads regardless."""
+    """Were the material file opened, its bad content would show up; the mesh loads
+    regardless."""
     (tmp_path / "secret.mtl").write_text("newmtl a\nmap_Kd /etc/hostname\n")
     mesh = str(trimesh.creation.box((1, 2, 3)).export(file_type="obj"))
     path = tmp_path / "box.obj"
@@ -172,7 +179,9 @@ def test_documents_come_back_equal(name: str) -> None:
 
 def test_mesh_and_voxel_documents_come_back_equal() -> None:
     mesh = mesh_phantom(stl(trimesh.creation.torus(5.0, 1.0)), file_type="stl")
-    grid = voxel_phantom(np.random.default_rng(0).random((3, 4, 5), dtype=np.float32), 0.5)
+    grid = voxel_phantom(
+        np.random.default_rng(0).random((3, 4, 5), dtype=np.float32), 0.5
+    )
     for p in (mesh, grid):
         assert Phantom.from_dict(json.loads(json.dumps(p.to_dict()))) == p
 
@@ -205,7 +214,8 @@ def test_wrong_bead_files_name_file_key_and_allowed(change: str, message: str) -
 JSON = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8),
     lambda inner: (
-        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.text(max_size=8), inner, max_size=4)
     ),
     max_leaves=12,
 )

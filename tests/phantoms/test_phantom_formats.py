@@ -1,4 +1,5 @@
-"""PLY, OFF and GLB: read as trimesh writes them, in the right unit; hostile ones cost nothing."""
+"""PLY, OFF and GLB: read as trimesh writes them, in the right unit; hostile ones cost
+nothing."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ def scene() -> trimesh.Scene:
     """Two bodies, turned, mirrored and moved, one of them under another."""
     made = trimesh.Scene()
     turn = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, 3.0), (0.1, 0.0, 0.0))
-    made.add_geometry(trimesh.creation.box((0.01, 0.02, 0.03)), node_name="a", transform=turn)
+    made.add_geometry(
+        trimesh.creation.box((0.01, 0.02, 0.03)), node_name="a", transform=turn
+    )
     mirror = np.diag([-2.0, 1.0, 0.5, 1.0])
     mirror[:3, 3] = (0.05, -0.02, 0.01)
     torus = trimesh.creation.torus(0.02, 0.005)
@@ -42,7 +45,9 @@ def glb(document: Any, binary: bytes = b"") -> bytes:
 def one(**change: Any) -> tuple[dict[str, Any], bytes]:
     """A document with one tetrahedron, as drawn without indices."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
-    points = corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3).tobytes()
+    points = (
+        corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3).tobytes()
+    )
     document: dict[str, Any] = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
@@ -98,7 +103,12 @@ def test_every_body_of_a_glb_scene_stands_in_its_place() -> None:
 def test_turn_scale_and_shift_of_a_node_are_applied_in_gltf_order() -> None:
     """Scaled along its own x, then turned a quarter about z, then moved."""
     half = 0.5**0.5
-    node = {"mesh": 0, "translation": [5, 0, 0], "rotation": [0, 0, half, half], "scale": [3, 1, 1]}
+    node = {
+        "mesh": 0,
+        "translation": [5, 0, 0],
+        "rotation": [0, 0, half, half],
+        "scale": [3, 1, 1],
+    }
     p = mesh_phantom(glb(*one(nodes=[node])), file_type="glb", unit="mm", place="keep")
     assert len(p.mesh().faces) == 4
     assert p.mesh().bounds[0] == pytest.approx([4, 0, 0], abs=1e-6)
@@ -259,7 +269,11 @@ def test_what_a_glb_refers_to_is_never_opened(place: str, tmp_path: Path) -> Non
     uri = "body.bin" if place == "file" else "http://127.0.0.1:9/body.bin"
     buffers = [{"byteLength": len(binary), "uri": uri}]
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
-    looks = {"images": [{"uri": uri}], "textures": [{"source": 0}], "materials": [material]}
+    looks = {
+        "images": [{"uri": uri}],
+        "textures": [{"source": 0}],
+        "materials": [material],
+    }
     file = tmp_path / "part.glb"
     file.write_bytes(glb({**document, "buffers": buffers}))
     opened: list[str] = []

@@ -24,7 +24,9 @@ def inside(scene: Scene, p: FloatArray, materials: tuple[str, ...]) -> FloatArra
             case Sphere(center, radius):
                 hit = np.linalg.norm(p - center, axis=1) < radius
             case Box(center, size, axes):
-                hit = (np.abs((p - center) @ np.array(axes).T) < np.array(size) / 2).all(axis=1)
+                hit = (np.abs((p - center) @ np.array(axes).T) < np.array(size) / 2).all(
+                    axis=1
+                )
             case Cylinder(center, radius, height, axis):
                 along = (p - center) @ np.array(axis)
                 across = np.linalg.norm(p - center - np.outer(along, axis), axis=1)
@@ -59,7 +61,9 @@ def test_one_bead_in_each_brick_on_a_spiral_out_of_any_plane() -> None:
 def test_attenuation_is_nowhere_negative_or_doubled() -> None:
     """Random points see air, plastic or steel, nothing in between: no solids overlap."""
     p = load_phantom("lego")
-    points = np.random.default_rng(1).uniform([-12, -8, -24.9], [12, 8, 24.9], (200_000, 3))
+    points = np.random.default_rng(1).uniform(
+        [-12, -8, -24.9], [12, 8, 24.9], (200_000, 3)
+    )
     plastic = inside(p.scene, points, ("abs",))
     assert set(np.unique(np.round(plastic / ABS, 9) + 0.0)) == {0.0, 1.0}
     both = inside(p.scene, points, ("abs", "steel"))

@@ -53,7 +53,9 @@ def test_between_the_points_it_follows_nist_45_keV() -> None:
 
 
 def test_no_extrapolation_and_no_guessing() -> None:
-    with pytest.raises(LimitError, match=r"10 keV is outside the table's \[20, 100\] keV"):
+    with pytest.raises(
+        LimitError, match=r"10 keV is outside the table's \[20, 100\] keV"
+    ):
         material("water").mu_at(10.0)
     with pytest.raises(UnknownNameError, match="there are: abs"):
         material("ABS plastic")

@@ -71,10 +71,14 @@ def centroid(data: np.ndarray, voxel: float) -> FloatArray:
 
 
 @pytest.mark.parametrize(("shape", "volume"), SHAPES, ids=lambda v: type(v).__name__)
-def test_solids_keep_mass_and_place_as_voxels_and_as_mesh(shape: Shape, volume: float) -> None:
+def test_solids_keep_mass_and_place_as_voxels_and_as_mesh(
+    shape: Shape, volume: float
+) -> None:
     p = Phantom("one", "", Scene((Solid(shape, "water", 0.5),)), BOX)
     grid = p.volume(0.25, oversample=4)
-    assert float(grid.data.sum(dtype=np.float64)) * 0.25**3 == pytest.approx(volume / 2, rel=3e-3)
+    assert float(grid.data.sum(dtype=np.float64)) * 0.25**3 == pytest.approx(
+        volume / 2, rel=3e-3
+    )
     assert float(grid.data.max()) == pytest.approx(0.5, rel=1e-5)
     assert centroid(grid.data, 0.25) == pytest.approx(CENTER, abs=0.02)
     mesh = p.mesh()
@@ -96,14 +100,18 @@ def test_the_chiral_phantom_is_not_mirrored_or_permuted_in_the_grid() -> None:
 
 
 def test_shepp_logan_takes_the_tables_contrasts() -> None:
-    """Values of the usual table along the middle: 1, 0.2, and 0.2 + 0.1 in the upper ellipse."""
+    """Values of the usual table along the middle: 1, 0.2, and 0.2 + 0.1 in the upper
+    ellipse."""
     p = load_phantom("shepp-logan")
     grid = p.volume(0.25)
     water = 0.02269
     nz, ny, nx = grid.data.shape
 
     def at(x: float, y: float, z: float) -> float:
-        i = [int(c * 25.0 // 0.25 + n / 2) for c, n in zip((x, y, z), (nx, ny, nz), strict=True)]
+        i = [
+            int(c * 25.0 // 0.25 + n / 2)
+            for c, n in zip((x, y, z), (nx, ny, nz), strict=True)
+        ]
         return float(grid.data[i[2], i[1], i[0]]) / water
 
     assert at(0.0, 0.9, 0.0) == pytest.approx(1.0, abs=1e-3)
@@ -127,7 +135,9 @@ def test_a_torus_fills_to_its_volume() -> None:
 def test_hollow_overlapping_and_inside_out_meshes_fill_rightly() -> None:
     outer, inner = trimesh.creation.box((8, 8, 8)), trimesh.creation.box((4, 4, 4))
     inner.invert()
-    assert filled(trimesh.util.concatenate([outer, inner])) == pytest.approx(512 - 64, rel=1e-4)
+    assert filled(trimesh.util.concatenate([outer, inner])) == pytest.approx(
+        512 - 64, rel=1e-4
+    )
     moved = trimesh.creation.box((8, 8, 8))
     moved.apply_translation((2.0, 0.0, 0.0))
     both = trimesh.util.concatenate([trimesh.creation.box((8, 8, 8)), moved])
@@ -139,11 +149,16 @@ def test_hollow_overlapping_and_inside_out_meshes_fill_rightly() -> None:
 
 
 def test_faces_and_edges_on_column_centres_do_not_leak() -> None:
-    """A box whose edges run exactly through column centres, where careless fills leave streaks."""
+    """A box whose edges run exactly through column centres, where careless fills leave
+    streaks."""
     box = trimesh.creation.box((6.0, 6.0, 6.0))
     box.apply_translation((0.25, 0.25, 0.25))  # edges at 3.25: centres of 0.5 mm voxels
     surface = Surface(box.vertices, box.faces, "water", 1.0)
-    data = Phantom("m", "", Scene(()), BOX, surfaces=(surface,)).volume(0.5, oversample=1).data
+    data = (
+        Phantom("m", "", Scene(()), BOX, surfaces=(surface,))
+        .volume(0.5, oversample=1)
+        .data
+    )
     assert np.count_nonzero(data) == 12 * 12 * 13
     assert float(data.sum()) == pytest.approx(12 * 12 * 12)
 
@@ -179,7 +194,9 @@ def test_voxels_cast_the_shadow_of_the_analytic_solids(name: str) -> None:
     """The two X-ray representations through the projector, from an oblique direction."""
     p = load_phantom(name)
     turn = rotation_about([0.0, 0.2, 1.0], 0.7)
-    cone = ConeVec.from_vectors([0.0, -300.0, 10.0], [0.0, 200.0, -3.0], [0.8, 0, 0], [0, 0, -0.8])
+    cone = ConeVec.from_vectors(
+        [0.0, -300.0, 10.0], [0.0, 200.0, -3.0], [0.8, 0, 0], [0, 0, -0.8]
+    )
     cone = cone.moved(turn, [0.0, 0.0, 0.0])
     exact = project_scene(p.scene, cone, (120, 100))[0]
 
@@ -215,14 +232,22 @@ def test_labels_are_one_grid_for_each_material(seed: int) -> None:
     total = 0.0
     k, i = int(rng.integers(5)), int(rng.integers(7))
     at = ((i - 3) * edges[0], (k - 2) * edges[2])
-    view = ConeVec.from_vectors((at[0], -400, at[1]), (at[0], 400, at[1]), (1, 0, 0), (0, 0, -1))
+    view = ConeVec.from_vectors(
+        (at[0], -400, at[1]), (at[0], 400, at[1]), (1, 0, 0), (0, 0, -1)
+    )
     for label, name in names.items():
         [[[path]]] = project_body(parts[name].body, view, (1, 1))
         wanted = float((labels[k, :, i] == label).sum() * edges[1])
         assert path == pytest.approx(wanted, abs=1e-5)
         total += wanted * material(name).mu_per_mm
-    assert line_integrals(phantom, view, (1, 1))[0, 0, 0] == pytest.approx(total, rel=1e-5)
-    for bad, said in ((labels - 1, "labels"), (labels.astype(str), "array"), ("lego", "'lego'")):
+    assert line_integrals(phantom, view, (1, 1))[0, 0, 0] == pytest.approx(
+        total, rel=1e-5
+    )
+    for bad, said in (
+        (labels - 1, "labels"),
+        (labels.astype(str), "array"),
+        ("lego", "'lego'"),
+    ):
         with pytest.raises(PhantomError, match=said):
             as_phantom(bad, material=names, voxel_mm=edges)
     with pytest.raises(PhantomError, match="allowed are 0 for nothing"):

@@ -10,7 +10,9 @@ import flexdt as fx
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.files.mesh_files import mesh_phantom
 
-SCAN = fx.ConeVec.from_vectors([0, -500, 0], [0, 500, 0], [0.5, 0, 0], [0, 0, -0.5], (1, 1))
+SCAN = fx.ConeVec.from_vectors(
+    [0, -500, 0], [0, 500, 0], [0.5, 0, 0], [0, 0, -0.5], (1, 1)
+)
 
 
 def stl(*bodies):

@@ -57,10 +57,16 @@ def test_a_uuid_comes_back_as_it_came(uuid: float | str) -> None:
         ({"reply type": "MAYBE"}, "RCV, FDB, ACK, ERR"),
         ({"UUID": float("nan")}, "number below 1e"),
         ({"arg1": ["x"]}, "arg1 must be text"),
-        ({"component": "tube\ud800"}, r"component holds U\+D800 at 4; allowed: anything but"),
+        (
+            {"component": "tube\ud800"},
+            r"component holds U\+D800 at 4; allowed: anything but",
+        ),
         ({"component": "tube\x00"}, r"component holds U\+0000 at 4"),
         ({"command": "x\u2028ray on"}, r"command holds U\+2028"),
-        ({"arg1": "\udcff"}, r"arg1 holds U\+DCFF at 0; allowed: anything but surrogates"),
+        (
+            {"arg1": "\udcff"},
+            r"arg1 holds U\+DCFF at 0; allowed: anything but surrogates",
+        ),
         ({"UUID": "\ud800"}, r"UUID holds U\+D800"),
         ({"UUID": 10**200}, "number below 1e"),
         ({"UUID": True}, "number below 1e"),
@@ -79,7 +85,9 @@ def test_what_is_no_event_is_refused_with_what_is_allowed(
         parse_event(json.dumps({**json.loads(LIVE), **change}))
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff\xfe", b"[]", b"{", b"[" * 100_000, b"x" * 2**21])
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff\xfe", b"[]", b"{", b"[" * 100_000, b"x" * 2**21]
+)
 def test_bytes_that_are_no_event_are_refused(data: bytes) -> None:
     with pytest.raises(AcquilaError):
         parse_event(data)
@@ -116,7 +124,9 @@ def test_a_tick_count_is_a_whole_number_of_64_bits(tick: float) -> None:
 def test_the_longest_text_of_each_field(field: str, most: int) -> None:
     event = format_event(parse_event(json.dumps({**json.loads(LIVE), field: "x" * most})))
     assert json.loads(event)[field] == "x" * most
-    with pytest.raises(AcquilaError, match=f"{field} of {most + 1} char.*allowed: {most}$"):
+    with pytest.raises(
+        AcquilaError, match=f"{field} of {most + 1} char.*allowed: {most}$"
+    ):
         parse_event(json.dumps({**json.loads(LIVE), field: "x" * (most + 1)}))
 
 

@@ -38,9 +38,14 @@ values = st.recursive(
     max_leaves=12,
 )
 ids = text | st.integers(-(2**53), 2**53)
-params = st.none() | st.lists(values, max_size=4) | st.dictionaries(text, values, max_size=4)
+params = (
+    st.none() | st.lists(values, max_size=4) | st.dictionaries(text, values, max_size=4)
+)
 errors = st.builds(
-    RpcError, st.integers(-40000, 40000), text, st.none() | values.filter(lambda v: v is not None)
+    RpcError,
+    st.integers(-40000, 40000),
+    text,
+    st.none() | values.filter(lambda v: v is not None),
 )
 singles: st.SearchStrategy[Any] = (
     st.builds(Request, ids, text, params)
@@ -72,7 +77,9 @@ def test_whatever_is_sent_arrives_however_it_is_cut(
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 10**6), max_size=8))
-def test_any_bytes_give_messages_and_never_an_exception(data: bytes, cuts: list[int]) -> None:
+def test_any_bytes_give_messages_and_never_an_exception(
+    data: bytes, cuts: list[int]
+) -> None:
     whole = Connection(max_message=100)
     expected = whole.receive_data(data)
     split = Connection(max_message=100)
@@ -121,7 +128,11 @@ def test_a_frame_above_the_limit_is_skipped_by_its_length() -> None:
     frame = Connection(Codec.MSGPACK).send(PING)
     wire = Connection(max_message=1000)
     big = (5000).to_bytes(4, "big") + b"\x00" * 5000
-    got = [m for piece in pieces(big + frame, [3, 4, 700, 5003]) for m in wire.receive_data(piece)]
+    got = [
+        m
+        for piece in pieces(big + frame, [3, 4, 700, 5003])
+        for m in wire.receive_data(piece)
+    ]
     assert isinstance(got[0], Malformed)
     assert got[0].error.code == -32008
     assert got[1:] == [PING]
@@ -131,7 +142,9 @@ def test_a_frame_above_the_limit_is_skipped_by_its_length() -> None:
 def test_a_frame_of_16_mib_ends_the_connection() -> None:
     wire = Connection()
     assert wire.receive_data(b"\x00\x00\x00") == []
-    [message] = wire.receive_data(b"\x01\xc0" + (MAX_FRAME + 1).to_bytes(4, "big") + b"xxxx")[1:]
+    [message] = wire.receive_data(
+        b"\x01\xc0" + (MAX_FRAME + 1).to_bytes(4, "big") + b"xxxx"
+    )[1:]
     assert isinstance(message, Malformed)
     assert message.fatal
     assert wire.receive_data(LINE) == []
@@ -170,7 +183,12 @@ def test_sending_16_mib_in_a_frame_is_refused_and_15_is_not() -> None:
 
 @pytest.mark.parametrize(
     "line",
-    [b"GET / HTTP/1.1", b"POST /rpc HTTP/1.0\r", b"PRI * HTTP/2.0\r", b"OPTIONS * HTTP/1.1"],
+    [
+        b"GET / HTTP/1.1",
+        b"POST /rpc HTTP/1.0\r",
+        b"PRI * HTTP/2.0\r",
+        b"OPTIONS * HTTP/1.1",
+    ],
 )
 def test_http_closes_the_connection(line: bytes) -> None:
     wire = Connection()
@@ -233,7 +251,9 @@ MALFORMED_MSGPACK = [
 
 @pytest.mark.parametrize("body", MALFORMED_MSGPACK, ids=lambda b: repr(b[:12]))
 def test_what_is_no_msgpack_is_a_parse_error(body: bytes) -> None:
-    [message] = Connection(Codec.MSGPACK).receive_data(len(body).to_bytes(4, "big") + body)
+    [message] = Connection(Codec.MSGPACK).receive_data(
+        len(body).to_bytes(4, "big") + body
+    )
     assert isinstance(message, Malformed)
     assert message.error.code == -32700
 
@@ -263,7 +283,9 @@ def test_what_is_no_msgpack_is_a_parse_error(body: bytes) -> None:
 )
 def test_what_is_no_message_is_an_invalid_request(document: object) -> None:
     body = msgpack.packb(document)
-    [message] = Connection(Codec.MSGPACK).receive_data(len(body).to_bytes(4, "big") + body)
+    [message] = Connection(Codec.MSGPACK).receive_data(
+        len(body).to_bytes(4, "big") + body
+    )
     assert isinstance(message, Malformed)
     assert message.error.code == -32600
     assert not message.fatal
@@ -333,14 +355,16 @@ PIECE = 1 << 16
 
 
 class Queue:
-    """What a connection should do, said with lists: whole messages, and bytes without an end."""
+    """What a connection should do, said with lists: whole messages, and bytes without an
+    end."""
 
     def __init__(self, codec: Codec) -> None:
         self.json, self.whole, self.judged = codec is Codec.JSON, list[bytes](), 0
         self.rest, self.fed = b"", list[bytes]()
 
     def end(self) -> int:
-        """Bytes of the message that `rest` begins with, framing included; 0: not all have come."""
+        """Bytes of the message that `rest` begins with, framing included; 0: not all have
+        come."""
         if self.json:
             return self.rest.find(b"\n") + 1
         size = 4 + int.from_bytes(self.rest[:4], "big")
@@ -384,11 +408,15 @@ class Queue:
 
 @pytest.mark.parametrize("codec", Codec)
 @pytest.mark.parametrize("seed", range(40))
-def test_messages_come_out_whole_once_and_urgent_ones_first(codec: Codec, seed: int) -> None:
+def test_messages_come_out_whole_once_and_urgent_ones_first(
+    codec: Codec, seed: int
+) -> None:
     rng = random.Random(seed)
     wire, queue, stream = Connection(codec), Queue(codec), b""
     for _ in range(rng.randrange(2, 30)):
-        body = rng.choice([b"stop", b"stop now", b"go", b"x", b"", b" \r"]) * rng.choice([1, 1, 3])
+        body = rng.choice([b"stop", b"stop now", b"go", b"x", b"", b" \r"]) * rng.choice(
+            [1, 1, 3]
+        )
         if rng.random() < 0.15:
             body += b"." * (PIECE - rng.randrange(-3, 12))
         stream += body + b"\n" if queue.json else len(body).to_bytes(4, "big") + body

@@ -1,4 +1,5 @@
-"""Requests and answers of one connection: vectors whole, byte by byte and cut off; properties."""
+"""Requests and answers of one connection: vectors whole, byte by byte and cut off;
+properties."""
 
 from __future__ import annotations
 
@@ -106,7 +107,10 @@ def test_a_stream_that_ends_inside_a_message_is_an_error(codec: Codec, step: int
 
 
 def test_the_end_inside_a_message_that_is_too_long_is_an_error_too() -> None:
-    for codec, begun in ((Codec.JSON, b"x" * 200), (Codec.MSGPACK, b"\0\0\1\0" + b"x" * 200)):
+    for codec, begun in (
+        (Codec.JSON, b"x" * 200),
+        (Codec.MSGPACK, b"\0\0\1\0" + b"x" * 200),
+    ):
         wire = Connection(codec, max_message=100)
         [refused] = wire.receive_data(begun)
         assert isinstance(refused, Malformed)

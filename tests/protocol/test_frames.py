@@ -38,7 +38,9 @@ def test_the_bytes_are_those_of_an_ordinary_frame(size: int, where: str) -> None
     data = np.arange(size, dtype=np.uint8)
     value = image.encode(data)
     message: Message = (
-        Response(7, value) if where == "result" else Request(7, "x", {"a": 1, "image": value})
+        Response(7, value)
+        if where == "result"
+        else Request(7, "x", {"a": 1, "image": value})
     )
     assert whole(message) == Connection(Codec.MSGPACK).send(message)
 

@@ -59,9 +59,21 @@ BAD: list[tuple[str, object, str]] = [
     ("sample.set", {"name": "a\x00b"}, "name"),
     ("sample.set", {"name": ""}, "name"),
     ("sample.upload", {"name": "a", "format": "stl", "total": 1, "data": "!!"}, "base64"),
-    ("sample.upload", {"name": "a", "format": "stl", "total": 1, "data": "QUJD"}, "total"),
-    ("sample.upload", {"name": "a", "format": "pickle", "total": 9, "data": ""}, "format"),
-    ("sample.upload", {"name": "a", "format": "raw", "total": 9, "data": ""}, "format raw"),
+    (
+        "sample.upload",
+        {"name": "a", "format": "stl", "total": 1, "data": "QUJD"},
+        "total",
+    ),
+    (
+        "sample.upload",
+        {"name": "a", "format": "pickle", "total": 9, "data": ""},
+        "format",
+    ),
+    (
+        "sample.upload",
+        {"name": "a", "format": "raw", "total": 9, "data": ""},
+        "format raw",
+    ),
     ("script.submit", {}, "text or data_base64"),
     ("script.submit", {"text": "a", "data_base64": "b"}, "text or data_base64"),
     ("script.submit", {"text": "a", "name": "C:\\x"}, "name"),
@@ -93,13 +105,17 @@ def test_whole_numbers_are_numbers_and_positions_count() -> None:
     assert move.relative is True  # type: ignore[attr-defined]
     hello = parse_params(METHODS["session.hello"], {"protocol": 1.0, "client": "nc"})
     assert hello.protocol == "1.0"  # type: ignore[attr-defined]
-    assert parse_params(METHODS["state.get"], None) == parse_params(METHODS["state.get"], [])
+    assert parse_params(METHODS["state.get"], None) == parse_params(
+        METHODS["state.get"], []
+    )
 
 
 def test_bytes_and_base64_are_the_same_upload() -> None:
     base = {"name": "a", "format": "stl", "total": 3}
     raw = SampleUpload.model_validate({**base, "data": b"ABC"})
-    text = SampleUpload.model_validate({**base, "data": base64.b64encode(b"ABC").decode()})
+    text = SampleUpload.model_validate(
+        {**base, "data": base64.b64encode(b"ABC").decode()}
+    )
     assert raw == text
     assert raw.data == b"ABC"
 
@@ -119,7 +135,8 @@ def test_results_may_grow_and_wrong_ones_are_noticed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoken", "served"), [("1.0", True), ("1", True), ("1.9", True), ("2.0", False), ("", False)]
+    ("spoken", "served"),
+    [("1.0", True), ("1", True), ("1.9", True), ("2.0", False), ("", False)],
 )
 def test_versions(spoken: str, served: bool) -> None:
     assert PROTOCOL.startswith("1.")
@@ -220,7 +237,9 @@ def test_the_document_gives_types_units_and_defaults() -> None:
     assert params["targets"]["required"]
     assert params["wait"]["schema"]["type"] == "boolean"
     assert params["wait"]["schema"]["default"] is False
-    version = {p["name"]: p for p in methods["session.hello"]["params"]}["protocol"]["schema"]
+    version = {p["name"]: p for p in methods["session.hello"]["params"]}["protocol"][
+        "schema"
+    ]
     assert [kind["type"] for kind in version["anyOf"]] == ["string", "number"]
     assert "mm or deg" in params["targets"]["description"]
     assert methods["axes.stop"]["x-urgent"]
@@ -340,7 +359,10 @@ def test_the_last_that_fits_and_the_first_that_does_not(
     method: str, good: Any, bad: Any, says: str
 ) -> None:
     def encoded(params: dict[str, Any]) -> dict[str, Any]:
-        return {k: image.encode(v) if isinstance(v, np.ndarray) else v for k, v in params.items()}
+        return {
+            k: image.encode(v) if isinstance(v, np.ndarray) else v
+            for k, v in params.items()
+        }
 
     table = METHODS if method in METHODS else PROJECTOR_METHODS
     assert parse_params(table[method], encoded(good))
@@ -379,8 +401,14 @@ def test_a_clipped_text_is_the_text_as_far_as_it_goes(limit: int) -> None:
         assert clip(["x"] * length, limit).startswith("['x'"[:limit])
     some = limit // 2
     for count in (some - 1, some, some + 1):
-        whole = "[" + ", ".join(["1"] * min(count, some)) + (", ...]" if count > some else "]")
-        assert clip([1] * count, limit) == (whole if len(whole) <= limit else whole[:limit] + "...")
+        whole = (
+            "["
+            + ", ".join(["1"] * min(count, some))
+            + (", ...]" if count > some else "]")
+        )
+        assert clip([1] * count, limit) == (
+            whole if len(whole) <= limit else whole[:limit] + "..."
+        )
         pairs = ", ".join(f"{i}: 1" for i in range(min(count, some)))
         whole = "{" + pairs + (", ...}" if count > some else "}")
         shown = clip(dict.fromkeys(range(count), 1), limit)

@@ -29,7 +29,9 @@ def table() -> str:
     rows = []
     for name, method in METHODS.items():
         fields = method.params.model_fields
-        words = [f"`{key}`" + ("" if f.is_required() else "?") for key, f in fields.items()]
+        words = [
+            f"`{key}`" + ("" if f.is_required() else "?") for key, f in fields.items()
+        ]
         rows.append(f"| `{name}` | {', '.join(words) or 'none'} |\n")
     return "".join(rows)
 

@@ -1,4 +1,5 @@
-"""SPEC.md's examples are the test vectors: each whole, byte by byte, and with bytes after it."""
+"""SPEC.md's examples are the test vectors: each whole, byte by byte, and with bytes after
+it."""
 
 from __future__ import annotations
 
@@ -159,7 +160,9 @@ def test_conversations_fit_the_models() -> None:
 
 def test_the_table_of_methods_is_complete() -> None:
     rows = re.findall(r"^\| `([a-z_.]+)` \| ([a-z, ]*) \| (.*) \|$", SPEC, re.MULTILINE)
-    table = {name: (set(filter(None, marks.split(", "))), text) for name, marks, text in rows}
+    table = {
+        name: (set(filter(None, marks.split(", "))), text) for name, marks, text in rows
+    }
     assert set(table) == set(METHODS)
     for name, method in METHODS.items():
         marks = {k for k in ("control", "urgent", "safe") if getattr(method, k)}

@@ -58,7 +58,9 @@ async def answers(root: Path, asked: list[str]) -> list[bytes]:
         answer = b'"state":"queued"'
         while re.search(rb'"state":"(queued|running)"', answer):
             writer.write(line.encode() + b"\n")
-            while b'"event"' in (answer := await asyncio.wait_for(reader.readline(), 120)):
+            while b'"event"' in (
+                answer := await asyncio.wait_for(reader.readline(), 120)
+            ):
                 pass
         here = writer.get_extra_info("sockname")[1]
         out.append(answer.replace(f":{here}#".encode(), b":50412#"))
@@ -89,7 +91,9 @@ def check(name: str, folder: Path) -> set[str]:
         image, other = json.loads(want)["result"], json.loads(got)["result"]
         if "dtype" in image:
             np.testing.assert_allclose(decode(other), decode(image), rtol=1e-4, atol=1e-6)
-            want, got = (s.replace(i["data"], "") for s, i in ((want, image), (got, other)))
+            want, got = (
+                s.replace(i["data"], "") for s, i in ((want, image), (got, other))
+            )
         assert got == want
     return methods
 

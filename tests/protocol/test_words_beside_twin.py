@@ -23,12 +23,16 @@ from flexdt.twin.script.scan_request import Kind
     [
         pytest.param(get_args(scanner_messages.LengthUnit), tuple(UNITS_MM), id="units"),
         pytest.param(get_args(image_messages.ScanKind), get_args(Kind), id="scans"),
-        pytest.param(get_args(calibration_messages.ImageKind), get_args(FrameKind), id="frames"),
+        pytest.param(
+            get_args(calibration_messages.ImageKind), get_args(FrameKind), id="frames"
+        ),
         pytest.param(get_args(state_model.StopPath), get_args(StopPath), id="stops"),
         pytest.param(tuple(SAFETY_NAMES), get_args(SafetyName), id="safety"),
     ],
 )
-def test_the_wire_has_the_words_of_the_core(wire: tuple[str, ...], core: tuple[str, ...]) -> None:
+def test_the_wire_has_the_words_of_the_core(
+    wire: tuple[str, ...], core: tuple[str, ...]
+) -> None:
     assert len(core) >= 3
     assert set(wire) == set(core)
 

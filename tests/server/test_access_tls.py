@@ -121,7 +121,9 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
         def talk() -> None:
             with TwinClient(port=port, ssl=trusting()) as client:
                 assert client.ping() == 1.0
-            with pytest.raises(ConnectionLost):  # a client that does not trust the certificate
+            with pytest.raises(
+                ConnectionLost
+            ):  # a client that does not trust the certificate
                 TwinClient(port=port, ssl=ssl.create_default_context())
             with pytest.raises(ConnectionLost):
                 TwinClient(port=port, timeout_s=60.0)
@@ -135,7 +137,9 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
 def test_one_too_many_is_told_so_over_tls() -> None:
     async def main() -> None:
         limits = ConnectionLimits(max_clients=1)
-        server = await serve(_Echo().open, ssl=server_tls(CERTIFICATE, KEY), limits=limits)
+        server = await serve(
+            _Echo().open, ssl=server_tls(CERTIFICATE, KEY), limits=limits
+        )
 
         def talk() -> None:
             with TwinClient(port=server.port, ssl=trusting()) as client:
@@ -155,7 +159,9 @@ def test_one_too_many_is_told_so_over_tls() -> None:
 def test_the_projector_speaks_tls() -> None:
     async def main() -> None:
         server = await serve_projector(
-            memory_limit=2**20, ssl=server_tls(CERTIFICATE, KEY), token="a token of sixteen letters"
+            memory_limit=2**20,
+            ssl=server_tls(CERTIFICATE, KEY),
+            token="a token of sixteen letters",
         )
         async with ProjectorUser(
             port=server.port, ssl=trusting(), token="a token of sixteen letters"
@@ -175,7 +181,8 @@ def test_the_projector_speaks_tls() -> None:
 
 
 def self_signed(folder: Path, name: str) -> tuple[Path, Path]:
-    """A fresh certificate for the loopback and its key; the kept one where openssl is missing."""
+    """A fresh certificate for the loopback and its key; the kept one where openssl is
+    missing."""
     openssl = shutil.which("openssl")
     if openssl is None:
         return CERTIFICATE, KEY

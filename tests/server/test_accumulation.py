@@ -1,7 +1,8 @@
 """What accumulates over years: written in proportion to the change, bounded, and removable.
 
-Histories of submissions, uploads, corrections, deletions, kills and power cuts are drawn; a list of
-what was acknowledged, which shares no code with the server, says what must be known afterwards.
+Histories of submissions, uploads, corrections, deletions, kills and power cuts are drawn; a
+list of what was acknowledged, which shares no code with the server, says what must be known
+afterwards.
 """
 
 from __future__ import annotations
@@ -62,8 +63,14 @@ class History:
         """Ask for something drawn; what a power cut leaves open is noted."""
         name = f"n{self.made}"
         self.made += 1
-        what = self.rng.choice(["scan", "scan", "upload", "correct", "forget", "delete", "undo"])
-        old = {"forget": self.jobs, "delete": sorted(self.samples), "undo": self.corrections[:-1]}
+        what = self.rng.choice(
+            ["scan", "scan", "upload", "correct", "forget", "delete", "undo"]
+        )
+        old = {
+            "forget": self.jobs,
+            "delete": sorted(self.samples),
+            "undo": self.corrections[:-1],
+        }
         chosen = self.rng.choice(old[what]) if old.get(what) else name
         try:
             self._ask(what, name, chosen)
@@ -82,7 +89,12 @@ class History:
             upload(self.sim, client, name, self.made % 200)
             self.samples.add(name)
         elif what == "correct":
-            call(client, "calibration.apply", parameters={"dD_x": 1e-3 * self.made}, name=name)
+            call(
+                client,
+                "calibration.apply",
+                parameters={"dD_x": 1e-3 * self.made},
+                name=name,
+            )
             self.corrections.append(name)
         elif what == "forget" and chosen != name:
             self.sim.advance(60.0)  # the scan ends
@@ -99,7 +111,9 @@ class History:
         """All that was acknowledged is known, and nothing else but what a cut left open."""
         call, client = self.sim.call, self.client
         jobs = {j["job"]: j["name"] for j in call(client, "job.list")["jobs"]}
-        samples = {s["name"] for s in call(client, "sample.list")["samples"] if s["uploaded"]}
+        samples = {
+            s["name"] for s in call(client, "sample.list")["samples"] if s["uploaded"]
+        }
         there = [c["name"] for c in call(client, "calibration.list")["corrections"]]
         unsure_jobs = {job for job, name in jobs.items() if name in self.unsure}
         assert set(self.jobs) - self.unsure <= set(jobs)
@@ -190,7 +204,9 @@ def test_jobs_of_an_earlier_version_stay_in_the_state_while_the_disk_is_full(
         with mock.patch.object(JobFiles, "write", refused):
             for _ in range(2):
                 sim.start()
-                assert [j["job"] for j in sim.call(sim.client(), "job.list")["jobs"]] == names
+                assert [
+                    j["job"] for j in sim.call(sim.client(), "job.list")["jobs"]
+                ] == names
                 sim.call(sim.client(), "tube.set", kV=72.0)
                 sim.advance(1.0)
                 sim.kill()
@@ -262,12 +278,16 @@ def test_ended_jobs_are_kept_by_count_and_by_age(tmp_path: Path) -> None:
         assert (await c.error("job.status", job="job-1")).code == -32602
         today += timedelta(days=31)
         job = (await c.call("script.submit", text=script(3)))["job"]
-        assert [j["job"] for j in (await c.call("job.list"))["jobs"]] == [job] == ["job-5"]
+        assert (
+            [j["job"] for j in (await c.call("job.list"))["jobs"]] == [job] == ["job-5"]
+        )
         await lab.ended(c, job)
         await lab.twin.keeper.flush()
         files = {f.name for f in (lab.root / "jobs" / "status").iterdir()}
         assert files == {"job-5.json"}
-        assert not list((lab.root / "jobs").glob("*.json")), "complete: nothing goes on from it"
+        assert not list((lab.root / "jobs").glob("*.json")), (
+            "complete: nothing goes on from it"
+        )
 
     run(tmp_path, body, limits=TwinLimits(max_ended_jobs=3, ended_job_days=30.0))
 
@@ -291,7 +311,9 @@ def test_what_is_in_use_is_not_deleted_and_the_answer_says_why(tmp_path: Path) -
         assert (error.code, job in error.message) == (-32003, True)
         assert (await c.error("job.forget", job=job)).code == -32003
         assert (await c.call("job.forget", days=0.0))["jobs"] == []
-        assert (await other.error("sample.delete", name="third")).code == -32003, "no controller"
+        assert (await other.error("sample.delete", name="third")).code == -32003, (
+            "no controller"
+        )
         assert (await c.error("sample.delete", name="nothing")).code == -32602
         await c.call("job.abort", job=job)
         await lab.ended(c, job)
@@ -306,13 +328,14 @@ def test_what_is_in_use_is_not_deleted_and_the_answer_says_why(tmp_path: Path) -
         assert (await c.call("job.forget", job=job))["jobs"] == [job]
         with pytest.raises(RpcError, match="no jobs yet"):
             await c.call("job.status", job=job)
-        # What a forgotten scan left goes on if it is submitted again; of one whose data set is gone
-        # nothing is left.
+        # What a forgotten scan left goes on if it is submitted again; of one whose data set is
+        # gone nothing is left.
         first, second = ["kept", "gone"]
         for name in (first, second):
             lab.projector.limit = lab.projector.views + 1
             job = (await c.call("script.submit", text=script(3), name=name))["job"]
-            await lab.until(lambda: (lab.root / name / "flexdt.json").exists(), "it begins")  # noqa: B023
+            description = lab.root / name / "flexdt.json"
+            await lab.until(description.exists, "it begins")
             await c.call("job.abort", job=job)
             await lab.ended(c, job)
         lab.projector.limit = None
@@ -335,12 +358,18 @@ def test_there_is_a_most_of_samples_and_corrections(tmp_path: Path) -> None:
             if fits:
                 await c.call("sample.upload", **params)
             else:
-                assert "sample.delete" in (await c.error("sample.upload", **params)).message
+                assert (
+                    "sample.delete" in (await c.error("sample.upload", **params)).message
+                )
         for number, name in enumerate("ab"):
-            await c.call("calibration.apply", parameters={"dD_x": 0.1 + number}, name=name)
+            await c.call(
+                "calibration.apply", parameters={"dD_x": 0.1 + number}, name=name
+            )
         refused = await c.error("calibration.apply", parameters={"dD_x": 0.7}, name="c")
         assert "calibration.delete" in refused.message
-        await c.call("calibration.apply", parameters={"dD_x": 0.1}, name="a")  # it is there
+        await c.call(
+            "calibration.apply", parameters={"dD_x": 0.1}, name="a"
+        )  # it is there
 
     run(tmp_path, body, limits=TwinLimits(max_samples=2, max_corrections=2))
 
@@ -360,14 +389,21 @@ def test_revert_goes_back_through_what_was_put_in_force_whatever_was_killed(
             name = f"c{rng.randint(0, 6)}"
             if rng.random() < 0.6:
                 number = int(name[1:])
-                sim.call(client, "calibration.apply", parameters={"dD_x": number / 8}, name=name)
+                sim.call(
+                    client,
+                    "calibration.apply",
+                    parameters={"dD_x": number / 8},
+                    name=name,
+                )
                 stack.append(name)
             elif stack:
                 sim.call(client, "calibration.revert")
                 stack.pop()
             if rng.random() < 0.3:
                 sim.kill()
-                if step == 10:  # as an earlier version left it: all in the state, and no file
+                if (
+                    step == 10
+                ):  # as an earlier version left it: all in the state, and no file
                     state = json.loads((sim.data / "state.json").read_text())
                     state["corrections"] = stack
                     (sim.data / "state.json").write_text(json.dumps(state))
@@ -421,7 +457,9 @@ def test_what_a_directory_holds_is_counted_without_reading_it_all_again(
         if place is not None:
             touch(place)
         read.clear()
-        assert used.count() == sum(f.stat().st_size for f in tmp_path.rglob("*") if f.is_file())
+        assert used.count() == sum(
+            f.stat().st_size for f in tmp_path.rglob("*") if f.is_file()
+        )
         assert len(read) <= 3, "what has changed, and a new folder in it"
 
 

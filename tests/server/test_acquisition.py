@@ -20,7 +20,12 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng
+from flexdt.twin.physics.exposure import (
+    ExposureSettings,
+    IdealResponse,
+    expose,
+    frame_rng,
+)
 from flexdt.twin.scanner.state import Sample, StagePlacement
 from flexdt.twin.script.parse import parse_script
 from flexdt.twin.script.planning.planner import plan_script
@@ -57,7 +62,9 @@ class AngleProjector:
     async def remove(self, name: str) -> None:
         pass
 
-    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
         angle = np.degrees(np.arctan2(cone_vec.source[:, 0], -cone_vec.source[:, 1]))
         self.angles += angle.tolist()
         thickness = (np.abs(angle) / 90.0).astype(np.float32)
@@ -71,18 +78,26 @@ def scan(
     assert not plan.errors
     projector = AngleProjector()
     store = SampleStore(open_data(tmp_path))
-    imaging = Imaging(projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.pixels)
+    imaging = Imaging(
+        projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.pixels
+    )
     made: dict[str, npt.NDArray[np.uint16]] = {}
     way = Radiography(imaging, IdealResponse())
-    acquisition = Acquisition(plan, way, Sample("normal"), seed, made.__setitem__, moments)
+    acquisition = Acquisition(
+        plan, way, Sample("normal"), seed, made.__setitem__, moments
+    )
     asyncio.run(acquisition.produce(list(plan.exposures)))
     return made, projector.angles
 
 
-def test_moments_spread_evenly_over_the_exposure_about_the_nominal_angle(tmp_path: Path) -> None:
+def test_moments_spread_evenly_over_the_exposure_about_the_nominal_angle(
+    tmp_path: Path,
+) -> None:
     still, angles = scan(tmp_path, 1)
     assert len(still) == 9
-    assert angles[:3] == pytest.approx([0.0, 45.0, 90.0], abs=1e-6)  # dO_x undoes axs_tan here
+    assert angles[:3] == pytest.approx(
+        [0.0, 45.0, 90.0], abs=1e-6
+    )  # dO_x undoes axs_tan here
     blurred, angles = scan(tmp_path, 4)
     assert len(angles) == 36
     # Frame 1 stands for 45 degrees and turns 45 degrees while it is exposed: eighths of it.
@@ -96,8 +111,12 @@ def test_moments_spread_evenly_over_the_exposure_about_the_nominal_angle(tmp_pat
 
 def test_noise_is_numbered_by_the_place_among_all_saved_images(tmp_path: Path) -> None:
     noisy, _ = scan(tmp_path, 1, seed=9)
-    flat = np.full((16, 16), np.float32(2.0), dtype=np.float32)  # frame 4 stands at 180 degrees
-    expected = expose(IdealResponse(), flat, ExposureSettings(90.0, 1.0, 1000.0), frame_rng(9, 4))
+    flat = np.full(
+        (16, 16), np.float32(2.0), dtype=np.float32
+    )  # frame 4 stands at 180 degrees
+    expected = expose(
+        IdealResponse(), flat, ExposureSettings(90.0, 1.0, 1000.0), frame_rng(9, 4)
+    )
     assert np.array_equal(noisy["scan_000004.tif"], expected)
 
 
@@ -115,7 +134,9 @@ def test_an_empty_stage_needs_no_projector_and_offsets_reach_it(tmp_path: Path) 
     assert not blank.any()
     assert projector.angles == []
     # A sample turned by 10 degrees sees the source 10 degrees less far round.
-    asyncio.run(imaging.line_integrals(Sample("lego", StagePlacement(rz=10.0)), pose, camera))
+    asyncio.run(
+        imaging.line_integrals(Sample("lego", StagePlacement(rz=10.0)), pose, camera)
+    )
     assert projector.angles == pytest.approx([20.0])
 
 

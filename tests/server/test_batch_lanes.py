@@ -1,4 +1,5 @@
-"""Batches by lane: urgent items overtake, their neighbours keep their turn, answers their order."""
+"""Batches by lane: urgent items overtake, their neighbours keep their turn, answers their
+order."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ class Wire(asyncio.Transport):
         super().__init__()
         self.written = bytearray()
 
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+    def set_write_buffer_limits(
+        self, high: int | None = None, low: int | None = None
+    ) -> None:
         pass
 
     def write(self, data: Any) -> None:
@@ -109,7 +112,8 @@ def test_urgent_items_overtake_and_ordinary_ones_keep_their_turn(
         link.connection_made(transport)
         sent = list(numbered(drawn))
         lines = [
-            json.dumps(requests if isinstance(message, list) else requests[0]).encode() + b"\n"
+            json.dumps(requests if isinstance(message, list) else requests[0]).encode()
+            + b"\n"
             for message, requests in zip(drawn, sent, strict=True)
         ]
         data = b"".join(lines)
@@ -124,9 +128,12 @@ def test_urgent_items_overtake_and_ordinary_ones_keep_their_turn(
         flat = [request for requests in sent for request in requests]
         ordinary = [r["params"]["job"] for r in flat if r["method"] == ORDINARY]
         urgent = {r["params"]["job"] for r in flat if r["method"] == URGENT}
-        # The gate is closed: what is urgent has been served, and one ordinary request has begun.
+        # The gate is closed: what is urgent has been served, and one ordinary request has
+        # begun.
         served = {job for event, job in app.record if event == "ends"}
-        begun = [job for event, job in app.record if event == "begins" and job not in urgent]
+        begun = [
+            job for event, job in app.record if event == "begins" and job not in urgent
+        ]
         assert served == urgent
         assert begun == ordinary[:1]
 

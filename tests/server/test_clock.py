@@ -55,7 +55,9 @@ def test_max_jumps_from_one_awaited_moment_to_the_next_in_order() -> None:
                 await clock.sleep_until(moment)
                 seen.append((name, clock.now()))
 
-        await asyncio.gather(walker("a", [10.0, 30.0, 1e6]), walker("b", [20.0, 25.0, 40.0]))
+        await asyncio.gather(
+            walker("a", [10.0, 30.0, 1e6]), walker("b", [20.0, 25.0, 40.0])
+        )
         assert seen == [
             ("a", 10.0), ("b", 20.0), ("b", 25.0), ("a", 30.0), ("b", 40.0), ("a", 1e6),
         ]  # fmt: skip
@@ -79,7 +81,9 @@ def test_max_stands_still_while_held_or_nobody_waits() -> None:
     asyncio.run(main())
 
 
-def test_sleeping_in_real_time_reaches_the_moment_and_a_faster_clock_wakes_earlier() -> None:
+def test_sleeping_in_real_time_reaches_the_moment_and_a_faster_clock_wakes_earlier() -> (
+    None
+):
     async def main() -> None:
         clock = TwinClock(1.0)
         await clock.sleep_until(0.02)
@@ -138,7 +142,9 @@ def test_a_clock_that_is_late_runs_in_real_time_and_motion_on_it_is_swept() -> N
     rng = np.random.default_rng(1)
     now = LATE_S
     for _ in range(40):
-        scanner.move({"rot_obj": rng.uniform(-400, 400), "mag_obj": rng.uniform(300, 700)}, now)
+        scanner.move(
+            {"rot_obj": rng.uniform(-400, 400), "mag_obj": rng.uniform(300, 700)}, now
+        )
         now += rng.uniform(0.0, 9.0)
         scanner.stop(now)
     assert scanner.rest_time(now) >= now

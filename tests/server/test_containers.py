@@ -1,4 +1,5 @@
-"""What the compose file and the systemd unit hold: limits, rights, and who may read the token."""
+"""What the compose file and the systemd unit hold: limits, rights, and who may read the
+token."""
 
 from __future__ import annotations
 
@@ -21,7 +22,14 @@ import yaml
 from flexdt.runtime import compile_ahead
 
 HOME = Path(__file__).resolve().parents[2] / "docker"
-UNITS = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
+UNITS = {
+    "k": 1 << 10,
+    "m": 1 << 20,
+    "g": 1 << 30,
+    "KiB": 1 << 10,
+    "MiB": 1 << 20,
+    "GiB": 1 << 30,
+}
 
 
 def size(text: str) -> int:
@@ -45,7 +53,9 @@ def test_every_service_of_compose_has_limits_and_no_rights() -> None:
         assert "size=" in scratch, "what is written there counts as memory"
     words = services["projector"]["command"]
     kept = size(words[words.index("--memory-limit") + 1])
-    assert kept <= 0.8 * size(services["projector"]["mem_limit"]), "volumes leave room to compute"
+    assert kept <= 0.8 * size(services["projector"]["mem_limit"]), (
+        "volumes leave room to compute"
+    )
 
 
 def stages() -> dict[str, list[tuple[str, str]]]:
@@ -67,12 +77,16 @@ def environment(steps: list[tuple[str, str]]) -> dict[str, str]:
     return dict(pair.split("=", 1) for pair in pairs)
 
 
-def mounts(name: str, service: dict[str, Any], image: list[tuple[str, str]]) -> dict[str, str]:
+def mounts(
+    name: str, service: dict[str, Any], image: list[tuple[str, str]]
+) -> dict[str, str]:
     """Path in a container -> what an engine mounts there: a named volume, `tmpfs`, or the
     anonymous volume of an image's VOLUME, which is another one after `compose down`."""
     found = {path: "anonymous" for word, path in image if word == "VOLUME"}
     found |= {word.split(":")[0]: "tmpfs" for word in service.get("tmpfs", ())}
-    return found | {path: volume for volume, path in (v.split(":") for v in service["volumes"])}
+    return found | {
+        path: volume for volume, path in (v.split(":") for v in service["volumes"])
+    }
 
 
 def written(service: dict[str, Any], image: list[tuple[str, str]]) -> set[str]:
@@ -80,14 +94,16 @@ def written(service: dict[str, Any], image: list[tuple[str, str]]) -> set[str]:
     entry = next(json.loads(rest) for word, rest in image if word == "ENTRYPOINT")
     words = [part for word in (*entry, *service["command"]) for part in word.split("=")]
     paths = {
-        word for word in words if word.startswith("/") and not word.startswith("/run/secrets/")
+        word
+        for word in words
+        if word.startswith("/") and not word.startswith("/run/secrets/")
     }
     return {*paths, environment(image)["NUMBA_CACHE_DIR"], "/tmp"}
 
 
 def lying_in(path: str, found: dict[str, str]) -> str | None:
-    """What is mounted at the path, or at the nearest folder above it; None: the image's own root,
-    which is read-only."""
+    """What is mounted at the path, or at the nearest folder above it; None: the image's own
+    root, which is read-only."""
     at = [where for where in found if path == where or path.startswith(f"{where}/")]
     return found[max(at, key=len)] if at else None
 
@@ -119,7 +135,11 @@ def test_folders_of_volumes_are_the_users() -> None:
         for word, rest in steps:
             user = rest if word == "USER" else user
             if word == "VOLUME":
-                made = [s for w, s in steps if w == "RUN" and (rest in s or "compile_ahead" in s)]
+                made = [
+                    s
+                    for w, s in steps
+                    if w == "RUN" and (rest in s or "compile_ahead" in s)
+                ]
                 assert user == "flexdt", name
                 assert made, f"{name}: nothing makes {rest} before it is a volume"
 
@@ -128,11 +148,16 @@ def test_images_hold_their_kernels_and_the_extras_of_their_options() -> None:
     images = stages()
     for name in ("projector", "twin", "viewer"):
         steps = images[name]
-        compiles = next(i for i, (w, s) in enumerate(steps) if w == "RUN" and "compile_ahead" in s)
+        compiles = next(
+            i for i, (w, s) in enumerate(steps) if w == "RUN" and "compile_ahead" in s
+        )
         assert steps[compiles][1] == f"python -P -m {compile_ahead.MODULE}"
         before = steps[:compiles]
         assert ("USER", "flexdt") in before
-        assert environment(before)["NUMBA_CACHE_DIR"] == environment(steps)["NUMBA_CACHE_DIR"]
+        assert (
+            environment(before)["NUMBA_CACHE_DIR"]
+            == environment(steps)["NUMBA_CACHE_DIR"]
+        )
     (install,) = [s for w, s in images["build"] if w == "RUN" and "pip install" in s]
     extras = set(re.findall(r"[a-z]+", install.rpartition("[")[2]))
     options = tomllib.loads((HOME.parent / "pyproject.toml").read_text())["project"]
@@ -141,7 +166,8 @@ def test_images_hold_their_kernels_and_the_extras_of_their_options() -> None:
 
 
 def test_monitoring_reaches_every_page_of_the_stack() -> None:
-    """A page listens beyond its container, and its port is published from a network that can."""
+    """A page listens beyond its container, and its port is published from a network that
+    can."""
     document, images = yaml.safe_load((HOME / "compose.yaml").read_text()), stages()
     published = dict[str, str]()
     for name, service in document["services"].items():
@@ -153,10 +179,13 @@ def test_monitoring_reaches_every_page_of_the_stack() -> None:
             if inside == options["--http-port"]:
                 published[f"{host}:{outside}"] = name
         reached = [n for n in service["networks"] if not (document["networks"][n] or {})]
-        assert reached, f"{name} is on internal networks alone: no port of it can be published"
+        assert reached, (
+            f"{name} is on internal networks alone: no port of it can be published"
+        )
     text = (HOME / "monitoring" / "prometheus.yaml").read_text()
     wanted = {
-        t: job for job, t in re.findall(r'job_name: flexdt-(\w+)\n.*targets: \["(.*?)"\]', text)
+        t: job
+        for job, t in re.findall(r'job_name: flexdt-(\w+)\n.*targets: \["(.*?)"\]', text)
     }
     assert published == wanted
 
@@ -171,7 +200,9 @@ def test_monitoring_reaches_every_page_of_the_stack() -> None:
         ("no JSON", "", 1),
     ],
 )
-def test_a_container_is_healthy_when_its_page_says_so(page: str, wants: str, code: int) -> None:
+def test_a_container_is_healthy_when_its_page_says_so(
+    page: str, wants: str, code: int
+) -> None:
     class Page(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(200)
@@ -197,7 +228,9 @@ def test_the_token_is_for_the_containers_user_alone() -> None:
     text = (HOME / "compose.yaml").read_text()
     uid = re.search(r"--uid (\d+)", (HOME / "Dockerfile").read_text())
     assert uid is not None
-    advice = " ".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+    advice = " ".join(
+        line.lstrip("# ") for line in text.splitlines() if line.startswith("#")
+    )
     assert f"chown {uid[1]}:{uid[1]} docker/token" in advice
     assert "chmod 400 docker/token" in advice
     assert "umask 077" in advice, "nor may it be read before"
@@ -217,7 +250,9 @@ def test_the_unit_has_limits_and_no_rights() -> None:
     for name in ("MemoryHigh", "MemoryMax"):
         assert 50 <= int(found[name].removesuffix("%")) <= 90
     assert 256 <= int(found["TasksMax"]) <= 4096
-    assert found["OOMPolicy"] == "continue", "one process that is too large must not end the others"
+    assert found["OOMPolicy"] == "continue", (
+        "one process that is too large must not end the others"
+    )
     assert found["UMask"] == "0077"
     assert found["StateDirectoryMode"] == "0700"
     assert found["CapabilityBoundingSet"] == found["AmbientCapabilities"] == ""
@@ -229,14 +264,20 @@ def test_the_unit_has_limits_and_no_rights() -> None:
           "LockPersonality", "RemoveIPC")  # fmt: skip
     assert {name: found[name] for name in on} == dict.fromkeys(on, "yes")
     families = found["RestrictAddressFamilies"].split()
-    assert set(families) == {"AF_INET", "AF_INET6", "AF_UNIX"}  # AF_UNIX: viser behind the viewer
+    assert set(families) == {
+        "AF_INET",
+        "AF_INET6",
+        "AF_UNIX",
+    }  # AF_UNIX: viser behind the viewer
     assert "MemoryDenyWriteExecute" not in found, "kernels are compiled at run time"
 
 
 def test_the_workflow_builds_every_image_of_the_dockerfile() -> None:
     workflows = HOME.parent / ".github" / "workflows"
     job = yaml.safe_load((workflows / "images.yml").read_text())["jobs"]["image"]
-    stages = re.findall(r"^FROM base AS (\w+)$", (HOME / "Dockerfile").read_text(), re.MULTILINE)
+    stages = re.findall(
+        r"^FROM base AS (\w+)$", (HOME / "Dockerfile").read_text(), re.MULTILINE
+    )
     assert sorted(job["strategy"]["matrix"]["target"]) == sorted(stages)
     (build,) = [s["with"] for s in job["steps"] if "build-push" in s.get("uses", "")]
     assert build["file"] == "docker/Dockerfile"

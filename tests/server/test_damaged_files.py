@@ -1,4 +1,5 @@
-"""Files of ours that are damaged or missing: set aside, said, and the twin starts without them."""
+"""Files of ours that are damaged or missing: set aside, said, and the twin starts without
+them."""
 
 from __future__ import annotations
 
@@ -44,14 +45,20 @@ def on(whole: Path, root: Path, damage: Callable[[Path], object]) -> dict[str, A
         sim.advance(0.5)
         return {
             "state": sim.call(client, "state.get"),
-            "corrections": [c["name"] for c in sim.call(client, "calibration.list")["corrections"]],
+            "corrections": [
+                c["name"] for c in sim.call(client, "calibration.list")["corrections"]
+            ],
             "uploads": [
-                s["name"] for s in sim.call(client, "sample.list")["samples"] if s["uploaded"]
+                s["name"]
+                for s in sim.call(client, "sample.list")["samples"]
+                if s["uploaded"]
             ],
             "told": [e["data"]["message"] for e in client.of("log")],
             "logged": [r.getMessage() for r in sim.log if r.levelname == "ERROR"],
             "facts": [getattr(r, "facts", {}) for r in sim.log],
-            "aside": sorted(str(f.relative_to(sim.data)) for f in sim.data.rglob("*unreadable*")),
+            "aside": sorted(
+                str(f.relative_to(sim.data)) for f in sim.data.rglob("*unreadable*")
+            ),
         }
 
 
@@ -109,7 +116,9 @@ class Counted:
         return self.file.read(size)
 
 
-def test_a_damaged_correction_in_force_leaves_the_twin_nominal(whole: Path, tmp_path: Path) -> None:
+def test_a_damaged_correction_in_force_leaves_the_twin_nominal(
+    whole: Path, tmp_path: Path
+) -> None:
     found = on(whole, tmp_path, lambda data: correction(data, "scenic").write_text("{"))
     assert found["state"]["correction"] is None
     assert found["corrections"] == ["one", "two"]
@@ -119,7 +128,9 @@ def test_a_damaged_correction_in_force_leaves_the_twin_nominal(whole: Path, tmp_
 
 
 @pytest.mark.parametrize("number", ["1e999", "NaN", "-Infinity", "1e300", '"0.5"'])
-def test_numbers_that_no_scanner_has_are_damage(number: str, whole: Path, tmp_path: Path) -> None:
+def test_numbers_that_no_scanner_has_are_damage(
+    number: str, whole: Path, tmp_path: Path
+) -> None:
     def damage(data: Path) -> None:
         file = correction(data, "one")
         file.write_text(file.read_text().replace('"dD_x": 0.5', f'"dD_x": {number}'))
@@ -130,7 +141,9 @@ def test_numbers_that_no_scanner_has_are_damage(number: str, whole: Path, tmp_pa
     assert found["logged"] == ["a correction cannot be read; without it"]
 
 
-@pytest.mark.parametrize("how", ["missing", "cut", "other bytes", "no head", "absurd pitch"])
+@pytest.mark.parametrize(
+    "how", ["missing", "cut", "other bytes", "no head", "absurd pitch"]
+)
 def test_an_upload_that_stood_on_the_stage_and_cannot_be_read(
     how: str, whole: Path, tmp_path: Path
 ) -> None:
@@ -152,11 +165,15 @@ def test_an_upload_that_stood_on_the_stage_and_cannot_be_read(
     found = on(whole, tmp_path, damage)
     assert found["state"]["sample"]["name"] is None
     assert found["uploads"] == []
-    assert any("'cube', which stood on the stage, cannot be read" in t for t in found["told"])
+    assert any(
+        "'cube', which stood on the stage, cannot be read" in t for t in found["told"]
+    )
     assert bool(found["aside"]) is (how != "no head")
 
 
-def test_an_upload_may_come_again_after_it_was_set_aside(whole: Path, tmp_path: Path) -> None:
+def test_an_upload_may_come_again_after_it_was_set_aside(
+    whole: Path, tmp_path: Path
+) -> None:
     shutil.copytree(whole, tmp_path / "data")
     next((tmp_path / "data" / "samples").glob("*.bin")).unlink()
     with Simulation(tmp_path) as sim:
@@ -176,6 +193,8 @@ def test_a_server_starts_whatever_bit_is_another_one(whole: Path, tmp_path: Path
     for number in range(25):
         folder = tmp_path / str(number)
         shutil.copytree(whole, folder / "data")
-        kept = [f for f in sorted(folder.rglob("*")) if f.is_file() and f.suffix != ".tif"]
+        kept = [
+            f for f in sorted(folder.rglob("*")) if f.is_file() and f.suffix != ".tif"
+        ]
         damaged(rng.choice(kept), rng)
         starts(folder, number)

@@ -25,7 +25,14 @@ from flexdt.twin.machine.description import profile_of
 pytestmark = pytest.mark.slow
 
 FRAMES = 25
-TRUTH = {"dO_x": 0.9, "dO_y": -0.6, "dO_z": 2.5, "alpha": 33.0, "tau_x": 0.4, "tau_z": -0.3}
+TRUTH = {
+    "dO_x": 0.9,
+    "dO_y": -0.6,
+    "dO_z": 2.5,
+    "alpha": 33.0,
+    "tau_x": 0.4,
+    "tau_z": -0.3,
+}
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +68,12 @@ def called(served: Served, method: str, **params: object) -> Any:
         client = lab.client()
         told.append(await client.call(method, **params))
         if told[0].get("correction"):
-            applied = await client.call("calibration.apply", parameters=told[0]["correction"])
-            assert applied["correction"]["parameters"] == pytest.approx(told[0]["correction"])
+            applied = await client.call(
+                "calibration.apply", parameters=told[0]["correction"]
+            )
+            assert applied["correction"]["parameters"] == pytest.approx(
+                told[0]["correction"]
+            )
         client.close()
 
     served(body)
@@ -84,20 +95,28 @@ def test_a_fit_over_the_wire_is_that_of_the_package(served: Served, own: Any) ->
     assert np.allclose(told["covariance"], fit.covariance, rtol=1e-3, atol=1e-9)
     beads = told["rms_per_bead_px"]
     for k, stated in enumerate(beads):
-        off = np.array([frame[k] for frame in told["residuals_px"] if frame[k] is not None])
+        off = np.array(
+            [frame[k] for frame in told["residuals_px"] if frame[k] is not None]
+        )
         assert np.sqrt(np.mean(off**2)) == pytest.approx(stated, abs=1e-4)
     assert [s["frames"] for s in told["steps"]] == [7, 13, 19, 25]
     [tracked] = told["tracks"]["datasets"]
     for frame, off in zip(tracked["frames"], told["residuals_px"], strict=True):
-        for seen, after, residual in zip(frame["measured"], frame["after"], off, strict=True):
+        for seen, after, residual in zip(
+            frame["measured"], frame["after"], off, strict=True
+        ):
             if residual is not None:
                 assert np.subtract(seen, after) == pytest.approx(residual, abs=2e-3)
-    assert {q["code"] for q in told["problems"]} == {f.code for f in own.calibration.findings}
+    assert {q["code"] for q in told["problems"]} == {
+        f.code for f in own.calibration.findings
+    }
 
 
-def marks(views: range, truth: dict[str, float], noise_px: float) -> list[dict[str, object]]:
-    """Where the beads stand in the scan's images (SOD 600, SDD 1059, 478 x 380 pixels of 0.2992 mm,
-    15 degrees from one to the next), by sines and cosines alone."""
+def marks(
+    views: range, truth: dict[str, float], noise_px: float
+) -> list[dict[str, object]]:
+    """Where the beads stand in the scan's images (SOD 600, SDD 1059, 478 x 380 pixels of 0.2992
+    mm, 15 degrees from one to the next), by sines and cosines alone."""
     rng = np.random.default_rng(5)
     told: list[dict[str, object]] = []
     for view in views:
@@ -154,7 +173,9 @@ def test_markers_of_which_nobody_knows_where_they_are(served: Served) -> None:
     really = np.linalg.norm(beads[:, None] - beads, axis=2)
     assert np.abs(between - really).max() < 0.5
     assert len(told["residuals_px"]) == 9
-    free = called(served, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen)
+    free = called(
+        served, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen
+    )
     assert free["scale"] == "free"
 
 
@@ -184,13 +205,18 @@ def test_marks_that_do_not_hold_are_refused(served: Served) -> None:
             error = await client.error(
                 "calibration.fit", datasets=["lego"], phantom="lego", markers=markers
             )
-            assert (error.code, says in f"{error.message} {error.data}") == (-32602, True), says
+            assert (error.code, says in f"{error.message} {error.data}") == (
+                -32602,
+                True,
+            ), says
         for phantom, scale, says in (
             ("lego", "0-1=3", "this phantom states its own size"),
             ("unknown", "0-1", "allowed: A-B=MM"),
             ("unknown", None, "1 markers; allowed: three or more"),
         ):
-            asked = {"markers": [mark], "phantom": phantom} | ({"scale": scale} if scale else {})
+            asked = {"markers": [mark], "phantom": phantom} | (
+                {"scale": scale} if scale else {}
+            )
             error = await client.error("calibration.fit", datasets=["lego"], **asked)
             assert (error.code, says in error.message) == (-32602, True), error
         both = await client.error(
@@ -199,7 +225,11 @@ def test_marks_that_do_not_hold_are_refused(served: Served) -> None:
         assert "2 data sets with markers" in both.message
         # Too few of them are no error: the answer says that they do not determine anything.
         few = await client.call(
-            "calibration.fit", datasets=["lego"], phantom="lego", markers=[mark], tracks=True
+            "calibration.fit",
+            datasets=["lego"],
+            phantom="lego",
+            markers=[mark],
+            tracks=True,
         )
         assert not few["identifiable"]
         assert few["verdict"].startswith("Not to be used")
@@ -207,7 +237,9 @@ def test_marks_that_do_not_hold_are_refused(served: Served) -> None:
     served(body)
 
 
-def test_an_alignment_over_the_wire_is_that_of_the_package(data: Path, served: Served) -> None:
+def test_an_alignment_over_the_wire_is_that_of_the_package(
+    data: Path, served: Served
+) -> None:
     own = fx.align(data / "lego", per_frame=True)
     told = called(served, "calibration.align", name="lego", per_frame=True)
     assert own.identifiable
@@ -234,7 +266,9 @@ def test_what_is_not_there_is_refused(data: Path, served: Served, tmp_path: Path
             error = await client.error("calibration.fit", datasets=names, phantom=phantom)
             assert error.code == -32602
             assert says in error.message
-        free = await client.error("calibration.fit", datasets=["lego"], phantom="lego", free=["up"])
+        free = await client.error(
+            "calibration.fit", datasets=["lego"], phantom="lego", free=["up"]
+        )
         assert (free.code, "up" in free.message) == (-32602, True)
 
     served(body)
@@ -297,10 +331,15 @@ def test_the_steps_are_what_the_first_frames_would_know(own: Any) -> None:
         for i in range(len(x)):
             step = np.zeros_like(x)
             step[i] = 1e-5
-            ends = (problem.whitened(x + step).ravel(), problem.whitened(x - step).ravel())
+            ends = (
+                problem.whitened(x + step).ravel(),
+                problem.whitened(x - step).ravel(),
+            )
             columns.append((ends[1] - ends[0])[mask] / 2e-5)
         rows = np.stack(columns, axis=1)
-        told = np.linalg.inv(rows.T @ rows / noise**2 + np.diag(1 / problem.prior_sigma**2))
+        told = np.linalg.inv(
+            rows.T @ rows / noise**2 + np.diag(1 / problem.prior_sigma**2)
+        )
         degrees = np.array([180 / np.pi if e.unit == "deg" else 1.0
                             for e in fit.certificate.estimates.values()])  # fmt: skip
         p_ = len(degrees)

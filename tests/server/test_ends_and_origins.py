@@ -108,7 +108,9 @@ def test_an_abort_says_who_and_switches_x_rays_off(tmp_path: Path, paused: bool)
         assert status["ended_by"].startswith("Anna ")
         assert status["start"] == pytest.approx(stood)
         assert not state["tube"]["on"]
-        assert lab.twin.scanner.final_positions()["rot_obj"] != pytest.approx(stood["rot_obj"])
+        assert lab.twin.scanner.final_positions()["rot_obj"] != pytest.approx(
+            stood["rot_obj"]
+        )
         again = await owner.call("job.resume", job=job)
         assert again["ended_by"] is None
         lab.projector.limit = None

@@ -22,7 +22,13 @@ from flexdt.twin.scanner.state import changed_camera
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
 
-ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "material": "pmma"}
+ROD = {
+    "kind": "cylinder",
+    "center": [0, 0, 0],
+    "radius": 12.0,
+    "height": 60,
+    "material": "pmma",
+}
 
 
 def predicted(**settings: Any) -> ExposurePrediction:
@@ -34,7 +40,9 @@ def predicted(**settings: Any) -> ExposurePrediction:
 
 def test_a_prediction_is_what_noisy_images_show() -> None:
     told = predicted(power_W=40.0, exposure_ms=150.0)
-    geometry = fx.ConeVec.circular(sod=600, sdd=1059, angles=1, shape=(760, 956), pixel=0.1496)
+    geometry = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=1, shape=(760, 956), pixel=0.1496
+    )
     made = fx.simulate(
         ROD, geometry, tube=fx.Tube(kV=70, power_W=40), noise=4,
         detector=fx.Detector(exposure_ms=150),
@@ -91,13 +99,17 @@ def test_a_twin_predicts_its_own_images() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.campaign(1)
-def test_prediction_report_and_finished_data_set_are_one(tmp_path: Path, seed: int) -> None:
+def test_prediction_report_and_finished_data_set_are_one(
+    tmp_path: Path, seed: int
+) -> None:
     """In drawn camera modes, regions and kinds of scan: bytes to the byte, and time."""
     rng = np.random.default_rng(4300 + seed)
     kind = ("fly", "step", "tiled", "helical", "calibration")[seed]
     mode = str(rng.choice(M.detector.mode_names))
     left, top = (int(x) for x in rng.integers(700, 850, 2))  # near enough for the motors
-    roi = Roi(left, top, left + int(rng.integers(60, 400)), top + int(rng.integers(60, 300)))
+    roi = Roi(
+        left, top, left + int(rng.integers(60, 400)), top + int(rng.integers(60, 300))
+    )
     frames, exposure = int(rng.integers(40, 60)), float(rng.uniform(300, 500))
     sod, sdd = round(float(rng.uniform(500, 700)), 4), 1059.0
     request = ScanRequest(

@@ -1,7 +1,8 @@
 """A disk that fails, or loses its power, at every third change of a whole run.
 
-Start, upload, settings, scans, corrections, scenes, poses, an abort and a resume; see `whole_run`.
-Here the ways to fail take turns; `tests/studies/faults.py` has every change in all of them.
+Start, upload, settings, scans, corrections, scenes, poses, an abort and a resume; see
+`whole_run`. Here the ways to fail take turns; `tests/studies/faults.py` has every change in all
+of them.
 """
 
 from __future__ import annotations

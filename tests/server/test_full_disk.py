@@ -21,7 +21,9 @@ BROKEN = Fault(at=0, error=errno.EIO, lasting=True)
 
 @pytest.mark.daily(2)
 @pytest.mark.parametrize("seed", range(12))
-def test_what_was_acknowledged_on_a_full_disk_survives_a_kill(seed: int, tmp_path: Path) -> None:
+def test_what_was_acknowledged_on_a_full_disk_survives_a_kill(
+    seed: int, tmp_path: Path
+) -> None:
     """`tests/studies/full_disk.py` lives 500 such histories, and some on real full disks."""
     assert run_history(tmp_path, seed).asked > 0
 
@@ -86,7 +88,12 @@ def test_a_data_directory_that_was_removed_is_the_disk_s_fault(tmp_path: Path) -
         await c.call("calibration.apply", parameters={"dD_x": 0.1}, name="one")
         while root.exists():  # the state is being written meanwhile
             shutil.rmtree(root, ignore_errors=True)
-        voxels = {"kind": "voxels", "format": "raw", "shape": [1, 1, 1], "voxel_mm": [1.0] * 3}
+        voxels = {
+            "kind": "voxels",
+            "format": "raw",
+            "shape": [1, 1, 1],
+            "voxel_mm": [1.0] * 3,
+        }
         asked: dict[str, dict[str, Any]] = {
             "tube.set": {"kV": 50.0},
             "sample.set": {"name": "lego"},

@@ -160,15 +160,21 @@ def with_gateway(
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     told: list[Any] = []
     monkeypatch.setattr(shell, "FOREIGN_S", 0.05)
-    monkeypatch.setattr(shell, "log", lambda *event, **facts: told.append((event[0], facts)))
+    monkeypatch.setattr(
+        shell, "log", lambda *event, **facts: told.append((event[0], facts))
+    )
     return told
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=150,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.one_of(EVENTS.map(lambda e: json.dumps(e).encode()), RUBBISH))
-def test_no_event_ends_the_loop(data: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_no_event_ends_the_loop(
+    data: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """In process, without sockets between: what `run` does with each."""
 
     async def run() -> None:
@@ -225,11 +231,17 @@ def test_hostile_events_over_real_sockets_are_answered_and_the_next_is_served(
         await program.say.send_multipart([b"x"] * 10_000)
         while "10000 frames" not in (await program.event())["reply"]:
             continue
-        await program.say.send(b"x" * (MAX_BYTES + 1))  # ZeroMQ itself hangs up, and meets again
+        await program.say.send(
+            b"x" * (MAX_BYTES + 1)
+        )  # ZeroMQ itself hangs up, and meets again
         await program.meet()
         _, writer = await asyncio.open_connection("127.0.0.1", gateway.inbound)
         writer.write(
-            b"\xff" + b"\x00" * 8 + b"\x01\x7f" + b"\xaa" * 4096 + b"GET / HTTP/1.1\r\n\r\n"
+            b"\xff"
+            + b"\x00" * 8
+            + b"\x01\x7f"
+            + b"\xaa" * 4096
+            + b"GET / HTTP/1.1\r\n\r\n"
         )
         await writer.drain()
         writer.close()
@@ -259,7 +271,9 @@ def test_what_nobody_expected_is_told_once_and_the_next_event_is_served(
         assert (await program.ends())["reply"] == "so far and no further"
 
     with_gateway(work, tmp_path, Nowhere())
-    assert [event for event, _ in quick] == ["gateway command failed"] * 2  # as many as are shown
+    assert [event for event, _ in quick] == [
+        "gateway command failed"
+    ] * 2  # as many as are shown
 
 
 def test_commands_beyond_the_limit_are_told_and_stop_is_not(

@@ -5,7 +5,11 @@ from __future__ import annotations
 import pytest
 
 from flexdt.clients.gateway.actions import ACTIONS
-from flexdt.clients.gateway.event_server import bind_endpoint, check_loopback, transcript_line
+from flexdt.clients.gateway.event_server import (
+    bind_endpoint,
+    check_loopback,
+    transcript_line,
+)
 from flexdt.clients.gateway.vocabulary import (
     Question,
     Refusal,
@@ -33,7 +37,9 @@ def test_commands_are_the_scripts_own() -> None:
     )
     move = read("ROT_OBJ", "move absolute", "360.5", "0.0")
     assert move == c.MoveAbsolute(component="rot_obj", target=360.5, trigger=0.0)
-    assert read("mag_obj", "status_position_get") == Question(path=("axes", "mag_obj", "position"))
+    assert read("mag_obj", "status_position_get") == Question(
+        path=("axes", "mag_obj", "position")
+    )
 
 
 def test_names_of_axes_are_the_machines_own_in_any_case() -> None:
@@ -52,7 +58,10 @@ def test_names_of_axes_are_the_machines_own_in_any_case() -> None:
     ("event", "says"),
     [
         (("tube", "explode"), "knows: xrayon, xrayoff, set kV"),
-        (("tra_sky", "move absolute", "1"), "the twin has: tube, camera, scanner, ver_tube"),
+        (
+            ("tra_sky", "move absolute", "1"),
+            "the twin has: tube, camera, scanner, ver_tube",
+        ),
         (("tube", "set kV", "ninety"), "kV must be a number"),
         (("tube", "xrayon", "1"), "takes no argument"),
         (("camera", "set number of frames", "0"), "from 1 to"),
@@ -106,7 +115,9 @@ def test_the_transcript_is_a_script() -> None:
         c.SetVoltage, c.MoveAbsolute, c.TakeSequence, c.SetOutputPath,
     ]  # fmt: skip
     assert script.commands[1].wait is c.Wait.POS
-    assert transcript_line(AcquilaEvent("rot_obj", "stop"), read("rot_obj", "stop")) is None
+    assert (
+        transcript_line(AcquilaEvent("rot_obj", "stop"), read("rot_obj", "stop")) is None
+    )
 
 
 def test_only_this_machine_may_connect() -> None:

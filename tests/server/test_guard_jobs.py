@@ -37,7 +37,9 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
         job = jobs.draft("scan", str(tmp_path / "scan"), plan, prepare)
         jobs.enqueue(job)
         await asyncio.wait_for(asked.wait(), 60)
-        with pytest.raises(RpcError, match="a move is refused while job-1 begins") as refused:
+        with pytest.raises(
+            RpcError, match="a move is refused while job-1 begins"
+        ) as refused:
             jobs.require_idle("a move")
         assert refused.value.code == -32003
         answer.set()

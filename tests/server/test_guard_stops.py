@@ -20,7 +20,9 @@ async def in_a_scan(lab: Lab, client: Client, frames: int = 1) -> str:
     """A fly scan of `client` that has made so many frames."""
     name = (await client.call("script.submit", text=script(**FLY), name="scan"))["job"]
     job = lab.twin.jobs.get(name)
-    await lab.until(lambda: job.runner is not None and job.runner.progress.frames_done >= frames)
+    await lab.until(
+        lambda: job.runner is not None and job.runner.progress.frames_done >= frames
+    )
     return str(name)
 
 
@@ -29,7 +31,9 @@ def angle(lab: Lab) -> float:
 
 
 @pytest.mark.parametrize("stop", ["axes.stop", "safety.estop", "job.pause"])
-def test_a_stop_and_a_resume_at_once_return_to_the_plan(tmp_path: Path, stop: str) -> None:
+def test_a_stop_and_a_resume_at_once_return_to_the_plan(
+    tmp_path: Path, stop: str
+) -> None:
     """The run went on exposing at planned positions, with the motors standing still."""
 
     async def body(lab: Lab) -> None:
@@ -109,7 +113,9 @@ def test_nothing_is_moved_or_set_while_the_rest_of_a_scan_is_swept(
 
 
 @pytest.mark.parametrize("stop", ["axes.stop", "safety.estop"])
-def test_a_scene_that_is_being_loaded_moves_nothing_after_a_stop(tmp_path: Path, stop: str) -> None:
+def test_a_scene_that_is_being_loaded_moves_nothing_after_a_stop(
+    tmp_path: Path, stop: str
+) -> None:
     async def body(lab: Lab) -> None:
         client = lab.client()
         document = (await client.call("scene.save"))["document"]
@@ -163,7 +169,9 @@ def test_a_stop_before_a_scan_goes_on_sets_nothing(tmp_path: Path) -> None:
         await client.call("job.abort", job=name)
         await client.call("tube.set", on=False)
         resumed = asyncio.ensure_future(client.call("job.resume", job=name))
-        await lab.until(lambda: lab.twin.jobs.current is not None and lab.twin.jobs._preparing)
+        await lab.until(
+            lambda: lab.twin.jobs.current is not None and lab.twin.jobs._preparing
+        )
         await client.call("axes.stop")
         await resumed
         job = lab.twin.jobs.get(name)  # the one that takes its place

@@ -84,7 +84,9 @@ def test_subscriptions_and_views_have_a_limit_and_a_refusal_changes_nothing() ->
     asyncio.run(main())
 
 
-def test_a_rate_limit_sends_the_newest_value_of_each_slot_and_never_the_old_ones() -> None:
+def test_a_rate_limit_sends_the_newest_value_of_each_slot_and_never_the_old_ones() -> (
+    None
+):
     async def main() -> None:
         hub = Hub(lambda: 0.0)
         slow, fast = Ear(), Ear()
@@ -162,7 +164,9 @@ def test_kept_events_come_to_the_late_in_order_and_once() -> None:
         hub.publish("log", 6, slot=None)
         hub.subscribe(late, ["log"])
         await asyncio.sleep(0.01)
-        assert [(e["seq"], e["data"]) for e, _ in late.heard] == [(i, i) for i in range(2, 7)]
+        assert [(e["seq"], e["data"]) for e, _ in late.heard] == [
+            (i, i) for i in range(2, 7)
+        ]
         assert [e["time"] for e, _ in late.heard][:3] == [2.0, 3.0, 4.0]
         hub.drop(late)
         hub.subscribe(late, ["log"])

@@ -44,7 +44,9 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
 
     first = Late.model_construct(**dict(make(False)))
     root = Directory(tmp_path)
-    keeper = StateStore(root, lambda last: make(True) if last else first, JobFiles(root), dict)
+    keeper = StateStore(
+        root, lambda last: make(True) if last else first, JobFiles(root), dict
+    )
     written: list[str] = []
     keep = Directory.keep
 
@@ -70,7 +72,8 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
 
 @pytest.mark.parametrize("at", range(12))
 def test_a_change_is_undone_on_a_disk_that_stays_full(tmp_path: Path, at: int) -> None:
-    """Whatever write of three the disk is full at: it takes no room to have the old files back."""
+    """Whatever write of three the disk is full at: it takes no room to have the old files
+    back."""
     root = tmp_path / "disk"
     root.mkdir()
     for name in ("a", "b"):

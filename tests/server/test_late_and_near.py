@@ -1,4 +1,5 @@
-"""What a late subscriber hears of the log; what is said of a correction that brings parts near."""
+"""What a late subscriber hears of the log; what is said of a correction that brings parts
+near."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ def server(rays: Process, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 def logged(wire: Wire, count: int) -> list[dict[str, Any]]:
-    """Entries of the log, once there are `count`; they go out in slices between the requests."""
+    """Entries of the log, once there are `count`; they go out in slices between the
+    requests."""
     until = time.monotonic() + 60.0
     while True:
         wire.call("session.ping")
@@ -42,7 +44,9 @@ def test_who_comes_late_gets_the_last_entries_of_the_log_once(server: Process) -
     early.call("calibration.revert")
     late.call("state.subscribe", topics=["log"])
     seqs = [e["seq"] for e in logged(late, 51)]
-    assert seqs == [e["seq"] for e in logged(early, 61)[-51:]], "nothing twice, nothing missed"
+    assert seqs == [e["seq"] for e in logged(early, 61)[-51:]], (
+        "nothing twice, nothing missed"
+    )
     for _ in range(59):
         early.call("calibration.revert")
     assert early.call("calibration.get")["correction"] is None
@@ -51,7 +55,9 @@ def test_who_comes_late_gets_the_last_entries_of_the_log_once(server: Process) -
 
 
 @pytest.mark.slow
-def test_a_correction_that_would_bring_parts_too_close_is_refused(server: Process) -> None:
+def test_a_correction_that_would_bring_parts_too_close_is_refused(
+    server: Process,
+) -> None:
     wire = Wire(server.port)
     refused = wire.ask("axes.move", targets={"mag_det": 100.0})["error"]
     assert refused["code"] == -32002

@@ -64,7 +64,9 @@ def test_limits_that_are_none(word: str) -> None:
 
 @pytest.mark.timeout(120)
 @pytest.mark.slow
-def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_hold_in_a_process(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rays = projector("--limit", "max_clients=9")
     options = [f"--limit={w}" for w in ("max_jobs=2", "max_upload=1000", "disk_quota=30e6",
                                          "control_idle_s=2", "max_clients=3",
@@ -156,7 +158,10 @@ def test_retries_wait_longer_each_time_and_forget_after_progress(
         waits.append(seconds)
         await asyncio.sleep(0)
 
-    own = {"create_task": asyncio.create_task, "get_running_loop": asyncio.get_running_loop}
+    own = {
+        "create_task": asyncio.create_task,
+        "get_running_loop": asyncio.get_running_loop,
+    }
     monkeypatch.setattr(job_retries, "asyncio", SimpleNamespace(sleep=sleep, **own))
 
     async def body() -> None:
@@ -166,7 +171,9 @@ def test_retries_wait_longer_each_time_and_forget_after_progress(
             done.clear()
             retry.schedule(ProjectorUnavailable("gone"), done.set)
             left = retry.waits_s
-            retry.schedule(ProjectorUnavailable("gone"), done.set)  # the pending one is kept
+            retry.schedule(
+                ProjectorUnavailable("gone"), done.set
+            )  # the pending one is kept
             assert left is not None
             assert 0.0 <= left <= min(50.0, 10.0 * 2.0**attempt)
             await done.wait()
@@ -240,18 +247,24 @@ def test_the_wire_of_version_1_is_not_taken_back() -> None:
         fields = METHODS[name].params.model_fields
         for parameter, required in parameters.items():
             assert parameter in fields, f"{name} has lost {parameter}"
-            assert fields[parameter].is_required() <= required, f"{name}: {parameter} is required"
+            assert fields[parameter].is_required() <= required, (
+                f"{name}: {parameter} is required"
+            )
         new = set(fields) - set(parameters)
         assert not [n for n in new if fields[n].is_required()], f"{name} requires more"
 
 
 def test_what_overflowed_is_repeated_as_text() -> None:
-    error = RpcError(-32001, "too far", {"asked": math.inf, "all": [math.nan, 1.0, (-math.inf,)]})
+    error = RpcError(
+        -32001, "too far", {"asked": math.inf, "all": [math.nan, 1.0, (-math.inf,)]}
+    )
     sent: Any = json.loads(Connection().send(Failure(1, error)))
     assert sent["error"]["data"] == {"asked": "inf", "all": ["nan", 1.0, ["-inf"]]}
 
 
-@pytest.mark.parametrize("text", [b"rot_obj\t", b"camera\t\t\t\t\t\t", b"ver_tube\t\r\nx\t"])
+@pytest.mark.parametrize(
+    "text", [b"rot_obj\t", b"camera\t\t\t\t\t\t", b"ver_tube\t\r\nx\t"]
+)
 def test_a_component_alone_is_a_syntax_error(text: bytes) -> None:
     report = check_script(text, M, P)
     assert not report.ok

@@ -1,4 +1,5 @@
-"""Structured logs: every line is one JSON object, with a traceback only where something failed."""
+"""Structured logs: every line is one JSON object, with a traceback only where something
+failed."""
 
 from __future__ import annotations
 

@@ -15,7 +15,17 @@ from lab import Process, Wire, fly_script, projector, twin
 from flexdt.protocol.state_model import JobPhase
 
 HOME = Path(__file__).resolve().parents[2] / "docker" / "monitoring"
-WORDS = {"and", "or", "on", "by", "sum", "rate", "increase", "predict_linear", "histogram_quantile"}
+WORDS = {
+    "and",
+    "or",
+    "on",
+    "by",
+    "sum",
+    "rate",
+    "increase",
+    "predict_linear",
+    "histogram_quantile",
+}
 TARGET_LABELS = {"job", "instance"}
 """Prometheus adds them, and `up`."""
 NAME = r"[a-zA-Z_:][a-zA-Z0-9_:]*"
@@ -42,11 +52,17 @@ def parts(expression: str) -> tuple[set[str], set[str], set[tuple[str, str]]]:
     wanted = re.findall(rf'({NAME})(?:=~|!~|!=|=)"([^"]*)"', expression)
     bare = re.sub(r"\{[^}]*\}|\[[^\]]*\]|\"[^\"]*\"", " ", expression)
     labels = {
-        x for inside in re.findall(r"\b(?:by|on) \(([^)]*)\)", bare) for x in inside.split(", ")
+        x
+        for inside in re.findall(r"\b(?:by|on) \(([^)]*)\)", bare)
+        for x in inside.split(", ")
     }
     bare = re.sub(r"\b(?:by|on) \([^)]*\)", " ", bare)
     bare = re.sub(r"\b\d[\d.e]*\b", " ", bare)
-    return set(re.findall(NAME, bare)) - WORDS, labels | {n for n, _ in wanted}, set(wanted)
+    return (
+        set(re.findall(NAME, bare)) - WORDS,
+        labels | {n for n, _ in wanted},
+        set(wanted),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +74,9 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[tuple[str, 
     server = twin(rays.port, data, *nobody, "--speed-up", "max", "--http-port", 0)
     try:
         wire = Wire(server.port)
-        wire.wait(wire.call("script.submit", text=fly_script(13), name="seen")["job"], "done")
+        wire.wait(
+            wire.call("script.submit", text=fly_script(13), name="seen")["job"], "done"
+        )
         found: dict[str, set[tuple[str, str]]] = {"up": set()}
         for process in (server, rays):
             for line in page(process).splitlines():
@@ -80,7 +98,9 @@ def page(process: Process) -> str:
 
 @pytest.mark.timeout(240)
 @pytest.mark.slow
-def test_every_figure_label_and_state_exists(shown: dict[str, set[tuple[str, str]]]) -> None:
+def test_every_figure_label_and_state_exists(
+    shown: dict[str, set[tuple[str, str]]],
+) -> None:
     # The reader of expressions finds what is wrong.
     assert parts('sum by (x) (rate(no_such{a="b"}[5m])) > 1e9') == (
         {"no_such"},
@@ -91,7 +111,11 @@ def test_every_figure_label_and_state_exists(shown: dict[str, set[tuple[str, str
         metrics, labels, wanted = parts(expression)
         assert metrics
         assert metrics <= shown.keys(), expression
-        there = {label for metric in metrics for label, _ in shown[metric]} | TARGET_LABELS | {"le"}
+        there = (
+            {label for metric in metrics for label, _ in shown[metric]}
+            | TARGET_LABELS
+            | {"le"}
+        )
         assert labels <= there, expression
         for label, pattern in wanted - {("job", "flexdt-.*")}:
             values = {v for metric in metrics for k, v in shown[metric] if k == label}
@@ -100,7 +124,9 @@ def test_every_figure_label_and_state_exists(shown: dict[str, set[tuple[str, str
             assert any(re.fullmatch(pattern, value) for value in values), expression
     drawn = [t for panel in panels() for t in panel["targets"]]
     told = [(t["expr"], t["legendFormat"], r"\{\{(\w+)\}\}") for t in drawn]
-    told += [(r["expr"], r["annotations"]["summary"], r"\$labels\.(\w+)") for r in rules()]
+    told += [
+        (r["expr"], r["annotations"]["summary"], r"\$labels\.(\w+)") for r in rules()
+    ]
     for expression, text, form in told:
         there = {k for m in parts(expression)[0] for k, _ in shown[m]} | TARGET_LABELS
         assert set(re.findall(form, text)) <= there, text
@@ -108,7 +134,8 @@ def test_every_figure_label_and_state_exists(shown: dict[str, set[tuple[str, str
 
 def test_states_in_alerts_are_states_of_jobs() -> None:
     named = [
-        re.findall(r'flexdt_jobs\{state=~?"([^"]*)"', expression) for expression in expressions()
+        re.findall(r'flexdt_jobs\{state=~?"([^"]*)"', expression)
+        for expression in expressions()
     ]
     states = {state for found in named for text in found for state in text.split("|")}
     assert states
@@ -120,7 +147,9 @@ def test_files_hold_together() -> None:
     assert all((HOME / file).is_file() for file in config["rule_files"])
     jobs = {scrape["job_name"] for scrape in config["scrape_configs"]}
     assert jobs
-    assert all(re.fullmatch("flexdt-.*", job) for job in jobs), "what the expressions select"
+    assert all(re.fullmatch("flexdt-.*", job) for job in jobs), (
+        "what the expressions select"
+    )
     names = [rule["alert"] for rule in rules()]
     assert len(set(names)) == len(names)
     for rule in rules():

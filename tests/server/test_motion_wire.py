@@ -1,4 +1,5 @@
-"""Several clients of a whole server, in any order, under the eye of the motion oracle: short form.
+"""Several clients of a whole server, in any order, under the eye of the motion oracle: short
+form.
 
 The long one is `tests/studies/motion_campaign.py`.
 """

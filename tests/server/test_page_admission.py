@@ -17,7 +17,10 @@ from flexdt.runtime import http_pages
 from flexdt.runtime.http_pages import HttpResponse, served_pages
 from flexdt.runtime.process_settings import ServerSettings
 
-PAGES = {"/healthz": lambda: HttpResponse("well"), "/metrics": lambda: HttpResponse("figures")}
+PAGES = {
+    "/healthz": lambda: HttpResponse("well"),
+    "/metrics": lambda: HttpResponse("figures"),
+}
 TOKEN = "a-token-of-some-length"
 
 
@@ -54,13 +57,16 @@ hosts = st.tuples(
 def test_pages_of_other_sites_read_nothing(
     drawn: list[tuple[tuple[str, int], str, str, str]],
 ) -> None:
-    """A name that its owner has rebound to the loopback is told by the Host that it comes with."""
+    """A name that its owner has rebound to the loopback is told by the Host that it comes
+    with."""
 
     async def work(at: int) -> None:
         for (name, status), port, field, path in drawn:
             head = f"GET {path} HTTP/1.1\r\n{field}: {name}{port}\r\n\r\n".encode()
             assert await ask(at, head) == status
-            assert await ask(at, f"GET {path} HTTP/1.0\r\n\r\n".encode()) == 200  # no browser's
+            assert (
+                await ask(at, f"GET {path} HTTP/1.0\r\n\r\n".encode()) == 200
+            )  # no browser's
 
     with_pages(work)
 
@@ -74,7 +80,8 @@ def test_peers_that_hold_connections_keep_nobody_out(
     token = tmp_path / "token"
     token.write_text(TOKEN)
     honest = (
-        b"GET /metrics HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer %b\r\n\r\n" % TOKEN.encode()
+        b"GET /metrics HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer %b\r\n\r\n"
+        % TOKEN.encode()
     )
 
     async def work(port: int) -> None:

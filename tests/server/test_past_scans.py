@@ -76,9 +76,16 @@ def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
     frames = document["frames"]
     with TwinClient(port=server.port) as client:
         [info] = client.datasets().datasets
-        assert (info.name, info.state, info.machine) == ("first scan", "complete", "flexray")
+        assert (info.name, info.state, info.machine) == (
+            "first scan",
+            "complete",
+            "flexray",
+        )
         assert (info.projections, info.present) == (FRAMES, FRAMES)
-        assert (info.kV, info.sample) == (document["tube"]["kV"], document["sample"]["name"])
+        assert (info.kV, info.sample) == (
+            document["tube"]["kV"],
+            document["sample"]["name"],
+        )
         told = client.dataset("first scan", measure=True, script=True)
         assert told.info == info
         assert told.same_machine
@@ -101,25 +108,36 @@ def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
             assert np.array_equal(pixels, images[index])
             assert about.cone_vec == frames[index]["cone_vec"]
             assert about.positions == frames[index]["positions"]
-            assert (about.image, about.file) == (frames[index]["kind"], frames[index]["file"])
+            assert (about.image, about.file) == (
+                frames[index]["kind"],
+                frames[index]["file"],
+            )
             number = int(about.file[5:11]) if about.file.startswith("scan_") else None
             assert about.projection == number
         dark, flat = (
-            np.mean([i for i, f in zip(images, frames, strict=True) if f["kind"] == kind], axis=0)
+            np.mean(
+                [i for i, f in zip(images, frames, strict=True) if f["kind"] == kind],
+                axis=0,
+            )
             for kind in ("dark", "flat")
         )
-        integrals, _ = client.dataset_frame("first scan", len(frames) - 1, "line_integral")
+        integrals, _ = client.dataset_frame(
+            "first scan", len(frames) - 1, "line_integral"
+        )
         lit = images[-1] > dark + 1
         expected = -np.log((images[-1] - dark)[lit] / (flat - dark)[lit])
         assert np.asarray(integrals)[lit] == pytest.approx(expected, abs=1e-5)
         halved, _ = client.dataset_frame("first scan", 1, binning=2)
         rows, cols = (2 * (n // 2) for n in images[1].shape)
-        mean = images[1][:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).mean(axis=(1, 3))
+        mean = (
+            images[1][:rows, :cols].reshape(rows // 2, 2, cols // 2, 2).mean(axis=(1, 3))
+        )
         assert np.abs(np.asarray(halved, dtype=float) - mean).max() <= 0.5
 
 
 def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> None:
-    """Against flexdt.json of the same scan, which is taken away. The texts have fewer digits."""
+    """Against flexdt.json of the same scan, which is taken away. The texts have fewer
+    digits."""
     whole = json.loads((data / "first scan" / "flexdt.json").read_text("utf-8"))
     shots = [f for f in whole["frames"] if f["kind"] == "projection"]
     shutil.copytree(data / "first scan", data / "texts")
@@ -128,7 +146,10 @@ def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> No
         told = asked(data, DatasetGet(name="texts"))
         assert told["same_machine"]
         assert told["times_s"] is None
-        assert (told["info"]["kV"], told["info"]["state"]) == (whole["tube"]["kV"], "complete")
+        assert (told["info"]["kV"], told["info"]["state"]) == (
+            whole["tube"]["kV"],
+            "complete",
+        )
         assert told["kinds"].count("projection") == FRAMES
         first = told["kinds"].index("projection")
         for motor, values in told["positions"].items():
@@ -143,7 +164,9 @@ def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> No
             assert frame["camera"] == there
             there = asked(data, DatasetFrame(name="first scan", index=first + index))
             assert frame["camera"] == there["camera"]
-        (data / "texts" / "io000000.tif").unlink()  # a link among the files is none of them
+        (
+            data / "texts" / "io000000.tif"
+        ).unlink()  # a link among the files is none of them
         (data / "texts" / "io000000.tif").symlink_to(data / "first scan" / "io000000.tif")
         told = asked(data, DatasetGet(name="texts"))
         assert "io000000.tif" not in told["files"]
@@ -153,8 +176,9 @@ def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> No
 
 
 def test_the_nearest_parts_are_those_the_check_finds(server: Process, data: Path) -> None:
-    """The dry run's least clearance is of the whole motion, so no image is nearer than it; and of
-    the sample's own shape, which the cylinder contains, so images of the scan may say less."""
+    """The dry run's least clearance is of the whole motion, so no image is nearer than it; and
+    of the sample's own shape, which the cylinder contains, so images of the scan may say
+    less."""
     with TwinClient(port=server.port) as client:
         near = client.dataset("first scan", measure=True).clearance_mm
         checked = client.check_script(fly_script(frames=FRAMES)).min_clearance_mm
@@ -192,7 +216,8 @@ def test_mean_counts_that_were_late_are_read_the_next_time(
 
 
 @pytest.mark.parametrize(
-    "name", ["..", ".", "../data", "first scan/..", "jobs", "no such", "con", "a:b", "/etc"]
+    "name",
+    ["..", ".", "../data", "first scan/..", "jobs", "no such", "con", "a:b", "/etc"],
 )
 def test_no_name_leads_anywhere_else(server: Process, name: str) -> None:
     with TwinClient(port=server.port) as client:
@@ -216,7 +241,9 @@ def garbled(folder: Path, rng: random.Random) -> None:
     file = rng.choice(sorted(f for f in folder.iterdir() if f.is_file()))
     raw = bytearray(file.read_bytes())
     for _ in range(rng.randrange(1, 40)):
-        raw[rng.randrange(min(len(raw), rng.choice([200, len(raw)])))] = rng.randrange(256)
+        raw[rng.randrange(min(len(raw), rng.choice([200, len(raw)])))] = rng.randrange(
+            256
+        )
     file.write_bytes(raw)
 
 
@@ -225,9 +252,13 @@ def lost(folder: Path, rng: random.Random) -> None:
     rng.choice(sorted(f for f in folder.iterdir() if f.is_file())).unlink()
 
 
-@pytest.mark.parametrize("file", ["flexdt.json", "io000000.tif", "scan_000001.tif", "none of all"])
+@pytest.mark.parametrize(
+    "file", ["flexdt.json", "io000000.tif", "scan_000001.tif", "none of all"]
+)
 @pytest.mark.daily(1)
-def test_replies_do_not_say_where_the_data_lie(server: Process, data: Path, file: str) -> None:
+def test_replies_do_not_say_where_the_data_lie(
+    server: Process, data: Path, file: str
+) -> None:
     """Errors and warnings about damaged files name them below the data directory."""
     folder = data / "spoilt"
     shutil.copytree(data / "first scan", folder)
@@ -345,7 +376,10 @@ def test_damage_is_said_and_nothing_else_is(
     root = tmp_path / "data"
     for name in ("scan", "sound"):
         shutil.copytree(data / "first scan", root / name)
-    done = [rng.choice([cut, garbled, lost, strange, other]) for _ in range(rng.choice([1, 1, 3]))]
+    done = [
+        rng.choice([cut, garbled, lost, strange, other])
+        for _ in range(rng.choice([1, 1, 3]))
+    ]
     for damage in done:
         try:
             damage(root / "scan", rng)
@@ -353,7 +387,11 @@ def test_damage_is_said_and_nothing_else_is(
             continue  # what it would damage has been damaged before
     found = answers(root)
     sound = next(info for info in found if info["name"] == "sound")
-    assert (sound["state"], sound["present"], sound["problem"]) == ("complete", FRAMES, "")
+    assert (sound["state"], sound["present"], sound["problem"]) == (
+        "complete",
+        FRAMES,
+        "",
+    )
     for info in found:
         there = [f for f in (root / info["name"]).glob("scan_*.tif") if f.is_file()]
         assert info["present"] <= len(there)
@@ -398,17 +436,23 @@ def test_odd_names_and_other_folders_are_no_data_sets(
         asked(tmp_path, DatasetGet(name="link"))
 
 
-def test_search_pages_and_what_is_running(data: Path, server: Process, tmp_path: Path) -> None:
+def test_search_pages_and_what_is_running(
+    data: Path, server: Process, tmp_path: Path
+) -> None:
     for k in range(5):
         shutil.copytree(data / "first scan", tmp_path / f"set-{k}")
         os.utime(tmp_path / f"set-{k}", (k, k))
     told = asked(tmp_path, DatasetList(count=2, start=1))
     assert [d["name"] for d in told["datasets"]] == ["set-3", "set-2"]
     assert told["total"] == 5
-    assert [d["name"] for d in listed(tmp_path, search="LEGO set-4 complete")] == ["set-4"]
+    assert [d["name"] for d in listed(tmp_path, search="LEGO set-4 complete")] == [
+        "set-4"
+    ]
     assert [d["name"] for d in listed(tmp_path, search="90kV set")][:1] == ["set-4"]
     assert listed(tmp_path, search="no such word") == []
-    states = {d["name"]: d["state"] for d in asked(tmp_path, DatasetList(), "set-1")["datasets"]}
+    states = {
+        d["name"]: d["state"] for d in asked(tmp_path, DatasetList(), "set-1")["datasets"]
+    }
     assert states == {f"set-{k}": "running" if k == 1 else "complete" for k in range(5)}
 
 
@@ -437,7 +481,9 @@ def test_folders_that_come_and_go_disturb_no_list(
     def unrest() -> None:
         k = 0
         while not over.is_set():
-            shutil.copytree(data / "first scan", root / f"goes {k % 3}", dirs_exist_ok=True)
+            shutil.copytree(
+                data / "first scan", root / f"goes {k % 3}", dirs_exist_ok=True
+            )
             shutil.rmtree(root / f"goes {k % 3}")
             k += 1
 

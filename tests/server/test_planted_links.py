@@ -1,9 +1,9 @@
 """Links under every name that a twin opens in its data directory: none is ever followed.
 
 A short life of a twin (an upload, corrections, a scan, a restart in the middle of another, its
-resumption, readings of past scans) is traced, and lived again with links in place of what it opened
-or changed: to a file that would be taken for the right one, to a directory that would, to nothing.
-The witness looks at what the system opened, not at what the twin says.
+resumption, readings of past scans) is traced, and lived again with links in place of what it
+opened or changed: to a file that would be taken for the right one, to a directory that would,
+to nothing. The witness looks at what the system opened, not at what the twin says.
 """
 
 from __future__ import annotations
@@ -42,7 +42,15 @@ DATED = re.compile(r"\d{4}-\d\d-\d\dT\d{6} ")
 NUMBERED = re.compile(r"(?<=\.part-)\d+-\d+-\d+$")
 ENDED = ("done", "failed", "aborted", "incomplete", "paused")
 FRAMES = 3
-PATHS = {"open", "os.listdir", "os.scandir", "os.mkdir", "os.rename", "os.remove", "os.rmdir"}
+PATHS = {
+    "open",
+    "os.listdir",
+    "os.scandir",
+    "os.mkdir",
+    "os.rename",
+    "os.remove",
+    "os.rmdir",
+}
 """Events of the interpreter whose first argument is a path."""
 OPENED: list[str] = []
 """Paths that were used whole, while `WATCHED` is the data directory."""
@@ -58,7 +66,9 @@ def heard(event: str, arguments: tuple[Any, ...]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def listening() -> Iterator[None]:
-    sys.addaudithook(heard)  # for the rest of the process: without `WATCHED` it does nothing
+    sys.addaudithook(
+        heard
+    )  # for the rest of the process: without `WATCHED` it does nothing
     yield
     WATCHED.clear()
 
@@ -170,26 +180,35 @@ class Life:
         asked.append(CalibrationFit(datasets=["first"], phantom="beads.toml"))
         for params in asked:
             try:
-                self.said.append(b"".join(work(self.data, params, around, Codec.JSON)).decode())
+                self.said.append(
+                    b"".join(work(self.data, params, around, Codec.JSON)).decode()
+                )
             except (TwinError, RpcError) as error:
                 self.refused.append(str(error))
 
 
 def content(folder: Path) -> dict[str, tuple[object, ...]]:
     return {
-        str(f.relative_to(folder)): (f.read_bytes() if f.is_file() else None, f.lstat().st_nlink)
+        str(f.relative_to(folder)): (
+            f.read_bytes() if f.is_file() else None,
+            f.lstat().st_nlink,
+        )
         for f in sorted(folder.rglob("*"))
     }
 
 
 def candidates(name: str) -> list[str]:
-    """The names that `name` of a traced life may be in another: dates and numbers are not known."""
+    """The names that `name` of a traced life may be in another: dates and numbers are not
+    known."""
     now = datetime.now(UTC)
     if DATED.search(name):
         moments = (now + timedelta(seconds=s) for s in range(60))
         return [DATED.sub(f"{m:%Y-%m-%dT%H%M%S} ", name) for m in moments]
     if NUMBERED.search(name):
-        start, who = next(directory._TEMPORARY_NUMBERS), f"{os.getpid()}-{name.split('-')[-2]}"
+        start, who = (
+            next(directory._TEMPORARY_NUMBERS),
+            f"{os.getpid()}-{name.split('-')[-2]}",
+        )
         return [NUMBERED.sub(f"{who}-{start + i}", name) for i in range(200)]
     return [name]
 
@@ -214,12 +233,16 @@ class Trace:
             WATCHED[:] = [life.data]
             life.second()
         assert OPENED == []
-        assert [r for r in life.refused if not r.startswith("calibration")] == life.refused
+        assert [
+            r for r in life.refused if not r.startswith("calibration")
+        ] == life.refused
         self.life = life
         named = life.sim.disk.named | {"beads.toml"}
         self.folders = sorted(n for n in named - {"."} if (self.whole / n).is_dir())
         files = sorted(named - {"."} - set(self.folders))
-        self.files = list({NUMBERED.sub("N", DATED.sub("D ", n)): n for n in files}.values())
+        self.files = list(
+            {NUMBERED.sub("N", DATED.sub("D ", n)): n for n in files}.values()
+        )
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +250,9 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> Trace:
     return Trace(tmp_path_factory.mktemp("trace"))
 
 
-def plant(trace: Trace, data: Path, victims: Path, names: Sequence[str], kind: str) -> list[str]:
+def plant(
+    trace: Trace, data: Path, victims: Path, names: Sequence[str], kind: str
+) -> list[str]:
     """Links under these names; returns what was planted."""
     planted = []
     for number, traced in enumerate(names):
@@ -283,14 +308,23 @@ def test_an_undisturbed_life_does_all_of_it(trace: Trace) -> None:
                    "first/scan_000000.tif", "first/flexdt.json", "first/script.txt",
                    "second/flexdt.json", ".part-", ".before-"):  # fmt: skip
         assert wanted in said, wanted
-    assert trace.folders == ["corrections", "first", "jobs", "jobs/status", "samples", "second"]
+    assert trace.folders == [
+        "corrections",
+        "first",
+        "jobs",
+        "jobs/status",
+        "samples",
+        "second",
+    ]
     assert (trace.whole / "second" / "scan_000002.tif").exists()
 
 
 @pytest.mark.parametrize("when", ["begin", "restart"])
 @pytest.mark.parametrize("kind", ["file", "directory", "nothing"])
 def test_no_link_is_followed(trace: Trace, tmp_path: Path, kind: str, when: str) -> None:
-    inner = [n for n in trace.folders if "/" in n]  # none below a link in the outer one's place
+    inner = [
+        n for n in trace.folders if "/" in n
+    ]  # none below a link in the outer one's place
     outer = [n for n in trace.folders if n not in inner]
     for what, names in (("files", trace.files), ("outer", outer), ("inner", inner)):
         live(trace, tmp_path / what, names, kind, when)

@@ -42,7 +42,11 @@ def test_each_kind_of_value_is_read() -> None:
     given = ["--projector", "[::1]:7", "--data", "d", "--fresh", "--limit", "a=1", "--limit", "b=2",
              "--http-port", "0", "--physics", "poly"]  # fmt: skip
     found = parse(TwinSettings, given)
-    assert (found.projector, found.data, found.fresh) == (Address("::1", 7), Path("d"), True)
+    assert (found.projector, found.data, found.fresh) == (
+        Address("::1", 7),
+        Path("d"),
+        True,
+    )
     assert (found.limit, found.http_port, found.physics) == (("a=1", "b=2"), 0, "poly")
     assert parse(ProjectorSettings, ["--memory-limit", "2KiB"]).memory_limit == 2048
 
@@ -97,7 +101,8 @@ def test_up_leaves_the_data_directory_of_the_viewer_open() -> None:
 
 
 def test_a_data_directory_is_locked_without_a_file_in_it(tmp_path: Path) -> None:
-    """Nothing there can be deleted, or be a link to another file, of which `.lock` once was one."""
+    """Nothing there can be deleted, or be a link to another file, of which `.lock` once was
+    one."""
     victim, data = tmp_path / "victim", tmp_path / "data"
     data.mkdir()
     victim.write_text("somebody's")

@@ -1,7 +1,7 @@
 """Meshes on the projector: exact paths, uploads in pieces, what does not close.
 
-The witness of the paths is the box or ball that the mesh stands for, as an analytic solid, and for
-drawn meshes every ray met with every triangle.
+The witness of the paths is the box or ball that the mesh stands for, as an analytic solid, and
+for drawn meshes every ray met with every triangle.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ def views(rng: np.random.Generator, n: int) -> np.ndarray:
         ahead /= np.linalg.norm(ahead)
         u = np.cross(ahead, rng.normal(size=3))
         u /= np.linalg.norm(u)
-        rows.append(np.concatenate([-60 * ahead, 40 * ahead, 0.5 * u, 0.5 * np.cross(ahead, u)]))
+        rows.append(
+            np.concatenate([-60 * ahead, 40 * ahead, 0.5 * u, 0.5 * np.cross(ahead, u)])
+        )
     return np.array(rows)
 
 
@@ -116,9 +118,19 @@ def test_what_is_no_closed_mesh_is_refused_and_the_server_lives_on() -> None:
             (corners, far, {}, "names vertex 8"),
             (corners, negative, {}, "names vertex"),
             (corners, faces, {"start": 8}, "does not fit"),
-            (corners, faces, {"mesh": {"vertices": 9, "triangles": 13, "name": 1}}, "name"),
+            (
+                corners,
+                faces,
+                {"mesh": {"vertices": 9, "triangles": 13, "name": 1}},
+                "name",
+            ),
             (corners, faces, {"mesh": {"vertices": 3, "triangles": 12}}, "vertices"),
-            (corners, faces, {"grid": {"shape": [1, 1, 1], "voxel_mm": [1, 1, 1]}}, "give one of"),
+            (
+                corners,
+                faces,
+                {"grid": {"shape": [1, 1, 1], "voxel_mm": [1, 1, 1]}},
+                "give one of",
+            ),
             (corners, faces, {"data": None}, "data"),
         ]
         for points, triangles, more, says in cases:
@@ -129,7 +141,9 @@ def test_what_is_no_closed_mesh_is_refused_and_the_server_lives_on() -> None:
         await put(corners, faces)
         with pytest.raises(RpcError, match="has no voxels"):
             await client.client.ask("volume.get", {"name": "m"})
-        assert (await client.project("m", views(np.random.default_rng(1), 1), SHAPE)).any()
+        assert (
+            await client.project("m", views(np.random.default_rng(1), 1), SHAPE)
+        ).any()
 
     run(body)
 

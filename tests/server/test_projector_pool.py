@@ -63,7 +63,9 @@ class Stand:
         self.check()
         del self.held[name]
 
-    async def project(self, name: str, body: Scene, views: ConeVec, shape: tuple[int, int]) -> Any:
+    async def project(
+        self, name: str, body: Scene, views: ConeVec, shape: tuple[int, int]
+    ) -> Any:
         self.calls.append(asyncio.get_running_loop().time())
         self.busy += 1
         self.most = max(self.most, self.busy)
@@ -90,7 +92,9 @@ def pool_of(*stands: Stand) -> ProjectorPool:
     return ProjectorPool(stands, patience_s=10.0)  # type: ignore[arg-type]
 
 
-def test_views_are_dealt_by_speed_and_a_volume_of_the_same_name_replaces_the_old_one() -> None:
+def test_views_are_dealt_by_speed_and_a_volume_of_the_same_name_replaces_the_old_one() -> (
+    None
+):
     quick, slow = Stand(1, pace_s=0.01), Stand(2, pace_s=0.04)
 
     async def work() -> None:
@@ -103,15 +107,22 @@ def test_views_are_dealt_by_speed_and_a_volume_of_the_same_name_replaces_the_old
         assert len(quick.calls) == pytest.approx(80, abs=4)
         assert len(quick.calls) + len(slow.calls) == 100
         assert (quick.most, slow.most) == (2, 2)
-        assert pool.views == {"host:1": 4 * len(quick.calls), "host:2": 4 * len(slow.calls)}
+        assert pool.views == {
+            "host:1": 4 * len(quick.calls),
+            "host:2": 4 * len(slow.calls),
+        }
         await pool.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.7),)))
-        again = await asyncio.gather(*(pool.project("s", VIEWS, (2, 2)) for _ in range(20)))
+        again = await asyncio.gather(
+            *(pool.project("s", VIEWS, (2, 2)) for _ in range(20))
+        )
         assert {round(float(image.max()), 6) for image in again} == {0.7}
 
     on_virtual_time(work)
 
 
-def test_one_that_is_stopped_delays_only_what_it_has_and_works_again_when_it_goes_on() -> None:
+def test_one_that_is_stopped_delays_only_what_it_has_and_works_again_when_it_goes_on() -> (
+    None
+):
     async def work() -> None:
         good, other = Stand(1), Stand(2)
         pool = pool_of(good, other)
@@ -134,7 +145,9 @@ def test_one_that_is_stopped_delays_only_what_it_has_and_works_again_when_it_goe
     on_virtual_time(work)
 
 
-def test_what_is_lost_goes_to_another_and_the_lost_one_is_asked_again_after_a_rest() -> None:
+def test_what_is_lost_goes_to_another_and_the_lost_one_is_asked_again_after_a_rest() -> (
+    None
+):
     async def work() -> None:
         loop = asyncio.get_running_loop()
         back_at = loop.time() + 3.0

@@ -56,7 +56,9 @@ def test_ready_line_service_and_sigterm() -> None:
 
         async def talk() -> None:
             async with ProjectorUser(port=ready["port"]) as client:
-                await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
+                await client.put(
+                    "s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),))
+                )
                 row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
                 seen = await client.project("s", row, (31, 41))
                 assert seen[0, 15, 20] == np.float32(2.0)
@@ -117,7 +119,9 @@ def test_a_projector_that_hangs_is_given_up_and_used_again(
 
         async def talk() -> None:
             async with ProjectorUser(port=port, patience_s=2.0) as client:
-                await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
+                await client.put(
+                    "s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),))
+                )
                 first = await client.project("s", row, (31, 41))
                 process.send_signal(signal.SIGSTOP)
                 for _ in range(2):  # the connection that stood, and one that is opened
@@ -134,7 +138,9 @@ def test_a_projector_that_hangs_is_given_up_and_used_again(
 
 
 @pytest.mark.slow
-def test_a_projector_that_computes_for_long_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_projector_that_computes_for_long_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(wire, "SILENT_S", 2.0)
     monkeypatch.setattr(wire, "ASK_AGAIN_S", 0.3)
     computing = threading.Event()

@@ -38,7 +38,9 @@ pytestmark = pytest.mark.usefixtures("on_processor")
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
-VOLUME = Volume(RNG.random((12, 10, 8), dtype=np.float32), (0.5, 0.6, 0.7), (0.1, -0.2, 0.3))
+VOLUME = Volume(
+    RNG.random((12, 10, 8), dtype=np.float32), (0.5, 0.6, 0.7), (0.1, -0.2, 0.3)
+)
 SCENE = Scene(
     (
         Solid(Sphere((1.0, 2.0, 3.0), 1.5), "steel", 0.8),
@@ -173,9 +175,13 @@ def test_a_volume_of_many_chunks_arrives_whole() -> None:
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("big", big)
         cone = views(1, 0.2)
-        assert_array_equal(await client.project("big", cone, SHAPE), forward(big, cone, SHAPE))
+        assert_array_equal(
+            await client.project("big", cone, SHAPE), forward(big, cone, SHAPE)
+        )
         await client.put("big", VOLUME)
-        assert_array_equal(await client.project("big", cone, SHAPE), forward(VOLUME, cone, SHAPE))
+        assert_array_equal(
+            await client.project("big", cone, SHAPE), forward(VOLUME, cone, SHAPE)
+        )
 
     run(body)
 
@@ -256,7 +262,12 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 async def keyed(link: ProjectorLink, row: ConeRows) -> Images:
-    params = {"volume": "v", "cone_vec": image.encode(row[None]), "detector": SHAPE, "key": "k"}
+    params = {
+        "volume": "v",
+        "cone_vec": image.encode(row[None]),
+        "detector": SHAPE,
+        "key": "k",
+    }
     return await link.ask_array("project", params, (1, *SHAPE))
 
 
@@ -360,7 +371,9 @@ def test_an_id_in_use_is_refused_and_the_first_request_goes_on(
     run(body)
 
 
-def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_gone_in_mid_request_leaves_no_work(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     gate = Gate(monkeypatch)
 
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
@@ -413,7 +426,11 @@ def test_the_memory_limit_is_an_error_that_says_what_is_left() -> None:
 
 def test_an_upload_of_a_client_that_goes_away_is_forgotten() -> None:
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
-        put = {"name": "x", "grid": {"shape": [4, 4, 4], "voxel_mm": [1, 1, 1]}, "data": b"1234"}
+        put = {
+            "name": "x",
+            "grid": {"shape": [4, 4, 4], "voxel_mm": [1, 1, 1]},
+            "data": b"1234",
+        }
         [reply] = await raw(server, {"id": 1, "method": "volume.put", "params": put})
         assert reply["result"]["received"] == 4
         await until(lambda: server.context.store.used == 0)
@@ -434,7 +451,9 @@ def test_the_wire_by_hand() -> None:
         )
         assert stored["result"]["complete"]
         assert seen["id"] == "b"
-        image = np.frombuffer(seen["result"]["data"], "<f4").reshape(seen["result"]["shape"])
+        image = np.frombuffer(seen["result"]["data"], "<f4").reshape(
+            seen["result"]["shape"]
+        )
         assert image.shape == (2, 3, 5)
         assert_allclose(image[:, 1, 2], 2 * 2.0 * 0.5, rtol=1e-6)  # through the centre
 
@@ -473,7 +492,10 @@ BAD += [
     (project_with(cone_vec=[["1"] * 12]), -32602),
     (project_with(cone_vec=[]), -32602),
     (project_with(cone_vec={"dtype": "object", "shape": [1, 12], "data": b""}), -32602),
-    (project_with(cone_vec={"dtype": "float64", "shape": [2, 12], "data": b"123"}), -32602),
+    (
+        project_with(cone_vec={"dtype": "float64", "shape": [2, 12], "data": b"123"}),
+        -32602,
+    ),
     (project_with(detector=[0, 5]), -32602),
     (project_with(detector=[30000, 30000]), -32008),
     (project_with(volume="w"), -32602),
@@ -518,7 +540,9 @@ def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
 
 
 @pytest.mark.parametrize("requests", [1, 60])
-def test_a_client_that_never_reads_is_cut_off_and_others_are_served(requests: int) -> None:
+def test_a_client_that_never_reads_is_cut_off_and_others_are_served(
+    requests: int,
+) -> None:
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("s", SCENE)
         _, writer = await asyncio.open_connection("127.0.0.1", server.port)
@@ -690,7 +714,9 @@ def test_a_projector_that_breaks_the_protocol_is_left(
 
     async def body() -> None:
         server = await asyncio.start_server(broken, "127.0.0.1", 0)
-        channel = await ProjectorLink.connect("127.0.0.1", server.sockets[0].getsockname()[1])
+        channel = await ProjectorLink.connect(
+            "127.0.0.1", server.sockets[0].getsockname()[1]
+        )
         async with asyncio.timeout(30.0):
             with pytest.raises(LinkLost, match=f"broke the protocol.*{why}"):
                 await channel.ask("health", {})
@@ -699,4 +725,6 @@ def test_a_projector_that_breaks_the_protocol_is_left(
 
     asyncio.run(body())
     level = logging.WARNING if kind == "half a frame" else logging.ERROR
-    assert {r.levelno for r in caplog.records if "broke the protocol" in r.getMessage()} == {level}
+    assert {
+        r.levelno for r in caplog.records if "broke the protocol" in r.getMessage()
+    } == {level}

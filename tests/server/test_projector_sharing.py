@@ -28,7 +28,9 @@ def run(work: Any, limit: int = LIMIT) -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=limit)
         one, other = (ProjectorUser(port=server.port) for _ in range(2))
-        pool = ProjectorPool([ProjectorClient(port=server.port), ProjectorClient(port=server.port)])
+        pool = ProjectorPool(
+            [ProjectorClient(port=server.port), ProjectorClient(port=server.port)]
+        )
         try:
             await asyncio.wait_for(work(server, one, other, pool), 300)
         finally:
@@ -42,7 +44,9 @@ def run(work: Any, limit: int = LIMIT) -> None:
 def test_equal_names_with_different_contents_are_two_things() -> None:
     """By turns, each twin gets its own: a cube of 24 mm is 24 mm and a little thick."""
 
-    async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
+    async def work(
+        server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool
+    ) -> None:
         twins = [(imaging_of(c, Shelf(thing=block(mu))), mu)
                  for c, mu in ((one, 0.01), (other, 0.03), (pool, 0.05))]  # fmt: skip
         for _ in range(3):
@@ -56,8 +60,12 @@ def test_equal_names_with_different_contents_are_two_things() -> None:
 
 
 def test_equal_contents_are_one_thing() -> None:
-    async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
-        found = [await brightest(imaging_of(c, Shelf(thing=block(0.02)))) for c in (one, other)]
+    async def work(
+        server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool
+    ) -> None:
+        found = [
+            await brightest(imaging_of(c, Shelf(thing=block(0.02)))) for c in (one, other)
+        ]
         assert found[0] == found[1] > 0.4
         assert len((await one.volumes()).volumes) == 1
 
@@ -66,7 +74,9 @@ def test_equal_contents_are_one_thing() -> None:
 
 @pytest.mark.parametrize("through_pool", [False, True])
 def test_two_versions_of_a_sample_stay_and_older_ones_go(through_pool: bool) -> None:
-    async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
+    async def work(
+        server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool
+    ) -> None:
         shelf = Shelf(thing=block(0.01), still=block(0.09))
         imaging = imaging_of(pool if through_pool else other, shelf)
         await brightest(imaging, "still")
@@ -84,7 +94,9 @@ def test_two_versions_of_a_sample_stay_and_older_ones_go(through_pool: bool) -> 
 
 
 def test_another_twin_gets_what_was_removed_once_more() -> None:
-    async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
+    async def work(
+        server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool
+    ) -> None:
         mine, shelf = imaging_of(one, Shelf(thing=block(0.01))), Shelf(thing=block(0.01))
         first = await brightest(mine)
         theirs = imaging_of(other, shelf)
@@ -100,7 +112,9 @@ def test_another_twin_gets_what_was_removed_once_more() -> None:
 def test_a_projector_that_is_full_forgets_versions_before_it_refuses() -> None:
     """Room for two and a half volumes of 64^3, of which each takes 2 MiB."""
 
-    async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
+    async def work(
+        server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool
+    ) -> None:
         shelf = Shelf(thing=block(0.01, 64), next=block(0.05, 64))
         imaging = imaging_of(one, shelf)
         for mu in (0.01, 0.02):
@@ -114,8 +128,12 @@ def test_a_projector_that_is_full_forgets_versions_before_it_refuses() -> None:
 
 
 def test_materials_of_a_sample_are_named_by_content_too(tmp_path: Path) -> None:
-    async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
-        imaging = Imaging(one, TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels)
+    async def work(
+        server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool
+    ) -> None:
+        imaging = Imaging(
+            one, TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels
+        )
         channels, paths, _ = await imaging.path_lengths(Sample("lego"), POSES, CAMERA)
         assert len(channels) == len(paths) > 1
         names = [v.name for v in (await one.volumes()).volumes]

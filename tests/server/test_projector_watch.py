@@ -32,13 +32,17 @@ class Standin:
         while self.how == "hangs":
             await asyncio.sleep(0.05)
         if self.how == "refuses":
-            raise ProjectorUnavailable(f"no projector at {self.host}:{self.port} (refused)")
+            raise ProjectorUnavailable(
+                f"no projector at {self.host}:{self.port} (refused)"
+            )
         if self.how == "errs":
             raise RpcError(Code.INTERNAL, "no figures")
         return {}
 
 
-def watched(clients: list[Standin], story: Callable[[ProjectorWatch], Awaitable[None]]) -> None:
+def watched(
+    clients: list[Standin], story: Callable[[ProjectorWatch], Awaitable[None]]
+) -> None:
     async def work() -> None:
         watch = ProjectorWatch(clients)
         task = asyncio.create_task(watch.run())

@@ -1,4 +1,5 @@
-"""Images by the whole physics: materials taken apart, the spectrum, frames in any order, lag."""
+"""Images by the whole physics: materials taken apart, the spectrum, frames in any order,
+lag."""
 
 from __future__ import annotations
 
@@ -16,7 +17,13 @@ import pytest
 import trimesh
 
 from flexdt.library.reading.folders import load_dataset
-from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
+from flexdt.phantoms import (
+    bead_phantom,
+    load_phantom,
+    material,
+    mesh_phantom,
+    voxel_phantom,
+)
 from flexdt.phantoms.channels import chain_through, channels, scatter_object
 from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
@@ -58,7 +65,13 @@ from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
 from flexdt.twin.physics.scatter import Beam, ScatterSettings, scatter_image
 from flexdt.twin.physics.tube import Filter, TubeModel, tube_spectrum
-from flexdt.twin.projection import TriangleMesh, Volume, forward, project_body, project_scene
+from flexdt.twin.projection import (
+    TriangleMesh,
+    Volume,
+    forward,
+    project_body,
+    project_scene,
+)
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.parse import parse_script
@@ -93,13 +106,18 @@ FLY = "\r\n".join(
 
 def radiography(tmp_path: Path, physics: str, **panel: float) -> Radiography:
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels
+        DirectProjector(),
+        TrueGeometry(),
+        SampleStore(open_data(tmp_path)),
+        M.detector.pixels,
     )
     made = Radiography.of(imaging, M, physics)  # type: ignore[arg-type]
     return replace(made, panel=replace(made.panel, **panel))
 
 
-def take(way: Radiography, sample: str, exposure: ExposureSettings = LISTING_1) -> Float32Array:
+def take(
+    way: Radiography, sample: str, exposure: ExposureSettings = LISTING_1
+) -> Float32Array:
     pose = poses(M, P, MIDDLE, {"rot_obj": [20.0]})
     return asyncio.run(way.take(Sample(sample), pose, MIDDLE, [exposure]))[0].integrals
 
@@ -124,12 +142,17 @@ def test_a_bead_displaces_its_body() -> None:
     parts = {c.material.name: c.body for c in channels(bead_phantom("normal", 1))}
     assert set(parts) == {"abs", "steel"}
     through = ConeVec(np.array([[8.0, -400, 0, 8.0, 200, 0, 1, 0, 0, 0, 0, -1]]))
-    assert project_scene(parts["steel"], through, (1, 1))[0, 0, 0] == pytest.approx(4.0, abs=1e-4)
-    assert project_scene(parts["abs"], through, (1, 1))[0, 0, 0] == pytest.approx(36.0, abs=1e-4)
+    assert project_scene(parts["steel"], through, (1, 1))[0, 0, 0] == pytest.approx(
+        4.0, abs=1e-4
+    )
+    assert project_scene(parts["abs"], through, (1, 1))[0, 0, 0] == pytest.approx(
+        36.0, abs=1e-4
+    )
 
 
 def test_the_twins_images_have_the_samples_scatter(tmp_path: Path) -> None:
-    """The witness: the same view by `fx.simulate`'s way, other photons, its geometry by hand."""
+    """The witness: the same view by `fx.simulate`'s way, other photons, its geometry by
+    hand."""
     phantom = load_phantom("lego")
     parts = channels(phantom)
     way = replace(radiography(tmp_path, "mono"), tube=SHARP)
@@ -164,7 +187,12 @@ def test_scatter_of_a_view_does_not_depend_on_the_views_beside_it(tmp_path: Path
     way = replace(radiography(tmp_path, "mono"), scatter="mc")
     angles = [3.0, 40.0, 170.0]
     together = asyncio.run(
-        way.take(Sample("lego"), poses(M, P, MIDDLE, {"rot_obj": angles}), MIDDLE, [LISTING_1] * 3)
+        way.take(
+            Sample("lego"),
+            poses(M, P, MIDDLE, {"rot_obj": angles}),
+            MIDDLE,
+            [LISTING_1] * 3,
+        )
     )
     for angle, image in zip(angles, together, strict=True):
         pose = poses(M, P, MIDDLE, {"rot_obj": [angle]})
@@ -174,9 +202,14 @@ def test_scatter_of_a_view_does_not_depend_on_the_views_beside_it(tmp_path: Path
 
 def test_ideal_physics_has_no_scatter(tmp_path: Path) -> None:
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels
+        DirectProjector(),
+        TrueGeometry(),
+        SampleStore(open_data(tmp_path)),
+        M.detector.pixels,
     )
-    with pytest.raises(LimitError, match="scatter mc needs physics mono or poly, not ideal"):
+    with pytest.raises(
+        LimitError, match="scatter mc needs physics mono or poly, not ideal"
+    ):
         Radiography.of(imaging, M, "ideal", "mc")
 
 
@@ -217,14 +250,18 @@ def test_a_spectrum_is_the_sum_over_its_energies(tmp_path: Path) -> None:
     way = replace(radiography(tmp_path, "poly"), tube=SHARP)
     got = take(way, "lego")
     phantom = load_phantom("lego")
-    cone = TrueGeometry().cone_vec(poses(M, P, MIDDLE, {"rot_obj": [20.0]}), Sample().offset)
+    cone = TrueGeometry().cone_vec(
+        poses(M, P, MIDDLE, {"rot_obj": [20.0]}), Sample().offset
+    )
     mu, paths = [], []
     for channel in channels(phantom):
         assert isinstance(channel.body, Scene)
         mu.append(channel.material.substance.attenuation())
         paths.append(project_scene(channel.body, cone, MIDDLE.shape)[0].ravel()[::37])
     signal, _ = weights_of(Chain(way.panel, way.tube), 90.0)
-    through = np.exp(-np.array(paths, dtype=float).T @ np.array(mu)) @ signal / signal.sum()
+    through = (
+        np.exp(-np.array(paths, dtype=float).T @ np.array(mu)) @ signal / signal.sum()
+    )
     np.testing.assert_allclose(np.exp(-got.ravel()[::37]), through, rtol=1e-3)
     assert through.min() < 0.2  # beads were met
     ideal = take(radiography(tmp_path, "ideal"), "lego").ravel()[::37]
@@ -270,11 +307,15 @@ def test_filters_and_focal_spot_are_the_machine_file_s(tmp_path: Path) -> None:
         tube_spectrum(20.0, TubeModel((Filter(Substance.parse("Pb@11.3"), 100.0),)))
 
 
-def test_rays_from_points_of_the_focal_spot_blur_each_depth_as_it_is(tmp_path: Path) -> None:
+def test_rays_from_points_of_the_focal_spot_blur_each_depth_as_it_is(
+    tmp_path: Path,
+) -> None:
     """The witness: transmission averaged over a grid of sources."""
     fwhm, keV = 0.4, stated_keV()
     spot = f"smallest_spot_mm = {fwhm}\nspot_points = 48"
-    own = parse_machine(re.sub("smallest_spot_mm = .*", spot, FLEXRAY.read_text()), "own.toml")
+    own = parse_machine(
+        re.sub("smallest_spot_mm = .*", spot, FLEXRAY.read_text()), "own.toml"
+    )
     way = radiography(tmp_path, "mono")
     made = Radiography.of(way.imaging, own, "mono")
     assert TubeModel.of_figures(made.record()) == made.tube
@@ -317,7 +358,9 @@ def test_tube_and_camera_have_their_effect(tmp_path: Path) -> None:
     assert 8_000 < base < 14_000
     assert abs(dark) < 10
     assert level(replace(LISTING_1, power_W=25.0)) == pytest.approx(base / 2, rel=0.01)
-    assert level(replace(LISTING_1, exposure_ms=50.0)) == pytest.approx(base / 2, rel=0.01)
+    assert level(replace(LISTING_1, exposure_ms=50.0)) == pytest.approx(
+        base / 2, rel=0.01
+    )
     assert level(replace(LISTING_1, kV=60.0)) < 0.75 * base
     far = poses(M, P, MIDDLE, {"mag_det": [700.0]})
     short = replace(LISTING_1, exposure_ms=20.0)
@@ -358,7 +401,9 @@ def test_lag_comes_from_the_poses_before(tmp_path: Path) -> None:
     assert more.mean() > 500
     first = frames(tmp_path, [[1]], lag_fraction=0.2, lag_s=0.5)
     plain = frames(tmp_path, [[1]], lag_fraction=0.0)
-    assert all(np.array_equal(first[n], plain[n]) for n in first)  # only a dark came before
+    assert all(
+        np.array_equal(first[n], plain[n]) for n in first
+    )  # only a dark came before
 
 
 def test_traps_give_back_what_they_took(tmp_path: Path) -> None:
@@ -398,7 +443,9 @@ def test_traps_give_back_what_they_took(tmp_path: Path) -> None:
 
 
 def test_the_machine_file_states_the_traps(tmp_path: Path) -> None:
-    detector = M.detector.model_copy(update={"long_lag_fraction": 0.004, "long_lag_s": 3.0})
+    detector = M.detector.model_copy(
+        update={"long_lag_fraction": 0.004, "long_lag_s": 3.0}
+    )
     own = M.model_copy(update={"detector": detector})
     way = radiography(tmp_path, "poly")
     made = Radiography.of(way.imaging, own, "poly")
@@ -428,10 +475,17 @@ def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:
     chain = Chain(made.panel, made.tube, (aluminium,), (40.0,))
     signal, noise = weights_of(chain, 90.0)
     through = np.exp(-20.0 * aluminium.attenuation())
-    assert signal @ through / signal.sum() == pytest.approx(behind @ left / (fluence @ left))
-    assert (noise >= signal**2 / np.maximum(fluence, 1e-300)).all()  # no less than Poisson's
+    assert signal @ through / signal.sum() == pytest.approx(
+        behind @ left / (fluence @ left)
+    )
+    assert (
+        noise >= signal**2 / np.maximum(fluence, 1e-300)
+    ).all()  # no less than Poisson's
     plain = weights_of(Chain(Detector(), made.tube, (aluminium,), (40.0,)), 90.0)[0]
-    assert abs(plain @ through / plain.sum() / (signal @ through / signal.sum()) - 1.0) > 0.02
+    assert (
+        abs(plain @ through / plain.sum() / (signal @ through / signal.sum()) - 1.0)
+        > 0.02
+    )
 
 
 @pytest.mark.parametrize(
@@ -447,7 +501,9 @@ def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:
 def test_responses_that_no_detector_has(curve: str, said: str) -> None:
     text = FLEXRAY.read_text()
     with pytest.raises(MachineFileError, match=re.escape(said)):
-        parse_machine(text.replace("[detector]", f"[detector]\nresponse = {curve}", 1), "own.toml")
+        parse_machine(
+            text.replace("[detector]", f"[detector]\nresponse = {curve}", 1), "own.toml"
+        )
 
 
 def test_a_resumed_scan_keeps_its_physics() -> None:
@@ -470,14 +526,21 @@ def test_the_data_set_says_what_made_it(tmp_path: Path) -> None:
     assert figures["physics_poly"] == 1.0
     assert figures["scintillator_CsI@4.51"] == 1.0
     assert figures["full_well_e_high"] == 1.6e6
-    assert set(radiography(tmp_path, "ideal").record()) >= {"i0_counts", "read_noise_counts"}
+    assert set(radiography(tmp_path, "ideal").record()) >= {
+        "i0_counts",
+        "read_noise_counts",
+    }
 
 
 @pytest.mark.parametrize(("physics", "weak"), [("ideal", 0.1), ("poly", 0.12)])
-def test_flags_say_what_is_wrong_with_an_image(tmp_path: Path, physics: str, weak: float) -> None:
+def test_flags_say_what_is_wrong_with_an_image(
+    tmp_path: Path, physics: str, weak: float
+) -> None:
     way = radiography(tmp_path, physics)
 
-    def flags(camera: CameraSettings, exposure: ExposureSettings, sample: str, **at: float):
+    def flags(
+        camera: CameraSettings, exposure: ExposureSettings, sample: str, **at: float
+    ):
         pose = poses(M, P, camera, {n: [v] for n, v in at.items()})
         image = asyncio.run(way.take(Sample(sample), pose, camera, [exposure]))[0]
         return flags_of(way, image, camera, exposure, 1.5)
@@ -545,7 +608,8 @@ def test_marks_are_what_the_saved_counts_say(tmp_path: Path, physics: str) -> No
 
 
 def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
-    """All the way: the server's own submissions make images by the physics it was started with."""
+    """All the way: the server's own submissions make images by the physics it was started
+    with."""
 
     async def body() -> None:
         twin = TwinServer(
@@ -603,8 +667,12 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
         with pytest.raises(LimitError, match=r"\[20, 90\]"):
             await set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
         assert twin.scanner.tube.kV == 90.0
-        plain = TwinServer(M, P, DirectProjector(), open_data(tmp_path / "ideal"), speed_up="max")
-        assert _document(await plain.submissions.check(ScanSource(text), Codec.JSON))["ok"]
+        plain = TwinServer(
+            M, P, DirectProjector(), open_data(tmp_path / "ideal"), speed_up="max"
+        )
+        assert _document(await plain.submissions.check(ScanSource(text), Codec.JSON))[
+            "ok"
+        ]
 
     asyncio.run(body())
 
@@ -637,8 +705,11 @@ def test_a_machine_that_starts_without_a_spectrum_is_refused() -> None:
     assert with_spectra(M, "mono").tube.max_kV == M.tube.max_kV
 
 
-def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(tmp_path: Path) -> None:
-    """As when a scan that was begun with another physics is taken up: nothing checked it then."""
+def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(
+    tmp_path: Path,
+) -> None:
+    """As when a scan that was begun with another physics is taken up: nothing checked it
+    then."""
 
     async def body() -> None:
         twin = TwinServer(
@@ -671,13 +742,19 @@ def test_meshes_and_voxels_are_taken_apart_too() -> None:
     view = ConeVec(np.array([[0, -400, 0, 0, 200, 0, 0.9, 0, 0, 0, 0, -0.9]]))
     ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
     mesh = mesh_phantom(
-        ball.export(file_type="stl"), unit="mm", material="C8H8@1.05", file_type="stl", name="ball"
+        ball.export(file_type="stl"),
+        unit="mm",
+        material="C8H8@1.05",
+        file_type="stl",
+        name="ball",
     )
     (one,) = channels(mesh)
     assert one.material.name == "C8H8@1.05"
     assert isinstance(one.body, TriangleMesh)
     assert project_body(one.body, view, (1, 1))[0, 0, 0] == pytest.approx(20.0, rel=0.01)
-    voxels = voxel_phantom(np.full((20, 20, 20), 0.05, np.float32), (1.0, 1.0, 1.0), name="cube")
+    voxels = voxel_phantom(
+        np.full((20, 20, 20), 0.05, np.float32), (1.0, 1.0, 1.0), name="cube"
+    )
     (water,) = channels(voxels)
     assert "water" in water.assumed
     assert isinstance(water.body, Volume)

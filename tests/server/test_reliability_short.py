@@ -34,7 +34,9 @@ def test_kill_9_loses_nothing() -> None:
 
 @pytest.mark.campaign
 def test_servers_whose_disk_fails_do_nothing_by_halves() -> None:
-    assert "0 things were wrong" in run("faults.py", "writes", "--count", "2", "--seed", "4")
+    assert "0 things were wrong" in run(
+        "faults.py", "writes", "--count", "2", "--seed", "4"
+    )
 
 
 def test_absurd_values_in_every_field(tmp_path: Path) -> None:
@@ -51,13 +53,17 @@ def test_attacks_get_nothing() -> None:
 
 @pytest.mark.campaign
 def test_new_clients_are_answered_beside_a_flood_of_connections() -> None:
-    run("floods.py", "--connections", "40")  # it fails without an answer, or with a long log
+    run(
+        "floods.py", "--connections", "40"
+    )  # it fails without an answer, or with a long log
 
 
 @pytest.mark.campaign
 def test_an_old_twin_costs_what_a_young_one_does() -> None:
     few = ("--samples", "60", "--corrections", "60", "--scans", "5", "--requests", "20")
-    out = run("age.py", "--jobs", "20000", *few, "--no-times")  # a busy machine changes times
+    out = run(
+        "age.py", "--jobs", "20000", *few, "--no-times"
+    )  # a busy machine changes times
     assert "0 figures have grown" in out
 
 

@@ -63,7 +63,9 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
         before = wire.call("state.get")
         wire.call("clock.set", speed_up=1)  # slow, so that the kill comes in the midst
         job = wire.call("script.submit", text=fly_script(31), name="cut", seed=4)["job"]
-        queued = wire.call("script.submit", text=fly_script(3), name="later", seed=4)["job"]
+        queued = wire.call("script.submit", text=fly_script(3), name="later", seed=4)[
+            "job"
+        ]
         while wire.call("job.status", job=job)["frames_done"] < 7:
             time.sleep(0.01)
         process = restarted(process, rays, data, "--speed-up", "max")
@@ -75,7 +77,9 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
         assert state["axes"]["tra_obj"]["speed"] == 3.0
         assert state["tube"]["kV"] == 70.0
         assert state["tube"]["on"] is False  # X-rays never come on by themselves
-        assert state["axes"]["mag_obj"]["position"] == before["axes"]["mag_obj"]["position"]
+        assert (
+            state["axes"]["mag_obj"]["position"] == before["axes"]["mag_obj"]["position"]
+        )
         jobs = {j["job"]: j for j in wire.call("job.list")["jobs"]}
         assert jobs[whole["job"]]["state"] == "done"
         assert jobs[job]["state"] == jobs[queued]["state"] == "incomplete"
@@ -94,7 +98,9 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
         assert correction_of(data / "cut") == correction_of(data / "whole")
         assert {n: (data / "cut" / n).stat().st_mtime_ns for n in stamps} == stamps
         assert wire.wait(queued, "done", "failed")["state"] == "done"
-        assert correction_of(data / "later")["name"] == "another", "none of its frames were made"
+        assert correction_of(data / "later")["name"] == "another", (
+            "none of its frames were made"
+        )
         with pytest.raises(Refused, match="-32003"):
             wire.call("job.resume", job=job)
     finally:
@@ -111,7 +117,10 @@ def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
         wire = Wire(process.port)
         wire.call("axes.move", targets={"rot_obj": 720.0})
         until_written(data, lambda memory: memory["scene"]["positions"]["rot_obj"] > 1.0)
-        seen, begun = wire.call("state.get")["axes"]["rot_obj"]["position"], time.monotonic()
+        seen, begun = (
+            wire.call("state.get")["axes"]["rot_obj"]["position"],
+            time.monotonic(),
+        )
         process.kill()
         longest = 22.5 * (time.monotonic() - begun)
         process = twin(rays.port, data)

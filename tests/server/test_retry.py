@@ -40,8 +40,12 @@ def test_each_pause_is_twice_the_last_one_up_to_the_longest() -> None:
             done = asyncio.Event()
             begun = now()
             attempts.schedule(ProjectorUnavailable("gone"), done.set)
-            assert attempts.waits_s == pytest.approx(2.0 ** len(pauses) if len(pauses) < 5 else 30)
-            attempts.schedule(ProjectorUnavailable("gone"), pytest.fail)  # the pending one stays
+            assert attempts.waits_s == pytest.approx(
+                2.0 ** len(pauses) if len(pauses) < 5 else 30
+            )
+            attempts.schedule(
+                ProjectorUnavailable("gone"), pytest.fail
+            )  # the pending one stays
             await done.wait()
             pauses.append(now() - begun)
             assert attempts.waits_s is None
@@ -96,7 +100,7 @@ def test_which_errors_waiting_may_help() -> None:
     assert transient(ProjectorUnavailable("gone"))
     assert not transient(None)
     assert not transient(LimitError("far"))
-    assert [hopeless(e) for e in (LimitError("a"), GeometryError("b"), TwinError("c"))] == [
-        True
-    ] * 3
+    assert [
+        hopeless(e) for e in (LimitError("a"), GeometryError("b"), TwinError("c"))
+    ] == [True] * 3
     assert not hopeless(full)

@@ -1,4 +1,5 @@
-"""The scan runner with a fake projector and sink: the same frames whatever happens on the way."""
+"""The scan runner with a fake projector and sink: the same frames whatever happens on the
+way."""
 
 from __future__ import annotations
 
@@ -16,7 +17,12 @@ from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng
+from flexdt.twin.physics.exposure import (
+    ExposureSettings,
+    IdealResponse,
+    expose,
+    frame_rng,
+)
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.script.parse import parse_script
@@ -62,7 +68,9 @@ def fly_plan() -> ScanPlan:
 class Lab:
     """A scanner, a clock and a sink in memory."""
 
-    def __init__(self, plan: ScanPlan, speed_up: float | str = "max", **options: object) -> None:
+    def __init__(
+        self, plan: ScanPlan, speed_up: float | str = "max", **options: object
+    ) -> None:
         self.plan = plan
         wall = asyncio.get_running_loop().time
         self.clock = TwinClock(speed_up, wall=wall)  # type: ignore[arg-type]
@@ -88,7 +96,9 @@ class Lab:
             assert e.file not in self.made
             thickness = sum(e.positions.values()) % 3.0
             image = np.full((8, 8), thickness, dtype=np.float32)
-            tube = ExposureSettings(e.kV, e.power_W, e.exposure_ms, e.averages, e.xrays_on)
+            tube = ExposureSettings(
+                e.kV, e.power_W, e.exposure_ms, e.averages, e.xrays_on
+            )
             counts = expose(IdealResponse(), image, tube, frame_rng(4, e.index))
             self.made[e.file] = counts.tobytes()
 
@@ -148,7 +158,9 @@ def test_motion_follows_the_plan_and_frames_are_where_the_motor_is() -> None:
         await lab.runner.run()
         origin = lab.runner.origin
         for tau in np.linspace(0.0, lab.plan.duration_s, 3000):
-            actual = lab.scanner.positions(origin + tau)  # the programme is still in force
+            actual = lab.scanner.positions(
+                origin + tau
+            )  # the programme is still in force
             for axis, x in lab.plan.positions(tau).items():
                 assert actual[axis] == pytest.approx(float(x), abs=1e-9)
         assert origin > 0.0
@@ -176,15 +188,21 @@ def test_a_frame_that_a_pause_falls_into_is_exposed_again_at_the_speed_of_the_sc
         async def before(batch: Sequence[Exposure]) -> None:
             for e in batch:
                 ends = lab.runner.origin + e.start_s + e.duration_s
-                assert lab.clock.now() >= ends - 1e-6, "handed on before its exposure has ended"
+                assert lab.clock.now() >= ends - 1e-6, (
+                    "handed on before its exposure has ended"
+                )
                 times = lab.runner.origin + e.start_s + np.linspace(0.0, e.duration_s, 50)
-                exposed[str(e.file)] = [lab.scanner.velocities(t)["rot_obj"] for t in times]
+                exposed[str(e.file)] = [
+                    lab.scanner.velocities(t)["rot_obj"] for t in times
+                ]
 
         lab.before = before
         task = asyncio.create_task(lab.runner.run())
         within = frame.start_s + share * frame.duration_s
         await lab.until(lambda: lab.runner.progress.tau >= frame.start_s)
-        lab.clock.set_speed_up(1.0)  # so that the pause comes within the frame on any machine
+        lab.clock.set_speed_up(
+            1.0
+        )  # so that the pause comes within the frame on any machine
         await lab.clock.sleep_until(lab.runner.origin + within)
         lab.runner.pause()
         await lab.until(lambda: lab.runner.progress.phase == "paused")
@@ -226,7 +244,9 @@ def test_pausing_moving_by_hand_and_resuming_gives_the_same_bytes() -> None:
     run(body)
 
 
-def test_resume_first_returns_and_then_passes_the_pose_of_the_pause_at_scan_speed() -> None:
+def test_resume_first_returns_and_then_passes_the_pose_of_the_pause_at_scan_speed() -> (
+    None
+):
     plan = fly_plan()
     moment = plan.exposures[4].start_s + 0.3
     way = rejoin(plan, moment, {n: a.acceleration for n, a in M.axes.items()})
@@ -271,7 +291,9 @@ def test_step_runs_one_frame_or_command_at_a_time() -> None:
     run(body)
 
 
-def test_each_step_runs_something_where_the_pause_met_a_frame_that_waited_for_room() -> None:
+def test_each_step_runs_something_where_the_pause_met_a_frame_that_waited_for_room() -> (
+    None
+):
     async def body() -> None:
         lab = Lab(plan_poses([{"rot_obj": float(i)} for i in range(60)], M, P, 10.0))
         go = asyncio.Event()
@@ -331,7 +353,9 @@ def test_a_resume_that_is_refused_leaves_what_is_moved_by_hand(
     run(body)
 
 
-def test_a_projector_that_fails_pauses_the_job_and_nothing_is_lost_or_done_twice() -> None:
+def test_a_projector_that_fails_pauses_the_job_and_nothing_is_lost_or_done_twice() -> (
+    None
+):
     expected = reference()
 
     async def body() -> None:
@@ -359,7 +383,9 @@ def test_a_projector_that_fails_pauses_the_job_and_nothing_is_lost_or_done_twice
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_frames_that_nobody_can_make_end_the_run_and_do_not_pause_it(paused: bool) -> None:
+def test_frames_that_nobody_can_make_end_the_run_and_do_not_pause_it(
+    paused: bool,
+) -> None:
     async def body() -> None:
         lab = Lab(fly_plan())
 
@@ -368,7 +394,9 @@ def test_frames_that_nobody_can_make_end_the_run_and_do_not_pause_it(paused: boo
                 if paused:
                     lab.runner.pause()
                     await lab.until(lambda: lab.runner.progress.phase == "paused")
-                raise LimitError("no spectrum for 15 kV", {"asked": 15.0, "allowed": [20.0, 240.0]})
+                raise LimitError(
+                    "no spectrum for 15 kV", {"asked": 15.0, "allowed": [20.0, 240.0]}
+                )
 
         lab.before = before
         with pytest.raises(LimitError, match="no spectrum"):

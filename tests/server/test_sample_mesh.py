@@ -39,14 +39,18 @@ def read(stl: bytes) -> Any:
     return trimesh.load(io.BytesIO(stl), file_type="stl")
 
 
-def test_the_shape_of_an_upload_comes_back_and_its_revision_changes(server: Process) -> None:
+def test_the_shape_of_an_upload_comes_back_and_its_revision_changes(
+    server: Process,
+) -> None:
     with TwinClient(port=server.port) as client:
         with pytest.raises(RpcError, match="nothing stands on the stage"):
             client.sample_mesh()
         revisions = []
         for height in (8.0, 8.0, 9.0):
             mesh = angle(height)
-            client.upload_mesh(mesh.export(file_type="stl"), "angle", format="stl", unit="mm")
+            client.upload_mesh(
+                mesh.export(file_type="stl"), "angle", format="stl", unit="mm"
+            )
             client.set_sample(file="angle")
             revisions.append(client.state().sample.revision)
             got = read(client.sample_mesh())
@@ -70,7 +74,9 @@ def test_every_format_that_the_wire_names_is_read(server: Process, form: str) ->
     raw = raw.encode() if isinstance(raw, str) else raw
     with TwinClient(port=server.port) as client:
         assert form in MESH_FORMATS
-        done = client.upload_mesh(raw, f"as-{form}", format=form, unit="mm", material="pmma")
+        done = client.upload_mesh(
+            raw, f"as-{form}", format=form, unit="mm", material="pmma"
+        )
         assert done.complete
         client.set_sample(file=f"as-{form}")
         sample = client.state().sample
@@ -86,16 +92,22 @@ def test_every_format_that_the_wire_names_is_read(server: Process, form: str) ->
                 client.upload_mesh(raw, "unsaid", format=form)
 
 
-def test_a_file_that_claims_what_it_has_not_is_an_error_and_nothing_more(server: Process) -> None:
+def test_a_file_that_claims_what_it_has_not_is_an_error_and_nothing_more(
+    server: Process,
+) -> None:
     claim = (
         b'{"asset":{"version":"2.0"},"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],'
         b'"meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}],'
         b'"accessors":[{"componentType":5126,"count":30000000,"type":"VEC3"}]}'
     )
     claim += b" " * (-len(claim) % 4)
-    raw = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(claim), len(claim), b"JSON") + claim
+    raw = (
+        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(claim), len(claim), b"JSON") + claim
+    )
     with TwinClient(port=server.port) as client:
-        with pytest.raises(RpcError, match="not a readable GLB file: accessor 0") as refused:
+        with pytest.raises(
+            RpcError, match="not a readable GLB file: accessor 0"
+        ) as refused:
             client.upload_mesh(raw, "claim", format="glb")
         assert refused.value.code == -32602
         assert "claim" not in [s.name for s in client.samples().samples]
@@ -130,7 +142,9 @@ def box(client: TwinClient, side: float) -> list[str]:
     return list(client.upload_mesh(stl, "thing", format="stl", unit="mm").warnings)
 
 
-def test_another_file_under_the_same_name_is_what_stands_and_collides(server: Process) -> None:
+def test_another_file_under_the_same_name_is_what_stands_and_collides(
+    server: Process,
+) -> None:
     with TwinClient(port=server.port) as client:
         box(client, 10.0)
         client.set_sample(file="thing")

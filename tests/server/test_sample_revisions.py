@@ -22,7 +22,9 @@ FRAMES = 12
 class Shows(PointProjector):
     """Every content has a brightness of its own."""
 
-    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
         lines = await super().project(name, cone_vec, shape)
         return lines + np.float32(zlib.crc32(name.encode()) % 1000 / 1000)
 
@@ -98,7 +100,9 @@ def test_a_paused_scan_goes_on_with_the_file_it_began_with(
     scene.call("job.resume")
     job = scene.until(lambda job: job["error"] is not None)
     assert (job["state"], job["error"]["code"]) == ("paused", -32003)
-    assert "'mine' has been uploaded anew since this scan began" in job["error"]["message"]
+    assert (
+        "'mine' has been uploaded anew since this scan began" in job["error"]["message"]
+    )
     assert job["frames_done"] == before["frames_done"]
     scene.upload(0.1)
     scene.call("job.resume")
@@ -144,7 +148,9 @@ def test_an_interrupted_scan_is_refused_while_another_file_has_the_name(
     assert scene.images("a") == scene.whole()
 
 
-def test_what_an_older_server_wrote_is_resumed_and_pinned_from_then_on(scene: Scene) -> None:
+def test_what_an_older_server_wrote_is_resumed_and_pinned_from_then_on(
+    scene: Scene,
+) -> None:
     """It knew of no revision."""
     scene.begin("a")
     scene.killed()

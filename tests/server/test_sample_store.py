@@ -56,7 +56,8 @@ def test_others_may_be_near(tmp_path: Path, name: str) -> None:
 def test_an_older_file_that_was_being_read_does_not_come_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another file comes under the name while the first is still being read by somebody else."""
+    """Another file comes under the name while the first is still being read by somebody
+    else."""
     first = SampleStore(open_data(tmp_path))
     first.receive(head("a"), 0, np.float32(1.0).tobytes())
     old = completed(first, "a")

@@ -1,4 +1,5 @@
-"""Phantom and scene files put on the stage: what is taken, what is not, and what stands there."""
+"""Phantom and scene files put on the stage: what is taken, what is not, and what stands
+there."""
 
 from __future__ import annotations
 
@@ -39,7 +40,9 @@ def sent(document: object, name: str = "thing") -> Phantom:
 
 def store_of(folder: Path, raw: bytes, form: str, name: str = "thing") -> SampleStore:
     store = SampleStore(open_data(folder))
-    store.receive(UploadHead(name=name, kind="scene", format=form, total=len(raw)), 0, raw)
+    store.receive(
+        UploadHead(name=name, kind="scene", format=form, total=len(raw)), 0, raw
+    )
     return store
 
 
@@ -63,7 +66,10 @@ def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
     file.write_text(SCENE_FILE)
     asked = next(upload_scene(file))
     assert isinstance(asked, Ask)
-    data, head = asked.params["data"], {"name": "assembly", "kind": "scene", "format": "json"}
+    data, head = (
+        asked.params["data"],
+        {"name": "assembly", "kind": "scene", "format": "json"},
+    )
     assert isinstance(data, bytes)
     assert head.items() <= asked.params.items()
     found = phantom_files.sent_scene(data, name="assembly")
@@ -77,7 +83,10 @@ def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
     [
         ("\xff", "not valid TOML"),
         ("[1, 2", "not valid TOML"),
-        ({"schema": 1, "solid": [{**BALL, "material": "cheese"}]}, "unknown material 'cheese'"),
+        (
+            {"schema": 1, "solid": [{**BALL, "material": "cheese"}]},
+            "unknown material 'cheese'",
+        ),
         ({"schema": 1, "solid": [{**BALL, "radius": -1}]}, "radius is -1"),
         ({"schema": 1, "solid": [{**BALL, "color": 3}]}, "unknown key 'color'"),
         ({"schema": 1, "solid": [BALL] * 501}, "501 solids; allowed: 500"),
@@ -86,7 +95,9 @@ def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
         ({"schema": 2, "solid": [BALL]}, "schema is 2"),
     ],
 )
-def test_what_does_not_hold_is_refused_with_its_place(document: object, message: str) -> None:
+def test_what_does_not_hold_is_refused_with_its_place(
+    document: object, message: str
+) -> None:
     with pytest.raises(TwinError, match=message):
         sent(document)
 
@@ -118,7 +129,8 @@ def test_a_reader_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_pieces_on_the_stage_hold_every_round_solid(tmp_path: Path) -> None:
-    """Random points of each surface lie inside the convex pieces; inscribed polyhedra fail this."""
+    """Random points of each surface lie inside the convex pieces; inscribed polyhedra fail
+    this."""
     rng = np.random.default_rng(3)
     document = {
         "schema": 1,

@@ -33,7 +33,9 @@ def scan(root: Path, seed: int) -> tuple[list[tuple[str, str]], float, dict[str,
 
 
 def test_a_seed_is_a_run(tmp_path: Path) -> None:
-    one, again, other = (scan(tmp_path / n, seed) for n, seed in (("a", 1), ("b", 1), ("c", 2)))
+    one, again, other = (
+        scan(tmp_path / n, seed) for n, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
     assert one == again
     assert one[1] != other[1]
     assert one[2] == other[2]

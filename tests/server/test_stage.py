@@ -34,7 +34,9 @@ def approach(guard: Guard) -> Contact:
 
 def test_a_guard_is_of_one_correction(tmp_path: Path) -> None:
     stage = Stage(M, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path)))
-    guards = [stage.guard(Sample("lego"), p) for p in (NOMINAL, Offsets(dO_z=15.0, dD_z=-5.0))]
+    guards = [
+        stage.guard(Sample("lego"), p) for p in (NOMINAL, Offsets(dO_z=15.0, dD_z=-5.0))
+    ]
     nominal, corrected = (approach(guard) for guard in guards if guard is not None)
     # The stage stands 15 mm nearer to the detector, which stands 5 mm nearer to it.
     ahead = corrected.last_free["mag_det"] - nominal.last_free["mag_det"]
@@ -55,7 +57,9 @@ def test_the_sample_on_the_stage_decides(tmp_path: Path) -> None:
 
 def test_a_machine_without_components_has_no_guard(tmp_path: Path) -> None:
     bare = M.model_copy(update={"components": (), "allowed_contacts": ()})
-    stage = Stage(bare, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path)))
+    stage = Stage(
+        bare, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path))
+    )
     assert stage.guard(Sample("lego")) is None
     assert stage.scene(Sample()) is None
 
@@ -75,7 +79,12 @@ def test_what_stands_on_the_stage_is_never_read_or_cut_anew_in_the_loop(
 
     async def body(lab: Lab) -> None:
         c = lab.client()
-        grid = {"kind": "voxels", "format": "raw", "shape": [2, 2, 2], "voxel_mm": [9.0] * 3}
+        grid = {
+            "kind": "voxels",
+            "format": "raw",
+            "shape": [2, 2, 2],
+            "voxel_mm": [9.0] * 3,
+        }
         for i in range(10):
             await c.call("sample.upload", name=f"v{i}", total=32, **grid, data=b"\0" * 32)
         await c.call("sample.set", name="v0")

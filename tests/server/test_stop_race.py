@@ -1,8 +1,8 @@
 """Several people at E-STOP and RESET of one twin: nobody releases a stop that he has not seen.
 
-States and requests of each person are on their way for a drawn time, each in its order. Whether a
-release was meant is judged by the times at which presses came to the twin and the time of the state
-that the person saw; the numbers of stops are not looked at.
+States and requests of each person are on their way for a drawn time, each in its order. Whether
+a release was meant is judged by the times at which presses came to the twin and the time of the
+state that the person saw; the numbers of stops are not looked at.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ class Person(Client):
             meant = wish == "reset" and not newer
             room.outcomes[released, meant] += room.down
             room.down = room.down and not released
-        assert room.stopped == room.down, "the twin is stopped unless a reset has released it"
+        assert room.stopped == room.down, (
+            "the twin is stopped unless a reset has released it"
+        )
 
 
 class Room:
@@ -131,7 +133,8 @@ class Room:
         return self.sim.twin.scanner.safety.state == "estopped"
 
     async def episode(self, count: int) -> None:
-        """Two people or three, one after the other joining the topic `state`, press for a while."""
+        """Two people or three, one after the other joining the topic `state`, press for a
+        while."""
         draw = lambda: self.rng.choice(DELAYS_S)  # noqa: E731
         people = [Person(self, f"person-{i}", (draw(), draw())) for i in range(count)]
         for person in people:
@@ -152,9 +155,13 @@ def played(folder: Path, logic: Logic, episodes: int) -> Room:
         return room
 
 
-@pytest.mark.parametrize("episodes", [100, pytest.param(1000, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "episodes", [100, pytest.param(1000, marks=pytest.mark.campaign)]
+)
 @pytest.mark.slow
-def test_no_interleaving_releases_a_stop_that_was_not_seen(tmp_path: Path, episodes: int) -> None:
+def test_no_interleaving_releases_a_stop_that_was_not_seen(
+    tmp_path: Path, episodes: int
+) -> None:
     room = played(tmp_path, page, episodes)
     assert room.outcomes[True, False] == 0, "unintended releases"
     assert room.outcomes[False, True] == 0, "a reset that is meant is done"
@@ -165,5 +172,7 @@ def test_no_interleaving_releases_a_stop_that_was_not_seen(tmp_path: Path, episo
 
 @pytest.mark.parametrize("logic", [toggle, unnumbered])
 @pytest.mark.daily(1)
-def test_the_same_people_with_other_pages_release_stops(tmp_path: Path, logic: Logic) -> None:
+def test_the_same_people_with_other_pages_release_stops(
+    tmp_path: Path, logic: Logic
+) -> None:
     assert played(tmp_path, logic, 50).outcomes[True, False] > 10

@@ -1,4 +1,5 @@
-"""Connections without a place: a drawn flood of peers without the token beside clients with it."""
+"""Connections without a place: a drawn flood of peers without the token beside clients with
+it."""
 
 from __future__ import annotations
 
@@ -65,12 +66,18 @@ class Session:
 class Client:
     """Sends lines, one after the other."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def __init__(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         self.reader, self.writer = reader, writer
 
     @classmethod
     async def dial(cls, server: TcpServer, source: str = "127.0.0.1") -> Client:
-        return cls(*await asyncio.open_connection("127.0.0.1", server.port, local_addr=(source, 0)))
+        return cls(
+            *await asyncio.open_connection(
+                "127.0.0.1", server.port, local_addr=(source, 0)
+            )
+        )
 
     async def ask(self, line: bytes) -> dict[str, Any]:
         self.writer.write(line)
@@ -109,7 +116,9 @@ def test_new_clients_are_served_whatever_peers_without_the_token_do(
 
     async def main() -> list[bytes]:
         app, playing = App(), list[asyncio.Task[bytes]]()
-        server = await serve(app.open, token=TOKEN, limits=ConnectionLimits(max_clients=2))
+        server = await serve(
+            app.open, token=TOKEN, limits=ConnectionLimits(max_clients=2)
+        )
         holders = [await Client.dial(server, OTHER) for _ in range(2)]
         for holder in holders:  # these have all the places
             await served(holder, "session.hello", "state.get")
@@ -141,13 +150,17 @@ def test_new_clients_are_served_whatever_peers_without_the_token_do(
     assert not any(b'"result"' in said for said in heard)
     events = Counter(record.getMessage() for record in caplog.records)
     assert set(events) <= {"closing", "cut off", "wrong token"}
-    assert max(events.values()) <= 2 * 10 + 5  # ten, with and without the token, and the seconds
+    assert (
+        max(events.values()) <= 2 * 10 + 5
+    )  # ten, with and without the token, and the seconds
 
 
 def test_a_client_with_the_token_has_no_place_but_is_served_what_is_urgent() -> None:
     async def main() -> None:
         app = App()
-        server = await serve(app.open, token=TOKEN, limits=ConnectionLimits(max_clients=1))
+        server = await serve(
+            app.open, token=TOKEN, limits=ConnectionLimits(max_clients=1)
+        )
         first, second = await Client.dial(server), await Client.dial(server)
         silent = await Client.dial(server)
         await served(first, "session.hello", "state.get")
@@ -176,7 +189,9 @@ def test_clients_beyond_the_reserved_places_displace_the_oldest(
     monkeypatch.setattr(tcp, "RESERVED_PLACES", 3)
 
     async def main() -> None:
-        server = await serve(App().open, token=TOKEN, limits=ConnectionLimits(max_clients=1))
+        server = await serve(
+            App().open, token=TOKEN, limits=ConnectionLimits(max_clients=1)
+        )
         clients = [await Client.dial(server) for _ in range(10)]
         for client in clients:
             await served(client, *NEW)
@@ -276,7 +291,9 @@ def test_without_a_token_a_crowd_at_a_full_server_displaces_only_its_own(
     asyncio.run(asyncio.wait_for(main(), 60))
 
 
-def test_without_a_token_who_says_nothing_takes_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_token_who_says_nothing_takes_no_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(tcp.waiting_room, "WAITING", 8)
 
     async def main() -> None:
@@ -311,7 +328,9 @@ def test_what_is_kept_of_a_peer_without_the_token_is_little() -> None:
         app, limits = App(), ConnectionLimits(hello_timeout_s=0.5)
         server = await serve(app.open, token=TOKEN, limits=limits, read=unread)
         endless, long, many = [await Client.dial(server) for _ in range(3)]
-        assert (await long.ask(b'{"x":"' + b"x" * 40_000 + b'"}\n'))["error"]["code"] == -32004
+        assert (await long.ask(b'{"x":"' + b"x" * 40_000 + b'"}\n'))["error"][
+            "code"
+        ] == -32004
         endless.writer.write(b"x" * 5_000_000)
         lines = (await (await _said(many, request("state.get") * 100)).end()).splitlines()
         assert len(lines) == 10  # then it is closed
@@ -322,7 +341,10 @@ def test_what_is_kept_of_a_peer_without_the_token_is_little() -> None:
         # What follows a hello at once is read on, however large it is.
         ready = await Client.dial(server)
         ready.writer.write(hello(TOKEN) + b" " * 1_000_000 + request("state.get"))
-        assert json.loads(await ready.reader.readline())["result"]["method"] == "session.hello"
+        assert (
+            json.loads(await ready.reader.readline())["result"]["method"]
+            == "session.hello"
+        )
         await _ended(server, long, endless, many, ready)
 
     asyncio.run(asyncio.wait_for(main(), 60))
@@ -343,7 +365,10 @@ class Guest:
         self.ended = True
 
 
-@given(st.integers(1, 6), st.lists(st.tuples(st.sampled_from("abcd"), st.booleans()), max_size=60))
+@given(
+    st.integers(1, 6),
+    st.lists(st.tuples(st.sampled_from("abcd"), st.booleans()), max_size=60),
+)
 @settings(deadline=None)
 def test_a_newcomer_gets_in_and_who_goes_is_the_oldest_of_the_most(
     most: int, steps: list[tuple[str, bool]]
@@ -391,7 +416,12 @@ def test_an_hour_of_complaints_is_less_than_a_megabyte_and_none_is_uncounted() -
         for i in range(3600 * 30):
             now[0] = i / 30.0
             kind = kinds[i % 4]
-            lines.log(kind, logging.WARNING, client="[2001:db8::1]:65535#9999999", reason="x" * 60)
+            lines.log(
+                kind,
+                logging.WARNING,
+                client="[2001:db8::1]:65535#9999999",
+                reason="x" * 60,
+            )
             sent += 1
         now[0] += 1000.0
         for kind in kinds:

@@ -1,4 +1,5 @@
-"""The supervisor against small fake services in real processes: order, restart, stop, orphans."""
+"""The supervisor against small fake services in real processes: order, restart, stop,
+orphans."""
 
 from __future__ import annotations
 
@@ -84,7 +85,9 @@ while True:
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Service]:
     (tmp_path / "fake_service.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(module, "SILENT_S", 1e6)  # a loaded machine adds no notes of its own
+    monkeypatch.setattr(
+        module, "SILENT_S", 1e6
+    )  # a loaded machine adds no notes of its own
 
     def make(mode: str) -> Service:
         def command(known: Addresses) -> tuple[str, ...]:
@@ -97,7 +100,9 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Servi
 
 
 def started(folder: Path, mode: str) -> list[int]:
-    return sorted(int(p.stem.rpartition("-")[2]) for p in folder.glob(f"{mode}-*.started"))
+    return sorted(
+        int(p.stem.rpartition("-")[2]) for p in folder.glob(f"{mode}-*.started")
+    )
 
 
 def answers(at: Address) -> bool:
@@ -215,7 +220,17 @@ def test_a_service_that_keeps_dying_ends_no_other_and_is_told_ever_less_often(
 
 def test_pauses_grow_to_half_a_minute_and_begin_anew_after_steady_work() -> None:
     ends = module.Ends()
-    assert [ends.after(0.1) for _ in range(9)] == [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
+    assert [ends.after(0.1) for _ in range(9)] == [
+        0.0,
+        0.5,
+        1.0,
+        2.0,
+        4.0,
+        8.0,
+        16.0,
+        30.0,
+        30.0,
+    ]
     assert ends.after(10.0) == 0.0
     assert ends.after(3.0) == 0.5
     ends.row = 10**6
@@ -232,7 +247,8 @@ def test_a_service_killed_before_it_was_ready_is_started_again(
     assert len(started(tmp_path, "killed-early")) == 3
     assert notes == [
         "the killed-early ended (killed by SIGKILL, while starting); starting it again",
-        "the killed-early ended (killed by SIGKILL, while starting); starting it again in 0.5 s",
+        "the killed-early ended (killed by SIGKILL, while starting); starting it again "
+        "in 0.5 s",
     ]
 
 
@@ -286,7 +302,9 @@ def test_what_an_ended_service_started_does_not_outlive_it(
         await wait_for(lambda: not alive(held))
 
     supervise([fake("parent")], kill)
-    asyncio.run(wait_for(lambda: not any(alive(pid) for pid in started(tmp_path, "held"))))
+    asyncio.run(
+        wait_for(lambda: not any(alive(pid) for pid in started(tmp_path, "held")))
+    )
 
 
 def test_a_service_that_says_nothing_is_ended_and_started_again(
@@ -304,7 +322,10 @@ def test_a_service_that_says_nothing_is_ended_and_started_again(
         await running
 
     asyncio.run(scenario())
-    assert notes[0] == "the mute ended (it did nothing for 2 s, while starting); starting it again"
+    assert (
+        notes[0]
+        == "the mute ended (it did nothing for 2 s, while starting); starting it again"
+    )
     assert not any(alive(pid) for pid in started(tmp_path, "mute"))
 
 
@@ -360,19 +381,25 @@ def test_a_system_without_room_for_a_process_is_asked_again(
     monkeypatch.setattr(asyncio, "create_subprocess_exec", full)
     addresses, notes = supervise([fake("one")], None)
     assert list(addresses) == ["one"]
-    assert notes[0].startswith("the one ended (no process: Resource temporarily unavailable")
+    assert notes[0].startswith(
+        "the one ended (no process: Resource temporarily unavailable"
+    )
 
 
 def test_a_service_that_never_starts_is_an_error_with_its_exit_code(
     tmp_path: Path, fake: Callable[..., Service]
 ) -> None:
-    with pytest.raises(ServiceError, match=r"dies-early did not start \(exit code 3\)") as caught:
+    with pytest.raises(
+        ServiceError, match=r"dies-early did not start \(exit code 3\)"
+    ) as caught:
         supervise([fake("one"), fake("dies-early")], None)
     assert caught.value.exit_code == 3
     assert not any(alive(pid) for pid in started(tmp_path, "one"))
 
 
-def test_a_printing_service_never_blocks(tmp_path: Path, fake: Callable[..., Service]) -> None:
+def test_a_printing_service_never_blocks(
+    tmp_path: Path, fake: Callable[..., Service]
+) -> None:
     async def wait(*_: object) -> None:
         await wait_for((tmp_path / "chatty.done").exists)
 
@@ -399,7 +426,9 @@ def test_children_stop_when_the_parent_is_killed_outright(
         "asyncio.run(Supervisor([s], lambda a: print('ready', flush=True), print)"
         ".run(asyncio.Event()))\n"
     )
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE
+    ) as parent:
         assert parent.stdout is not None
         assert parent.stdout.readline() == b"ready\n"
         pid = started(tmp_path, "one")[0]
@@ -443,7 +472,8 @@ def test_addresses_read_as_urls_have_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "handed"), [([], []), (["--projector-memory", "3GiB"], ["--memory-limit", "3GiB"])]
+    ("words", "handed"),
+    [([], []), (["--projector-memory", "3GiB"], ["--memory-limit", "3GiB"])],
 )
 def test_up_hands_the_projector_its_memory(words: list[str], handed: list[str]) -> None:
     first = services(parse(UpSettings, words))[0]
@@ -453,7 +483,12 @@ def test_up_hands_the_projector_its_memory(words: list[str], handed: list[str]) 
 
 
 def test_up_hands_the_twin_further_projectors(tmp_path: Path) -> None:
-    words = ["--projectors", "lab:1,[::1]:2", "--projector-token-file", str(tmp_path / "token")]
+    words = [
+        "--projectors",
+        "lab:1,[::1]:2",
+        "--projector-token-file",
+        str(tmp_path / "token"),
+    ]
     twin = services(parse(UpSettings, words))[1]
     assert twin.name == "twin"
     command = list(twin.command({"projector": Address("127.0.0.1", 7)}))

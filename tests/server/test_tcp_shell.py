@@ -103,7 +103,9 @@ async def ask(
 
 
 def call(method: str, id: int = 1, **params: object) -> bytes:
-    return json.dumps({"jsonrpc": "2.0", "id": id, "method": method, "params": params}).encode()
+    return json.dumps(
+        {"jsonrpc": "2.0", "id": id, "method": method, "params": params}
+    ).encode()
 
 
 def test_a_line_is_answered_by_a_line() -> None:
@@ -173,7 +175,9 @@ def test_bad_input_each_gets_its_code_and_the_connection_lives_on() -> None:
         logging.disable(logging.NOTSET)
 
 
-def test_handler_failures_are_logged_with_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
+def test_handler_failures_are_logged_with_a_traceback(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)
         await ask(reader, writer, call("tube.set"))
@@ -261,7 +265,12 @@ def test_batches_are_answered_in_one_line_without_the_notifications() -> None:
             {"jsonrpc": "2.0", "id": 1, "method": "state.get"},
             {"jsonrpc": "2.0", "method": "state.get"},
             7,
-            {"jsonrpc": "2.0", "id": 2, "method": "axes.set", "params": ["mag_obj", 99.0]},
+            {
+                "jsonrpc": "2.0",
+                "id": 2,
+                "method": "axes.set",
+                "params": ["mag_obj", 99.0],
+            },
         ]
         [reply] = await ask(reader, writer, json.dumps(batch).encode())
         assert [r["id"] for r in reply] == [1, None, 2]
@@ -321,7 +330,9 @@ def test_end_of_file_inside_a_message_is_answered_with_an_error(last: bytes) -> 
     run(body)
 
 
-def test_a_client_that_never_reads_loses_values_and_then_only_its_own_connection() -> None:
+def test_a_client_that_never_reads_loses_values_and_then_only_its_own_connection() -> (
+    None
+):
     async def body(server: TcpServer, app: FakeApp) -> None:
         heard, deaf = await dial(server)
         reader, writer = await dial(server)
@@ -400,7 +411,9 @@ def test_urgent_requests_of_a_client_that_does_not_read_are_held_back_too() -> N
         reader, writer = await dial(server)
         writer.transport.pause_reading()  # type: ignore[attr-defined]
         count = 3000
-        task = asyncio.create_task(_write_all(writer, call("session.ping") + b"\n", count))
+        task = asyncio.create_task(
+            _write_all(writer, call("session.ping") + b"\n", count)
+        )
         before = -1
         while before != len(app.calls):
             before = len(app.calls)
@@ -430,7 +443,13 @@ def test_tokens() -> None:
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)
-        for line in (call("state.get"), call("axes.stop"), hello(), hello("wrong"), hello(7)):
+        for line in (
+            call("state.get"),
+            call("axes.stop"),
+            hello(),
+            hello("wrong"),
+            hello(7),
+        ):
             [reply] = await ask(reader, writer, line)
             assert reply["error"]["code"] in (-32004, -32602), (line, reply)
         assert not app.peers
@@ -479,7 +498,8 @@ def test_slowloris_is_cut_off_but_a_steady_talker_is_not() -> None:
 
 
 def test_an_estop_that_comes_in_two_parts_leaves_no_time_out_behind() -> None:
-    """It is taken out of the queue as it comes, and the wait for its end went on for a minute."""
+    """It is taken out of the queue as it comes, and the wait for its end went on for a
+    minute."""
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)
@@ -498,7 +518,9 @@ def test_an_estop_that_comes_in_two_parts_leaves_no_time_out_behind() -> None:
 def test_http_is_turned_away_before_its_body_is_read() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)
-        writer.write(b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" + call("axes.stop") + b"\n")
+        writer.write(
+            b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" + call("axes.stop") + b"\n"
+        )
         lines = (await reader.read()).splitlines()
         assert len(lines) == 1
         assert json.loads(lines[0])["error"]["code"] == -32600
@@ -534,7 +556,9 @@ def test_one_too_many_is_told_in_its_own_codec_until_there_is_a_place() -> None:
         for codec in Codec:
             reader, writer = await dial(server)
             wire = Connection(codec)
-            writer.write(wire.send(Request(1, "state.get", {})) + wire.send(Request(2, "x", {})))
+            writer.write(
+                wire.send(Request(1, "state.get", {})) + wire.send(Request(2, "x", {}))
+            )
             told: list[Any] = []
             while len(told) < 2:
                 told += wire.receive_data(await reader.read(65536))
@@ -591,7 +615,11 @@ def test_another_version_is_not_let_in_with_the_right_token() -> None:
             answers: list[Any] = []
             while len(answers) < 3:
                 answers += wire.receive_data(await reader.read(65536))
-            assert {a.id: a.error.code for a in answers} == {1: -32602, 2: -32004, 3: -32004}
+            assert {a.id: a.error.code for a in answers} == {
+                1: -32602,
+                2: -32004,
+                3: -32004,
+            }
             assert not app.peers
             said["token"] = "x" * 16  # who has no token is not told what is spoken here
             writer.write(wire.send(Request(4, "session.hello", said)))
@@ -608,10 +636,16 @@ def test_another_version_is_not_let_in_with_the_right_token() -> None:
 
 
 anything = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8),
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.text(max_size=8),
     lambda inner: (
         st.lists(inner, max_size=3)
-        | st.dictionaries(st.sampled_from(["targets", "axis", "mag_obj", "x"]), inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["targets", "axis", "mag_obj", "x"]), inner, max_size=3
+        )
     ),
     max_leaves=6,
 )
@@ -639,7 +673,9 @@ def test_fuzzed_lines_never_cause_an_internal_error_of_ours(sent: list[bytes]) -
     async def body(server: TcpServer, app: FakeApp) -> None:
         app.moved.set()
         reader, writer = await dial(server)
-        writer.write(b" " + b"".join(line + b"\n" for line in sent) + call("state.get", -7) + b"\n")
+        writer.write(
+            b" " + b"".join(line + b"\n" for line in sent) + call("state.get", -7) + b"\n"
+        )
         while True:
             reply = json.loads(await reader.readline())
             for one in reply if isinstance(reply, list) else [reply]:

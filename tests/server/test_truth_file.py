@@ -10,7 +10,9 @@ from flexdt.server.imaging.projections import load_truth
 from flexdt.twin.errors import MachineFileError
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e300", "1" + 400 * "0", "true", '"x"'])
+@pytest.mark.parametrize(
+    "value", ["nan", "inf", "-inf", "1e300", "1" + 400 * "0", "true", '"x"']
+)
 def test_a_value_that_no_geometry_can_have_is_refused_with_its_key(
     tmp_path: Path, value: str
 ) -> None:

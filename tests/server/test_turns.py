@@ -1,4 +1,5 @@
-"""Who is served when: no socket, no clock, no measured time; a loop and transports that record."""
+"""Who is served when: no socket, no clock, no measured time; a loop and transports that
+record."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ class Transport(asyncio.Transport):
     def get_extra_info(self, name: str, default: Any = None) -> Any:
         return _Sock() if name == "socket" else default
 
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+    def set_write_buffer_limits(
+        self, high: int | None = None, low: int | None = None
+    ) -> None:
         pass
 
     def write(self, data: Any) -> None:
@@ -147,7 +150,9 @@ def test_one_request_is_served_in_a_turn_of_the_loop() -> None:
 
 @pytest.mark.parametrize("urgent", [m.name for m in METHODS.values() if m.urgent])
 @pytest.mark.parametrize("codec", Codec)
-def test_an_urgent_request_is_found_behind_a_deep_queue(urgent: str, codec: Codec) -> None:
+def test_an_urgent_request_is_found_behind_a_deep_queue(
+    urgent: str, codec: Codec
+) -> None:
     async def body(bench: Bench) -> None:
         flood, stop = bench.dial()[0], bench.dial()[0]
         wire = Connection(codec)
@@ -194,7 +199,12 @@ def test_urgent_items_of_a_batch_go_first_and_its_answers_keep_their_order() -> 
 def test_a_text_that_names_an_urgent_method_keeps_its_place() -> None:
     async def body(bench: Bench) -> None:
         link, transport = bench.dial()
-        lie = {"jsonrpc": "2.0", "id": 1, "method": "state.get", "params": ["safety.estop"]}
+        lie = {
+            "jsonrpc": "2.0",
+            "id": 1,
+            "method": "state.get",
+            "params": ["safety.estop"],
+        }
         link.data_received(call("geometry.get", 0) + json.dumps(lie).encode() + b"\n")
         while len(transport.answers()) < 2:
             await bench.turn()
@@ -219,7 +229,9 @@ def test_reading_stops_while_enough_waits_and_goes_on_later() -> None:
 def test_a_message_that_has_begun_is_read_to_its_end() -> None:
     async def body(bench: Bench) -> None:
         link, transport = bench.dial()
-        link.data_received(b'{"jsonrpc":"2.0","id":1,"method":"state.get","params":{"x":"')
+        link.data_received(
+            b'{"jsonrpc":"2.0","id":1,"method":"state.get","params":{"x":"'
+        )
         for _ in range(20):
             link.data_received(b"x" * READ_AHEAD_BYTES)
             assert transport.reading
@@ -253,7 +265,9 @@ def test_a_turn_of_who_has_gone_is_given_to_the_next() -> None:
 class _Flood:
     """A connection that always has more to look at."""
 
-    def __init__(self, server: TcpServer, turns: list[int], seen: list[tuple[int, object]]) -> None:
+    def __init__(
+        self, server: TcpServer, turns: list[int], seen: list[tuple[int, object]]
+    ) -> None:
         self.server, self.turns, self.seen, self.looks = server, turns, seen, 6
 
     def overtake(self) -> None:
@@ -282,7 +296,9 @@ def test_floods_of_urgent_requests_are_looked_at_once_in_a_turn(
             await asyncio.sleep(0)
             turns[0] += 1
         assert [turn for turn, _ in seen] == list(range(len(seen)))  # one in each turn
-        assert [flood for _, flood in seen] == floods * 3  # in turn, up to the look that fails
+        assert [
+            flood for _, flood in seen
+        ] == floods * 3  # in turn, up to the look that fails
         server.look_soon(floods[0])  # type: ignore[arg-type]
         await asyncio.sleep(0)
         assert seen[-1][1] is floods[0]

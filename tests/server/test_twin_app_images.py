@@ -36,16 +36,20 @@ def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
         answer = await c.call("axes.move", targets={"mag_obj": 600.0 - 450.0})
         assert answer["duration_s"] == pytest.approx(10.0)
         await lab.until(
-            lambda: lab.twin.scanner.rest_time(0.0) < lab.twin.clock.now(), "the motion ends"
+            lambda: lab.twin.scanner.rest_time(0.0) < lab.twin.clock.now(),
+            "the motion ends",
         )
         source = list((await c.call("geometry.get"))["cone_vec"])[:3]
         for heard in (c, other):
             await lab.until(
-                lambda heard=heard: heard.of("projection")[-1]["data"]["cone_vec"][:3] == source,
+                lambda heard=heard: (
+                    heard.of("projection")[-1]["data"]["cone_vec"][:3] == source
+                ),
                 "the final pose",
             )
         await lab.until(
-            lambda: c.of("state")[-1]["data"]["axes"]["mag_obj"]["position"] == 150.0, "at rest"
+            lambda: c.of("state")[-1]["data"]["axes"]["mag_obj"]["position"] == 150.0,
+            "at rest",
         )
         images = [e["data"] for e in c.of("projection")]
         distinct = {i["data"] for i in images}
@@ -63,7 +67,9 @@ def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
         assert slow[-1]["data"]["shape"] == [24, 32]
         assert slow[-1]["data"]["dtype"] == "uint16"
         before = -1
-        while before != lab.projector.views:  # nothing changes, so in the end nothing is computed
+        while (
+            before != lab.projector.views
+        ):  # nothing changes, so in the end nothing is computed
             before = lab.projector.views
             await asyncio.sleep(0.1)
 
@@ -82,7 +88,9 @@ def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
         true = lab.twin.scanner.poses(0.0).cone_vec(Offsets(dD_x=secret))
         spot = true.project_points(PointProjector.POINT, (48, 64))[0, 0]
         assert image[int(spot[1]), int(spot[0])] > 0
-        shown = ConeVec(nominal["cone_vec"]).project_points(PointProjector.POINT, (48, 64))[0, 0]
+        shown = ConeVec(nominal["cone_vec"]).project_points(
+            PointProjector.POINT, (48, 64)
+        )[0, 0]
         assert shown[0] - spot[0] == pytest.approx(secret / 0.1496)
         job = await c.call("script.submit", text=script(), name="one")
         assert (await lab.ended(c, job["job"]))["state"] == "done"
@@ -92,7 +100,12 @@ def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
         ) + json.dumps(c.events)  # fmt: skip
         texts = [f.read_text(errors="replace") for f in lab.root.rglob("*")
                  if f.is_file() and f.suffix != ".tif"]  # fmt: skip
-        for text in (everything, *texts, repr(lab.twin.imaging), repr(lab.options["truth"])):
+        for text in (
+            everything,
+            *texts,
+            repr(lab.twin.imaging),
+            repr(lab.options["truth"]),
+        ):
             assert "1.2345" not in text
             assert 'dD_x": 1' not in text
         assert len(texts) >= 4
@@ -101,8 +114,8 @@ def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_an_image_of_another_pose_is_predicted_from_what_is_known(tmp_path: Path) -> None:
-    """Where the point lies follows from the machine's pose and the correction; the hidden truth,
-    and what stands now, have no part in it. Poses are drawn, settings too."""
+    """Where the point lies follows from the machine's pose and the correction; the hidden
+    truth, and what stands now, have no part in it. Poses are drawn, settings too."""
     known = {"dD_x": 0.8, "dO_z": -0.4}
 
     async def body(lab: Lab) -> None:
@@ -111,12 +124,24 @@ def test_an_image_of_another_pose_is_predicted_from_what_is_known(tmp_path: Path
         stands = (await c.call("state.get"))["axes"]
         rng = np.random.default_rng(21)
         for _ in range(5):
-            there = {"rot_obj": rng.uniform(-360, 360), "ver_det": 20 + rng.uniform(-2, 2)}
-            camera = {"roi": ROI, "mode": "HW2SW1High", "exposure_ms": 50.0, "averages": 2}
+            there = {
+                "rot_obj": rng.uniform(-360, 360),
+                "ver_det": 20 + rng.uniform(-2, 2),
+            }
+            camera = {
+                "roi": ROI,
+                "mode": "HW2SW1High",
+                "exposure_ms": 50.0,
+                "averages": 2,
+            }
             told = await c.call("projection.get", positions=there, camera=camera)
             image = wire_image.decode(told)
             poses = lab.twin.scanner.poses_at(
-                {n: there.get(n, a["position"]) for n, a in stands.items() if n in M.axes},
+                {
+                    n: there.get(n, a["position"])
+                    for n, a in stands.items()
+                    if n in M.axes
+                },
                 replace(lab.twin.scanner.camera, mode="HW2SW1High", roi=Roi(*ROI)),
             )
             cone = poses.cone_vec(Offsets.from_edge(known))
@@ -136,13 +161,18 @@ def test_an_image_of_another_pose_is_predicted_from_what_is_known(tmp_path: Path
             await c.call("projection.get", kind="counts", tube={"on": False},
                          camera={"roi": ROI, "exposure_ms": 50.0})
         ).astype(float)  # fmt: skip
-        assert np.abs((full - dark) - 2 * (half - dark)).max() <= 2  # no noise: rounded alone
+        assert (
+            np.abs((full - dark) - 2 * (half - dark)).max() <= 2
+        )  # no noise: rounded alone
         assert full.mean() > half.mean() > dark.mean()
         for axis, now in (await c.call("state.get"))["axes"].items():
             assert now["position"] == stands[axis]["position"]
         assert (await c.error("projection.get", positions={"up": 1.0})).code == -32602
         assert (await c.error("projection.get", tube={"kV": 9e3})).code == -32001
-        assert (await c.error("projection.get", camera={"mode": "none"})).code in (-32001, -32602)
+        assert (await c.error("projection.get", camera={"mode": "none"})).code in (
+            -32001,
+            -32602,
+        )
 
     run(tmp_path, body, truth=TrueGeometry(Offsets(dD_x=1.5, dO_z=0.7)))
 
@@ -169,14 +199,17 @@ def test_the_ray_of_a_pixel_ends_in_it(tmp_path: Path) -> None:
         assert set(told) >= {"abs"}
         for _, cone, shape in seen:
             assert shape == (1, 1)
-            # From the sample's own frame back to the object's; then the whole image sees the pixel.
+            # From the sample's own frame back to the object's; then the whole image sees the
+            # pixel.
             turn = np.radians(20.0)
             back = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0],
                              [0.0, 0.0, 1.0]])  # fmt: skip
             place = back @ cone.detector[0] + [1.0, 0.0, 0.0]
             spot = nominal.project_points(place[None] * (1 - 1e-9), (48, 64))[0, 0]
             assert spot == pytest.approx([7.25, 40.5], abs=1e-5)
-            assert back @ cone.source[0] + [1.0, 0.0, 0.0] == pytest.approx(nominal.source[0])
+            assert back @ cone.source[0] + [1.0, 0.0, 0.0] == pytest.approx(
+                nominal.source[0]
+            )
         for outside in ([64.0, 3.0], [3.0, 47.6]):
             assert (await c.error("projection.ray", pixel=outside)).code == -32001
         await c.call("sample.set", name="empty")
@@ -202,7 +235,9 @@ def test_a_correction_shows_in_geometry_get_and_stands_beside_the_data_set(
         await lab.ended(c, job["job"])
         document = json.loads((lab.root / "corrected" / "flexdt.json").read_text())
         assert document["correction"]["parameters"]["alpha"] == pytest.approx(1.0)
-        assert document["frames"][1]["cone_vec"][6] == pytest.approx(0.1496)  # nominal: not turned
+        assert document["frames"][1]["cone_vec"][6] == pytest.approx(
+            0.1496
+        )  # nominal: not turned
         assert (await c.call("calibration.revert"))["correction"]["name"] == "first"
         listed = await c.call("calibration.list")
         assert listed["corrections"][0]["name"] == "first"
@@ -283,7 +318,9 @@ def test_images_stay_dark_until_x_rays_are_ready(tmp_path: Path) -> None:
         assert 0.9 * takes < tube["ready_in_s"] <= takes
         early = wire_image.decode(await c.call("projection.get", kind="counts"))
         state = (await c.call("state.get"))["tube"]
-        if not state["ready"]:  # a machine that took seconds over this has nothing to show
+        if not state[
+            "ready"
+        ]:  # a machine that took seconds over this has nothing to show
             assert float(np.mean(early)) < 200.0
             assert state["ready_in_s"] < takes
         seen = []

@@ -10,7 +10,9 @@ import pytest
 from in_process import Lab, M, run
 
 
-def test_a_colliding_move_halts_is_counted_and_at_last_needs_a_reset(tmp_path: Path) -> None:
+def test_a_colliding_move_halts_is_counted_and_at_last_needs_a_reset(
+    tmp_path: Path,
+) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
         e = await c.error("axes.move", targets={"mag_det": 100.0})
@@ -47,7 +49,9 @@ def test_a_target_within_the_arrival_tolerance_arrives_at_the_limit_and_is_told(
         c = lab.client()
         await c.call("axes.move", targets={"mag_det": 1058.0}, wait=True)
         for plan in (False, True):
-            done = await c.call("axes.move", targets={"mag_det": 1060.0}, wait=True, plan=plan)
+            done = await c.call(
+                "axes.move", targets={"mag_det": 1060.0}, wait=True, plan=plan
+            )
             assert done["arrived"] is True
             assert done["warnings"] == [
                 "mag_det target 1060 mm is outside [100, 1059] mm; set to the limit"
@@ -74,7 +78,9 @@ def test_a_waiting_move_is_answered_when_a_stop_has_brought_the_axes_to_rest(
         await a.call("clock.set", speed_up=1.0)
         asked = a.call("axes.move", targets={"mag_obj": 900.0}, wait=True, plan=plan)
         moving = asyncio.create_task(asked)
-        await lab.until(lambda: lab.twin.scanner.moving(lab.twin.clock.now()), "the motion")
+        await lab.until(
+            lambda: lab.twin.scanner.moving(lab.twin.clock.now()), "the motion"
+        )
         await b.call(command)
         done = await moving
         assert done["duration_s"] > 250.0
@@ -88,7 +94,9 @@ def test_a_waiting_move_is_answered_when_a_stop_has_brought_the_axes_to_rest(
 def test_a_planned_move_says_its_legs(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
-        direct = await c.call("axes.move", targets={"mag_obj": 650.0}, plan=True, wait=True)
+        direct = await c.call(
+            "axes.move", targets={"mag_obj": 650.0}, plan=True, wait=True
+        )
         assert direct["moves"] == [{"mag_obj": 650.0}]
         assert direct["warnings"] == []
         assert (await c.call("state.get"))["axes"]["mag_obj"]["position"] == 650.0
@@ -101,7 +109,9 @@ def test_a_planned_move_says_its_legs(tmp_path: Path) -> None:
         assert "would collide on the direct way" in around["warnings"][0]
         state = await c.call("state.get")
         assert {n: state["axes"][n]["position"] for n in targets} == targets
-        e = await c.error("axes.move", targets={"mag_det": 100.0, "mag_obj": 600.0}, plan=True)
+        e = await c.error(
+            "axes.move", targets={"mag_det": 100.0, "mag_obj": 600.0}, plan=True
+        )
         assert e.code == -32002
         assert not lab.twin.scanner.moving(lab.twin.clock.now())
         e = await c.error("axes.move", targets={"mag_obj": 5.0}, plan=True)
@@ -128,8 +138,12 @@ def test_a_refused_request_lets_a_planned_move_go_on(
         await c.call("axes.set", axis="mag_obj", speed=2.0)
         await c.call("clock.set", speed_up=20.0)
         targets = {"mag_det": 400.0, "mag_obj": 200.0}
-        moved = asyncio.create_task(c.call("axes.move", targets=targets, plan=True, wait=True))
-        await lab.until(lambda: lab.twin.scanner.moving(lab.twin.clock.now()), "the first leg")
+        moved = asyncio.create_task(
+            c.call("axes.move", targets=targets, plan=True, wait=True)
+        )
+        await lab.until(
+            lambda: lab.twin.scanner.moving(lab.twin.clock.now()), "the first leg"
+        )
         if ends:
             await c.call(method, **params)
         else:

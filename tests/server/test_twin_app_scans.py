@@ -1,4 +1,5 @@
-"""Scans and jobs of the twin server: scripts, trajectories, pauses, full disks, taking up again."""
+"""Scans and jobs of the twin server: scripts, trajectories, pauses, full disks, taking up
+again."""
 
 from __future__ import annotations
 
@@ -10,7 +11,9 @@ import pytest
 from in_process import ROI, Lab, digest, run, script
 
 
-def test_a_script_becomes_a_data_set_with_the_same_bytes_at_any_speed_up(tmp_path: Path) -> None:
+def test_a_script_becomes_a_data_set_with_the_same_bytes_at_any_speed_up(
+    tmp_path: Path,
+) -> None:
     found: list[dict[str, str]] = []
 
     async def body(lab: Lab) -> None:
@@ -45,7 +48,9 @@ def test_a_script_becomes_a_data_set_with_the_same_bytes_at_any_speed_up(tmp_pat
 def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
-        reference = await c.call("script.submit", text=script(), name="ref", seed=3, speed_up="max")
+        reference = await c.call(
+            "script.submit", text=script(), name="ref", seed=3, speed_up="max"
+        )
         await lab.ended(c, reference["job"])
         lab.projector.limit = lab.projector.views + 3
         job = (await c.call("script.submit", text=script(), name="paused", seed=3))["job"]
@@ -58,9 +63,12 @@ def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) 
         ):
             e = await c.error(method, **params)
             assert (e.code, e.data["job"]) == (-32003, job)
-        await c.call("clock.set", speed_up=20.0)  # on a slow machine it must not run to its end
+        await c.call(
+            "clock.set", speed_up=20.0
+        )  # on a slow machine it must not run to its end
         await lab.until(
-            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).frames_done >= 3, "3 frames"
+            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).frames_done >= 3,
+            "3 frames",
         )
         status = await c.call("job.pause", job=job)
         assert status["state"] == "paused"
@@ -80,14 +88,17 @@ def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) 
     run(tmp_path, body, virtual=True, speed_up=150.0)
 
 
-def test_stop_during_a_scan_pauses_it_and_abort_leaves_it_incomplete(tmp_path: Path) -> None:
+def test_stop_during_a_scan_pauses_it_and_abort_leaves_it_incomplete(
+    tmp_path: Path,
+) -> None:
     async def body(lab: Lab) -> None:
         c, watcher = lab.client(), lab.client()
         job = (await c.call("script.submit", text=script(), name="cut"))["job"]
         await lab.until(lambda: lab.twin.jobs.running, "it runs")
         await watcher.call("axes.stop")
         await lab.until(
-            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused", "it pauses"
+            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused",
+            "it pauses",
         )
         status = await watcher.call("job.abort", job=job, reason="sure enough")
         assert status["state"] == "aborted"
@@ -100,12 +111,16 @@ def test_stop_during_a_scan_pauses_it_and_abort_leaves_it_incomplete(tmp_path: P
     run(tmp_path, body, virtual=True, speed_up=50.0)
 
 
-def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(tmp_path: Path) -> None:
+def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(
+    tmp_path: Path,
+) -> None:
     async def first(lab: Lab) -> None:
         c = lab.client()
         await c.call("axes.move", targets={"tra_obj": 12.0, "mag_obj": 500.0}, wait=True)
         await c.call("sample.set", name="normal", offset={"x": 1.0})
-        whole = await c.call("script.submit", text=script(), name="whole", seed=5, speed_up="max")
+        whole = await c.call(
+            "script.submit", text=script(), name="whole", seed=5, speed_up="max"
+        )
         await lab.ended(c, whole["job"])
         lab.projector.limit = lab.projector.views + 4
         await c.call("script.submit", text=script(), name="cut", seed=5)
@@ -117,7 +132,9 @@ def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(tmp_path
             "4 frames",
         )
 
-    run(tmp_path, first, virtual=True, speed_up=150.0)  # the server is stopped in the midst of it
+    run(
+        tmp_path, first, virtual=True, speed_up=150.0
+    )  # the server is stopped in the midst of it
     cut = tmp_path / "cut"
     document = json.loads((cut / "flexdt.json").read_text())
     assert document["complete"] is False
@@ -132,7 +149,9 @@ def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(tmp_path
         views = lab.projector.views
         job = await c.call("script.submit", text=script(), name="cut")
         assert (await lab.ended(c, job["job"]))["state"] == "done"
-        assert lab.projector.views - views == 10 - len(there)  # the dark needs no projection
+        assert lab.projector.views - views == 10 - len(
+            there
+        )  # the dark needs no projection
         assert digest(cut) == digest(tmp_path / "whole")
         assert {n: (cut / n).stat().st_mtime_ns for n in stamps} == stamps
         assert (await c.error("script.submit", text=script(), name="cut")).code == -32602
@@ -149,7 +168,8 @@ def test_a_projector_that_is_gone_pauses_the_job_with_its_code(tmp_path: Path) -
         lab.projector.down = True
         job = (await c.call("script.submit", text=script(), name="gone", seed=3))["job"]
         await lab.until(
-            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused", "it pauses"
+            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused",
+            "it pauses",
         )
         status = await c.call("job.status", job=job)
         assert status["error"]["code"] == -32006
@@ -183,7 +203,8 @@ def test_a_full_disk_pauses_the_job_and_no_partial_file_is_left(
         c = lab.client()
         job = (await c.call("script.submit", text=script(), name="full", seed=3))["job"]
         await lab.until(
-            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused", "it pauses"
+            lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused",
+            "it pauses",
         )
         status = await c.call("job.status", job=job)
         assert status["error"]["code"] == -32001
@@ -219,7 +240,9 @@ def test_a_scan_that_does_not_fit_on_the_disk_is_refused_before_it_starts(
     run(tmp_path, body)
 
 
-def test_a_bad_script_is_refused_with_all_its_problems_and_nothing_moves(tmp_path: Path) -> None:
+def test_a_bad_script_is_refused_with_all_its_problems_and_nothing_moves(
+    tmp_path: Path,
+) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
         bad = script().replace("set exposure\t2000.0", "set exposure\tlong") + (
@@ -244,7 +267,9 @@ def test_a_trajectory_is_played_and_checked(tmp_path: Path) -> None:
         poses = [{"rot_obj": 10.0 * i, "mag_obj": 500.0 + i} for i in range(5)]
         report = await c.call("trajectory.check", poses=poses, exposure_ms=50.0)
         assert (report["ok"], report["frames"]) == (True, 5)
-        job = await c.call("trajectory.submit", poses=poses, exposure_ms=50.0, name="played")
+        job = await c.call(
+            "trajectory.submit", poses=poses, exposure_ms=50.0, name="played"
+        )
         assert (await lab.ended(c, job["job"]))["state"] == "done"
         document = json.loads((lab.root / "played" / "flexdt.json").read_text())
         shown = [f["positions"] for f in document["frames"] if f["kind"] == "projection"]
@@ -283,7 +308,9 @@ def test_a_scan_that_is_being_prepared_can_be_aborted_and_stopped(tmp_path: Path
         await c.call("axes.move", targets={"tra_obj": 100.0})
         job = (await c.call("script.submit", text=script(), name="early"))["job"]
         await lab.until(lambda: lab.twin.jobs.current is not None, "its turn has come")
-        assert (await anyone.call("job.abort", job=job, reason="no"))["state"] == "aborted"
+        assert (await anyone.call("job.abort", job=job, reason="no"))[
+            "state"
+        ] == "aborted"
         await anyone.call("axes.stop")
         await lab.until(lambda: lab.twin.jobs.current is None, "it has ended")
         state = await c.call("state.get")

@@ -27,8 +27,12 @@ def test_state_motion_and_geometry_agree(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
         hello = await c.call("session.hello", protocol="1.0", client="test")
-        answer = await c.call("axes.move", targets={"mag_obj": 650.0, "rot_obj": 90.0}, wait=True)
-        assert answer["duration_s"] == pytest.approx(4.0)  # 90 deg: 45 deg/s after 2 s at 22.5
+        answer = await c.call(
+            "axes.move", targets={"mag_obj": 650.0, "rot_obj": 90.0}, wait=True
+        )
+        assert answer["duration_s"] == pytest.approx(
+            4.0
+        )  # 90 deg: 45 deg/s after 2 s at 22.5
         state = await c.call("state.get")
         assert state["axes"]["mag_obj"]["position"] == 650.0
         assert state["axes"]["rot_obj"]["moving"] is False
@@ -40,7 +44,9 @@ def test_state_motion_and_geometry_agree(tmp_path: Path) -> None:
         assert g["cone_vec"][0] == pytest.approx(650.0 + 14.9192)
         assert g["detector_shape"] == (760, 956)
         jog = await c.call("axes.jog", axis="mag_obj", velocity=-10.0, lease_s=2.0)
-        await lab.until(lambda: not lab.twin.scanner.moving(lab.twin.clock.now()), "jog ends")
+        await lab.until(
+            lambda: not lab.twin.scanner.moving(lab.twin.clock.now()), "jog ends"
+        )
         # 10 mm/s at 50 mm/s2: 0.2 s up within the lease, 0.2 s down after it.
         assert jog["duration_s"] == pytest.approx(2.2)
         state = await c.call("state.get")
@@ -49,11 +55,17 @@ def test_state_motion_and_geometry_agree(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
-def test_errors_have_the_codes_of_the_wire_and_say_what_is_allowed(tmp_path: Path) -> None:
+def test_errors_have_the_codes_of_the_wire_and_say_what_is_allowed(
+    tmp_path: Path,
+) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
         e = await c.error("axes.move", targets={"mag_obj": 5.0})
-        assert (e.code, e.data["asked"], e.data["allowed"]) == (-32001, 5.0, [70.0, 996.0])
+        assert (e.code, e.data["asked"], e.data["allowed"]) == (
+            -32001,
+            5.0,
+            [70.0, 996.0],
+        )
         e = await c.error("axes.move", targets={"mag_obj": 300.0, "wings": 1.0})
         assert e.code == -32602
         assert "ver_obj" in e.data["allowed"]
@@ -64,7 +76,9 @@ def test_errors_have_the_codes_of_the_wire_and_say_what_is_allowed(tmp_path: Pat
         assert (await c.error("sample.set", file="unicorn")).code == -32602
         assert (await c.error("job.status", job="job-9")).code == -32602
         assert (await c.error("calibration.get", name="none")).code == -32602
-        assert (await c.error("calibration.apply", parameters={"dQ_x": 1.0})).code == -32602
+        assert (
+            await c.error("calibration.apply", parameters={"dQ_x": 1.0})
+        ).code == -32602
         for slip in ({"dO_x": 1e5}, {"dS_x": -1e5}, {"angle_scale": 0.0}, {"angle_scale": -1.0},
                      {"det_roll": 90.0}):  # fmt: skip
             refused = await c.error("calibration.apply", parameters=slip)
@@ -91,7 +105,9 @@ def test_one_controller_moves_and_everyone_may_stop(tmp_path: Path) -> None:
         state = await a.call("safety.estop")
         assert state["safety"]["estop"] is True
         assert (await b.error("axes.move", targets={"mag_obj": 600.0})).code == -32003
-        assert (await a.error("safety.reset")).code == -32003  # leaving it is the controller's
+        assert (
+            await a.error("safety.reset")
+        ).code == -32003  # leaving it is the controller's
         assert (await b.call("safety.reset"))["safety"]["state"] == "ok"
         b.close()
         await a.call("axes.move", targets={"mag_obj": 600.0})  # control was free again
@@ -147,8 +163,12 @@ def test_uploads_come_in_chunks_and_stay_after_a_restart(tmp_path: Path) -> None
         assert (answer["received"], answer["complete"]) == (half, False)
         e = await c.error("sample.upload", **what, start=half + 9, data=b"x")
         assert e.code == -32001
-        await c.call("sample.upload", **what, start=half - 5, data=data[half - 5 : half + 3])
-        answer = await c.call("sample.upload", **what, start=half + 3, data=data[half + 3 :])
+        await c.call(
+            "sample.upload", **what, start=half - 5, data=data[half - 5 : half + 3]
+        )
+        answer = await c.call(
+            "sample.upload", **what, start=half + 3, data=data[half + 3 :]
+        )
         assert answer["complete"] is True
         assert answer["sample"]["size_mm"] == pytest.approx((10.0, 8.0, 6.0))
         done = await c.call("sample.set", file="my box")
@@ -160,7 +180,11 @@ def test_uploads_come_in_chunks_and_stay_after_a_restart(tmp_path: Path) -> None
         voxels = np.zeros((3, 4, 5), dtype="<f4").tobytes()
         grid = {"name": "grid", "kind": "voxels", "format": "raw", "total": len(voxels)}
         answer = await c.call(
-            "sample.upload", **grid, shape=[3, 4, 5], voxel_mm=[1.0, 1.0, 2.0], data=voxels
+            "sample.upload",
+            **grid,
+            shape=[3, 4, 5],
+            voxel_mm=[1.0, 1.0, 2.0],
+            data=voxels,
         )
         assert answer["sample"]["size_mm"] == pytest.approx((5.0, 4.0, 6.0))
 
@@ -190,7 +214,9 @@ def test_clients_that_leave_take_their_subscriptions_and_control_with_them(
         assert not any(lab.twin.hub.wanted(t) for t in ("state", "projection", "job"))
         assert lab.twin.control.holder is None
         document = await lab.client().call("rpc.discover")
-        assert await lab.client().call("rpc.discover") is document  # making it takes 0.1 s
+        assert (
+            await lab.client().call("rpc.discover") is document
+        )  # making it takes 0.1 s
         assert {m["name"] for m in document["methods"]} == set(METHODS)
 
     run(tmp_path, body)

@@ -119,7 +119,10 @@ def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) 
     process = twin(rays, tmp_path / "data", "--speed-up", "max")
     try:
         wire = Wire(process.ready["port"])
-        assert wire.call("axes.move", targets={"mag_obj": 500}, wait=True)["duration_s"] == 3.0
+        assert (
+            wire.call("axes.move", targets={"mag_obj": 500}, wait=True)["duration_s"]
+            == 3.0
+        )
         image = wire.call("projection.get", binning=4)
         assert image["shape"] == [190, 239]
         values = np.frombuffer(base64.b64decode(image["data"]), dtype="<f4")
@@ -136,13 +139,17 @@ def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(
+    tmp_path: Path,
+) -> None:
     first = Process("flexdt.server.projector.main", "--port", "0", "--threads", "1")
     process = twin(first, tmp_path / "data", "--speed-up", "60")
     second: Process | None = None
     try:
         wire = Wire(process.ready["port"])
-        reference = wire.call("script.submit", text=script(61), name="ref", seed=2, speed_up="max")
+        reference = wire.call(
+            "script.submit", text=script(61), name="ref", seed=2, speed_up="max"
+        )
         wire.wait(reference["job"], "done")
         job = wire.call("script.submit", text=script(61), name="killed", seed=2)["job"]
         while wire.call("job.status", job=job)["frames_done"] < 5:
@@ -150,7 +157,11 @@ def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path:
         first.end(signal.SIGKILL)
         assert wire.call("session.ping")["time"] > 0  # the twin lives on
         second = Process(
-            "flexdt.server.projector.main", "--threads", "1", "--port", str(first.ready["port"])
+            "flexdt.server.projector.main",
+            "--threads",
+            "1",
+            "--port",
+            str(first.ready["port"]),
         )
         status = wire.wait(job, "done", "failed", "paused")
         if status["state"] == "paused":  # it was away for longer than the twin's patience
@@ -158,9 +169,16 @@ def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path:
             wire.call("job.resume", job=job)
             status = wire.wait(job, "done", "failed")
         assert (status["state"], status["frames_done"]) == ("done", 61)
-        for name in ("scan_000000.tif", "scan_000030.tif", "scan_000060.tif", "di000000.tif"):
+        for name in (
+            "scan_000000.tif",
+            "scan_000030.tif",
+            "scan_000060.tif",
+            "di000000.tif",
+        ):
             folder = tmp_path / "data"
-            assert (folder / "killed" / name).read_bytes() == (folder / "ref" / name).read_bytes()
+            assert (folder / "killed" / name).read_bytes() == (
+                folder / "ref" / name
+            ).read_bytes()
     finally:
         process.end()
         first.end(signal.SIGKILL)
@@ -196,7 +214,11 @@ def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
         (["--profile", "yesterday"], 1, "cwi-2023-08-21"),
         (["--machine", "missing.toml"], 1, "missing.toml: No such file"),
         (["--profile", "missing.toml"], 1, "missing.toml: No such file"),
-        (["--machine", "xyzr_cabinet", "--profile", "thesis"], 1, "for machine 'flexray'"),
+        (
+            ["--machine", "xyzr_cabinet", "--profile", "thesis"],
+            1,
+            "for machine 'flexray'",
+        ),
         (["--speed-up", "-3"], 2, "speed-up"),
         (["--sample", "unicorn"], 1, "lego"),
     ],

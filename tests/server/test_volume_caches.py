@@ -1,4 +1,5 @@
-"""Samples in the memory of twin and projector: the least recently used go, what is in use stays."""
+"""Samples in the memory of twin and projector: the least recently used go, what is in use
+stays."""
 
 from __future__ import annotations
 
@@ -87,7 +88,10 @@ def limited(pool: ProjectorPool, shelf: Shelf, limit: int | None = None) -> Imag
 def test_any_number_of_samples_is_shown_within_the_limits() -> None:
     """Room for three: names come by turns and at random, each is shown as it is."""
     mu = {f"s{i}": 0.001 * (i + 1) for i in range(40)}
-    shelf, rng = Shelf(**{name: block(value, SIDE) for name, value in mu.items()}), random.Random(1)
+    shelf, rng = (
+        Shelf(**{name: block(value, SIDE) for name, value in mu.items()}),
+        random.Random(1),
+    )
 
     async def work(pool: ProjectorPool) -> None:
         imaging = limited(pool, shelf, 3 * TAKES // 2)
@@ -152,7 +156,9 @@ def upload(name: str, side: int) -> dict[str, Any]:
             "voxel_mm": [0.5] * 3, "total": len(voxels), "data": voxels}  # fmt: skip
 
 
-def test_a_scan_whose_sample_cannot_be_held_is_refused_with_the_figures(tmp_path: Path) -> None:
+def test_a_scan_whose_sample_cannot_be_held_is_refused_with_the_figures(
+    tmp_path: Path,
+) -> None:
     left: list[int | None] = [None]
 
     async def room() -> int | None:
@@ -183,7 +189,9 @@ def test_a_scan_whose_sample_cannot_be_held_is_refused_with_the_figures(tmp_path
     run(tmp_path, body, memory_limit=40_000, projector_room=room)
 
 
-def test_a_scan_that_no_projector_takes_fails_and_the_next_one_runs(tmp_path: Path) -> None:
+def test_a_scan_that_no_projector_takes_fails_and_the_next_one_runs(
+    tmp_path: Path,
+) -> None:
     """What fills the projector may come after the submission."""
 
     async def body(lab: Lab) -> None:

@@ -99,13 +99,23 @@ def test_one_request_bears_one_id_in_both_logs(server: Process, rays: Process) -
     wire.call("projection.get", binning=8)
     until = time.monotonic() + 60.0  # lines are written by a thread of their own
     while True:
-        mine = [e["trace"] for e in server.logged("debug") if e.get("method") == "projection.get"]
-        theirs = [e for e in rays.logged("debug") if mine and _under(e.get("trace"), mine[-1])]
+        mine = [
+            e["trace"]
+            for e in server.logged("debug")
+            if e.get("method") == "projection.get"
+        ]
+        theirs = [
+            e for e in rays.logged("debug") if mine and _under(e.get("trace"), mine[-1])
+        ]
         if theirs and theirs[-1]["method"] == "project":
             break
         assert time.monotonic() < until, (mine, theirs)
         time.sleep(0.05)
-    frames = [e["trace"] for e in rays.logged("debug") if str(e["trace"]).startswith("job-1.scan_")]
+    frames = [
+        e["trace"]
+        for e in rays.logged("debug")
+        if str(e["trace"]).startswith("job-1.scan_")
+    ]
     assert frames  # a scan's frames are named by job and file
 
 
@@ -118,7 +128,9 @@ def test_one_request_bears_one_id_in_both_logs(server: Process, rays: Process) -
     ],
 )
 def test_http_takes_little(server: Process, sent: bytes, status: bytes) -> None:
-    with socket.create_connection(("127.0.0.1", server.ready["http_port"]), timeout=20) as s:
+    with socket.create_connection(
+        ("127.0.0.1", server.ready["http_port"]), timeout=20
+    ) as s:
         s.sendall(sent)
         got = b""
         while part := s.recv(65536):
@@ -128,13 +140,17 @@ def test_http_takes_little(server: Process, sent: bytes, status: bytes) -> None:
     assert body in (b"", b"{}") or status == b"414"
 
 
-def test_clients_that_send_half_a_request_hold_up_nobody(rays: Process, tmp_path: Path) -> None:
+def test_clients_that_send_half_a_request_hold_up_nobody(
+    rays: Process, tmp_path: Path
+) -> None:
     """Neither the pages, nor the loop, nor the end of the process."""
     process = twin(rays.port, tmp_path / "data", "--http-port", 0)
     address = "127.0.0.1", process.ready["http_port"]
     with contextlib.ExitStack() as stack:
         for said in (b"", b"GET /metrics HTTP/1.1\r\nHost:", b"\x00\xff\xfe") * 10:
-            stack.enter_context(socket.create_connection(address, timeout=20)).sendall(said)
+            stack.enter_context(socket.create_connection(address, timeout=20)).sendall(
+                said
+            )
         assert get(process, "/healthz")[0] == 200
         assert Wire(process.port).call("state.get")["time"] >= 0.0
         begun = time.monotonic()
@@ -142,7 +158,9 @@ def test_clients_that_send_half_a_request_hold_up_nobody(rays: Process, tmp_path
         assert time.monotonic() - begun < 60.0
 
 
-def test_beyond_the_loopback_metrics_want_the_token(rays: Process, tmp_path: Path) -> None:
+def test_beyond_the_loopback_metrics_want_the_token(
+    rays: Process, tmp_path: Path
+) -> None:
     token = tmp_path / "token"
     token.write_text("a-token-of-some-length\n")
     process = twin(rays.port, tmp_path / "data", "--http-port", 0, "--http-host", "0.0.0.0",

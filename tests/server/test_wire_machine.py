@@ -1,7 +1,7 @@
 """Several clients do anything in any order; a small model says what a twin must answer.
 
-A hypothesis state machine over real connections: who controls, the safety state, where the motors
-are bound, and the order of events, for every interleaving hypothesis can think of.
+A hypothesis state machine over real connections: who controls, the safety state, where the
+motors are bound, and the order of events, for every interleaving hypothesis can think of.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def machine(port: int) -> type[RuleBasedStateMachine]:
             self.open: list[Wire] = []
             self.watch.call("session.control", action="force")
             self.watch.call("safety.reset")
-            self.watch.call("axes.move", targets={"mag_obj": 500.0, "rot_obj": 0.0}, wait=True)
+            self.watch.call(
+                "axes.move", targets={"mag_obj": 500.0, "rot_obj": 0.0}, wait=True
+            )
             self.watch.call("session.control", action="release")
             self.holder: Wire | None = None
             self.estop = False
@@ -73,7 +75,9 @@ def machine(port: int) -> type[RuleBasedStateMachine]:
                     assert time.monotonic() < until, "control was not given back"
                     time.sleep(0.002)
 
-        def commands(self, wire: Wire, method: str, **params: Any) -> dict[str, Any] | None:
+        def commands(
+            self, wire: Wire, method: str, **params: Any
+        ) -> dict[str, Any] | None:
             """Ask for something that moves; None where somebody else is the controller."""
             answer = wire.ask(method, **params)
             if self.holder not in (None, wire):
@@ -93,8 +97,12 @@ def machine(port: int) -> type[RuleBasedStateMachine]:
                 return
             low, high = LIMITS[axis]
             if self.estop or not low <= position <= high:
-                assert answer["error"]["code"] == (-32003 if self.estop else -32001), answer
-            elif "error" in answer:  # something stands in the way: it halts where it is free
+                assert answer["error"]["code"] == (-32003 if self.estop else -32001), (
+                    answer
+                )
+            elif (
+                "error" in answer
+            ):  # something stands in the way: it halts where it is free
                 assert answer["error"]["code"] == -32002, answer
                 axes = wire.call("state.get")
                 self.bound = {n: axes["axes"][n]["target"] for n in LIMITS}
@@ -118,14 +126,20 @@ def machine(port: int) -> type[RuleBasedStateMachine]:
             else:
                 self.holder = wire
 
-        @rule(wire=wires, method=st.sampled_from(["axes.stop", "safety.estop", "session.ping"]))
+        @rule(
+            wire=wires,
+            method=st.sampled_from(["axes.stop", "safety.estop", "session.ping"]),
+        )
         def anyone(self, wire: Wire, method: str) -> None:
             wire.call(method)
             self.estop = self.estop or method == "safety.estop"
 
         @rule(wire=wires)
         def nonsense(self, wire: Wire) -> None:
-            assert wire.ask("axes.move", targets={"mag_obj": "far"})["error"]["code"] == -32602
+            assert (
+                wire.ask("axes.move", targets={"mag_obj": "far"})["error"]["code"]
+                == -32602
+            )
             assert wire.ask("no.method")["error"]["code"] == -32601
             wire.socket.sendall(b"{broken\n")
             while (answer := wire.read()).get("method") == "event":

@@ -106,7 +106,9 @@ def test_a_plan_is_made_once_and_anew_where_anything_it_depends_on_is_another() 
         first = matter(ScanSource(long_script(1)))
         for name, other in OTHERS.items():
             made = await checks.sound(first)
-            assert await checks.sound(replace(first)) is made, "equal matter, the same certificate"
+            assert await checks.sound(replace(first)) is made, (
+                "equal matter, the same certificate"
+            )
             made = await checks.sound(first)
             changed = replace(first, **{name: other(first)})
             found = await checks.sound(changed)
@@ -140,7 +142,9 @@ def _unwanted(*_: object) -> Any:
     pytest.fail("it was swept")
 
 
-def test_a_report_too_large_is_refused_before_it_is_swept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_too_large_is_refused_before_it_is_swept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(checking, "MAX_ANSWER", {Codec.JSON: 50_000})
     monkeypatch.setattr(checking, "collision_check", lambda *_: _unwanted)
     with pytest.raises(RpcError) as refused:
@@ -151,7 +155,9 @@ def test_a_report_too_large_is_refused_before_it_is_swept(monkeypatch: pytest.Mo
 
 def worked(body: Callable[[Workers], Awaitable[None]], **limits: Any) -> None:
     async def main() -> None:
-        workers = Workers(**{"count": 1, "memory_bytes": 2 << 30, "seconds": 60.0, **limits})
+        workers = Workers(
+            **{"count": 1, "memory_bytes": 2 << 30, "seconds": 60.0, **limits}
+        )
         try:
             await asyncio.wait_for(body(workers), 120)
         finally:

@@ -2,11 +2,12 @@
 
     python tests/studies/accuracy_rank.py --count 200 --seed 63
 
-Scans of `bias_bound.py` that the panel sees whole, without noise. Means over cubes of five voxels,
-all over the object and away from edges, are compared with the truth: what half of them, and nine
-of ten, are off by is what `accuracy.half` and `accuracy.most` state. Prints the share of scans in
-which they hold, the stated over the true figure (median), and their rank correlation (Spearman).
-Exits with 1 where `half` holds in less than 98 % of scans, or ranks them by less than 0.5.
+Scans of `bias_bound.py` that the panel sees whole, without noise. Means over cubes of five
+voxels, all over the object and away from edges, are compared with the truth: what half of them,
+and nine of ten, are off by is what `accuracy.half` and `accuracy.most` state. Prints the share
+of scans in which they hold, the stated over the true figure (median), and their rank
+correlation (Spearman). Exits with 1 where `half` holds in less than 98 % of scans, or ranks
+them by less than 0.5.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Stated:
 
 
 def judged(seed: int, number: int) -> Stated | None:
-    """Compare what is stated of a drawn scan with the truth; None of too few uniform regions."""
+    """Compare what is stated of a drawn scan with the truth; None of too few uniform
+    regions."""
     scan = replace(bias_bound.drawn(seed, number), counts=0.0)
     if " cut " in scan.said:
         return None
@@ -59,7 +61,11 @@ def judged(seed: int, number: int) -> Stated | None:
         truncation = truncation_of(images.__getitem__, scan.geometry, scan.shape)
         bias = bias_of(images.__getitem__, scan.geometry, scan.shape, truncation)
         volume = fdk_parts(
-            lambda: [images.copy()], scan.geometry, scan.shape, grid, truncation=truncation
+            lambda: [images.copy()],
+            scan.geometry,
+            scan.shape,
+            grid,
+            truncation=truncation,
         )
     except fx.TwinError:
         return None
@@ -69,13 +75,17 @@ def judged(seed: int, number: int) -> Stated | None:
     x, y, z = volume.centers()
     places = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], axis=-1)
     truth = scan.truth(places)
-    uniform = minimum_filter(truth, UNIFORM_VOXELS) == maximum_filter(truth, UNIFORM_VOXELS)
+    uniform = minimum_filter(truth, UNIFORM_VOXELS) == maximum_filter(
+        truth, UNIFORM_VOXELS
+    )
     means = uniform_filter(np.nan_to_num(volume.data), REGION_VOXELS)
     seen = uniform_filter(np.isnan(volume.data).astype(float), REGION_VOXELS) == 0.0
     regions = uniform & seen & (truth > LEAST_SHARE * scan.solids[0].mu)
     if regions.sum() < FEWEST_REGIONS:
         return None
-    half, most = np.percentile(np.abs(means[regions] / truth[regions] - 1.0), [50.0, 90.0])
+    half, most = np.percentile(
+        np.abs(means[regions] / truth[regions] - 1.0), [50.0, 90.0]
+    )
     return Stated(scan.said, (accuracy.half, accuracy.most), (float(half), float(most)))
 
 
@@ -88,11 +98,14 @@ def main() -> int:
     chosen = parser.parse_args()
     begun = time.process_time()
     numbers = range(chosen.first, chosen.first + chosen.count)
-    found = [one for number in numbers if (one := judged(chosen.seed, number)) is not None]
+    found = [
+        one for number in numbers if (one := judged(chosen.seed, number)) is not None
+    ]
     good = True
     for place, name in enumerate(("half of the regions", "nine of ten")):
         stated, true = (
-            np.array([getattr(one, which)[place] for one in found]) for which in ("stated", "true")
+            np.array([getattr(one, which)[place] for one in found])
+            for which in ("stated", "true")
         )
         within, rank = float((true <= stated).mean()), float(spearmanr(stated, true)[0])
         print(f"{name}: holds in {100 * within:.1f} % of {len(found)} scans; stated over true, "

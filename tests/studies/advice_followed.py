@@ -2,10 +2,11 @@
 
     python tests/studies/advice_followed.py [--each 4] [--seed 0] [--kinds a,b] [--json]
 
-Scans are spoilt in the ways of `faults_drawn.KINDS` and calibrated; every argument that a finding
-advises (`--per-frame ...`, `free ... too`, `--bead-tolerance`) is given to a second calibration of
-the same scan. That must be refused, or right within 4 sigma. A line for each argument and code says
-how often it was followed, and what came of it; exit code 1 where an answer was wrong.
+Scans are spoilt in the ways of `faults_drawn.KINDS` and calibrated; every argument that a
+finding advises (`--per-frame ...`, `free ... too`, `--bead-tolerance`) is given to a second
+calibration of the same scan. That must be refused, or right within 4 sigma. A line for each
+argument and code says how often it was followed, and what came of it; exit code 1 where an
+answer was wrong.
 
 Shadows come from `faults_drawn`, which shares nothing with what is tested.
 """
@@ -39,9 +40,9 @@ ADVISED: Final = (
     "axis_far_aslant", "tau_held", "height_held", "across_held", "strain_x", "strain_z", "grows",
     "source_jumps",
 )  # fmt: skip
-"""Kinds of faults whose findings advise arguments. Not among them: `other_pitch`, whose sentence
-names the pixels beside dD_z (freed, dD_z is 56 sigma off), and `four_tiles`, whose tiles may have
-no name."""
+"""Kinds of faults whose findings advise arguments. Not among them: `other_pitch`, whose
+sentence names the pixels beside dD_z (freed, dD_z is 56 sigma off), and `four_tiles`, whose
+tiles may have no name."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,21 @@ def followed(kind: str, seed: int) -> list[Followed]:
             try:
                 found = calibrated(scan, **options)
             except TwinError:
-                out.append(Followed(kind, seed, finding.code, argument, False, 0.0, "", before))
+                out.append(
+                    Followed(kind, seed, finding.code, argument, False, 0.0, "", before)
+                )
                 continue
             worst, where = worst_error(found, scan) if found.identifiable else (0.0, "")
             out.append(
                 Followed(
-                    kind, seed, finding.code, argument, found.identifiable, worst, where, before
+                    kind,
+                    seed,
+                    finding.code,
+                    argument,
+                    found.identifiable,
+                    worst,
+                    where,
+                    before,
                 )
             )
     return out
@@ -111,8 +121,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--each", type=int, default=4, help="scans of each kind")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kinds", default=",".join(ADVISED), help=f"of {', '.join(KINDS)}")
-    parser.add_argument("--json", action="store_true", help="a line for each argument as well")
+    parser.add_argument(
+        "--kinds", default=",".join(ADVISED), help=f"of {', '.join(KINDS)}"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="a line for each argument as well"
+    )
     args = parser.parse_args(argv)
     runs: list[Followed] = []
     for kind in args.kinds.split(","):

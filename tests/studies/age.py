@@ -1,11 +1,11 @@
 """An old twin beside a young one: `age.py --jobs 100000 --samples 10000`.
 
 A directory is aged in two steps, a tenth and the whole: jobs as an earlier version left them (a
-list in `state.json`), uploads of 16^3 voxels, corrections and small real scans by the wire. Before
-and after each step the same requests are measured: processor time and bytes written a request, the
-size of the state, memory of twin and projector, processor time of a start. Figures that a machine's
-other work hardly changes decide: ends with 1 where one of them has grown by more than `--allowed`.
-Nothing of flexdt is imported.
+list in `state.json`), uploads of 16^3 voxels, corrections and small real scans by the wire.
+Before and after each step the same requests are measured: processor time and bytes written a
+request, the size of the state, memory of twin and projector, processor time of a start. Figures
+that a machine's other work hardly changes decide: ends with 1 where one of them has grown by
+more than `--allowed`. Nothing of flexdt is imported.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ START_S = 2.0
 SMALL_MB = 20.0
 SMALL_BYTES = 2048
 SMALL_MS = 0.5
-"""Allowed beside a part of the young figure: memory for names (1 kB each), bytes and processor time
-a request below what is measured."""
+"""Allowed beside a part of the young figure: memory for names (1 kB each), bytes and processor
+time a request below what is measured."""
 
 
 @dataclass
@@ -77,9 +77,13 @@ class Figures:
         for field in fields(self):
             before, now = getattr(young, field.name), getattr(self, field.name)
             unit = field.name.rpartition("_")[2]
-            if field.name in ("ping_ms", "set_wall_ms") or (unit in ("s", "ms") and not times):
+            if field.name in ("ping_ms", "set_wall_ms") or (
+                unit in ("s", "ms") and not times
+            ):
                 continue
-            most = before + START_S if unit == "s" else before * (1 + allowed) + small[unit]
+            most = (
+                before + START_S if unit == "s" else before * (1 + allowed) + small[unit]
+            )
             if now > most:
                 found.append(f"{field.name} {before:.2f} became {now:.2f}")
         return found
@@ -101,7 +105,9 @@ class Old:
 
     def start(self) -> None:
         room = [f"--limit={name}=30000" for name in ("max_samples", "max_corrections")]
-        self.twin = twin(self.rays.port, self.data, "--sample", "empty", "--speed-up", "max", *room)
+        self.twin = twin(
+            self.rays.port, self.data, "--sample", "empty", "--speed-up", "max", *room
+        )
         self.start_s = self.twin.processor_s()
         self.wire = Wire(self.twin.port)
 
@@ -109,7 +115,9 @@ class Old:
         self.twin.end()
 
     def upload(self, name: str, grey: int) -> None:
-        voxels = base64.b64encode(struct.pack("<f", 1e-3 * (1 + grey % 50)) * SIDE**3).decode()
+        voxels = base64.b64encode(
+            struct.pack("<f", 1e-3 * (1 + grey % 50)) * SIDE**3
+        ).decode()
         self.wire.call("sample.upload", name=name, kind="voxels", format="raw", data=voxels,
                        shape=[SIDE] * 3, voxel_mm=[0.5] * 3, total=4 * SIDE**3)  # fmt: skip
 
@@ -126,7 +134,9 @@ class Old:
                 self.wire.call("projection.get")
         self.wire.call("sample.set", name="empty")
         for i in range(self.corrections, corrections):
-            self.wire.call("calibration.apply", parameters={"dD_x": 1e-5 * i}, name=f"c{i}")
+            self.wire.call(
+                "calibration.apply", parameters={"dD_x": 1e-5 * i}, name=f"c{i}"
+            )
         for i in range(self.scans, scans):
             self.wire.wait(self.scan(f"scan-{i}", 3), "done")
         self.end()
@@ -154,7 +164,9 @@ class Old:
         state["jobs_made"] = made + count
         file.write_text(json.dumps(state))
 
-    def _each(self, ask: Callable[[int], object], count: int) -> tuple[float, float, list[float]]:
+    def _each(
+        self, ask: Callable[[int], object], count: int
+    ) -> tuple[float, float, list[float]]:
         """Processor time [ms] and bytes written a request, and latencies [ms]."""
         self._settle()
         used, written, times = self.twin.processor_s(), written_bytes(self.twin), []
@@ -179,7 +191,9 @@ class Old:
         sets = self._each(lambda i: call("tube.set", kV=50.0 + i % 30), n)
         uploads = self._each(lambda i: self.upload(f"{new}-{i:06}", i), n)
         corrections = self._each(
-            lambda i: call("calibration.apply", parameters={"dD_x": 1e-6 * i}, name=f"{new}-{i}"),
+            lambda i: call(
+                "calibration.apply", parameters={"dD_x": 1e-6 * i}, name=f"{new}-{i}"
+            ),
             max(1, n // 4),
         )
         scans = self._each(
@@ -206,7 +220,9 @@ def main() -> int:
     p.add_argument("--scans", type=int, default=1000)
     p.add_argument("--requests", type=int, default=100, help="measured at each age")
     p.add_argument("--allowed", type=float, default=0.2, help="growth, as a part")
-    p.add_argument("--no-times", action="store_true", help="let bytes and memory decide alone")
+    p.add_argument(
+        "--no-times", action="store_true", help="let bytes and memory decide alone"
+    )
     options = p.parse_args()
     print(f"{machine()}; Python's own time in ms of processor time a request", flush=True)
     wrong = []
@@ -227,7 +243,11 @@ def main() -> int:
         finally:
             old.end()
             old.rays.end()
-    print(f"{len(wrong)} figures have grown by more than {options.allowed:.0%}", *wrong, sep="\n")
+    print(
+        f"{len(wrong)} figures have grown by more than {options.allowed:.0%}",
+        *wrong,
+        sep="\n",
+    )
     return 1 if wrong else 0
 
 

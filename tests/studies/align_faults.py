@@ -1,13 +1,15 @@
-"""Is anything that `align` tells far off? Random objects and scanners, with what spoils such scans.
+"""Is anything that `align` tells far off? Random objects and scanners, with what spoils such
+scans.
 
-    python tests/studies/align_faults.py [--count 200] [--seed 1] [--only cube] [--column] [--json]
+    python tests/studies/align_faults.py [--count 200] [--seed 1] [--only cube] [--column]
+    [--json]
 
-Every scan has an object drawn at random, a scanner that is not where it is said to be, and one or
-two of some fifty kinds of trouble. Every second one is asked for shifts of single frames too. A
-line for each kind tells how often column, row and shifts were told and how far they were off at
-most, in standard deviations; exit code 1 when anything was off by more than `--sigmas` (default 5).
-Gaps between tiles and lists of frames that are wrong (one is there twice) have to be named, too.
-`--column` leaves row and shifts, which take most of the time, untold.
+Every scan has an object drawn at random, a scanner that is not where it is said to be, and one
+or two of some fifty kinds of trouble. Every second one is asked for shifts of single frames
+too. A line for each kind tells how often column, row and shifts were told and how far they were
+off at most, in standard deviations; exit code 1 when anything was off by more than `--sigmas`
+(default 5). Gaps between tiles and lists of frames that are wrong (one is there twice) have to
+be named, too. `--column` leaves row and shifts, which take most of the time, untold.
 
 Line integrals and kinematics are those of examples/research/align_targets.py.
 """
@@ -88,7 +90,8 @@ class Scan:
     repeats: bool = False
     """Whether frame views / 3 is there twice, and all after it come one late."""
     swapped: tuple[int, int] | None = None
-    """A frame that is lost, and another that is exposed twice, so that their number is right."""
+    """A frame that is lost, and another that is exposed twice, so that their number is
+    right."""
     nominal: Callable[[fx.ConeVec], fx.ConeVec] = lambda cone: cone
 
     def boxes_added(self, *boxes: list[float]) -> None:
@@ -216,7 +219,9 @@ def holder(s: Scan, rng: Rng) -> None:
 @fault
 def table(s: Scan, rng: Rng) -> None:
     wide, z = rng.choice([12, 20, 30, 60]), rng.uniform(-28, -18)
-    s.boxes_added([*rng.uniform(-3, 3, 2), z - 50, wide, wide * rng.uniform(0.7, 1), 50, 0.02])
+    s.boxes_added(
+        [*rng.uniform(-3, 3, 2), z - 50, wide, wide * rng.uniform(0.7, 1), 50, 0.02]
+    )
 
 
 @fault
@@ -274,14 +279,22 @@ def foam(s: Scan, rng: Rng) -> None:
 @fault
 def still_table(s: Scan, rng: Rng) -> None:
     x, y = rng.uniform(-10, 10, 2)
-    wide, z, dense = rng.uniform(10, 80), rng.uniform(-78, -68), rng.uniform(0.0001, 0.003)
+    wide, z, dense = (
+        rng.uniform(10, 80),
+        rng.uniform(-78, -68),
+        rng.uniform(0.0001, 0.003),
+    )
     s.still = np.array([[x, SOD + y, z, wide, 20, 50, dense]])
 
 
 @fault
 def still_strip(s: Scan, rng: Rng) -> None:
     x, z, y = *rng.uniform(-25, 25, 2), rng.uniform(-100, 100)
-    wide, high, dense = rng.uniform(0.5, 3), rng.uniform(0.5, 10), rng.uniform(0.001, 0.01)
+    wide, high, dense = (
+        rng.uniform(0.5, 3),
+        rng.uniform(0.5, 10),
+        rng.uniform(0.001, 0.01),
+    )
     s.still = np.array([[x, SOD + y, z, wide, 1, high, dense]])
 
 
@@ -305,12 +318,16 @@ def shaken_upwards(s: Scan, rng: Rng) -> None:
 
 @fault
 def drift_upwards(s: Scan, rng: Rng) -> None:
-    s.shift[:, 1] += np.linspace(-0.5, 0.5, len(s.shift)) * rng.uniform(0.3, 1) * either(rng)
+    s.shift[:, 1] += (
+        np.linspace(-0.5, 0.5, len(s.shift)) * rng.uniform(0.3, 1) * either(rng)
+    )
 
 
 @fault
 def drift_aside(s: Scan, rng: Rng) -> None:
-    s.shift[:, 0] += np.linspace(-0.5, 0.5, len(s.shift)) * rng.uniform(0.3, 1) * either(rng)
+    s.shift[:, 0] += (
+        np.linspace(-0.5, 0.5, len(s.shift)) * rng.uniform(0.3, 1) * either(rng)
+    )
 
 
 @fault
@@ -477,13 +494,17 @@ def near_the_source(s: Scan, rng: Rng) -> None:
 def part_of_the_panel(s: Scan, rng: Rng) -> None:
     rows, cols = s.hidden.shape
     low = rng.random() < 0.5
-    shape = (int(rng.integers(20, 60)), cols) if low else (rows, int(rng.integers(60, 110)))
+    shape = (
+        (int(rng.integers(20, 60)), cols) if low else (rows, int(rng.integers(60, 110)))
+    )
     s.hidden = replace(s.hidden, shape=shape)
 
 
 @fault
 def rolled(s: Scan, rng: Rng) -> None:
-    s.hidden = replace(s.hidden, tilts=(rng.uniform(2, 5) * either(rng), *s.hidden.tilts[1:]))
+    s.hidden = replace(
+        s.hidden, tilts=(rng.uniform(2, 5) * either(rng), *s.hidden.tilts[1:])
+    )
 
 
 @fault
@@ -619,7 +640,10 @@ def tried(kinds: list[str], seed: int, per_frame: bool) -> dict[str, Any]:
     if not found.identifiable:
         return told
     shift = s.shift[shown]
-    true = {"axis_column_px": hidden.axis_in_image()[0], "source_row_px": hidden.source_row()}
+    true = {
+        "axis_column_px": hidden.axis_in_image()[0],
+        "source_row_px": hidden.source_row(),
+    }
     for i, (name, value) in enumerate(true.items()):
         if name in found.parameters:
             p: Any = found.parameters[name]
@@ -643,7 +667,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--only", help="kinds, with commas between them")
     parser.add_argument("--sigmas", type=float, default=5.0)
     parser.add_argument("--column", action="store_true", help="no row, no shifts")
-    parser.add_argument("--json", action="store_true", help="one line for each scan as well")
+    parser.add_argument(
+        "--json", action="store_true", help="one line for each scan as well"
+    )
     o = parser.parse_args(words)
     if o.column:
         turn_planes.find_height = untold  # type: ignore[assignment]

@@ -4,8 +4,8 @@
 
 Each way runs in a process of its own, where nothing else checks arguments. The mistakes and the
 right calls are those of `tests/face/test_mistakes.py`. validate_call gets every help: names
-resolved as `signatures.py` resolves them, arrays tested by the same function, its errors made one
-sentence.
+resolved as `signatures.py` resolves them, arrays tested by the same function, its errors made
+one sentence.
 docs/decisions/0022-own-argument-checks.md quotes it.
 """
 
@@ -45,9 +45,24 @@ REPEATS: Final = 7
 """Measurements, of which the shortest counts."""
 ALLOWED: Final = ("allowed", "must be", "did you mean")
 """Words of a sentence that says what is allowed, as the test has them."""
-NEEDED: Final = ("translated", "resolved", "sentence", "by_pydantic", "_as_array", "_as_instance")
+NEEDED: Final = (
+    "translated",
+    "resolved",
+    "sentence",
+    "by_pydantic",
+    "_as_array",
+    "_as_instance",
+)
 """Functions of this module that flexdt would need with validate_call."""
-REPLACED: Final = ("Kind", "kinds", "checked", "kind_of", "_is_number", "_is_list", "PLAIN")
+REPLACED: Final = (
+    "Kind",
+    "kinds",
+    "checked",
+    "kind_of",
+    "_is_number",
+    "_is_list",
+    "PLAIN",
+)
 """What of `twin/signatures.py` they would stand for."""
 IMPORTS: Final = {
     "flexdt.ConeVec": "import flexdt; flexdt.ConeVec",
@@ -91,7 +106,9 @@ def by_pydantic_alone(function: Callable[..., Any], text: str) -> Check:
         try:
             found: Arguments = validated(*given, **named)
         except ValidationError as error:
-            raise signatures.ArgumentError(str(error).replace("should be", "must be")) from None
+            raise signatures.ArgumentError(
+                str(error).replace("should be", "must be")
+            ) from None
         return found
 
     return check
@@ -121,8 +138,11 @@ def by_pydantic(*, strict: bool) -> Callable[[Callable[..., Any], str], Check]:
 
 
 def resolved(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function with the same parameters that returns its arguments; annotations are objects."""
-    numpy_types = types.SimpleNamespace(ArrayLike=signatures.Array, NDArray=signatures.Array)
+    """A function with the same parameters that returns its arguments; annotations are
+    objects."""
+    numpy_types = types.SimpleNamespace(
+        ArrayLike=signatures.Array, NDArray=signatures.Array
+    )
     names = signatures.Names(function.__globals__, npt=numpy_types)
 
     def arguments(*given: Any, **named: Any) -> Arguments:
@@ -138,7 +158,9 @@ def resolved(function: Callable[..., Any]) -> Callable[..., Any]:
     shown.__name__, shown.__qualname__ = function.__name__, function.__qualname__
     shown.__signature__ = inspect.Signature(parameters)
     shown.__annotations__ = {
-        p.name: p.annotation for p in parameters if p.annotation is not inspect.Parameter.empty
+        p.name: p.annotation
+        for p in parameters
+        if p.annotation is not inspect.Parameter.empty
     }
     return arguments
 
@@ -177,7 +199,9 @@ def _as_instance(kind: type, value: Any) -> Any:
     return value
 
 
-def sentence(function: Callable[..., Any], where: str, error: Any, call: Arguments) -> str:
+def sentence(
+    function: Callable[..., Any], where: str, error: Any, call: Arguments
+) -> str:
     """What pydantic says of the first argument that does not hold, as one sentence."""
     takes = inspect.signature(function).parameters
     found = error.errors(include_url=False)
@@ -211,7 +235,8 @@ WAYS: Final[dict[str, Callable[[], Callable[[Callable[..., Any], str], Check]]]]
 
 
 class Checks:
-    """Stands for `signatures._checked`, with another way; builds each check when it is first used.
+    """Stands for `signatures._checked`, with another way; builds each check when it is first
+    used.
 
     Attributes:
         build_s: processor time that building took.
@@ -230,7 +255,9 @@ class Checks:
         try:
             made = self.way(function, text)
         except Exception as error:
-            self.failed[function.__qualname__] = f"{type(error).__name__}: {error}".split("\n")[0]
+            self.failed[function.__qualname__] = f"{type(error).__name__}: {error}".split(
+                "\n"
+            )[0]
             made = by_nothing(function, text)
         self.build_s += time.process_time() - begun
         self.built += 1
@@ -300,7 +327,9 @@ def told(call: Callable[..., Any], mistake: Any) -> str:
 
 def four_parts(mistake: Any, text: str) -> bool:
     """Whether a text names function, argument, what was given and what is allowed."""
-    function = mistake.where.rpartition(".")[2] in text or mistake.where.split(".")[0] in text
+    function = (
+        mistake.where.rpartition(".")[2] in text or mistake.where.split(".")[0] in text
+    )
     allowed = any(word in text for word in ALLOWED)
     if mistake.kind == "another order":
         return function and allowed and " is " in text
@@ -315,9 +344,12 @@ def four_parts(mistake: Any, text: str) -> bool:
 
 
 def right_calls(right: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Right calls, and the same with equal values of other types -> the refusal, if it is one."""
+    """Right calls, and the same with equal values of other types -> the refusal, if it is
+    one."""
     for where, (call, named) in right.items():
-        inner: Any = getattr(call, "__init__" if isinstance(call, type) else "__func__", call)
+        inner: Any = getattr(
+            call, "__init__" if isinstance(call, type) else "__func__", call
+        )
         check = getattr(inner, "check", None)
         if check is None or not named.keys() <= inner.names:
             continue
@@ -333,7 +365,10 @@ def right_calls(right: dict[str, Any]) -> Iterator[tuple[str, str]]:
             try:
                 check(first, given)
             except Exception as error:
-                yield f"{where}, {form}", f"{type(error).__name__}: {error}".split("\n")[0][:160]
+                yield (
+                    f"{where}, {form}",
+                    f"{type(error).__name__}: {error}".split("\n")[0][:160],
+                )
             else:
                 yield f"{where}, {form}", ""
 
@@ -381,7 +416,9 @@ def call_times(way: str) -> dict[str, float]:
     return found
 
 
-def _time(call: Callable[..., Any], given: tuple[Any, ...], named: Any, calls: int) -> float:
+def _time(
+    call: Callable[..., Any], given: tuple[Any, ...], named: Any, calls: int
+) -> float:
     """Shortest mean processor time of a call [s]."""
     call(*given, **named)
     shortest = float("inf")
@@ -402,7 +439,9 @@ def import_times() -> Iterator[tuple[str, float, bool]]:
         code = (f"import time, sys; t = time.process_time(); {statement}; "
                 "print(1e3 * (time.process_time() - t), 'pydantic' in sys.modules)")  # fmt: skip
         runs = [
-            subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+            subprocess.run(
+                [sys.executable, "-c", code], capture_output=True, text=True, check=True
+            )
             for _ in range(REPEATS)
         ]
         times = [run.stdout.split() for run in runs]
@@ -415,13 +454,16 @@ def lines_of(file: Path, names: Sequence[str]) -> int:
     return sum(
         code_lines(textwrap.dedent(ast.get_source_segment(text, node, padded=True) or ""))
         for node in ast.walk(ast.parse(text))
-        if getattr(node, "name", getattr(getattr(node, "target", None), "id", None)) in names
+        if getattr(node, "name", getattr(getattr(node, "target", None), "id", None))
+        in names
     )
 
 
 def main() -> None:
     """Measure one way as JSON, or all of them as a report."""
-    parser = argparse.ArgumentParser(description="Mistakes in calls, answered in several ways.")
+    parser = argparse.ArgumentParser(
+        description="Mistakes in calls, answered in several ways."
+    )
     parser.add_argument("way", nargs="?", choices=[*WAYS])
     way = parser.parse_args().way
     if way is not None:
@@ -434,23 +476,40 @@ def main() -> None:
             [sys.executable, __file__, way], capture_output=True, text=True, check=False
         )
         if done.returncode:
-            *_, why = (line for line in done.stderr.splitlines() if "ArgumentError: " in line)
-            print(f"\n{way}: refuses calls that flexdt itself makes: {why.split(': ', 1)[1]}")
+            *_, why = (
+                line for line in done.stderr.splitlines() if "ArgumentError: " in line
+            )
+            print(
+                f"\n{way}: refuses calls that flexdt itself makes: {why.split(': ', 1)[1]}"
+            )
             continue
         found = json.loads(done.stdout.splitlines()[-1])
         kinds = ", ".join(f"{kind} {a} of {b}" for kind, (a, b) in found["kinds"].items())
         print(f"\n{way}: {found['answered']} of 150 mistakes get a sentence ({kinds});")
-        print(f"  {found['four parts']} name function, argument, the given and the allowed")
+        print(
+            f"  {found['four parts']} name function, argument, the given and the allowed"
+        )
         print(f"  refused of {found['right calls']} right calls: {len(found['refused'])}")
         print(f"  {found['built']} checks built in {found['build_ms']:.0f} ms;", end=" ")
-        print("added to a call:", ", ".join(f"{n} {us:.2f} us" for n, us in found["calls"].items()))
+        print(
+            "added to a call:",
+            ", ".join(f"{n} {us:.2f} us" for n, us in found["calls"].items()),
+        )
         for title in ("unanswered", "in part", "refused"):
             print(*(f"    {title}: {line}" for line in found[title]), sep="\n")
-        print(*(f"    not built: {n}: {why}" for n, why in found["failed"].items()), sep="\n")
+        print(
+            *(f"    not built: {n}: {why}" for n, why in found["failed"].items()),
+            sep="\n",
+        )
     for name, ms, loaded in import_times():
-        print(f"import of {name}: {ms:.0f} ms; pydantic is {'' if loaded else 'not '}loaded")
+        print(
+            f"import of {name}: {ms:.0f} ms; pydantic is {'' if loaded else 'not '}loaded"
+        )
     own = ROOT / "twin" / "signatures.py"
-    print(f"code lines of twin/signatures.py: {code_lines(own.read_text('utf-8'))};", end=" ")
+    print(
+        f"code lines of twin/signatures.py: {code_lines(own.read_text('utf-8'))};",
+        end=" ",
+    )
     print(f"validate_call would stand for {lines_of(own, REPLACED)}", end=" ")
     print(f"and need {lines_of(Path(__file__), NEEDED)}")
 

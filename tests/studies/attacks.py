@@ -1,10 +1,10 @@
 """Attacks on real processes, and what each got: `python tests/studies/attacks.py [NAME...]`.
 
-What no well-formed message tries: broken and vast frames, clients that never end, guessed tokens,
-files that are not what they say, links and names that lead elsewhere. Starts a projector and a
-twin, tries each, checks that the servers live on and that no line of their logs is an unhandled
-exception, and prints a table. Exit code 1 when one got through. Well-formed messages: see
-fuzz_schema.py.
+What no well-formed message tries: broken and vast frames, clients that never end, guessed
+tokens, files that are not what they say, links and names that lead elsewhere. Starts a
+projector and a twin, tries each, checks that the servers live on and that no line of their logs
+is an unhandled exception, and prints a table. Exit code 1 when one got through. Well-formed
+messages: see fuzz_schema.py.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class Ground:
 
     def raw(self, data: bytes, *, port: int | None = None, wait_s: float = 20.0) -> bytes:
         """Send bytes, then read until a line, an end or a timeout."""
-        with socket.create_connection(("127.0.0.1", port or self.twin.port), timeout=wait_s) as s:
+        with socket.create_connection(
+            ("127.0.0.1", port or self.twin.port), timeout=wait_s
+        ) as s:
             with contextlib.suppress(ConnectionError):
                 s.sendall(data)
             got = b""
@@ -126,10 +128,18 @@ def stl(faces: int, claimed: int | None = None) -> bytes:
     head = b"\0" * 80 + struct.pack("<I", faces if claimed is None else claimed)
     if faces == 12:
         corner = [(x, y, z) for x in (0, 9) for y in (0, 9) for z in (0, 9)]
-        quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        quads = [
+            (0, 1, 3, 2),
+            (4, 6, 7, 5),
+            (0, 4, 5, 1),
+            (2, 3, 7, 6),
+            (0, 2, 6, 4),
+            (1, 5, 7, 3),
+        ]
         tris = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
         body = b"".join(
-            struct.pack("<12fH", 0, 0, 0, *corner[a], *corner[b], *corner[c], 0) for a, b, c in tris
+            struct.pack("<12fH", 0, 0, 0, *corner[a], *corner[b], *corner[c], 0)
+            for a, b, c in tris
         )
         return head + body
     return head + np.random.default_rng(0).bytes(50 * faces)
@@ -137,7 +147,10 @@ def stl(faces: int, claimed: int | None = None) -> bytes:
 
 @attack("broken JSON")
 def broken_json(g: Ground) -> str:
-    codes = {code_of(g.raw(line + b"\n")) for line in (b"{", b"nonsense", b'{"a":1,}', b"\xff\xfe")}
+    codes = {
+        code_of(g.raw(line + b"\n"))
+        for line in (b"{", b"nonsense", b'{"a":1,}', b"\xff\xfe")
+    }
     assert codes == {-32700}, codes
     return "-32700, the connection goes on"
 
@@ -176,7 +189,9 @@ def deep_msgpack(g: Ground) -> str:
                 s.sendall(struct.pack(">I", len(body)) + body)
                 head = s.recv(4, socket.MSG_WAITALL)
                 assert len(head) == 4
-                assert b"error" in s.recv(struct.unpack(">I", head)[0], socket.MSG_WAITALL)
+                assert b"error" in s.recv(
+                    struct.unpack(">I", head)[0], socket.MSG_WAITALL
+                )
     return "-32700 from both servers"
 
 
@@ -195,7 +210,9 @@ def half_frames(g: Ground) -> str:
     before = g.twin.descriptors()
     for i in range(300):
         with socket.create_connection(("127.0.0.1", g.twin.port)) as s:
-            s.sendall(b"\x00\x00\x10\x00abc" if i % 2 else b'{"jsonrpc":"2.0","id":1,"meth')
+            s.sendall(
+                b"\x00\x00\x10\x00abc" if i % 2 else b'{"jsonrpc":"2.0","id":1,"meth'
+            )
     eventually(lambda: g.twin.descriptors() <= before + 2, "descriptors are left")
     return "nothing; no descriptor is left"
 
@@ -213,7 +230,10 @@ def browser(g: Ground) -> str:
 @attack("1 000 connections at once")
 def many(g: Ground) -> str:
     ping = b'{"jsonrpc":"2.0","id":1,"method":"session.ping"}\n'
-    open_ = [socket.create_connection(("127.0.0.1", g.twin.port), timeout=30) for _ in range(1000)]
+    open_ = [
+        socket.create_connection(("127.0.0.1", g.twin.port), timeout=30)
+        for _ in range(1000)
+    ]
     served, turned_away = 0, 0
     for s in open_:
         with contextlib.suppress(ConnectionError):
@@ -242,7 +262,12 @@ def deaf(g: Ground) -> str:
     s = socket.create_connection(("127.0.0.1", g.twin.port))
     s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     topics = ["state", "projection", "job", "log"]
-    request = {"jsonrpc": "2.0", "id": 1, "method": "state.subscribe", "params": {"topics": topics}}
+    request = {
+        "jsonrpc": "2.0",
+        "id": 1,
+        "method": "state.subscribe",
+        "params": {"topics": topics},
+    }
     s.sendall(json.dumps(request).encode() + b"\n")
     wire = g.wire()
     wire.call("session.control", action="force")
@@ -334,19 +359,26 @@ def guessing(g: Ground) -> str:
                 wire = Wire(server.port)
                 assert code_of(wire.ask("state.get")) == -32004
                 for _ in range(5):
-                    answer = wire.ask("session.hello", protocol="1.0", client="x", token=guess)
+                    answer = wire.ask(
+                        "session.hello", protocol="1.0", client="x", token=guess
+                    )
                     tries += 1
                     assert code_of(answer) == -32004
         took = time.monotonic() - begun
         wire = Wire(server.port)
         wire.call(
-            "session.hello", protocol="1.0", client="x", token="a-long-secret-token-for-tests"
+            "session.hello",
+            protocol="1.0",
+            client="x",
+            token="a-long-secret-token-for-tests",
         )
         assert wire.call("session.ping")
         assert "a-long-secret" not in server.log.read_text()
     finally:
         server.end()
-    return f"-32004; {tries} guesses took {took:.1f} s, three a connection, growing delays"
+    return (
+        f"-32004; {tries} guesses took {took:.1f} s, three a connection, growing delays"
+    )
 
 
 ESCAPES = ["../evil", "..", ".", "/tmp/evil", "\\\\host\\share\\evil", "C:\\evil", "C:evil",
@@ -424,9 +456,13 @@ def hostile_stl(g: Ground) -> str:
         b"\0" * 84,
         b"x",
     ]
-    codes = [code_of(upload(wire, f"bad{i}", raw, format="stl")) for i, raw in enumerate(raws)]
+    codes = [
+        code_of(upload(wire, f"bad{i}", raw, format="stl")) for i, raw in enumerate(raws)
+    ]
     assert set(codes) <= {-32602, -32001, -32008}, codes
-    assert not [n for n in wire.call("sample.list")["samples"] if n["name"].startswith("bad")]
+    assert not [
+        n for n in wire.call("sample.list")["samples"] if n["name"].startswith("bad")
+    ]
     return "-32602, nothing is kept"
 
 
@@ -448,14 +484,19 @@ def glb(count: int, nodes: int = 1, corners: int = 0, **accessor: Plain) -> byte
     return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
-@attack("hostile GLB, PLY and OFF: counts without bytes, a mesh in 10 000 places, other files")
+@attack(
+    "hostile GLB, PLY and OFF: counts without bytes, a mesh in 10 000 places, other files"
+)
 def hostile_meshes(g: Ground) -> str:
     ply = b"ply\nformat %s 1.0\nelement vertex 4000000000\nproperty float x\nend_header\n1\n"
     raws = [
         ("glb", glb(30_000_000)),
         ("glb", glb(30_000_000, corners=3, bufferView=0)),
         ("glb", glb(300_000, nodes=10_000, corners=300_000, bufferView=0)),
-        ("glb", glb(3, corners=3, bufferView=0).replace(b'"bufferView"', b'"bufferVuew"')),
+        (
+            "glb",
+            glb(3, corners=3, bufferView=0).replace(b'"bufferView"', b'"bufferVuew"'),
+        ),
         ("glb", b"glTF" + b"\xff" * 100),
         ("ply", ply % b"ascii"),
         ("ply", ply % b"binary_little_endian"),
@@ -476,13 +517,16 @@ def hostile_meshes(g: Ground) -> str:
     wire = g.wire()
     try:
         codes = [
-            code_of(upload(wire, f"bad{i}", raw, format=form)) for i, (form, raw) in enumerate(raws)
+            code_of(upload(wire, f"bad{i}", raw, format=form))
+            for i, (form, raw) in enumerate(raws)
         ]
     finally:
         done.set()
         thread.join()
     assert set(codes) == {-32602}, codes
-    assert not [n for n in wire.call("sample.list")["samples"] if n["name"].startswith("bad")]
+    assert not [
+        n for n in wire.call("sample.list")["samples"] if n["name"].startswith("bad")
+    ]
     assert 0.0 < worst < 1000.0, worst
     return f"-32602, nothing is kept; their readers took {worst:.0f} MB at most"
 
@@ -516,7 +560,8 @@ def big_mesh(g: Ground) -> str:
         thread.join()
     assert code_of(answer) in (-32602, -32008), answer
     return (
-        f"{code_of(answer)} after {took:.0f} s; twin now {g.twin.memory_mb():.0f} MB; slowest ping "
+        f"{code_of(answer)} after {took:.0f} s; twin now {g.twin.memory_mb():.0f} MB; "
+        "slowest ping "
         f"of another client {1000 * worst:.0f} ms"
     )
 
@@ -545,7 +590,9 @@ def pickles(g: Ground) -> str:
 def retag(raw: bytearray, values: dict[int, int]) -> None:
     """Give tags of a small little-endian TIFF other values."""
     for tag, value in values.items():
-        at = next(i for t in (3, 4) if (i := raw.find(struct.pack("<HHI", tag, t, 1))) >= 0)
+        at = next(
+            i for t in (3, 4) if (i := raw.find(struct.pack("<HHI", tag, t, 1))) >= 0
+        )
         raw[at : at + 12] = struct.pack("<HHII", tag, 4, 1, value)
 
 
@@ -568,7 +615,9 @@ def hostile_tiff(g: Ground) -> str:
     claims = bytearray(vast.getvalue())
     retag(claims, {256: 100_000, 257: 100_000})  # width and length
     bomb = io.BytesIO()
-    tifffile.imwrite(bomb, np.zeros((64, 64), np.uint16), metadata=None, compression="zlib")
+    tifffile.imwrite(
+        bomb, np.zeros((64, 64), np.uint16), metadata=None, compression="zlib"
+    )
     packed = bytearray(bomb.getvalue())
     evil = zlib.compress(b"\0" * (1 << 30), 9)
     retag(packed, {279: len(evil), 273: len(packed)})  # the strip's length and place
@@ -586,7 +635,9 @@ def hostile_tiff(g: Ground) -> str:
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     assert grown < 200, grown
     kib = len(evil) >> 10
-    return f"refused, {kib} KiB that inflate to 1 GiB included; {grown:.0f} MB more memory"
+    return (
+        f"refused, {kib} KiB that inflate to 1 GiB included; {grown:.0f} MB more memory"
+    )
 
 
 @attack("scripts that plan half a terabyte, a billion frames, or a time without an end")
@@ -611,7 +662,10 @@ def vast_scripts(g: Ground) -> str:
         report = wire.call("script.check", text=text)
         assert not report["ok"], text
         assert report["problems"]
-        assert refused(wire, "script.submit", text=text, name="vast").code in (-32005, -32001)
+        assert refused(wire, "script.submit", text=text, name="vast").code in (
+            -32005,
+            -32001,
+        )
     assert not (g.data / "vast").exists()
     assert wire.call("state.get")["axes"] == before
     return "-32001 for the disk, -32005 with their problems; nothing moves"
@@ -673,12 +727,16 @@ def main() -> int:
         finally:
             g.close()
         bad = [
-            e for p in (g.twin, g.projector) for e in p.logged("error", "critical", "unstructured")
+            e
+            for p in (g.twin, g.projector)
+            for e in p.logged("error", "critical", "unstructured")
         ]
         for entry in bad[:5]:
             print("LOG:", str(entry)[-1500:])
     tried = len(wanted) or len(ATTACKS)
-    print(f"\n{tried - failed} of {tried} attacks failed; {len(bad)} unhandled exceptions logged.")
+    print(
+        f"\n{tried - failed} of {tried} attacks failed; {len(bad)} unhandled exceptions logged."
+    )
     return 1 if failed or bad else 0
 
 

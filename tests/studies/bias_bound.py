@@ -2,10 +2,11 @@
 
     python tests/studies/bias_bound.py --count 200 --seed 1
 
-Solids of known attenuation are projected along rays of this file's own, through drawn geometries:
-whole turns, parts of turns, gaps, wedges, views at random or twice; panels in the middle, aside,
-far aside, tilted; sources near and far; objects taller and wider than the panel; noise, and a flat
-that drifts. Means of small even balls, all over the object, are compared with the truth.
+Solids of known attenuation are projected along rays of this file's own, through drawn
+geometries: whole turns, parts of turns, gaps, wedges, views at random or twice; panels in the
+    middle, aside,
+far aside, tilted; sources near and far; objects taller and wider than the panel; noise, and a
+flat that drifts. Means of small even balls, all over the object, are compared with the truth.
 Prints the part within the bound (and three times the noise), the bound over the error, and how
 many volumes had a warning. Exits with 1 where more than one region of fifty is outside.
 """
@@ -64,8 +65,13 @@ class Solid:
         for axis in flat:
             step = np.where(np.abs(along[..., axis]) < 1e-12, 1e-12, along[..., axis])
             ends = np.stack([(-1.0 - start[axis]) / step, (1.0 - start[axis]) / step])
-            low, high = np.maximum(low, ends.min(axis=0)), np.minimum(high, ends.max(axis=0))
-        round_ = {"ellipsoid": slice(0, 3), "cylinder": slice(0, 2), "box": slice(0, 0)}[self.kind]
+            low, high = (
+                np.maximum(low, ends.min(axis=0)),
+                np.minimum(high, ends.max(axis=0)),
+            )
+        round_ = {"ellipsoid": slice(0, 3), "cylinder": slice(0, 2), "box": slice(0, 0)}[
+            self.kind
+        ]
         if self.kind != "box":
             a = (along[..., round_] ** 2).sum(axis=-1)
             b = (along[..., round_] * start[round_]).sum(axis=-1)
@@ -106,7 +112,10 @@ class Scan:
         return out.astype(np.float32)
 
     def truth(self, at: np.ndarray) -> np.ndarray:
-        return sum((solid.mu * solid.inside(at) for solid in self.solids), np.zeros(at.shape[:-1]))
+        return sum(
+            (solid.mu * solid.inside(at) for solid in self.solids),
+            np.zeros(at.shape[:-1]),
+        )
 
 
 def drawn(seed: int, number: int) -> Scan:
@@ -114,7 +123,9 @@ def drawn(seed: int, number: int) -> Scan:
     rng = np.random.default_rng([seed, number])
     rows, cols = int(rng.integers(32, 73)), int(rng.integers(56, 105))
     field = 20.0  # radius of the field of view of a panel in the middle [mm]
-    wide = float(np.exp(rng.uniform(np.log(3.5), np.log(15.0))))  # radius of the circle over it
+    wide = float(
+        np.exp(rng.uniform(np.log(3.5), np.log(15.0)))
+    )  # radius of the circle over it
     sod = field * wide
     sdd = sod * float(rng.uniform(1.2, 4.0))
     pixel = 2.0 * sdd * np.tan(np.arcsin(field / sod)) / cols
@@ -142,10 +153,14 @@ def drawn(seed: int, number: int) -> Scan:
     else:
         angles = np.arange(views) * 360.0 / views
         angles = np.concatenate([angles, angles]) if kind == "twice" else angles
-    panel = str(rng.choice(["middle", "aside", "edge", "tilted"], p=[0.6, 0.2, 0.08, 0.12]))
+    panel = str(
+        rng.choice(["middle", "aside", "edge", "tilted"], p=[0.6, 0.2, 0.08, 0.12])
+    )
     if panel in ("aside", "edge") and kind in ("short", "gap"):
         panel = "middle"
-    part = {"aside": rng.uniform(0.1, 0.8), "edge": rng.uniform(0.85, 0.97)}.get(panel, 0.0)
+    part = {"aside": rng.uniform(0.1, 0.8), "edge": rng.uniform(0.85, 0.97)}.get(
+        panel, 0.0
+    )
     aside = float(part * rng.choice([-1.0, 1.0]) * 0.5 * cols * pixel)
     most = 5.0 if panel == "tilted" else 0.0
     tilts = tuple(rng.uniform(-most, most, 3).tolist())
@@ -185,7 +200,8 @@ def drawn(seed: int, number: int) -> Scan:
 
 @dataclass(frozen=True)
 class Judged:
-    """What came of a scan: of each region error, bound and noise of its mean, over the truth."""
+    """What came of a scan: of each region error, bound and noise of its mean, over the
+    truth."""
 
     errors: np.ndarray
     bounds: np.ndarray
@@ -209,7 +225,9 @@ def judged(scan: Scan) -> Judged:
         return Judged(none, none, none, "what it may be off by is not known")
     rng = np.random.default_rng(scan.seed)
     axes = volume.centers()
-    ball = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    ball = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(
+        -1, 3
+    )
     ball = ball[np.linalg.norm(ball, axis=1) <= BALL]
     shell = rng.standard_normal((150, 3))
     shell *= SPARE * grid.voxel_mm / np.linalg.norm(shell, axis=1, keepdims=True)
@@ -222,7 +240,11 @@ def judged(scan: Scan) -> Judged:
         values, true = data[kz, ky, kx], float(there[0])
         if true < 0.3 * body or np.ptp(there) > 1e-12 or np.isnan(values).any():
             continue
-        spread = 0.0 if sigma is None else float(np.linalg.norm(sigma[kz, ky, kx])) / len(values)
+        spread = (
+            0.0
+            if sigma is None
+            else float(np.linalg.norm(sigma[kz, ky, kx])) / len(values)
+        )
         most = float(bound[kz, ky, kx].mean())
         rows.append([float(values.mean()) / true - 1.0, most / true, spread / true])
         if len(rows) == REGIONS:
@@ -274,7 +296,9 @@ def main() -> int:
         some = (errors >= least) & (errors < most)
         if some.any():
             ratio = float(np.median(bounds[some] / np.maximum(errors[some], 1e-6)))
-            print(f"bound over error, median, {some.sum()} errors {least} to {most}: {ratio:.1f}")
+            print(
+                f"bound over error, median, {some.sum()} errors {least} to {most}: {ratio:.1f}"
+            )
     for verdict, count in counts.most_common():
         print(f"{count:6} {verdict}")
     print(f"{time.process_time() - begun:.0f} CPU s")

@@ -1,9 +1,10 @@
-"""Code lines by folder, of flexdt, its extensions and the page: no blanks, comments, docstrings.
+"""Code lines by folder, of flexdt, its extensions and the page: no blanks, comments,
+docstrings.
 
     python tests/studies/code_lines.py [ROOT]
 
-A line counts when a token other than a comment lies on it, so a call over five lines counts five.
-Strings that stand alone as a statement count as documentation.
+A line counts when a token other than a comment lies on it, so a call over five lines counts
+five. Strings that stand alone as a statement count as documentation.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ def code_lines(source: str) -> int:
             and isinstance(node.value, ast.Constant)
             and isinstance(node.value.value, str)
         ):
-            lines.difference_update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+            lines.difference_update(
+                range(node.lineno, (node.end_lineno or node.lineno) + 1)
+            )
     return len(lines)
 
 
@@ -50,7 +53,8 @@ def typescript_lines(source: str) -> int:
     """Number of lines of TypeScript that are neither blank nor comment alone."""
     bare = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
     return sum(
-        bool(line.strip()) and not line.strip().startswith("//") for line in bare.split("\n")
+        bool(line.strip()) and not line.strip().startswith("//")
+        for line in bare.split("\n")
     )
 
 

@@ -1,9 +1,11 @@
-"""Processor time that compiling kernels takes from an empty cache: `compile_times.py [CASE ...]`.
+"""Processor time that compiling kernels takes from an empty cache: `compile_times.py [CASE
+...]`.
 
 Each case runs in processes of its own with an empty NUMBA_CACHE_DIR. What each of its processes
-compiles is written down there by an event of numba's, with the thread's processor time, which other
-work on the machine does not change. A function that another one's compilation compiles counts for
-itself. `--keep FOLDER` takes that folder for the cache: a second run with it shows a warm start.
+compiles is written down there by an event of numba's, with the thread's processor time, which
+other work on the machine does not change. A function that another one's compilation compiles
+counts for itself. `--keep FOLDER` takes that folder for the cache: a second run with it shows a
+warm start.
 """
 
 from __future__ import annotations
@@ -138,7 +140,8 @@ def run(case: str, cache: Path | None) -> None:
         spent[function] += seconds
         kinds[function].append(signature)
     print(
-        f"{case}: {sum(spent.values()):.1f} s of {used_s() - before:.1f} s processor time compile, "
+        f"{case}: {sum(spent.values()):.1f} s of {used_s() - before:.1f} s processor "
+        "time compile, "
         f"{wall:.1f} s in all"
     )
     for function in sorted(spent, key=lambda f: -spent[f]):

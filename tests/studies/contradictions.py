@@ -3,12 +3,13 @@
     python tests/studies/contradictions.py --count 1000 --right 1000 --seed 1
 
 Each case begins with a right scan: distances, panel, angles and a ball are drawn, and its line
-integrals are chords that this file computes. One thing is then made to contradict another, by an
-amount that is drawn, and a door of the library is asked: `project`, FDK, iterative methods,
-`from_arrays`, `fx.open`, `read_tiffs`, readers of geometry. A case counts where there is a refusal
-or a warning that names the cause, or where the result is right. Right scans go through the same
-doors, and nothing may be said of them. Prints a line a kind, and exits with 1 where fewer than
-98 % of the contradictions count, or more than 1 % of the right scans are told something.
+integrals are chords that this file computes. One thing is then made to contradict another, by
+an amount that is drawn, and a door of the library is asked: `project`, FDK, iterative methods,
+`from_arrays`, `fx.open`, `read_tiffs`, readers of geometry. A case counts where there is a
+refusal or a warning that names the cause, or where the result is right. Right scans go through
+the same doors, and nothing may be said of them. Prints a line a kind, and exits with 1 where
+fewer than 98 % of the contradictions count, or more than 1 % of the right scans are told
+something.
 """
 
 from __future__ import annotations
@@ -143,7 +144,9 @@ class Told:
 
     def names(self, *causes: str) -> bool:
         """Whether one of the causes is in what was said."""
-        return any(cause.lower() in word.lower() for word in self.words for cause in causes)
+        return any(
+            cause.lower() in word.lower() for word in self.words for cause in causes
+        )
 
 
 def ask(door: Callable[[], Any]) -> Told:
@@ -179,7 +182,9 @@ def exposed(
     opened = float(rng.uniform(5_000, 40_000))
     level = np.broadcast_to(beam, len(scan.angles))[:, None, None]
     counts = rng.poisson(100 + opened * level * np.exp(-scan.integrals()))
-    flat = rng.poisson(100 + opened * np.asarray(flats)[:, None, None] * np.ones(scan.shape))
+    flat = rng.poisson(
+        100 + opened * np.asarray(flats)[:, None, None] * np.ones(scan.shape)
+    )
     dark = np.full(scan.shape, 100)
     return lambda: fx.DataSet.from_arrays(np.minimum(counts, 65535), scan.geometry(), dark=dark,
                                           flat=flat)  # fmt: skip
@@ -259,9 +264,12 @@ def units(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def distances(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
-    sod, sdd = ((0.0, scan.sdd), (scan.sdd, scan.sod), (scan.sod, 1e-10), (-scan.sod, scan.sdd))[
-        int(rng.integers(4))
-    ]
+    sod, sdd = (
+        (0.0, scan.sdd),
+        (scan.sdd, scan.sod),
+        (scan.sod, 1e-10),
+        (-scan.sod, scan.sdd),
+    )[int(rng.integers(4))]
     kind = int(rng.integers(3))
     if kind == 0:
         path = folder / "scan.xtekct"
@@ -286,7 +294,9 @@ def distances(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 def arc(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
     span = float(rng.uniform(20, 150))
-    short = scan.geometry(angles=rng.uniform(0, 360) + np.linspace(0, span, len(scan.angles)))
+    short = scan.geometry(
+        angles=rng.uniform(0, 360) + np.linspace(0, span, len(scan.angles))
+    )
     images = scan.mu * chords(short, scan.centre, scan.radius)
     told = method(rng, images, short, scan.grid)
     return told, told.names("directions", "FDK needs")
@@ -319,7 +329,9 @@ def transmission(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
     noise = rng.normal(0.0, rng.uniform(0.0, 0.02), scan.integrals().shape)
     images = np.exp(-scan.integrals()) + noise
     if rng.integers(2):
-        told = ask(lambda: fx.DataSet.from_arrays(images.astype(np.float32), scan.geometry()))
+        told = ask(
+            lambda: fx.DataSet.from_arrays(images.astype(np.float32), scan.geometry())
+        )
     else:
         told = method(rng, images, scan.geometry(), scan.grid)
     return told, told.names("transmission")
@@ -348,7 +360,9 @@ def hounsfield(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
     if rng.integers(2):
         told = ask(lambda: fx.project(volume, scan.geometry()))
     else:
-        told = ask(lambda: fx.simulate(volume.data, scan.geometry(), voxel_mm=volume.voxel_mm))
+        told = ask(
+            lambda: fx.simulate(volume.data, scan.geometry(), voxel_mm=volume.voxel_mm)
+        )
     return told, told.names("Hounsfield")
 
 
@@ -365,7 +379,9 @@ def whole(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 def steel(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
     images = rng.uniform(8, 60) * scan.integrals() / scan.integrals().max()
     told = ask(lambda: fx.DataSet.from_arrays(images, scan.geometry()))
-    same = told.value is not None and np.allclose(told.value.line_integrals(), images, rtol=1e-5)
+    same = told.value is not None and np.allclose(
+        told.value.line_integrals(), images, rtol=1e-5
+    )
     return told, same
 
 
@@ -416,7 +432,9 @@ def gap(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 def other_name(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
     written(folder, scan, [f"X_{i:03d}.tif" for i in range(len(scan.angles))], rng)
-    extra = str(rng.choice(["X_180deg.tif", "preview.tif", "X_007_bis.tif", "aX_001.tif"]))
+    extra = str(
+        rng.choice(["X_180deg.tif", "preview.tif", "X_007_bis.tif", "aX_001.tif"])
+    )
     (folder / extra).write_bytes((folder / "X_000.tif").read_bytes())
     if rng.integers(2):
         (folder / f"X_{int(rng.integers(len(scan.angles))):03d}.tif").unlink()
@@ -430,11 +448,17 @@ def blank(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
     if rng.integers(2):
         images = made.counts()
         images[-some:] = 0
-        told = ask(lambda: fx.DataSet.from_arrays(images, scan.geometry(), flat=made.flat.round()))
+        told = ask(
+            lambda: fx.DataSet.from_arrays(
+                images, scan.geometry(), flat=made.flat.round()
+            )
+        )
     else:
         made.save(folder / "set")
         for i in range(len(made) - some, len(made)):
-            tifffile.imwrite(folder / "set" / f"scan_{i:06d}.tif", np.zeros(scan.shape, np.uint16))
+            tifffile.imwrite(
+                folder / "set" / f"scan_{i:06d}.tif", np.zeros(scan.shape, np.uint16)
+            )
         told = ask(lambda: fx.open(folder / "set"))
     return told, told.names("nothing was recorded")
 
@@ -594,7 +618,9 @@ def right(rng: np.random.Generator, scan: Scan, folder: Path) -> tuple[str, Told
         geometry.save(folder / f"scan{ending}")
         pixel = scan.pixel if ending == ".xml" else None
         return f"file {ending}", ask(
-            lambda: fx.ConeVec.load(folder / f"scan{ending}", pixel=pixel, shape=scan.shape)
+            lambda: fx.ConeVec.load(
+                folder / f"scan{ending}", pixel=pixel, shape=scan.shape
+            )
         )
     astra = {**geometry.to_astra(), "type": "cone", "DetectorSpacingX": scan.pixel,
              "DetectorSpacingY": scan.pixel, "DistanceOriginSource": scan.sod,
@@ -610,7 +636,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--right", type=int, default=1000, help="right scans")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kind", choices=[*KINDS], help="this kind alone")
-    parser.add_argument("--out", type=Path, help="a line of JSON for each case that does not count")
+    parser.add_argument(
+        "--out", type=Path, help="a line of JSON for each case that does not count"
+    )
     asked = parser.parse_args(arguments)
     kinds = [asked.kind] if asked.kind else [*KINDS]
     good: Counter[str] = Counter()
@@ -623,7 +651,9 @@ def main(arguments: list[str] | None = None) -> int:
         made[kind] += 1
         good[kind] += bool(counts_ and not told.crashed)
         if not counts_ or told.crashed:
-            wrong.append({"kind": kind, "case": i, "said": told.words, "crashed": told.crashed})
+            wrong.append(
+                {"kind": kind, "case": i, "said": told.words, "crashed": told.crashed}
+            )
     for kind in kinds:
         print(f"{kind:22} {good[kind]:4} of {made[kind]:4}")
     false = 0
@@ -634,9 +664,13 @@ def main(arguments: list[str] | None = None) -> int:
         said = [w for w in told.words if not any(part in w for part in ALLOWED)]
         if said or told.crashed:
             false += 1
-            wrong.append({"right": door, "case": i, "said": said, "crashed": told.crashed})
+            wrong.append(
+                {"right": door, "case": i, "said": said, "crashed": told.crashed}
+            )
     share = sum(good.values()) / max(asked.count, 1)
-    print(f"refused, said with the cause, or right: {sum(good.values())} of {asked.count}")
+    print(
+        f"refused, said with the cause, or right: {sum(good.values())} of {asked.count}"
+    )
     print(f"right scans that were told something: {false} of {asked.right}")
     if asked.out is not None:
         asked.out.write_text("".join(json.dumps(one) + "\n" for one in wrong))

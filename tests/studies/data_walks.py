@@ -52,8 +52,14 @@ class Walk:
         """A source file of the package, relative to the repository; None for any other."""
         if name not in self._places:
             path = Path(name).resolve() if name.endswith(".py") else None
-            own = path is not None and path.is_relative_to(ROOT) and ".venv" not in path.parts
-            self._places[name] = path.relative_to(ROOT).as_posix() if own and path else None
+            own = (
+                path is not None
+                and path.is_relative_to(ROOT)
+                and ".venv" not in path.parts
+            )
+            self._places[name] = (
+                path.relative_to(ROOT).as_posix() if own and path else None
+            )
         return self._places[name]
 
     def _called(self, frame: FrameType, event: str, _: Any) -> None:
@@ -64,9 +70,16 @@ class Walk:
             return
         self.files.add(file)
         caller = frame.f_back
-        while caller is not None and (from_ := self._place(caller.f_code.co_filename)) is None:
+        while (
+            caller is not None
+            and (from_ := self._place(caller.f_code.co_filename)) is None
+        ):
             caller = caller.f_back
-        if caller is None or from_ is None or from_.startswith(("tests/", "flexdt/testing/")):
+        if (
+            caller is None
+            or from_ is None
+            or from_.startswith(("tests/", "flexdt/testing/"))
+        ):
             return
         rooms = from_.rpartition("/")[0], file.rpartition("/")[0]
         if rooms[0] != rooms[1]:
@@ -144,7 +157,9 @@ WALKS: dict[str, Callable[[Walk], None]] = {
 def main() -> None:
     """Walk and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the counts, and the files of each walk")
+    parser.add_argument(
+        "--json", type=Path, help="write the counts, and the files of each walk"
+    )
     chosen = parser.parse_args()
     found = {}
     for name, walked in WALKS.items():

@@ -1,11 +1,12 @@
-"""What only a CUDA device can say: speed against ASTRA, FDK from host to host, drawn geometries.
+"""What only a CUDA device can say: speed against ASTRA, FDK from host to host, drawn
+geometries.
 
     python tests/studies/device_check.py --out FOLDER [--budget-s 280]
     python tests/studies/device_check.py --tiny --out FOLDER   # the script itself, in the simulator
 
-Parts run one after the other, each if the time is likely to suffice (`run`); `device_check.json` is
-written anew after each, and says of the others that they were not begun. Ends with status 1 where a
-drawn geometry is wrong or a part failed, 3 where there is no device.
+Parts run one after the other, each if the time is likely to suffice (`run`);
+`device_check.json` is written anew after each, and says of the others that they were not begun.
+Ends with status 1 where a drawn geometry is wrong or a part failed, 3 where there is no device.
 """
 
 from __future__ import annotations
@@ -29,8 +30,20 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent / "support"), str(HERE.parents[1] / "extensions")]
-PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "numba-cuda", "cuda-bindings", "astra-toolbox")
+sys.path[:0] = [
+    str(HERE),
+    str(HERE.parent / "support"),
+    str(HERE.parents[1] / "extensions"),
+]
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "llvmlite",
+    "numba-cuda",
+    "cuda-bindings",
+    "astra-toolbox",
+)
 Document = dict[str, Any]
 
 
@@ -69,9 +82,13 @@ TINY = Sizes(
 )  # fmt: skip
 GEOMETRIES_S = 80.0
 """The geometries may take so long."""
-FDK_OBJECTS = {"whole": (30.0, 0.0), "cut off": (55.0, 0.0), "cut off, noise": (55.0, 0.02)}
-"""Radius [mm] of a cylinder of 0.02 / mm about the axis, and sigma of the noise of line integrals.
-The panel sees 40 mm."""
+FDK_OBJECTS = {
+    "whole": (30.0, 0.0),
+    "cut off": (55.0, 0.0),
+    "cut off, noise": (55.0, 0.02),
+}
+"""Radius [mm] of a cylinder of 0.02 / mm about the axis, and sigma of the noise of line
+integrals. The panel sees 40 mm."""
 FDK_ROUNDS = 2
 """Reconstructions of which the quickest counts."""
 
@@ -94,7 +111,9 @@ class Check:
         """Run a part and write the document; None where it is not begun or fails."""
         found: Any = None
         if self.left_s < needs_s:
-            self.document[name] = f"not begun: {self.left_s:.0f} s left, takes {needs_s:.0f}"
+            self.document[name] = (
+                f"not begun: {self.left_s:.0f} s left, takes {needs_s:.0f}"
+            )
         else:
             began = time.monotonic()
             try:
@@ -104,7 +123,9 @@ class Check:
                 self.failed = True
                 self.document[name] = f"failed: {error!r}"
                 traceback.print_exc()
-            self.document.setdefault("seconds", {})[name] = round(time.monotonic() - began, 1)
+            self.document.setdefault("seconds", {})[name] = round(
+                time.monotonic() - began, 1
+            )
         spent_s = self._budget_s - self.left_s
         print(f"{spent_s:5.0f} s  {name}: {json.dumps(self.document[name])}", flush=True)
         self._out.mkdir(parents=True, exist_ok=True)
@@ -129,7 +150,9 @@ def machine() -> Document:
         "--format=csv,noheader",
     ]
     try:
-        said = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+        said = subprocess.run(
+            command, capture_output=True, text=True, check=False
+        ).stdout.strip()
     except OSError as error:
         said = str(error)
     return {
@@ -172,16 +195,22 @@ def projections(name: str, sizes: Sizes) -> Document:
         entry: Document = {"kernel_ms": page.by_events(ahead) / views}
         if views == 1:
             exact = exact_images(volume, scan, sizes.panel)
-            entry["mean_error"], entry["worst_error"] = errors(images.copy_to_host(), exact)
+            entry["mean_error"], entry["worst_error"] = errors(
+                images.copy_to_host(), exact
+            )
         if views < many:
             out = np.empty((views, *sizes.panel), np.float32)
-            entry["call_ms"] = page.on_the_clock(partial(forward, volume, scan, sizes.panel, out))
+            entry["call_ms"] = page.on_the_clock(
+                partial(forward, volume, scan, sizes.panel, out)
+            )
         if views == few:
             sums = gpu.zeros(voxels.size)
             behind = gpu.launcher(box, sums, rays, flat, sizes.panel, transposed=True)
             entry["adjoint_ms"] = page.by_events(behind) / views
             entry["adjoint_over_forward"] = entry["adjoint_ms"] / entry["kernel_ms"]
-            entry["back_there_ms"] = page.on_the_clock(partial(back, images, scan, volume)) / views
+            entry["back_there_ms"] = (
+                page.on_the_clock(partial(back, images, scan, volume)) / views
+            )
             del sums
         if views == many:
             least = page.bound(volume, scan)
@@ -254,7 +283,9 @@ def run(check: Check, sizes: Sizes) -> None:
 
     def fdk_part(views: int, what: str, errors: bool, needs_s: float) -> Any:
         name = f"fdk {views} {what}{' with errors' if errors else ''}"
-        return check.part(name, needs_s, partial(reconstruction, views, what, errors, sizes))
+        return check.part(
+            name, needs_s, partial(reconstruction, views, what, errors, sizes)
+        )
 
     # Kernels are compiled in a first call, whose time does not count.
     for what in FDK_OBJECTS:
@@ -278,9 +309,13 @@ def run(check: Check, sizes: Sizes) -> None:
 def main() -> int:
     """Run all parts that the time allows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder of device_check.json")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of device_check.json"
+    )
     parser.add_argument("--budget-s", type=float, default=280.0, help="seconds in all")
-    parser.add_argument("--tiny", action="store_true", help="a few voxels in numba's simulator")
+    parser.add_argument(
+        "--tiny", action="store_true", help="a few voxels in numba's simulator"
+    )
     options = parser.parse_args()
     if options.tiny and os.environ.get("NUMBA_ENABLE_CUDASIM") != "1":
         environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
@@ -299,7 +334,9 @@ def main() -> int:
         gpu_fdk_kernels.THREADS = 8
         gpu.LINEAR = 64
         sizes = TINY
-        device_page.by_events = device_page.on_the_clock  # the simulator has no clock of its own
+        device_page.by_events = (
+            device_page.on_the_clock
+        )  # the simulator has no clock of its own
         device_page.COUNTS = (1, *sizes.views)
     device_page.PANEL, device_page.ROUNDS = sizes.panel, sizes.rounds
     if not gpu.availability().present:

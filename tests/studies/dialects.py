@@ -1,10 +1,11 @@
-"""Ten dialects of message servers: is every fault told in time, and a healthy day without alarms?
+"""Ten dialects of message servers: is every fault told in time, and a healthy day without
+alarms?
 
     python tests/studies/dialects.py [--conversations 10000] [--hours 24] [--seed 0]
 
-Conversations are drawn from all dialects in turns, each with a fault of the machine, of the server,
-of both or of neither; the days are healthy, once on a machine whose times are assumed and once on
-one with measured times that vary log-normally (median 0.4 s, 40 %).
+Conversations are drawn from all dialects in turns, each with a fault of the machine, of the
+server, of both or of neither; the days are healthy, once on a machine whose times are assumed
+and once on one with measured times that vary log-normally (median 0.4 s, 40 %).
 """
 
 from __future__ import annotations
@@ -45,12 +46,15 @@ def days(hours: float, seed: int) -> None:
         machine = FLEXRAY if overhead is None else measured(overhead)
         for dialect in DIALECTS:
             began, listener = time.monotonic(), Listener(machine=machine)
-            messages = sorted(healthy(dialect, seed, 3600.0 * hours, overhead), key=lambda m: m[0])
+            messages = sorted(
+                healthy(dialect, seed, 3600.0 * hours, overhead), key=lambda m: m[0]
+            )
             listener.hear(messages)
             kinds = Counter((a.severity, a.kind) for a in listener.alarms)
             errors = sum(n for (severity, _), n in kinds.items() if severity == "error")
             print(
-                f"{hours:g} h, {what} times, {dialect.name}: {len(messages)} messages, {errors} "
+                f"{hours:g} h, {what} times, {dialect.name}: {len(messages)} messages, "
+                f"{errors} "
                 f"errors, {len(listener.alarms) - errors} warnings {dict(kinds)}; "
                 f"{time.monotonic() - began:.0f} s",
                 flush=True,

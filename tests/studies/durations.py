@@ -1,9 +1,9 @@
 """Processor time that each test file took: `durations.py [--over 10] [FILE.xml ...]`.
 
-`make test`, `test-extensions`, `studies` and `page` write what each test took to build/durations/:
-processor time, which other work on the machine does not change, of the test, its fixtures and the
-processes that ended in it. The files that took more than `--over` seconds, the budget of a file in
-`make test`, are listed, the longest first, with their longest test.
+`make test`, `test-extensions`, `studies` and `page` write what each test took to
+build/durations/: processor time, which other work on the machine does not change, of the test,
+its fixtures and the processes that ended in it. The files that took more than `--over` seconds,
+the budget of a file in `make test`, are listed, the longest first, with their longest test.
 """
 
 from __future__ import annotations
@@ -29,12 +29,18 @@ def seconds(report: Path) -> dict[str, dict[str, float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("reports", nargs="*", type=Path, default=sorted(FOLDER.glob("*.xml")))
-    parser.add_argument("--over", type=float, default=10.0, help="list files above so many seconds")
+    parser.add_argument(
+        "reports", nargs="*", type=Path, default=sorted(FOLDER.glob("*.xml"))
+    )
+    parser.add_argument(
+        "--over", type=float, default=10.0, help="list files above so many seconds"
+    )
     chosen = parser.parse_args()
     for report in chosen.reports:
         files = {name: (sum(t.values()), t) for name, t in seconds(report).items()}
-        print(f"{report.stem}: {sum(t for t, _ in files.values()):.0f} s in {len(files)} files")
+        print(
+            f"{report.stem}: {sum(t for t, _ in files.values()):.0f} s in {len(files)} files"
+        )
         for name, (total, tests) in sorted(files.items(), key=lambda f: -f[1][0]):
             if total > chosen.over:
                 longest = max(tests, key=lambda test: tests[test])

@@ -1,14 +1,14 @@
 """CIL, TIGRE and LEAP themselves beside the geometries that flexdt writes for them.
 
-None of the three is on the package index, and TIGRE needs a CUDA device to project, so each is run
-as far as a processor takes it, from a checkout of its source:
+None of the three is on the package index, and TIGRE needs a CUDA device to project, so each is
+run as far as a processor takes it, from a checkout of its source:
 
-- CIL: `create_Cone3D_Flex` and `set_panel` make the geometry, CIL's own conversion makes ASTRA's
-  vectors of it (`convert_geometry_to_astra_vec_3D`); these are compared with ours.
-- TIGRE: `Geometry.check_geo` takes the attributes, and the functions of `Siddon_projection.cu` that
-  place source, first pixel and steps are compiled for the processor, in double precision.
-- LEAP: its library, built for the processor, keeps the modular beam and projects three blobs with
-  its own projector; places are compared by least squares.
+- CIL: `create_Cone3D_Flex` and `set_panel` make the geometry, CIL's own conversion makes
+  ASTRA's vectors of it (`convert_geometry_to_astra_vec_3D`); these are compared with ours.
+- TIGRE: `Geometry.check_geo` takes the attributes, and the functions of `Siddon_projection.cu`
+  that place source, first pixel and steps are compiled for the processor, in double precision.
+- LEAP: its library, built for the processor, keeps the modular beam and projects three blobs
+  with its own projector; places are compared by least squares.
 
     python tests/studies/exchange_peers.py --cil CIL --tigre TIGRE --leap LEAP/src [--count 50]
 
@@ -106,13 +106,19 @@ def cil(checkout: Path) -> Callable[[fx.ConeVec], float]:
     sys.modules["cil.version"] = version
     from cil.framework import ImageGeometry  # type: ignore[import-not-found]
 
-    path = "Wrappers/Python/cil/plugins/astra/utilities/convert_geometry_to_astra_vec_3D.py"
+    path = (
+        "Wrappers/Python/cil/plugins/astra/utilities/convert_geometry_to_astra_vec_3D.py"
+    )
     converter = loaded("converter", checkout / path)
 
     def compare(expected: fx.ConeVec) -> float:
         geometry = expected.to_cil()
-        assert [*geometry.shape] == [n for n in expected.shape if n > 1]  # as CIL leaves them out
-        _, theirs = converter.convert_geometry_to_astra_vec_3D(ImageGeometry(9, 9, 9), geometry)
+        assert [*geometry.shape] == [
+            n for n in expected.shape if n > 1
+        ]  # as CIL leaves them out
+        _, theirs = converter.convert_geometry_to_astra_vec_3D(
+            ImageGeometry(9, 9, 9), geometry
+        )
         return off_px(theirs["Vectors"], expected)
 
     return compare
@@ -135,7 +141,9 @@ def tigre(checkout: Path) -> Callable[[fx.ConeVec], float]:
     folder = Path(tempfile.mkdtemp())
     (folder / "place.cpp").write_text(text, "utf-8")
     made = folder / "place.so"
-    subprocess.run([CXX, "-shared", "-fPIC", "-o", made, folder / "place.cpp"], check=True)
+    subprocess.run(
+        [CXX, "-shared", "-fPIC", "-o", made, folder / "place.cpp"], check=True
+    )
     place = ctypes.CDLL(str(made)).place
     # The package's own __init__ wants its CUDA extension; the geometry's module does not.
     package = types.ModuleType("tigre")
@@ -156,7 +164,8 @@ def tigre(checkout: Path) -> Callable[[fx.ConeVec], float]:
             out = (ctypes.c_double * 12)()
             place((ctypes.c_double * 13)(*given), counts, out)
             first, u, step, at = np.array(out).reshape(4, 3)
-            # The kernel counts pixelV = nDetecV - v - 1: row v = 0 lies farthest along its step.
+            # The kernel counts pixelV = nDetecV - v - 1: row v = 0 lies farthest along its
+            # step.
             nv, nu = geometry.nDetector
             middle = first + (nu - 1) / 2 * u + (nv - 1) / 2 * step
             rows[view] = np.concatenate([at, middle, u, -step])
@@ -221,7 +230,9 @@ def leap(folder: Path) -> Callable[[fx.ConeVec], float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0] if __doc__ else None
+    )
     peers = {"cil": cil, "tigre": tigre, "leap": leap}
     for name in peers:
         parser.add_argument(f"--{name}", type=Path)

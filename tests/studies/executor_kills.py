@@ -77,7 +77,9 @@ def main() -> None:
         if thread is not None:
             thread.join(5.0)
         alive = thread is not None and thread.is_alive()
-        print(f"{case.__name__}: {how}; the pool's thread {'lives on' if alive else 'has ended'}")
+        print(
+            f"{case.__name__}: {how}; the pool's thread {'lives on' if alive else 'has ended'}"
+        )
     sys.stdout.flush()
     os._exit(0)  # Python's own end would wait for the thread that lives on
 

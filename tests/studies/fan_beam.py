@@ -1,11 +1,13 @@
-"""A slice from a fan beam beside a plain compiled loop, in turns: processor seconds, and results.
+"""A slice from a fan beam beside a plain compiled loop, in turns: processor seconds, and
+results.
 
     python tests/studies/fan_beam.py [--views 720] [--columns 512] [--rounds 5]
     NUMBA_NUM_THREADS=1 python tests/studies/fan_beam.py
 
 The loop has the weights, filter and backprojection that a textbook gives for a whole turn of a
 panel in the middle (Kak and Slaney 1988, 3.4.2), shares nothing with `twin/reconstruction`, and
-runs on one thread. Times are the least of the rounds, all compiled, from line integrals to volume.
+runs on one thread. Times are the least of the rounds, all compiled, from line integrals to
+volume.
 """
 
 from __future__ import annotations
@@ -84,9 +86,14 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=5)
     o = parser.parse_args(words)
     pitch = WIDTH / o.columns
-    scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=o.views, shape=(1, o.columns), pixel=pitch)
+    scan = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=o.views, shape=(1, o.columns), pixel=pitch
+    )
     voxel = 0.99 * pitch * SOD / SDD
-    grid, lines = fx.Grid((1, o.columns, o.columns), voxel), sinogram(o.views, o.columns, pitch)
+    grid, lines = (
+        fx.Grid((1, o.columns, o.columns), voxel),
+        sinogram(o.views, o.columns, pitch),
+    )
     ways = (
         lambda: fx.fdk(lines, scan, grid, errors=False).data[0],
         lambda: plain(lines, pitch, o.columns, voxel),

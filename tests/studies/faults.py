@@ -4,7 +4,8 @@ disk:   in one process, on a virtual clock and disk: every change of the disk in
         in each of six ways (no room, an error, a power cut, ...). --seeds N
 flips:  in one process: one bit of one kept file is another one (or the file is cut, or missing);
         a server starts on it and answers everything, and a scan can be made. --count N
-writes: over real servers, whose file operations fail at drawn moments: what they answered well is
+writes: over real servers, whose file operations fail at drawn moments: what they answered well
+    is
         there after a kill -9, and the data sets are whole. --count N
 
 Exit code 1 when anything was half done or did not start. Options: --seed N.
@@ -65,7 +66,10 @@ def disk(root: Path, seeds: int) -> int:
                             part.go(fault(n), right)
                     except Exception as error:
                         wrong += 1
-                        print(f"seed {seed} {name} way {way} n {n}: {error!r}"[:300], flush=True)
+                        print(
+                            f"seed {seed} {name} way {way} n {n}: {error!r}"[:300],
+                            flush=True,
+                        )
                     runs, told = runs + 1, told + bool(part.answers)
                     shutil.rmtree(folder)
     print(f"{runs} runs with a disk that fails once or from then on, {told} of which clients were "
@@ -110,7 +114,9 @@ def flips(root: Path, count: int, rng: random.Random) -> int:
         folder = root / "now"
         shutil.copytree(source, folder / "data")
         kept = [
-            f for f in sorted((folder / "data").rglob("*")) if f.is_file() and f.suffix != ".tif"
+            f
+            for f in sorted((folder / "data").rglob("*"))
+            if f.is_file() and f.suffix != ".tif"
         ]
         file = rng.choice(kept)
         kinds[how := damaged(file, rng)] += 1
@@ -138,7 +144,9 @@ def starts(folder: Path, seed: int) -> int:
         for job in sim.call(client, "job.list")["jobs"]:
             try_it(sim, client, "job.resume", job=job["job"])
         sim.advance(10.0)
-        for upload in [s for s in sim.call(client, "sample.list")["samples"] if s["uploaded"]]:
+        for upload in [
+            s for s in sim.call(client, "sample.list")["samples"] if s["uploaded"]
+        ]:
             try_it(sim, client, "sample.set", name=upload["name"])
         try_it(sim, client, "sample.set", name="empty")
         try_it(sim, client, "calibration.revert")
@@ -153,7 +161,9 @@ def starts(folder: Path, seed: int) -> int:
         sim.start()
         for method in READS:
             sim.call(sim.client(), method)
-        assert not [r for r in sim.log if r.exc_info and r.exc_info[0]], "a traceback in the log"
+        assert not [r for r in sim.log if r.exc_info and r.exc_info[0]], (
+            "a traceback in the log"
+        )
         return len(list(sim.data.rglob("*unreadable*")))
 
 
@@ -203,8 +213,8 @@ class Writes:
         )  # fmt: skip
 
     def scan(self, wire: Wire, *, full: bool = False) -> None:
-        """Submit the scan, or go on with it, to its end; on a disk that will stay full, until the
-        scan waits for room.
+        """Submit the scan, or go on with it, to its end; on a disk that will stay full, until
+        the scan waits for room.
         """
         jobs = [j for j in wire.call("job.list")["jobs"] if j["name"] == "scan"]
         if not jobs:
@@ -256,13 +266,21 @@ class Writes:
         try:
             wire = Wire(process.port)
             if (now := self.look(wire)) != seen:
-                self.bad(number, "kept", [(k, now[k], seen[k]) for k in now if now[k] != seen[k]])
+                self.bad(
+                    number,
+                    "kept",
+                    [(k, now[k], seen[k]) for k in now if now[k] != seen[k]],
+                )
             self.scan(wire)
             images = digests(data / "scan")
             if fault is None:
                 self.right = images
             elif images != self.right:
-                self.bad(number, "images", sorted(set(images.items()) ^ set(self.right.items())))
+                self.bad(
+                    number,
+                    "images",
+                    sorted(set(images.items()) ^ set(self.right.items())),
+                )
         finally:
             process.end()
         if list(data.rglob("*unreadable*")) or list(data.rglob(".part-*")):
@@ -278,7 +296,10 @@ class Writes:
     @staticmethod
     def look(wire: Wire) -> dict[str, Any]:
         """What is to survive."""
-        state, correction = wire.call("state.get"), wire.call("calibration.get")["correction"]
+        state, correction = (
+            wire.call("state.get"),
+            wire.call("calibration.get")["correction"],
+        )
         return {
             "sample": state["sample"]["name"], "offset": state["sample"]["offset"],
             "tube": state["tube"]["kV"], "camera": state["camera"]["exposure_ms"],
@@ -306,7 +327,8 @@ def writes(root: Path, count: int, rng: random.Random) -> int:
     finally:
         w.rays.end()
     print(f"{count} servers with a file operation to fail at a drawn moment (or all that take room "
-          f"from then on): it came to that in {w.failed}; {w.unstarted} said so and did not start, "
+          f"from then on): it came to that in {w.failed}; {w.unstarted} said so and did "
+          "not start, "
           f"{w.refused} requests were refused; {w.wrong} things were wrong "
           "after a kill -9.")  # fmt: skip
     return w.wrong

@@ -1,4 +1,5 @@
-"""Seconds to a page's first paint, to the viewer's picture of the scene and to the live one; bytes.
+"""Seconds to a page's first paint, to the viewer's picture of the scene and to the live one;
+bytes.
 
     python tests/studies/first_paint.py [--url http://127.0.0.1:8080/]
 
@@ -40,7 +41,8 @@ def opened(context: Any, url: str) -> tuple[float, float, float, float]:
     network.on(
         "Network.webSocketFrameReceived",
         lambda e: add(
-            len(e["response"]["payloadData"]) * (0.75 if e["response"]["opcode"] == 2 else 1.0)
+            len(e["response"]["payloadData"])
+            * (0.75 if e["response"]["opcode"] == 2 else 1.0)
         ),
     )
     begun, times = time.monotonic(), {}
@@ -68,7 +70,8 @@ def main() -> None:
         for what in ("cold", "warm", "warm"):
             paint, picture, live, mb = opened(context, url)
             print(
-                f"{what}: first paint {paint:.2f} s, picture {picture:.2f} s, live {live:.2f} s, "
+                f"{what}: first paint {paint:.2f} s, picture {picture:.2f} s, live "
+                f"{live:.2f} s, "
                 f"{mb:.2f} MB; load average {os.getloadavg()[0]:.1f}",
                 flush=True,
             )

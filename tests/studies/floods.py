@@ -4,15 +4,17 @@
     python tests/studies/floods.py --connections 1000 [--real-time]
 
 The second one is about a twin with a token. A peer without the token makes 10 000 connections a
-minute (`strangers.py`), while so many new clients with the token connect, say hello, ping and send
-an E-stop, every other one from the address of the peer. It prints the times from before connecting
-to the answers (without the flood, beside it, and with all places taken) and the bytes of log, apart
-from the lines about those E-stops. `--real-time` is for machines that are busy with other things.
-Exit code 1 when a client had no answer, or an hour would log more than 1 MB; times are not judged.
+minute (`strangers.py`), while so many new clients with the token connect, say hello, ping and
+send an E-stop, every other one from the address of the peer. It prints the times from before
+connecting to the answers (without the flood, beside it, and with all places taken) and the
+bytes of log, apart from the lines about those E-stops. `--real-time` is for machines that are
+busy with other things. Exit code 1 when a client had no answer, or an hour would log more than
+1 MB; times are not judged.
 
-Starts the servers, lets attackers loose one kind at a time, and prints for each the round trips of
-an honest `state.get` (of a page) or `status_time_get` (of a program) and the memory of the process
-before and after. Exit code 1 when a process has ended, or an answer was an internal error.
+Starts the servers, lets attackers loose one kind at a time, and prints for each the round trips
+of an honest `state.get` (of a page) or `status_time_get` (of a program) and the memory of the
+process before and after. Exit code 1 when a process has ended, or an answer was an internal
+error.
 """
 
 from __future__ import annotations
@@ -62,7 +64,10 @@ class Ports:
     def __init__(self, servers: Servers) -> None:
         ready: Any = servers.ready
         self.viewer = int(ready["viewer"]["port"])
-        self.out, self.into = int(ready["gateway"]["port"]), int(ready["gateway"]["inbound"])
+        self.out, self.into = (
+            int(ready["gateway"]["port"]),
+            int(ready["gateway"]["inbound"]),
+        )
         self._up = servers.pid
         self.pids = self.children()
 
@@ -88,7 +93,9 @@ class Ports:
         """A frame of viser in a page."""
         url = f"ws://127.0.0.1:{self.viewer}/scene/{number:012x}/iso"
         spoken = [Subprotocol(f"viser-v{viser.__version__}")]
-        return connect(url, max_size=None, proxy=None, compression=None, subprotocols=spoken)
+        return connect(
+            url, max_size=None, proxy=None, compression=None, subprotocols=spoken
+        )
 
 
 async def deaf(connection: ClientConnection) -> None:
@@ -149,7 +156,10 @@ async def drags(ports: Ports) -> None:
 
     def what(i: int) -> bytes:
         kinds = ("DragStart", "Update", "Update", "DragEnd")
-        said: dict[str, Any] = {"type": f"TransformControls{kinds[i % 4]}Message", **HANDLE}
+        said: dict[str, Any] = {
+            "type": f"TransformControls{kinds[i % 4]}Message",
+            **HANDLE,
+        }
         if "Update" in said["type"]:
             said |= {"wxyz": [1, 0, 0, 0], "position": [0.1 * (i % 7), 0.3, 0.1]}
         return bytes(msgpack.packb(CAMERA if i == 0 else said))
@@ -180,7 +190,9 @@ async def commands(ports: Ports) -> None:
         for i in itertools.count(10**9):
             component, command = kinds[i % 3]
             await say.send(
-                json.dumps({"component": component, "command": command, "UUID": i}).encode()
+                json.dumps(
+                    {"component": component, "command": command, "UUID": i}
+                ).encode()
             )
             if i % 100 == 0:
                 await asyncio.sleep(0.01)
@@ -226,7 +238,9 @@ class Honest:
         async with ports.page(0xABC) as page:
             while True:
                 id, begun = next(numbers), time.monotonic()
-                await page.send(json.dumps({"id": id, "method": "state.get", "params": {}}))
+                await page.send(
+                    json.dumps({"id": id, "method": "state.get", "params": {}})
+                )
                 async for message in page:
                     if isinstance(message, str) and f'"id": {id},' in message[:60]:
                         break
@@ -243,7 +257,10 @@ class Honest:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(1.0):
                         heard: dict[str, Any] = {}
-                        while heard.get("UUID") != id or heard["reply type"] not in ("ACK", "ERR"):
+                        while heard.get("UUID") != id or heard["reply type"] not in (
+                            "ACK",
+                            "ERR",
+                        ):
                             heard = json.loads(await hear.recv())
                         self._note(begun, "internal error" in heard["reply"])
                 await asyncio.sleep(GAP_S)
@@ -275,7 +292,8 @@ async def trial(ports: Ports, name: str, seconds: float) -> bool:
     for _ in range(MOST_WAITS):
         if honest.times:
             break
-        # A question to the gateway that was lost is asked again: a short flood may see no answer.
+        # A question to the gateway that was lost is asked again: a short flood may see no
+        # answer.
         await asyncio.sleep(1.0)
     alive, after = ports.children() == ports.pids, ports.megabytes(module)
     ended = asking.done()
@@ -298,7 +316,8 @@ PEER, OTHER = "127.0.0.2", "127.0.0.3"
 PLACES = 64
 PATIENCE_S = 10.0
 SETTLED_S = 5.0
-"""After this the flood has as many connections as it gets, and the log has had its first lines."""
+"""After this the flood has as many connections as it gets, and the log has had its first
+lines."""
 
 
 def strangers(port: int, seed: int, made: Any, alone: bool) -> None:
@@ -372,9 +391,13 @@ async def part(count: int, folder: Path, *, flood: bool, full: bool, alone: bool
     secret = folder / "token"
     secret.write_text(TOKEN)
     limit = f"max_clients={PLACES}"
-    server = twin(9, folder / "data", "--token-file", secret, "--limit", limit, log=folder / "log")
+    server = twin(
+        9, folder / "data", "--token-file", secret, "--limit", limit, log=folder / "log"
+    )
     made = PROCESSES.Value("l", 0)
-    attacker = PROCESSES.Process(target=strangers, args=(server.port, 1, made, alone), daemon=True)
+    attacker = PROCESSES.Process(
+        target=strangers, args=(server.port, 1, made, alone), daemon=True
+    )
     try:
         held = await holders(server.port) if full else []
         await newcomers(server.port, 8)  # what the first answers need is loaded now
@@ -417,7 +440,9 @@ async def part(count: int, folder: Path, *, flood: bool, full: bool, alone: bool
 
 def logged(log: Path) -> int:
     """Bytes of log but for the lines that the new clients' own E-stops write."""
-    return sum(len(line) for line in log.read_bytes().splitlines() if b"E-stop by" not in line)
+    return sum(
+        len(line) for line in log.read_bytes().splitlines() if b"E-stop by" not in line
+    )
 
 
 async def connections(count: int, *, alone: bool) -> bool:
@@ -430,14 +455,18 @@ async def connections(count: int, *, alone: bool) -> bool:
         with tempfile.TemporaryDirectory(prefix="flexdt-floods-") as folder:
             well = await part(count, Path(folder), flood=flood, full=full, alone=alone)
             sound = sound and well
-    print(f"times in ms; the machine stood still for {stalls.take():.0f} ms at most. {machine()}.")
+    print(
+        f"times in ms; the machine stood still for {stalls.take():.0f} ms at most. {machine()}."
+    )
     return sound
 
 
 def main() -> int:
     """Run the floods; returns the exit code."""
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(FLOODS)}")
+    options.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join(FLOODS)}"
+    )
     options.add_argument("--seconds", type=float, default=8.0, help="of each flood")
     options.add_argument("--connections", type=int, metavar="CLIENTS", help="see above")
     options.add_argument(
@@ -447,7 +476,11 @@ def main() -> int:
     )
     chosen = options.parse_args()
     if chosen.connections:
-        return 0 if asyncio.run(connections(chosen.connections, alone=chosen.real_time)) else 1
+        return (
+            0
+            if asyncio.run(connections(chosen.connections, alone=chosen.real_time))
+            else 1
+        )
     with tempfile.TemporaryDirectory(prefix="flexdt-floods-") as folder:
         log = Path(folder) / "log"
         given = {"data": Path(folder) / "data", "speed-up": 8, "gateway-port": 0}
@@ -455,10 +488,14 @@ def main() -> int:
             ports = Ports(servers)
 
             async def all_of_them() -> list[bool]:
-                return [await trial(ports, n, chosen.seconds) for n in chosen.names or FLOODS]
+                return [
+                    await trial(ports, n, chosen.seconds) for n in chosen.names or FLOODS
+                ]
 
             sound = asyncio.run(all_of_them())
-        print(f"{len(log.read_bytes().splitlines())} lines of log, {log.stat().st_size} bytes")
+        print(
+            f"{len(log.read_bytes().splitlines())} lines of log, {log.stat().st_size} bytes"
+        )
         traced = log.read_text().count('"traceback"')
     print(f"tracebacks: {traced}")
     return 0 if all(sound) and traced == 0 else 1

@@ -2,10 +2,10 @@
 
     python tests/studies/following.py [--runs 5] [--seed 1]
 
-A scanner of the study's own runs in another process and publishes over ZeroMQ; both processes read
-the same monotonic clock. A wrong limit and an offset count from the message that shows them, a slow
-motor from the moment at which it is 0.3 s behind, a lost link from the death (killed) or the
-standstill (stopped, as with a cable out) of the scanner's process.
+A scanner of the study's own runs in another process and publishes over ZeroMQ; both processes
+read the same monotonic clock. A wrong limit and an offset count from the message that shows
+them, a slow motor from the moment at which it is 0.3 s behind, a lost link from the death
+(killed) or the standstill (stopped, as with a cable out) of the scanner's process.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ class Bench:
 
     def __init__(self) -> None:
         self.pipe, theirs = mp.Pipe()
-        self.process = mp.get_context("spawn").Process(target=scanner, args=(theirs,), daemon=True)
+        self.process = mp.get_context("spawn").Process(
+            target=scanner, args=(theirs,), daemon=True
+        )
         self.process.start()
         self.port = self.pipe.recv()
         self.alarms: list[Alarm] = []
@@ -100,7 +102,8 @@ class Bench:
 
 
 async def ages(count: int, rng: random.Random) -> list[float]:
-    """From a published position to the mirror that has it, while the script's rest is checked."""
+    """From a published position to the mirror that has it, while the script's rest is
+    checked."""
     out = []
     async with Bench() as bench:
         await bench.say(event(1, ("mag_obj", "move absolute", "300")))
@@ -112,7 +115,9 @@ async def ages(count: int, rng: random.Random) -> list[float]:
             await bench.until(
                 lambda at=at: abs(bench.session.mirror.positions["mag_obj"] - at) < 1e-6
             )
-            moment = next(t for t, m in bench.seen if abs(m.positions["mag_obj"] - at) < 1e-6)
+            moment = next(
+                t for t, m in bench.seen if abs(m.positions["mag_obj"] - at) < 1e-6
+            )
             out.append(moment - sent)
             bench.seen.clear()
             await asyncio.sleep(rng.uniform(0.0, 0.1))
@@ -129,7 +134,9 @@ async def wrong_limit(rng: random.Random) -> float:
     async with Bench() as bench:
         words = ("tra_obj", "move absolute", repr(at))
         await bench.say(event(1, words))
-        sent = await bench.say(event(1, words, "ACK", motor_cluster(reply).decode("latin-1")))
+        sent = await bench.say(
+            event(1, words, "ACK", motor_cluster(reply).decode("latin-1"))
+        )
         return (await bench.alarm("limits")).at_s - sent
 
 
@@ -151,7 +158,9 @@ async def slow(rng: random.Random) -> float:
         axis.speed * rng.uniform(0.3, 0.8),
         axis.acceleration,
     )
-    nominal = Motor("mag_obj", axis.home, axis.home - 400.0, axis.speed, axis.acceleration)
+    nominal = Motor(
+        "mag_obj", axis.home, axis.home - 400.0, axis.speed, axis.acceleration
+    )
     grid = np.arange(0.0, moved.duration_s, 0.001)
     there = np.interp(
         [-moved.position(t) for t in grid], [-nominal.position(t) for t in grid], grid
@@ -202,7 +211,9 @@ def main() -> None:
     ):
         took = [asyncio.run(fault(rng)) for _ in range(options.runs)]
         middle, worst = np.median(took), max(took)
-        print(f"{name}: alarmed after {middle:.3f} s, worst {worst:.3f} s, n = {len(took)}")
+        print(
+            f"{name}: alarmed after {middle:.3f} s, worst {worst:.3f} s, n = {len(took)}"
+        )
 
 
 if __name__ == "__main__":

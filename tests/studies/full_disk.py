@@ -1,11 +1,12 @@
 """Full disks: `full_disk.py --histories 500 --real 10 --seed 1`.
 
-`--histories`: drawn histories of a twin on a simulated disk that becomes full at any write, with
-kills (`tests/support/full_disk_histories.py`). `--real`: a real twin on a small file system of its
-own (tmpfs, or ext4 in a file with `--ext4`, for root alone), which an observer's uploads fill as
-far as they may and another program to the last byte; then settings, motion and an E-stop, `kill -9`
-and a restart. The rest of the machine does not see that file system (`unshare`). Ends with 1 where
-anything acknowledged was lost, or an upload took the room of the state.
+`--histories`: drawn histories of a twin on a simulated disk that becomes full at any write,
+with kills (`tests/support/full_disk_histories.py`). `--real`: a real twin on a small file
+system of its own (tmpfs, or ext4 in a file with `--ext4`, for root alone), which an observer's
+uploads fill as far as they may and another program to the last byte; then settings, motion and
+an E-stop, `kill -9` and a restart. The rest of the machine does not see that file system
+(`unshare`). Ends with 1 where anything acknowledged was lost, or an upload took the room of the
+state.
 """
 
 from __future__ import annotations
@@ -72,7 +73,9 @@ class SmallDisk:
             subprocess.run(["mount", "-o", "loop", image, self.root], check=True)
         else:
             size = f"size={SIZE_MB}m"
-            subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", self.root], check=True)
+            subprocess.run(
+                ["mount", "-t", "tmpfs", "-o", size, "tmpfs", self.root], check=True
+            )
         self._fill = self.root / "another-program"
 
     def free(self) -> int:
@@ -139,7 +142,9 @@ def one_life(disk: SmallDisk, rng: random.Random) -> list[str]:
         for _ in range(rng.randint(1, 30)):
             wire.call("tube.set", kV=float(rng.randint(40, 90)))
             wire.call("camera.set", exposure_ms=float(rng.randint(50, 900)))
-        wire.call("axes.move", targets={"rot_obj": float(rng.randint(-90, 90))}, wait=True)
+        wire.call(
+            "axes.move", targets={"rot_obj": float(rng.randint(-90, 90))}, wait=True
+        )
         time.sleep(1.0)  # positions are written a moment later
         if rng.random() < 0.7:
             wire.call("safety.estop")
@@ -179,7 +184,9 @@ def main() -> int:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--histories", type=int, default=20)
     p.add_argument("--real", type=int, default=0, help="twins on a real full disk")
-    p.add_argument("--ext4", action="store_true", help="in a file, for root; otherwise tmpfs")
+    p.add_argument(
+        "--ext4", action="store_true", help="in a file, for root; otherwise tmpfs"
+    )
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--jobs", type=int, default=2)
     options = p.parse_args()
@@ -187,7 +194,11 @@ def main() -> int:
         own = [*([] if options.ext4 else ["--map-root-user"]), "--mount"]
         words = ["unshare", *own, sys.executable, __file__, *sys.argv[1:]]
         os.execvpe("unshare", words, {**os.environ, INSIDE: "1"})
-    wrong = simulated(options.histories, options.seed, options.jobs) if options.histories else []
+    wrong = (
+        simulated(options.histories, options.seed, options.jobs)
+        if options.histories
+        else []
+    )
     if options.real:
         wrong += real(options.real, options.seed, ext4=options.ext4)
     print(*wrong, sep="\n")

@@ -7,15 +7,15 @@
     python tests/studies/full_size.py --rtk --fraction 0.5
 
 1442 views of 1536 x 1944 pixels: a cylinder with five pins, one of which ends in the middle, in
-closed form, with noise. `--fraction` takes so much of each side and of the views; 0.5 is an eighth
-of the bytes. Reconstruction is by `flexdt reconstruct`'s function in a process of its own, which
-prints peak memory (VmHWM), bytes read and written, how often images were read, and processor
-seconds.
+closed form, with noise. `--fraction` takes so much of each side and of the views; 0.5 is an
+eighth of the bytes. Reconstruction is by `flexdt reconstruct`'s function in a process of its
+own, which prints peak memory (VmHWM), bytes read and written, how often images were read, and
+processor seconds.
 
 `--costs` measures the constants of work in `slab_fdk`, and `WORKING_IMAGES` of `memory_plan`.
-`--plan` divides the volume without making it. `--rtk` makes a slab of a sixteenth of the layers in
-the middle by flexdt and by itk-rtk (`pip install itk-rtk`), from the same rows, in processes of
-their own.
+`--plan` divides the volume without making it. `--rtk` makes a slab of a sixteenth of the layers
+in the middle by flexdt and by itk-rtk (`pip install itk-rtk`), from the same rows, in processes
+of their own.
 """
 
 from __future__ import annotations
@@ -70,7 +70,9 @@ RTK_PART = 16
 
 
 def scan_of(views: int, rows: int, cols: int, pixel: float) -> ConeVec:
-    return ConeVec.circular(sod=SOD_MM, sdd=SDD_MM, angles=views, shape=(rows, cols), pixel=pixel)
+    return ConeVec.circular(
+        sod=SOD_MM, sdd=SDD_MM, angles=views, shape=(rows, cols), pixel=pixel
+    )
 
 
 class Shadows:
@@ -83,13 +85,17 @@ class Shadows:
         body: tuple[float, float, float, float] = BODY,
     ) -> None:
         self.scan, self.shape, self._things = scan, shape, (body, *PINS)
-        self._noise = np.random.default_rng(1).normal(0.0, NOISE, shape).astype(np.float32)
+        self._noise = (
+            np.random.default_rng(1).normal(0.0, NOISE, shape).astype(np.float32)
+        )
 
     def __getitem__(self, index: int) -> np.ndarray:
         rows, cols = self.shape
         source, panel = self.scan.source[index], self.scan.detector[index]
         u, v = self.scan.u[index], self.scan.v[index]
-        rays = panel[:2] + (np.arange(cols) - (cols - 1) / 2)[:, None] * u[:2] - source[:2]
+        rays = (
+            panel[:2] + (np.arange(cols) - (cols - 1) / 2)[:, None] * u[:2] - source[:2]
+        )
         rise = (np.arange(rows) - (rows - 1) / 2) * v[2]
         longer = np.sqrt(1.0 + rise[:, None] ** 2 / (rays**2).sum(axis=1))
         every = [chord(source[:2], rays, *thing) for thing in self._things]
@@ -117,7 +123,9 @@ def sizes(fraction: float) -> tuple[int, int, int, float]:
 
 def scan_of_shadows(shadows: Shadows) -> DataSet:
     scan, shape = shadows.scan, shadows.shape
-    frames = tuple(Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(scan)))
+    frames = tuple(
+        Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(scan))
+    )
     flat = np.full((1, *shape), OPEN, np.uint16)
     arrays = Arrays(shadows, np.zeros_like(flat), flat)  # type: ignore[arg-type]
     return DataSet("full size", frames, shape, scan, arrays=arrays)
@@ -132,7 +140,9 @@ def write(folder: Path, fraction: float) -> None:
           f"{time.process_time() - begun:.0f} CPU s", flush=True)  # fmt: skip
 
 
-def reconstruct(folder: Path, out: Path, memory: int | None, voxel: float | None) -> dict[str, Any]:
+def reconstruct(
+    folder: Path, out: Path, memory: int | None, voxel: float | None
+) -> dict[str, Any]:
     """Reconstruct in this process, and say what it took."""
     reads, read = [0], image_set.read_image
 
@@ -186,7 +196,8 @@ def status(name: str) -> int:
 
 
 def costs(fraction: float) -> None:
-    """Print the work of a voxel, a filtered and a read pixel, in processor time of this machine."""
+    """Print the work of a voxel, a filtered and a read pixel, in processor time of this
+    machine."""
     _, rows, cols, pixel = sizes(fraction)
     scan, shape = scan_of(PART, rows, cols, pixel), (rows, cols)
     with tempfile.TemporaryDirectory() as folder:
@@ -209,7 +220,8 @@ def costs(fraction: float) -> None:
     filtered = (seen.stop - seen.start) * cols * PART
     voxel = (seconds[3] - filtering * filtered) / (PART * math.prod(many.shape))
     print(
-        f"a voxel and view {voxel * 1e9:.3f} ns; a filtered pixel {filtering / voxel:.1f} and one "
+        f"a voxel and view {voxel * 1e9:.3f} ns; a filtered pixel "
+        f"{filtering / voxel:.1f} and one "
         f"read {reading / voxel:.1f} times that",
         flush=True,
     )
@@ -225,7 +237,9 @@ def held(fraction: float, radius: float) -> None:
     fdk_parts(lambda: [flat], some, (24, 30), Grid((8, 8, 8), 1.0))  # the kernels' code
 
     def image(number: int) -> np.ndarray:
-        return np.log(OPEN / np.maximum(shadows[number], np.float32(1.0))).astype(np.float32)
+        return np.log(OPEN / np.maximum(shadows[number], np.float32(1.0))).astype(
+            np.float32
+        )
 
     def parts() -> Iterator[np.ndarray]:
         for first in range(0, len(scan), PART):
@@ -264,7 +278,12 @@ def part_of(fraction: float) -> tuple[ConeVec, tuple[int, int], Grid, slice]:
     scan = scan_of(views, rows, cols, pixel)
     voxel = round(pixel * SOD_MM / SDD_MM, 4)
     grid = Grid((max(rows // RTK_PART, 1), cols, cols), voxel)
-    return scan, (rows, cols), grid, StandingImages.of(scan, (rows, cols), None).rows(grid.blank())
+    return (
+        scan,
+        (rows, cols),
+        grid,
+        StandingImages.of(scan, (rows, cols), None).rows(grid.blank()),
+    )
 
 
 def beside_rtk(who: str, fraction: float, out: Path) -> None:
@@ -327,7 +346,9 @@ def compare(fraction: float) -> None:
             again("--part-by", file.stem, "--fraction", str(fraction), "--out", str(file))
         ours, theirs = (np.load(file, mmap_mode="r") for file in files)
         seen = np.isfinite(ours)
-        off = float(np.abs(ours - theirs, where=seen, out=np.zeros(ours.shape, np.float32)).max())
+        off = float(
+            np.abs(ours - theirs, where=seen, out=np.zeros(ours.shape, np.float32)).max()
+        )
         print(f"apart by at most {off:.2g} of {float(np.nanmax(ours)):.2g} / mm")
 
 
@@ -341,15 +362,23 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--write", type=Path, metavar="FOLDER")
-    parser.add_argument("--reconstruct", type=Path, metavar="FOLDER", nargs="?", const=Path())
+    parser.add_argument(
+        "--reconstruct", type=Path, metavar="FOLDER", nargs="?", const=Path()
+    )
     parser.add_argument("--memory", type=memory_size, metavar="SIZE")
-    parser.add_argument("--voxel", type=float, metavar="MM", help="default: a pixel's at the axis")
+    parser.add_argument(
+        "--voxel", type=float, metavar="MM", help="default: a pixel's at the axis"
+    )
     parser.add_argument("--fraction", type=float, default=1.0)
-    parser.add_argument("--out", type=Path, help="of the volume; default: beside FOLDER, removed")
+    parser.add_argument(
+        "--out", type=Path, help="of the volume; default: beside FOLDER, removed"
+    )
     parser.add_argument("--costs", action="store_true")
     parser.add_argument("--plan", action="store_true")
     parser.add_argument("--rtk", action="store_true")
-    parser.add_argument("--part-by", choices=("flexdt", "itk-rtk"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--part-by", choices=("flexdt", "itk-rtk"), help=argparse.SUPPRESS
+    )
     parser.add_argument("--held", type=float, metavar="MM", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.part_by is not None:
@@ -365,7 +394,10 @@ def main() -> None:
             again("--reconstruct", str(folder), *more)
             return
         out = given.out or folder.with_name(f"{folder.name}.mha")
-        print(json.dumps(reconstruct(folder, out, given.memory, given.voxel), indent=1), flush=True)
+        print(
+            json.dumps(reconstruct(folder, out, given.memory, given.voxel), indent=1),
+            flush=True,
+        )
         if given.out is None:
             os.remove(out)
     if given.costs:

@@ -5,17 +5,17 @@
 
 Twin, projector, viewer and gateway run as processes. What they publish of themselves
 (`rpc.discover`, the models of the viewer's pages, the gateway's vocabulary) makes the messages:
-valid ones, from names, jobs and positions of the live twin, in which one field (sometimes two) is
-at, beyond or far beyond its bounds, of another kind, missing, or joined by others; a few have their
-bytes changed. Several clients send at a time, in JSON and in MessagePack, in states that matter: a
-job that runs, one that is paused, a sample or an upload on the stage, an E-stop, a correction, a
-scanner that another client holds.
+valid ones, from names, jobs and positions of the live twin, in which one field (sometimes two)
+is at, beyond or far beyond its bounds, of another kind, missing, or joined by others; a few
+have their bytes changed. Several clients send at a time, in JSON and in MessagePack, in states
+that matter: a job that runs, one that is paused, a sample or an upload on the stage, an E-stop,
+a correction, a scanner that another client holds.
 
-A run fails where a process ends, an answer is -32603, a log holds an error, a value that the schema
-does not allow is accepted or refused without its field, a state cannot be had any more, an answer
-does not come, a refused request moves something, or memory grows: after each 1000 messages it is
-within 10 % and 50 MB of its plateau. What failed is written to a file, which --replay sends again
-one by one. Repeatable by --seed.
+A run fails where a process ends, an answer is -32603, a log holds an error, a value that the
+schema does not allow is accepted or refused without its field, a state cannot be had any more,
+an answer does not come, a refused request moves something, or memory grows: after each 1000
+messages it is within 10 % and 50 MB of its plateau. What failed is written to a file, which
+--replay sends again one by one. Repeatable by --seed.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ from schemas import NUMBERS, TEXTS, Path, Schema, Schemas
 
 BATCH = 400
 QUIET_S = 1.0
-"""Without an answer for so long, whatever keeps a batch (a slow clock, a long move) is ended."""
+"""Without an answer for so long, whatever keeps a batch (a slow clock, a long move) is
+ended."""
 HANGS_S = 90.0
 BROKEN = 0.03
 """Share of messages whose bytes are changed."""
@@ -68,7 +69,17 @@ COSTLY = {
 """Methods that are asked so much less often, so that a million messages end within the hour."""
 SCRIPT = "camera\tset exposure\t100\t\tACK\t\t"
 ROI = [900, 700, 1027, 827]
-STATES = ("idle", "sample", "upload", "estop", "corrected", "running", "paused", "held", "held")
+STATES = (
+    "idle",
+    "sample",
+    "upload",
+    "estop",
+    "corrected",
+    "running",
+    "paused",
+    "held",
+    "held",
+)
 HELD = ("session.control",)
 """Methods that are not asked of a scanner that another client holds."""
 TAKING: list[dict[str, Any]] = [
@@ -112,7 +123,9 @@ class Found:
 
     kept: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    def add(self, server: str, kind: str, messages: list[Any], told: object = None) -> None:
+    def add(
+        self, server: str, kind: str, messages: list[Any], told: object = None
+    ) -> None:
         first = messages[0] if len(messages) == 1 else {}
         where = f"{first.get('method', '')}" if isinstance(first, dict) else ""
         key = f"{server} {kind} {where} {re.sub('[0-9]+', '#', str(told))[:80]}"
@@ -128,7 +141,8 @@ class Maker:
     Args:
         schemas: what the methods' schemas refer to.
         methods: the schema of each one's parameters.
-        valid: whole parameters that are in order, for methods whose fields depend on each other.
+        valid: whole parameters that are in order, for methods whose fields depend on each
+            other.
         names: valid values of fields by their names.
     """
 
@@ -174,11 +188,15 @@ class Maker:
                 params[path[0]] = rng.choice([1, "x", None, {}])
             else:
                 path = self._change(method, schema, params, rng.choice(fields))
-            self.tried[f"{method} {'.'.join(str(p) for p in path if isinstance(p, str))[:60]}"] += 1
+            self.tried[
+                f"{method} {'.'.join(str(p) for p in path if isinstance(p, str))[:60]}"
+            ] += 1
             paths.append(path)
         return Said(document, tuple(paths), self._schemas.allows(schema, params))
 
-    def _change(self, method: str, schema: Schema, params: dict[str, Any], name: str) -> Path:
+    def _change(
+        self, method: str, schema: Schema, params: dict[str, Any], name: str
+    ) -> Path:
         """Make one value below `name` absurd; returns where."""
         rng = self.rng
         if name not in params:
@@ -207,7 +225,9 @@ class Maker:
         """Parameters in order."""
         made = self._valid.get(method)
         if made:
-            return copy.deepcopy(self.rng.choice(made)())  # parts of it are changed afterwards
+            return copy.deepcopy(
+                self.rng.choice(made)()
+            )  # parts of it are changed afterwards
         schema = self.methods[method]
         need = schema.get("required", ())
         return {
@@ -217,7 +237,9 @@ class Maker:
         }
 
     def _one(self, name: str, schema: Schema) -> Any:
-        if name in self._names and self._schemas.allows(schema, value := self._names[name]()):
+        if name in self._names and self._schemas.allows(
+            schema, value := self._names[name]()
+        ):
             return value
         return self._schemas.draw(self.rng, schema)
 
@@ -236,7 +258,9 @@ def fault(said: Said, answer: dict[str, Any]) -> str | None:
     if error["code"] != -32602:
         return f"{error['code']} for what the schema does not allow"
     problems = (error.get("data") or {}).get("problems") or [{}]
-    named = any(_names(p.get("path", ""), said.paths) and p.get("message") for p in problems)
+    named = any(
+        _names(p.get("path", ""), said.paths) and p.get("message") for p in problems
+    )
     return None if named else "refused without its field"
 
 
@@ -265,13 +289,19 @@ def _packed(document: Any) -> bytes:
 
 
 def _line(document: Any) -> bytes:
-    return json.dumps(document, default=lambda b: base64.b64encode(b).decode()).encode() + b"\n"
+    return (
+        json.dumps(document, default=lambda b: base64.b64encode(b).decode()).encode()
+        + b"\n"
+    )
 
 
 class Sender:
-    """Sends batches over new connections to the twin or the projector, and judges the answers."""
+    """Sends batches over new connections to the twin or the projector, and judges the
+    answers."""
 
-    def __init__(self, server: str, port: int, maker: Maker, found: Found, *, frames: bool) -> None:
+    def __init__(
+        self, server: str, port: int, maker: Maker, found: Found, *, frames: bool
+    ) -> None:
         self.server, self.port, self.maker, self.found = server, port, maker, found
         self.frames, self.tally = frames, Counter[str]()
         self.stuck: Callable[[], None] = lambda: None
@@ -295,8 +325,8 @@ class Sender:
     def _broken(self, said: Said) -> Said:
         """The same with other bytes, in a frame (or line) of its own."""
         rng = self.maker.rng
-        # Of the id's bytes any that are left over are text or a truth value: "broken" less its head
-        # and first letters is n, which MessagePack reads as the id 110 of another message.
+        # Of the id's bytes any that are left over are text or a truth value: "broken" less its
+        # head and first letters is n, which MessagePack reads as the id 110 of another message.
         document = {"jsonrpc": "2.0", "id": "\u00e9\u00e9", **said.document}
         raw = bytearray(_packed(document)[4:] if self.frames else _line(document))
         for _ in range(rng.randint(1, 4)):
@@ -322,7 +352,9 @@ class Sender:
         encode = _packed if self.frames else _line
         parts, waiting = [], {}
         for i, said in enumerate(batch):
-            parts.append(said.broken or encode({"jsonrpc": "2.0", "id": i, **said.document}))
+            parts.append(
+                said.broken or encode({"jsonrpc": "2.0", "id": i, **said.document})
+            )
             if not said.unreadable:
                 waiting[i] = said
         last = len(batch) - 1
@@ -333,7 +365,8 @@ class Sender:
                 sending.start()
                 buffer, answered, helped = bytearray(), time.monotonic(), time.monotonic()
                 while waiting:
-                    # Events of a subscription do not count: they come while others are waited for.
+                    # Events of a subscription do not count: they come while others are waited
+                    # for.
                     if time.monotonic() - answered > HANGS_S:
                         raise TimeoutError
                     if time.monotonic() - max(answered, helped) > QUIET_S:
@@ -356,13 +389,19 @@ class Sender:
             )
 
     def _take(
-        self, answer: dict[str, Any], batch: list[Said], waiting: dict[int, Said], last: int
+        self,
+        answer: dict[str, Any],
+        batch: list[Said],
+        waiting: dict[int, Said],
+        last: int,
     ) -> None:
         self.tally[str(answer["error"]["code"]) if "error" in answer else "ok"] += 1
         id = answer.get("id")
         if not isinstance(id, int) or isinstance(id, bool) or not 0 <= id < len(batch):
             if answer.get("error", {}).get("code") == INTERNAL:
-                self.found.add(self.server, "internal error", [b.document for b in batch], answer)
+                self.found.add(
+                    self.server, "internal error", [b.document for b in batch], answer
+                )
             return
         waiting.pop(id, None)
         wrong = fault(batch[id], answer)
@@ -389,7 +428,9 @@ def _answers(buffer: bytearray, frames: bool) -> Iterator[dict[str, Any]]:
     """Whole answers, taken out of the buffer."""
     while True:
         if frames:
-            size = struct.unpack_from(">I", buffer)[0] if len(buffer) >= 4 else len(buffer)
+            size = (
+                struct.unpack_from(">I", buffer)[0] if len(buffer) >= 4 else len(buffer)
+            )
             if len(buffer) < 4 + size:
                 return
             body = bytes(buffer[4 : 4 + size])
@@ -484,7 +525,9 @@ class Events:
         self._out.connect(f"tcp://127.0.0.1:{ready['inbound']}")
         self._in.connect(f"tcp://127.0.0.1:{ready['port']}")
         parts = ("tube", "camera", "scanner", "mag_obj", "rot_obj", "ver_obj")
-        self._known = [(part, command) for part in parts for command in known_commands(part)]
+        self._known = [
+            (part, command) for part in parts for command in known_commands(part)
+        ]
         self._known = [k for k in self._known if "take" not in k[1]] * 20 + self._known
         deadline = time.monotonic() + 30
         while not self._ask_state(0.5):  # connections of ZeroMQ come about by themselves
@@ -495,7 +538,9 @@ class Events:
         """Whether it answers a question."""
         self.asked += 1
         number = 10**9 + self.asked
-        self._out.send(json.dumps(event("tube", "status_XReady_get", UUID=number)).encode())
+        self._out.send(
+            json.dumps(event("tube", "status_XReady_get", UUID=number)).encode()
+        )
         until = time.monotonic() + patience_s
         while (left := until - time.monotonic()) > 0 and self._in.poll(1000 * left):
             told = json.loads(self._in.recv())
@@ -510,11 +555,21 @@ class Events:
         out = []
         for _ in range(count):
             part, command = self.rng.choice(self._known)
-            args = {"arg1": self.rng.choice(["", "1", "500", "FALSE", "20.0", "900 700 1027 827"])}
-            made: dict[str, Any] = event(part, command, UUID=self.rng.randrange(1, 2**40), **args)
+            args = {
+                "arg1": self.rng.choice(
+                    ["", "1", "500", "FALSE", "20.0", "900 700 1027 827"]
+                )
+            }
+            made: dict[str, Any] = event(
+                part, command, UUID=self.rng.randrange(1, 2**40), **args
+            )
             if self.rng.random() < 0.85:
-                name = self.rng.choice([*made, "arg1", "arg1", "arg2", "component", "extra"])
-                odd = self.rng.choice([*NUMBERS, *TEXTS, *map(str, NUMBERS), None, [], {}, True])
+                name = self.rng.choice(
+                    [*made, "arg1", "arg1", "arg2", "component", "extra"]
+                )
+                odd = self.rng.choice(
+                    [*NUMBERS, *TEXTS, *map(str, NUMBERS), None, [], {}, True]
+                )
                 made[name] = "x" * 10**6 if self.rng.random() < 0.001 else odd
                 if self.rng.random() < 0.03:
                     del made[name]
@@ -591,7 +646,9 @@ class Lab:
         out: list[Any] = []
         if "twin" in which:
             for i, frames in enumerate((False, False, True)):
-                maker = twin_maker(document, scene, random.Random(f"{self.rng.random()}{i}"))
+                maker = twin_maker(
+                    document, scene, random.Random(f"{self.rng.random()}{i}")
+                )
                 out.append(Sender("twin", port, maker, self.found, frames=frames))
         if "projector" in which:
             maker = projector_maker(self.servers["projector"].port, self.rng)
@@ -638,7 +695,14 @@ class Lab:
         self.unstick()
         call("session.control", action="force")
         with contextlib.suppress(Refused):
-            call("camera.set", roi=ROI, exposure_ms=100.0, mode="HW2SW1High", averages=1, frames=1)
+            call(
+                "camera.set",
+                roi=ROI,
+                exposure_ms=100.0,
+                mode="HW2SW1High",
+                averages=1,
+                frames=1,
+            )
             call("sample.set", name="empty")
             call("axes.move", targets={"mag_obj": 650.0, "mag_det": 1059.0}, wait=True)
             call("calibration.apply", parameters={}, name="nominal")
@@ -682,7 +746,9 @@ class Lab:
         """Processes and logs."""
         for name, server in self.servers.items():
             if not server.alive():
-                self.found.add(name, "the process has ended", [], server.log.read_text()[-1500:])
+                self.found.add(
+                    name, "the process has ended", [], server.log.read_text()[-1500:]
+                )
             for entry in server.logged("error", "critical", "unstructured")[:5]:
                 self.found.add(name, "logged", [], entry)
 
@@ -741,18 +807,29 @@ def methods_of(document: dict[str, Any]) -> dict[str, Schema]:
     }
 
 
-def twin_maker(document: dict[str, Any], scene: dict[str, Any], rng: random.Random) -> Maker:
+def twin_maker(
+    document: dict[str, Any], scene: dict[str, Any], rng: random.Random
+) -> Maker:
     """Messages to the twin."""
     axes = list(scene["positions"])
     small = base64.b64encode(np.ones(8, "<f4").tobytes()).decode()
 
     def targets() -> dict[str, float]:
         chosen = rng.sample(axes, rng.choice([1, 1, 2]))
-        return {axis: round(scene["positions"][axis] + rng.uniform(-20, 20), 3) for axis in chosen}
+        return {
+            axis: round(scene["positions"][axis] + rng.uniform(-20, 20), 3)
+            for axis in chosen
+        }
 
     def mesh() -> dict[str, Any]:
         size = len(base64.b64decode(STL))
-        return {"name": rng.choice("mno"), "format": "stl", "total": size, "start": 0, "data": STL}
+        return {
+            "name": rng.choice("mno"),
+            "format": "stl",
+            "total": size,
+            "start": 0,
+            "data": STL,
+        }
 
     def voxels() -> dict[str, Any]:
         return {"name": rng.choice("vw"), "kind": "voxels", "format": "raw", "total": 32,
@@ -762,7 +839,10 @@ def twin_maker(document: dict[str, Any], scene: dict[str, Any], rng: random.Rand
         return {**mesh(), "name": f"open{rng.randrange(20)}", "total": 10**6}
 
     folder = File(__file__).parents[2] / "examples" / "scripts"
-    texts = [f.read_text(encoding="utf-8", errors="replace")[:3000] for f in folder.glob("*.txt")]
+    texts = [
+        f.read_text(encoding="utf-8", errors="replace")[:3000]
+        for f in folder.glob("*.txt")
+    ]
     texts.append(fly_script(13))
     job = lambda: f"job-{rng.randrange(1, 30)}"  # noqa: E731
     valid: dict[str, list[Callable[[], dict[str, Any]]]] = {
@@ -820,7 +900,11 @@ def projector_maker(port: int, rng: random.Random) -> Maker:
                 "data": np.ones(shape, "<f4").tobytes()}  # fmt: skip
 
     def grid() -> dict[str, Any]:
-        return {"shape": [4, 4, 4], "voxel_mm": [1.0, 1.0, 1.0], "center_mm": [0.0, 0.0, 0.0]}
+        return {
+            "shape": [4, 4, 4],
+            "voxel_mm": [1.0, 1.0, 1.0],
+            "center_mm": [0.0, 0.0, 0.0],
+        }
 
     def name() -> str:
         return rng.choice(["a", "b", "s"])
@@ -849,7 +933,9 @@ def projector_maker(port: int, rng: random.Random) -> Maker:
     return Maker(schemas, methods, valid, {"name": name}, rng)
 
 
-def page_maker(document: dict[str, Any], scene: dict[str, Any], rng: random.Random) -> Maker:
+def page_maker(
+    document: dict[str, Any], scene: dict[str, Any], rng: random.Random
+) -> Maker:
     """Requests of pages: the viewer's own methods, and the twin's that pages may use."""
     from pydantic.json_schema import models_json_schema
 
@@ -857,11 +943,17 @@ def page_maker(document: dict[str, Any], scene: dict[str, Any], rng: random.Rand
     from flexdt.clients.viewer.page_methods import METHODS
 
     models = {name: model for name, (model, _) in METHODS.items()}
-    refs, defined = models_json_schema([(m, "validation") for m in dict.fromkeys(models.values())])
+    refs, defined = models_json_schema(
+        [(m, "validation") for m in dict.fromkeys(models.values())]
+    )
     definitions = {**document["components"]["schemas"], **defined["$defs"]}
     schemas = Schemas(definitions)
     own = {
-        name: {"properties": {}, "type": "object", **schemas.plain(refs[model, "validation"])}
+        name: {
+            "properties": {},
+            "type": "object",
+            **schemas.plain(refs[model, "validation"]),
+        }
         for name, model in models.items()
     }
     base = twin_maker(document, scene, rng)
@@ -885,7 +977,9 @@ def fuzz(count: int, seed: str, which: list[str], out: File, most: int) -> int:
     with tempfile.TemporaryDirectory() as folder:
         lab = Lab(File(folder), seed, which)
         try:
-            clients = [s for s in lab.senders if isinstance(s, Sender) and s.server == "twin"]
+            clients = [
+                s for s in lab.senders if isinstance(s, Sender) and s.server == "twin"
+            ]
             with ThreadPoolExecutor(len(lab.senders)) as pool:
                 for number in itertools.count():
                     if done >= count or len(lab.found.kept) >= most:
@@ -898,7 +992,8 @@ def fuzz(count: int, seed: str, which: list[str], out: File, most: int) -> int:
                     size = min(BATCH, max(1, (count - done) // len(lab.senders)))
                     batches = [s.batch(size) for s in lab.senders]
                     sent = [
-                        pool.submit(s.send, b) for s, b in zip(lab.senders, batches, strict=True)
+                        pool.submit(s.send, b)
+                        for s, b in zip(lab.senders, batches, strict=True)
                     ]
                     for one in sent:
                         one.result()
@@ -933,10 +1028,14 @@ def fuzz(count: int, seed: str, which: list[str], out: File, most: int) -> int:
         if hasattr(sender, "maker"):
             fields |= {f"{kind} {field}" for field in sender.maker.tried}
     if lab.found.kept:
-        out.write_text("".join(json.dumps(f, default=repr) + "\n" for f in lab.found.kept.values()))
+        out.write_text(
+            "".join(json.dumps(f, default=repr) + "\n" for f in lab.found.kept.values())
+        )
         print(f"what failed is in {out}; --replay {out} sends it again")
     for kind, codes in tally.items():
-        print(f"{kind}: " + ", ".join(f"{code}: {n}" for code, n in sorted(codes.items())))
+        print(
+            f"{kind}: " + ", ".join(f"{code}: {n}" for code, n in sorted(codes.items()))
+        )
     memory = ", ".join(f"{n} {min(v):.0f} to {max(v):.0f} MB" for n, v in series.items())
     print(f"{done} messages with {len(fields)} fields (seed {seed}) in "
           f"{time.monotonic() - begun:.0f} s; {memory}; {len(lab.found.kept)} problems. "
@@ -977,11 +1076,15 @@ def replay(file: File) -> int:
 
 
 def main() -> int:
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     p.add_argument("--count", type=int, default=20_000)
     p.add_argument("--seed", default="1")
     p.add_argument("--servers", default="twin,projector,viewer,gateway")
-    p.add_argument("--most", type=int, default=40, help="kinds of problems after which to end")
+    p.add_argument(
+        "--most", type=int, default=40, help="kinds of problems after which to end"
+    )
     p.add_argument("--out", type=File, default=File("fuzz-failures.jsonl"))
     p.add_argument("--replay", type=File)
     options = p.parse_args()

@@ -1,9 +1,9 @@
 """What the compiler makes of the CUDA kernels, held without a GPU.
 
-Each kernel is compiled to PTX and assembled for compute capability 9.0; registers and local memory
-are what ptxas reports, loops are found in the machine code itself (backward branches), where
-instructions, loads and double precision are counted. In an environment of its own, because numba's
-package for CUDA wants an older numpy:
+Each kernel is compiled to PTX and assembled for compute capability 9.0; registers and local
+memory are what ptxas reports, loops are found in the machine code itself (backward branches),
+where instructions, loads and double precision are counted. In an environment of its own,
+because numba's package for CUDA wants an older numpy:
 
     python -m venv out/gpu-code
     out/gpu-code/bin/pip install "numba-cuda[cu12]" nvidia-cuda-nvcc-cu12 "numpy<2.5"
@@ -91,10 +91,13 @@ def compiled(kernel: Any, signature: tuple[Any, ...], ptxas: Path) -> Code:
 
 
 def text_section(elf: bytes) -> list[tuple[int, int]]:
-    """The machine code of an ELF file with one kernel: (low, high) words of each instruction."""
+    """The machine code of an ELF file with one kernel: (low, high) words of each
+    instruction."""
     (table,) = struct.unpack_from("<Q", elf, 40)
     size, count, names = struct.unpack_from("<3H", elf, 58)
-    sections = [struct.unpack_from("<IIQQQQ", elf, table + i * size) for i in range(count)]
+    sections = [
+        struct.unpack_from("<IIQQQQ", elf, table + i * size) for i in range(count)
+    ]
     strings = sections[names][4]
     for name, _, _, _, offset, length in sections:
         if elf[strings + name :].startswith(b".text."):
@@ -103,7 +106,8 @@ def text_section(elf: bytes) -> list[tuple[int, int]]:
 
 
 def innermost_loops(words: list[tuple[int, int]]) -> list[list[int]]:
-    """Operation codes of every loop that holds no other: from a backward branch's target to it."""
+    """Operation codes of every loop that holds no other: from a backward branch's target to
+    it."""
     codes = [low & 0x1FF for low, _ in words]
     spans = []
     for i, (low, _) in enumerate(words):
@@ -128,7 +132,11 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     project = load_kernels("projection/kernels/gpu_kernels.py")
     fdk = load_kernels("reconstruction/kernels/gpu_reconstruction_kernels.py")
     table, images, flat2 = float64[:, ::1], float32[:, :, ::1], float32[:, ::1]
-    flat, counts, edges = float32[::1], types.UniTuple(int64, 3), types.UniTuple(float32, 3)
+    flat, counts, edges = (
+        float32[::1],
+        types.UniTuple(int64, 3),
+        types.UniTuple(float32, 3),
+    )
 
     def walk(voxel: Any) -> tuple[Any, ...]:
         return (
@@ -136,7 +144,11 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
             *[int64] * 4, float64,
         )  # fmt: skip
 
-    sizes, tables, shares = (int64, int64, int64), (flat2, flat2, flat2, images), (flat,) * 6
+    sizes, tables, shares = (
+        (int64, int64, int64),
+        (flat2, flat2, flat2, images),
+        (flat,) * 6,
+    )
     rows_of_two = (images, *sizes, *tables, int32[::1], *shares, int64, images)
     return {
         "project_slabs": (project.project_slabs, walk(float32)),
@@ -165,7 +177,10 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
             fdk.primal_step,
             (flat, flat, float32, counts, int64, edges, float32, flat, flat),
         ),
-        "dual_step": (fdk.dual_step, (flat, flat, flat, float32, float32, counts, int64, edges)),
+        "dual_step": (
+            fdk.dual_step,
+            (flat, flat, flat, float32, float32, counts, int64, edges),
+        ),
         "fold": (project.fold, (int64, float32[::1], float32[::1], float64[::1])),
     }
 
@@ -177,14 +192,18 @@ def faults(name: str, code: Code) -> list[str]:
     if code.registers > REGISTERS:
         found.append(f"{code.registers} registers, allowed {REGISTERS}")
     if code.local_bytes > PUT_ASIDE.get(name, 0) or code.local_in_loops:
-        found.append(f"{code.local_bytes} bytes of local memory, {code.local_in_loops} in loops")
+        found.append(
+            f"{code.local_bytes} bytes of local memory, {code.local_in_loops} in loops"
+        )
     if any(set(some) & set(DOUBLE) for some in code.loops):
         found.append("double precision in an inner loop")
     if name in A_SLAB:
         if loop.count(LOAD) < LOADS:
             found.append(f"{loop.count(LOAD)} loads in the unrolled body, wanted {LOADS}")
         if len(loop) > A_SLAB[name] * UNROLLED:
-            found.append(f"{len(loop) / UNROLLED} instructions a slab, allowed {A_SLAB[name]}")
+            found.append(
+                f"{len(loop) / UNROLLED} instructions a slab, allowed {A_SLAB[name]}"
+            )
     return found
 
 

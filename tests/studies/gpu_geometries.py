@@ -3,9 +3,9 @@
     python tests/studies/gpu_geometries.py --count 2000 --seed 1            # numba's simulator
     python tests/studies/gpu_geometries.py --count 400 --device --most 60   # the device
 
-Forward and adjoint of each; every array has cells around the volume that no kernel may touch: NaN
-where it is read, 0 where it is added to. Ends with status 1 where an error exceeds MOST_ERROR or a
-cell outside was touched, 3 where --device finds no device.
+Forward and adjoint of each; every array has cells around the volume that no kernel may touch:
+NaN where it is read, 0 where it is added to. Ends with status 1 where an error exceeds
+MOST_ERROR or a cell outside was touched, 3 where --device finds no device.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ KINDS = (
     "diagonal", "level", "rolled", "turned", "source inside", "pixels inside", "one row",
     "one column", "along z", "steep", "far", "upright",
 )  # fmt: skip
-"""Geometries, drawn in turns; `rolled` panels are turned by 30 to 60 degrees about the beam, and
-`diagonal` ones, too, where rays of one warp run along x and along y. Columns of `upright` panels
-are parallel to z, either way up."""
+"""Geometries, drawn in turns; `rolled` panels are turned by 30 to 60 degrees about the beam,
+and `diagonal` ones, too, where rays of one warp run along x and along y. Columns of `upright`
+panels are parallel to z, either way up."""
 AROUND = 64
 """Cells before and behind the volume's, beside as many as it has."""
 Floats = npt.NDArray[np.float64]
@@ -161,7 +161,9 @@ def drawn_view(draw: Draw, kind: str, radius: float, shape: tuple[int, int]) -> 
     magnified = (away + behind) / max(away, 0.3 * radius)
     spans = 2 * radius * magnified * draw.uniform(0.5, 1.1, 2) / np.array(shape)
     # A pixel about the panel's middle looks at the volume's centre: something is seen.
-    aside = (np.round(draw.uniform(0.25, 0.75, 2) * (np.array(shape) - 1)) + 0.5) / np.array(shape)
+    aside = (
+        np.round(draw.uniform(0.25, 0.75, 2) * (np.array(shape) - 1)) + 0.5
+    ) / np.array(shape)
     off = (0.5 - aside) * np.array(shape) + draw.uniform(-0.01, 0.01, 2)
     u, v = spans[1] * u, spans[0] * v
     return np.concatenate([-away * beam, behind * beam + off[1] * u + off[0] * v, u, v])
@@ -236,7 +238,8 @@ def campaign(
     twice: bool,
     budget_s: float = math.inf,
 ) -> dict[str, object]:
-    """Measure drawn cases until all are done or the time is up: {count, worst, kinds, wrong, ...}.
+    """Measure drawn cases until all are done or the time is up: {count, worst, kinds, wrong,
+    ...}.
 
     Args:
         count, seed, most: see `drawn`.
@@ -268,7 +271,9 @@ def campaign(
         "seed": seed,
         "most": most,
         "seconds_a_case": (time.monotonic() - begun) / max(1, len(seen)),
-        "kernel_seconds_a_case": float(np.mean([f.seconds for f in seen])) if seen else None,
+        "kernel_seconds_a_case": float(np.mean([f.seconds for f in seen]))
+        if seen
+        else None,
         "forward_worst": max((f.forward for f in seen), default=None),
         "adjoint_worst": max((f.adjoint for f in seen), default=None),
         "by_kind": {
@@ -292,8 +297,12 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--most", type=int, default=12, help="voxels along an axis")
-    parser.add_argument("--budget-s", type=float, default=math.inf, help="begin no case after")
-    parser.add_argument("--device", action="store_true", help="a device, not the simulator")
+    parser.add_argument(
+        "--budget-s", type=float, default=math.inf, help="begin no case after"
+    )
+    parser.add_argument(
+        "--device", action="store_true", help="a device, not the simulator"
+    )
     parser.add_argument("--out", type=Path, help="write the document here, too")
     options = parser.parse_args()
     if not options.device and os.environ.get("NUMBA_ENABLE_CUDASIM") != "1":

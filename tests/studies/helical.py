@@ -1,11 +1,12 @@
 """FDK of helices beside a circle's: `python tests/studies/helical.py`.
 
-Long random objects (an ellipse of one material with twelve ellipsoids of others in it, out to 0.9
-of the field of view) are projected as exact path lengths along helices of a part of the steepest
-rise that FDK accepts, three and a half turns on either side of the layers that are looked at. A
-line for each rise: mean error and rms of what is even for two voxels around, in layers at random
-heights, worst and mean of the objects. The circle sees each layer in its own plane, where FDK is
-exact, so that its rms is that of the sampling alone. --objects N, --views N (a turn), --seed N.
+Long random objects (an ellipse of one material with twelve ellipsoids of others in it, out to
+0.9 of the field of view) are projected as exact path lengths along helices of a part of the
+steepest rise that FDK accepts, three and a half turns on either side of the layers that are
+looked at. A line for each rise: mean error and rms of what is even for two voxels around, in
+layers at random heights, worst and mean of the objects. The circle sees each layer in its own
+plane, where FDK is exact, so that its rms is that of the sampling alone. --objects N, --views N
+(a turn), --seed N.
 """
 
 from __future__ import annotations
@@ -51,7 +52,10 @@ def truth(parts: list[Part], z: float) -> tuple[FloatArray, npt.NDArray[np.bool_
     near = 2.5 * 2.0 * FIELD / CELLS
     for place, axes, mu in parts:
         sizes = [
-            sum(((c - p) / a) ** 2 for c, p, a in zip((x, y, z), place, grown, strict=True))
+            sum(
+                ((c - p) / a) ** 2
+                for c, p, a in zip((x, y, z), place, grown, strict=True)
+            )
             for grown in (axes, axes + near, np.maximum(axes - near, 1e-3))
         ]
         value += mu * (sizes[0] <= 1.0)
@@ -60,13 +64,20 @@ def truth(parts: list[Part], z: float) -> tuple[FloatArray, npt.NDArray[np.bool_
 
 
 def measured(parts: list[Part], part: float, z: float, views: int) -> tuple[float, float]:
-    """Mean error and rms of a layer, relative to MU, `part` of the steepest rise; 0 is a circle."""
+    """Mean error and rms of a layer, relative to MU, `part` of the steepest rise; 0 is a
+    circle."""
     if part:
         turns = 7.0
         angles = np.linspace(0.0, 360.0 * turns, int(views * turns))
         rise = part * STEEPEST
         geometry = fx.ConeVec.helical(
-            sod=SOD, sdd=SDD, angles=angles, rise=rise, pixel=PITCH, shape=SHAPE, height=0.0
+            sod=SOD,
+            sdd=SDD,
+            angles=angles,
+            rise=rise,
+            pixel=PITCH,
+            shape=SHAPE,
+            height=0.0,
         )
     else:
         geometry = fx.ConeVec.circular(
@@ -79,7 +90,9 @@ def measured(parts: list[Part], part: float, z: float, views: int) -> tuple[floa
     images = project_scene(Scene(tuple(solids)), geometry, SHAPE)
     grid = Grid((1, CELLS, CELLS), 2.0 * FIELD / CELLS, (0.0, 0.0, z))
     value, even = truth(parts, z)
-    wrong = ((fdk(images, geometry, grid.blank(), errors=False).data[0] - value) / MU)[even]
+    wrong = ((fdk(images, geometry, grid.blank(), errors=False).data[0] - value) / MU)[
+        even
+    ]
     return float(wrong.mean()), float(np.sqrt((wrong**2).mean()))
 
 

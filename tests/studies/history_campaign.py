@@ -3,8 +3,8 @@
 Each machine file is drawn anew (`motion_histories`). On it parts are brought near, every small
 request is tried there, and the one that takes most from the gap is repeated up to `--repeats`
 times; then `--moves` drawn moves are compared with a dense sweep. The judge shares no code with
-the scanner. Prints what was asked, the most that any pair lost, the least gap, and moves that were
-refused although safe or allowed although unsafe. Ends with 1 on any violation.
+the scanner. Prints what was asked, the most that any pair lost, the least gap, and moves that
+were refused although safe or allowed although unsafe. Ends with 1 on any violation.
 """
 
 from __future__ import annotations
@@ -34,16 +34,25 @@ def main() -> int:
     p.add_argument("--requests", type=int, default=100_000, help="in histories, at least")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--runs", type=int, default=4, help="long runs on each machine")
-    p.add_argument("--repeats", type=int, default=2000, help="of a small request in each run")
-    p.add_argument("--moves", type=int, default=50, help="compared with a dense sweep, on each")
+    p.add_argument(
+        "--repeats", type=int, default=2000, help="of a small request in each run"
+    )
+    p.add_argument(
+        "--moves", type=int, default=50, help="compared with a dense sweep, on each"
+    )
     p.add_argument("--jobs", type=int, default=2)
-    p.add_argument("--minutes", type=float, default=math.inf, help="end earlier, with fewer")
+    p.add_argument(
+        "--minutes", type=float, default=math.inf, help="end earlier, with fewer"
+    )
     options = p.parse_args()
     begun = time.monotonic()
     machines = requests = runs = safe = near = unsafe = 0
     loss, least, said = 0.0, math.inf, list[str]()
     with ProcessPoolExecutor(options.jobs) as pool:
-        while requests < options.requests and time.monotonic() - begun < 60.0 * options.minutes:
+        while (
+            requests < options.requests
+            and time.monotonic() - begun < 60.0 * options.minutes
+        ):
             work = [
                 pool.submit(one_machine, options.seed, machines + i, options.runs,
                             options.repeats, options.moves)
@@ -58,8 +67,12 @@ def main() -> int:
                 safe, near = safe + verdicts.safe, near + verdicts.near
                 unsafe += verdicts.unsafe
                 said += [f"machine {number}: {words}" for words in histories.found]
-                said += [f"machine {number}: safe, refused: {w}" for w in verdicts.refused]
-                said += [f"machine {number}: unsafe, allowed: {w}" for w in verdicts.allowed]
+                said += [
+                    f"machine {number}: safe, refused: {w}" for w in verdicts.refused
+                ]
+                said += [
+                    f"machine {number}: unsafe, allowed: {w}" for w in verdicts.allowed
+                ]
             print(f"{requests} requests, {runs} long runs, {safe} safe moves,"
                   f" {time.monotonic() - begun:.0f} s, {len(said)} violations",
                   file=sys.stderr, flush=True)  # fmt: skip

@@ -1,15 +1,17 @@
 """Interrupt each of several commands at drawn moments: `python tests/studies/interrupts.py`.
 
-`--count` moments a command, from the start of its process to its end or `--longest` seconds, drawn
-with `--seed`. Every end is one of these:
+`--count` moments a command, from the start of its process to its end or `--longest` seconds,
+drawn with `--seed`. Every end is one of these:
 
 - told: exit code 130 and the line, no traceback;
 - done: the command's own end, its exit code without a traceback;
-- early: Python had not reached flexdt yet, whose own end or traceback names none of its modules;
+- early: Python had not reached flexdt yet, whose own end or traceback names none of its
+  modules;
 - wrong: anything else, printed with its moment.
 
-A line a command: how many of each, and the longest time from the signal to the end, by the clock
-and in processor time of the command and its children [s]. Exits with 1 where anything is wrong.
+A line a command: how many of each, and the longest time from the signal to the end, by the
+clock and in processor time of the command and its children [s]. Exits with 1 where anything is
+wrong.
 """
 
 from __future__ import annotations
@@ -55,7 +57,8 @@ COMMANDS: Mapping[str, Sequence[str]] = {
 
 @dataclass(frozen=True)
 class End:
-    """How an interrupted command ended: kind, exit code, what it said, wall and processor [s]."""
+    """How an interrupted command ended: kind, exit code, what it said, wall and processor
+    [s]."""
 
     kind: str
     code: int
@@ -150,18 +153,25 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--longest", type=float, default=6.0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="*", default=list(COMMANDS), choices=list(COMMANDS))
+    parser.add_argument(
+        "--only", nargs="*", default=list(COMMANDS), choices=list(COMMANDS)
+    )
     chosen = parser.parse_args()
     # A shell ignores SIGINT for what it starts in the background, and so would our children.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    print(f"{'command':12}{'told':>6}{'done':>6}{'early':>6}{'wrong':>6}{'clock':>8}{'used':>8}")
+    print(
+        f"{'command':12}{'told':>6}{'done':>6}{'early':>6}{'wrong':>6}{'clock':>8}{'used':>8}"
+    )
     wrong = 0
     for name in chosen.only:
         ends = []
         for _, moment, end in campaign([name], chosen.count, chosen.longest, chosen.seed):
             ends.append(end)
             if end.kind == "wrong":
-                print(f"{name} after {moment:.3f} s: code {end.code}\n{end.said}", file=sys.stderr)
+                print(
+                    f"{name} after {moment:.3f} s: code {end.code}\n{end.said}",
+                    file=sys.stderr,
+                )
         kinds = Counter(end.kind for end in ends)
         wrong += kinds["wrong"]
         row = "".join(f"{kinds[kind]:6}" for kind in ("told", "done", "early", "wrong"))

@@ -4,10 +4,11 @@
     python tests/studies/joint_iterations.py region
 
 `materials`: a cylinder of PMMA with two pins of steel, projected by this file's own sums over
-samples of rays and over all energies; errors of SART without correction, with that of one material,
-and with both in the loop, beside SART of images at one energy. `region`: an object of ellipses, a
-third of it wanted in fine voxels; errors in there, memory and time of the region alone, in coarse
-surroundings, and of everything in fine voxels. Exits with 1 where the joint way is not the better.
+samples of rays and over all energies; errors of SART without correction, with that of one
+material, and with both in the loop, beside SART of images at one energy. `region`: an object of
+ellipses, a third of it wanted in fine voxels; errors in there, memory and time of the region
+alone, in coarse surroundings, and of everything in fine voxels. Exits with 1 where the joint
+way is not the better.
 """
 
 from __future__ import annotations
@@ -52,7 +53,11 @@ def materials(o: argparse.Namespace) -> int:
     """PMMA of 28 mm with two steel pins of 3 mm, 8.5 mm from its axis."""
     n, cols, fine = 64, 100, 4
     scan = fx.ConeVec.circular(
-        sod=300, sdd=500, angles=np.arange(o.views) * 360.0 / o.views, shape=(1, cols), pixel=0.6
+        sod=300,
+        sdd=500,
+        angles=np.arange(o.views) * 360.0 / o.views,
+        shape=(1, cols),
+        pixel=0.6,
     )
     grid = Grid((1, n, n), 0.5)
     labels = {}
@@ -66,10 +71,14 @@ def materials(o: argparse.Namespace) -> int:
     ])  # fmt: skip
     weights, _ = weights_of(Chain(Detector()), KV)
     depth = np.tensordot(np.stack([PMMA.attenuation(), STEEL.attenuation()], 1), paths, 1)
-    seen = -np.log(np.tensordot(weights / weights.sum(), np.exp(-depth), 1)).astype(np.float32)
+    seen = -np.log(np.tensordot(weights / weights.sum(), np.exp(-depth), 1)).astype(
+        np.float32
+    )
     both = Polychromatic.of((PMMA, STEEL), KV, KEV)
     label, mu = labels[n], both.mu
-    inner = binary_erosion(label > 0, iterations=2) & ~binary_dilation(label == 2, iterations=2)
+    inner = binary_erosion(label > 0, iterations=2) & ~binary_dilation(
+        label == 2, iterations=2
+    )
     y, x = (np.mgrid[:n, :n] - (n - 1) / 2) * 0.5
     places = {
         "PMMA": inner,
@@ -90,7 +99,10 @@ def materials(o: argparse.Namespace) -> int:
             images, scan, grid, iterations=o.iterations, subsets=6, nonnegative=True, **options
         ).data[0]  # fmt: skip
         spent = time.process_time() - begun
-        mean = {k: float(found[p].mean()) / mu[int(k == "steel")] - 1 for k, p in places.items()}
+        mean = {
+            k: float(found[p].mean()) / mu[int(k == "steel")] - 1
+            for k, p in places.items()
+        }
         rim = inner & (x**2 + y**2 > 9.0**2) & (abs(y - 0.3) > 4.0)
         mean["PMMA, middle less rim"] -= float(found[rim].mean()) / mu[0] - 1
         errors[name] = abs(mean["between the pins"])
@@ -120,7 +132,10 @@ def region(o: argparse.Namespace) -> int:
             for axis, a, s in zip(axes, at[::-1], size[::-1], strict=True)
         ]
         places = zip(
-            (z[near[0]], y[:, near[1]], x[..., near[2]]), at[::-1], size[::-1], strict=True
+            (z[near[0]], y[:, near[1]], x[..., near[2]]),
+            at[::-1],
+            size[::-1],
+            strict=True,
         )
         inside = sum(((q - a) / s) ** 2 for q, a, s in places) < 1
         truth[tuple(near)][inside] = rng.uniform(0.0, 0.06)

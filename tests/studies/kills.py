@@ -1,9 +1,9 @@
 """kill -9 of twin and projector at random moments of scans: `python tests/studies/kills.py`.
 
 Each round submits a scan at a random pace, kills the twin or the projector at a random moment,
-starts it again, checks every file under a final name and every frame that was reported done, lets
-the scan go on, and compares the result byte for byte with an undisturbed scan (dates and durations
-in the texts apart). Exit code 1 when anything was lost. Options: --kills N, --seed N.
+starts it again, checks every file under a final name and every frame that was reported done,
+lets the scan go on, and compares the result byte for byte with an undisturbed scan (dates and
+durations in the texts apart). Exit code 1 when anything was lost. Options: --kills N, --seed N.
 """
 
 from __future__ import annotations
@@ -40,10 +40,13 @@ class Round:
         self.known: dict[str, int] = {}
 
     def start_twin(self) -> Process:
-        return twin(self.ray_port, self.data, "--speed-up", "max", log=self.root / "twin.log")
+        return twin(
+            self.ray_port, self.data, "--speed-up", "max", log=self.root / "twin.log"
+        )
 
     def kill_a_start(self) -> None:
-        """A twin that is killed while it starts: before, while or after it reads what it knows."""
+        """A twin that is killed while it starts: before, while or after it reads what it
+        knows."""
         self.kills["starting"] += 1
         longest = 1.2 * (max(self.down_s[-5:]) if self.down_s else 3.0)
         with (self.root / "twin.log").open("ab") as log:
@@ -96,7 +99,10 @@ class Round:
                 self.unresumed += 1
                 print(f"{name}: {job} is {status['state']} after the restart", flush=True)
         until = time.monotonic() + 120.0
-        while (status := wire.call("job.status", job=job))["state"] not in ("done", "failed"):
+        while (status := wire.call("job.status", job=job))["state"] not in (
+            "done",
+            "failed",
+        ):
             if time.monotonic() > until:
                 break
             time.sleep(0.02)
@@ -113,7 +119,9 @@ class Round:
         right = digests(whole)
         broken = [n for n, d in there.items() if right[n] != d]
         self.corrupt += len(broken)
-        missing = [n for n in (f"scan_{i:06d}.tif" for i in range(done)) if n not in there]
+        missing = [
+            n for n in (f"scan_{i:06d}.tif" for i in range(done)) if n not in there
+        ]
         # Batches may end out of order, so frames are counted, not named.
         if len([n for n in there if n.startswith("scan_")]) < done:
             self.lost += len(missing)
@@ -124,19 +132,30 @@ class Round:
                 if text == "flexdt.json" and "frames" not in json.loads(content):
                     self.corrupt += 1
         if broken or len([n for n in there if n.startswith("scan_")]) < done:
-            print(f"{name}: {done} done, broken {broken}, missing {missing[:3]}", flush=True)
+            print(
+                f"{name}: {done} done, broken {broken}, missing {missing[:3]}", flush=True
+            )
 
     def compare(self, name: str) -> None:
         """The result is the undisturbed one's, dates and durations apart."""
         if digests(self.data / name) != digests(self.data / "whole"):
             self.different += 1
             print(f"{name}: images differ", flush=True)
-        for text in ("scan settings.txt", "data settings XRE.txt", "flexdt.json", "script.txt"):
-            a, b = (timeless((self.data / n / text).read_bytes(), n) for n in (name, "whole"))
+        for text in (
+            "scan settings.txt",
+            "data settings XRE.txt",
+            "flexdt.json",
+            "script.txt",
+        ):
+            a, b = (
+                timeless((self.data / n / text).read_bytes(), n) for n in (name, "whole")
+            )
             if a != b:
                 self.different += 1
                 lines = [
-                    (x, y) for x, y in zip(a.split(b"\n"), b.split(b"\n"), strict=False) if x != y
+                    (x, y)
+                    for x, y in zip(a.split(b"\n"), b.split(b"\n"), strict=False)
+                    if x != y
                 ]
                 print(f"{name}: {text} differs: {lines[:3]}", flush=True)
         if [f for f in (self.data / name).iterdir() if f.name.startswith(".")]:
@@ -159,7 +178,9 @@ def timeless(text: bytes, name: str) -> bytes:
     text = DATES.sub(b"<date>", text.replace(name.encode(), b"<name>"))
     text = re.sub(rb'("duration_s": )[0-9.e+-]+', rb"\1<s>", text)
     return re.sub(
-        rb"(?im)^(.*(?:duration|elapsed|scan time|total time).*?)[0-9.]+.*$", rb"\1<s>", text
+        rb"(?im)^(.*(?:duration|elapsed|scan time|total time).*?)[0-9.]+.*$",
+        rb"\1<s>",
+        text,
     )
 
 
@@ -179,7 +200,10 @@ def main() -> int:
     p.add_argument("--seed", type=int, default=1)
     options = p.parse_args()
     rng = random.Random(options.seed)
-    print(f"{options.kills} kills at random moments, seed {options.seed}. {machine()}.", flush=True)
+    print(
+        f"{options.kills} kills at random moments, seed {options.seed}. {machine()}.",
+        flush=True,
+    )
     begun = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         r = Round(Path(folder), rng)
@@ -201,9 +225,12 @@ def main() -> int:
     print(
         f"{r.kills['twin']} twins, {r.kills['starting']} more while they started, and "
         f"{r.kills['projector']} projectors killed in {scans} scans of "
-        f"{FRAMES} frames within {time.monotonic() - begun:.0f} s: {r.lost} completed frames lost, "
-        f"{r.corrupt} corrupt files, {r.unresumed} scans not resumed, {r.different} results that "
-        f"differ; a twin was back after {sum(r.down_s) / max(1, len(r.down_s)):.1f} s on average."
+        f"{FRAMES} frames within {time.monotonic() - begun:.0f} s: {r.lost} completed "
+        "frames lost, "
+        f"{r.corrupt} corrupt files, {r.unresumed} scans not resumed, {r.different} "
+        "results that "
+        f"differ; a twin was back after {sum(r.down_s) / max(1, len(r.down_s)):.1f} s on "
+        "average."
     )
     return 1 if r.lost or r.corrupt or r.unresumed or r.different or bad else 0
 

@@ -40,7 +40,13 @@ class Process:
         with self.log.open("ab") as err:
             self.child = subprocess.Popen(
                 # `child` ends it should this program be killed: a study leaves no orphans.
-                [sys.executable, "-m", "flexdt.runtime.child", module, *map(str, options)],
+                [
+                    sys.executable,
+                    "-m",
+                    "flexdt.runtime.child",
+                    module,
+                    *map(str, options),
+                ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=err,
@@ -94,7 +100,10 @@ class Process:
 
     def memory_mb(self) -> float:
         status = Path(f"/proc/{self.pid}/status").read_text()
-        return int(next(x for x in status.splitlines() if x.startswith("VmRSS")).split()[1]) / 1024
+        return (
+            int(next(x for x in status.splitlines() if x.startswith("VmRSS")).split()[1])
+            / 1024
+        )
 
     def processor_s(self) -> float:
         """Processor time so far [s]."""
@@ -118,7 +127,9 @@ class Process:
 
 
 def projector(*options: object, **kept: Plain) -> Process:
-    return Process("flexdt.server.projector.main", "--port", 0, "--threads", 1, *options, **kept)
+    return Process(
+        "flexdt.server.projector.main", "--port", 0, "--threads", 1, *options, **kept
+    )
 
 
 def twin(projector_port: int, data: Path, *options: object, **kept: Plain) -> Process:
@@ -133,7 +144,11 @@ class Refused(Exception):
 
     def __init__(self, error: dict[str, Any]) -> None:
         super().__init__(f"{error['code']}: {error['message']}")
-        self.code, self.message, self.data = error["code"], error["message"], error.get("data")
+        self.code, self.message, self.data = (
+            error["code"],
+            error["message"],
+            error.get("data"),
+        )
 
 
 class Wire:
@@ -215,7 +230,9 @@ def fly_script(
 
 def digests(folder: Path, pattern: str = "*.tif") -> dict[str, str]:
     """SHA-256 of each file under its final name."""
-    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob(pattern)}
+    return {
+        f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob(pattern)
+    }
 
 
 def percentile(values: list[float], q: float) -> float:
@@ -226,4 +243,6 @@ def percentile(values: list[float], q: float) -> float:
 def machine() -> str:
     """What these figures were measured on."""
     load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
-    return f"{os.cpu_count()} cores, Python {platform.python_version()}, load average {load}"
+    return (
+        f"{os.cpu_count()} cores, Python {platform.python_version()}, load average {load}"
+    )

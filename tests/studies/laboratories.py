@@ -2,9 +2,9 @@
 
     PYTHONPATH=tests/support python tests/studies/laboratories.py [--laboratories 50] [--seed 1]
 
-Each laboratory (`past_laboratory.py`) has hidden limits, rates, zero offsets, a drift, a sign of
-one motor in its texts, a family of command times, regions and camera modes, and three planted
-contradictions. Its folders are written and read without any configuration.
+Each laboratory (`past_laboratory.py`) has hidden limits, rates, zero offsets, a drift, a sign
+of one motor in its texts, a family of command times, regions and camera modes, and three
+planted contradictions. Its folders are written and read without any configuration.
 """
 
 from __future__ import annotations
@@ -109,22 +109,30 @@ def main() -> None:
         pulls = ", ".join(f"{n} {p:+.1f}" for n, p in out.pulls.items())
         worst = max(map(abs, out.columns.values()), default=math.nan)
         print(
-            f"{k}: worst column {worst:.4f} px; {pulls}; wrong {out.wrong}; missed {out.missed}; "
+            f"{k}: worst column {worst:.4f} px; {pulls}; wrong {out.wrong}; missed "
+            f"{out.missed}; "
             f"not planted {out.false}; {out.seconds:.1f} s", flush=True,
         )  # fmt: skip
     columns = np.abs([c for out in done for c in out.columns.values()])
     print(f"\n{len(done)} laboratories, {sum(o.seconds for o in done):.0f} s in all")
     print(f"limits, rates or signs wrong in {sum(bool(o.wrong) for o in done)}")
     print(
-        f"axis column of {len(columns)} scans: rms {np.sqrt(np.mean(columns**2)):.4f} px, worst "
+        f"axis column of {len(columns)} scans: rms {np.sqrt(np.mean(columns**2)):.4f} "
+        "px, worst "
         f"{columns.max():.4f} px, {np.sum(columns > 0.05)} beyond 0.05 px"
     )
     for name in ("drift", "axs_tan", "det_tan", "det_roll_deg"):
         told = np.abs([o.pulls[name] for o in done if name in o.pulls])
         rms = np.sqrt(np.mean(told**2))
-        print(f"{name}: {np.sum(told <= 3)} of {len(told)} within 3 sigma, rms {rms:.2f} sigma")
-    missed, false = (sum(len(getattr(o, what)) for o in done) for what in ("missed", "false"))
-    print(f"contradictions: {missed} planted ones missed, {false} named that were not planted")
+        print(
+            f"{name}: {np.sum(told <= 3)} of {len(told)} within 3 sigma, rms {rms:.2f} sigma"
+        )
+    missed, false = (
+        sum(len(getattr(o, what)) for o in done) for what in ("missed", "false")
+    )
+    print(
+        f"contradictions: {missed} planted ones missed, {false} named that were not planted"
+    )
 
 
 if __name__ == "__main__":

@@ -3,12 +3,13 @@
     python tests/studies/large_volume.py [--nodes N] [--cores C]
         [--read GB/S] [--write GB/S]
 
-Measured here, with all cores: voxel updates of the backprojection, pixels filtered, pixels read and
-made line integrals (from files that the system has in memory), and voxels written as Zarr. The plan
-multiplies them by what --side, --views, --panel and the slabs of `flexdt reconstruct --scheduler`
-ask for. A core of another machine is taken to be one of this machine, and work to be shared evenly;
---read and --write are what all nodes together read and write a second, --gpus with --updates
-(voxel updates a second of each) replaces the processors' backprojection. None of these is measured.
+Measured here, with all cores: voxel updates of the backprojection, pixels filtered, pixels read
+and made line integrals (from files that the system has in memory), and voxels written as Zarr.
+The plan multiplies them by what --side, --views, --panel and the slabs of `flexdt reconstruct
+--scheduler` ask for. A core of another machine is taken to be one of this machine, and work to
+be shared evenly; --read and --write are what all nodes together read and write a second, --gpus
+with --updates (voxel updates a second of each) replaces the processors' backprojection. None of
+these is measured.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ def seconds(work: Callable[[], object], least_s: float = 0.0) -> float:
 def rates(folder: Path) -> dict[str, float]:
     """Of this machine, a second."""
     rows, cols, views, side = 256, 256, 64, 192
-    scan = fx.ConeVec.circular(sod=600, sdd=1000, angles=views, shape=(rows, cols), pixel=0.4)
+    scan = fx.ConeVec.circular(
+        sod=600, sdd=1000, angles=views, shape=(rows, cols), pixel=0.4
+    )
     images = np.random.default_rng(1).random((views, rows, cols), dtype=np.float32)
     images[:, :, :64] = images[:, :, -64:] = 0.0  # nothing is cut off
     grid = fx.Grid((side,) * 3, 0.3)
@@ -52,7 +55,9 @@ def rates(folder: Path) -> dict[str, float]:
     filter_s = seconds(lambda: filtered(images, response))
     whole_s = seconds(lambda: fdk(images, scan, grid, errors=False))
     few = fx.ConeVec.circular(sod=600, sdd=1000, angles=4, shape=(1024, 1024), pixel=0.1)
-    fx.simulate(fx.Volume(np.full((8, 8, 8), 0.02, np.float32), 2.0), few).save(folder / "scan")
+    fx.simulate(fx.Volume(np.full((8, 8, 8), 0.02, np.float32), 2.0), few).save(
+        folder / "scan"
+    )
     data = fx.open(folder / "scan")
     data.line_integrals(0)  # darks and flats are read once
     read_s = seconds(lambda: [data.line_integrals(i) for i in range(4)])
@@ -80,8 +85,12 @@ def main() -> None:
     p.add_argument("--cores", type=int, default=64, help="Of a node.")
     p.add_argument("--gpus", type=int, default=0, help="In all.")
     p.add_argument("--updates", type=float, default=5e10, help="Of a GPU (assumed).")
-    p.add_argument("--read", type=float, default=20.0, help="GB/s of all nodes (assumed).")
-    p.add_argument("--write", type=float, default=10.0, help="GB/s of all nodes (assumed).")
+    p.add_argument(
+        "--read", type=float, default=20.0, help="GB/s of all nodes (assumed)."
+    )
+    p.add_argument(
+        "--write", type=float, default=10.0, help="GB/s of all nodes (assumed)."
+    )
     o = p.parse_args()
     rows, cols = (int(n) for n in o.panel.split(","))
     with tempfile.TemporaryDirectory() as name:
@@ -89,19 +98,22 @@ def main() -> None:
     here = os.cpu_count() or 1
     print(
           f"{machine()}: {found['updates'] / 1e9:.2f} G voxel updates, "
-          f"{found['filtered'] / 1e6:.0f} M pixels filtered, {found['read'] / 1e6:.0f} M pixels "
+          f"{found['filtered'] / 1e6:.0f} M pixels filtered, {found['read'] / 1e6:.0f} M "
+          "pixels "
           f"read and made line integrals, {found['written'] / 1e6:.0f} MB written a second"
     )  # fmt: skip
     grid = fx.Grid((o.side,) * 3, 1.0)
     count = len(slabs(grid))
     pixels, times = o.views * rows * cols, min(o.nodes * o.cores, here * 10**6) / here
     updates = o.views * float(o.side) ** 3
-    # A slab needs the rows of its own shadow: its part of the panel, and a fifth more (assumed).
+    # A slab needs the rows of its own shadow: its part of the panel, and a fifth more
+    # (assumed).
     need = {
         "frames from the disk": count * 2 * pixels / (o.read * 1e9),
         "line integrals": count * pixels / found["read"] / times,
         "filter": pixels * min(count, 1 + 0.2 * count) / found["filtered"] / times,
-        "backprojection": updates / (o.gpus * o.updates if o.gpus else found["updates"] * times),
+        "backprojection": updates
+        / (o.gpus * o.updates if o.gpus else found["updates"] * times),
         "compression": 4 * float(o.side) ** 3 / found["written"] / times,
         "volume to the disk": 4 * float(o.side) ** 3 / (o.write * 1e9),
     }

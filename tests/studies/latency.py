@@ -1,11 +1,12 @@
-"""E-stop beside every load: `python tests/studies/latency.py [--seconds 10] [--loads NAME ...]`.
+"""E-stop beside every load: `python tests/studies/latency.py [--seconds 10] [--loads NAME
+...]`.
 
-One client sends `safety.estop` every 20 ms and times the answers, another subscribes to the state,
-which changes with every E-stop, and a third is the load, in a process of its own with a low
-priority. After each load the twin's `/metrics` tell how long turns of its loop took meanwhile.
-A real-time process that oversleeps tells when the whole machine stood still (a virtual one does).
-Prints a table and exits with 1 where a figure is beyond its limit (times `--slack`, for machines
-that are busy with other things).
+One client sends `safety.estop` every 20 ms and times the answers, another subscribes to the
+state, which changes with every E-stop, and a third is the load, in a process of its own with a
+low priority. After each load the twin's `/metrics` tell how long turns of its loop took
+meanwhile. A real-time process that oversleeps tells when the whole machine stood still (a
+virtual one does). Prints a table and exits with 1 where a figure is beyond its limit (times
+`--slack`, for machines that are busy with other things).
 """
 
 from __future__ import annotations
@@ -29,14 +30,23 @@ from typing import Any
 
 from lab import Wire, machine, percentile, projector, twin
 
-LIMITS = {"p99": 20.0, "worst": 100.0, "age": 250.0, "hold p99.9": 10.0, "hold worst": 50.0}
+LIMITS = {
+    "p99": 20.0,
+    "worst": 100.0,
+    "age": 250.0,
+    "hold p99.9": 10.0,
+    "hold worst": 50.0,
+}
 """E-stop round trip, age of the state at a subscriber, turns of the loop [ms]."""
 PROBE_S = 0.02
 GET = b'{"jsonrpc":"2.0","id":1,"method":"state.get"}\n'
 
 
 def line(method: str, params: bytes) -> bytes:
-    return b'{"jsonrpc":"2.0","id":1,"method":"%b","params":%b}\n' % (method.encode(), params)
+    return b'{"jsonrpc":"2.0","id":1,"method":"%b","params":%b}\n' % (
+        method.encode(),
+        params,
+    )
 
 
 def dial(port: int) -> socket.socket:
@@ -94,7 +104,9 @@ def flood(what: bytes) -> Callable[[int, float], int]:
     return load
 
 
-def asking(*lines: bytes, count: int = 1, once: bool = False) -> Callable[[int, float], int]:
+def asking(
+    *lines: bytes, count: int = 1, once: bool = False
+) -> Callable[[int, float], int]:
     """`count` connections that send these lines in turn, each after the answer to the last."""
 
     def load(port: int, seconds: float) -> int:
@@ -135,7 +147,9 @@ def poses(size: int) -> bytes:
 
 
 def script(size: int) -> bytes:
-    rows = "".join(f"rot_obj\tmove absolute\t{i % 360}\t\tACK\t\t\r\n" for i in range(size))
+    rows = "".join(
+        f"rot_obj\tmove absolute\t{i % 360}\t\tACK\t\t\r\n" for i in range(size)
+    )
     return line("script.check", json.dumps({"text": rows}).encode())
 
 
@@ -194,8 +208,12 @@ def loads(scale: float) -> dict[str, Callable[[int, float], int]]:
         "check of 20 000 lines": asking(script(int(20_000 * scale)), once=True),
         "15 MB of unfitting poses": asking(unfitting(15 * mb)),
         "15 MB of unfitting targets": asking(unfitting_names(15 * mb)),
-        "a JSON line of 16 MB": asking(line("state.get", b'{"x":"%b"}' % (b"x" * (16 * mb)))),
-        "a JSON line above the limit": asking(line("state.get", b'"%b"' % (b"x" * (40 * mb)))),
+        "a JSON line of 16 MB": asking(
+            line("state.get", b'{"x":"%b"}' % (b"x" * (16 * mb)))
+        ),
+        "a JSON line above the limit": asking(
+            line("state.get", b'"%b"' % (b"x" * (40 * mb)))
+        ),
         "uploads of 100 MB": upload(100 * mb),
         "batches of 1000": asking(batch(1000)),
         "deep JSON": asking(b"[" * 30_000 + b"\n", b'{"a":' * 6_000 + b"\n", GET),
@@ -241,7 +259,8 @@ class Stalls:
         self.known: bool = ours.recv()
 
     def take(self) -> float:
-        """Worst since this was last asked; NaN where the system grants no real-time priority."""
+        """Worst since this was last asked; NaN where the system grants no real-time
+        priority."""
         self._pipe.send(None)
         worst: float = self._pipe.recv()
         return worst if self.known else math.nan
@@ -287,7 +306,8 @@ def _watch(port: int, pipe: Any) -> None:
 
 
 def holds(port: int) -> tuple[dict[float, int], float]:
-    """Turns of the loop up to each bound [s], and the longest since this was last asked [ms]."""
+    """Turns of the loop up to each bound [s], and the longest since this was last asked
+    [ms]."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as page:
         text = page.read().decode()
     counts, worst = {}, 0.0
@@ -333,7 +353,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         rays = projector()
         server = twin(
-            rays.port, Path(folder) / "data", "--http-port", 0, log=Path(folder) / "twin.log"
+            rays.port,
+            Path(folder) / "data",
+            "--http-port",
+            0,
+            log=Path(folder) / "twin.log",
         )
         http = int(server.ready["http_port"])
         try:

@@ -1,9 +1,9 @@
 """How long the slices of a running scan take: a scan at its own pace, and beside it the process
 that the viewer starts for "Slices so far", at each size.
 
-`python tests/studies/live_volume.py [FRAMES]` starts its own servers and prints, for each size, the
-views a second, the seconds from one picture to the next, and how far the volume was behind the
-scan's last image when that was saved.
+`python tests/studies/live_volume.py [FRAMES]` starts its own servers and prints, for each size,
+the views a second, the seconds from one picture to the next, and how far the volume was behind
+the scan's last image when that was saved.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from flexdt.twin.script.scan_request import ScanRequest
 def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
     """One scan with its slices, in words."""
     machine = builtin_machine("flexray")
-    script = compose_script(ScanRequest(frames=frames), machine, profile_of(machine, None))
+    script = compose_script(
+        ScanRequest(frames=frames), machine, profile_of(machine, None)
+    )
     name = f"slices-{side}"
     job = twin.submit_script(script, name, 1.0).job
     grower = subprocess.Popen(
@@ -55,7 +57,8 @@ def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
     between = [b - a for a, b in itertools.pairwise(steps)]
     rate = (views[-1] - views[0]) / (steps[-1] - steps[0])
     return (
-        f"| {side} | {1000 * voxel_mm:.0f} um | {rate:.1f} | {statistics.median(between):.2f} s | "
+        f"| {side} | {1000 * voxel_mm:.0f} um | {rate:.1f} | "
+        f"{statistics.median(between):.2f} s | "
         f"{max(between):.2f} s | {behind:.1f} s |"
     )
 
@@ -63,7 +66,10 @@ def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
 def main(frames: int = 120) -> None:
     """The table."""
     print(f"load average before: {os.getloadavg()[0]:.1f}; {os.cpu_count()} processors")
-    print("| side | voxel | views/s | from picture to picture | at worst | behind the last image |")
+    print(
+        "| side | voxel | views/s | from picture to picture | at worst | behind the last "
+        "image |"
+    )
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder, fx.LocalTwin(data=folder) as twin:
         twin.set_sample("lego")

@@ -1,10 +1,10 @@
 """Many clients at once: `python tests/studies/load.py [--clients 200] [--seconds 20]`.
 
-Every client subscribes to the state at 20 Hz and checks the order of what it gets; some also ask
-`state.get` twice a second, and those answers are timed. First a real-time scan runs with the
-projector on one thread, then one at full speed. One more client subscribes to everything and never
-reads. Prints the latencies and what the twin's memory and descriptors did. The clients live in
-processes of their own: the same cores, but not the server's interpreter.
+Every client subscribes to the state at 20 Hz and checks the order of what it gets; some also
+ask `state.get` twice a second, and those answers are timed. First a real-time scan runs with
+the projector on one thread, then one at full speed. One more client subscribes to everything
+and never reads. Prints the latencies and what the twin's memory and descriptors did. The
+clients live in processes of their own: the same cores, but not the server's interpreter.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from lab import Process, Wire, fly_script, machine, percentile, projector, twin
 
 PER_PROCESS = 95
 ASKING = 10
-"""Clients that ask state.get twice a second; in a process of their own, so that what is timed is
-the server and not how busy a crowd of clients is with its events."""
+"""Clients that ask state.get twice a second; in a process of their own, so that what is timed
+is the server and not how busy a crowd of clients is with its events."""
 
 
 async def client(port: int, seconds: float, asks: bool, result: dict[str, Any]) -> None:
@@ -50,7 +50,9 @@ async def client(port: int, seconds: float, asks: bool, result: dict[str, Any]) 
     try:
         while time.monotonic() < until:
             try:
-                line = await asyncio.wait_for(reader.readline(), until - time.monotonic() + 0.01)
+                line = await asyncio.wait_for(
+                    reader.readline(), until - time.monotonic() + 0.01
+                )
             except TimeoutError:
                 break
             at = time.perf_counter()
@@ -125,7 +127,10 @@ def main() -> int:
                 job = wire.call("script.submit", text=script, speed_up=pace)["job"]
                 while wire.call("job.status", job=job)["frames_done"] < 3:
                     time.sleep(0.05)
-                before, frames = server.memory_mb(), wire.call("job.status", job=job)["frames_done"]
+                before, frames = (
+                    server.memory_mb(),
+                    wire.call("job.status", job=job)["frames_done"],
+                )
                 begun = time.monotonic()
                 got = phase(server, options.clients, options.seconds)
                 took = time.monotonic() - begun
@@ -134,7 +139,8 @@ def main() -> int:
                 factor = wire.call("state.get")["clock"]["real_time_factor"]
                 print(
                     f"{name}: {options.clients} clients, {got['events'] / took:.0f} events/s, "
-                    f"{got['disorder']} out of order, {got['lost']} cut off; {len(ms)} state.get: "
+                    f"{got['disorder']} out of order, {got['lost']} cut off; {len(ms)} "
+                    "state.get: "
                     f"median {percentile(ms, 0.5):.1f} ms, p99 {percentile(ms, 0.99):.1f} ms, "
                     f"worst {max(ms):.1f} ms; {done / took:.1f} frames/s (x{factor:.2f}); twin "
                     f"{before:.0f} -> {server.memory_mb():.0f} MB, {server.descriptors()} "
@@ -145,7 +151,9 @@ def main() -> int:
                 failed += got["disorder"] + got["lost"]
             deaf.close()
             time.sleep(0.5)
-            print(f"afterwards: {server.memory_mb():.0f} MB, {server.descriptors()} descriptors")
+            print(
+                f"afterwards: {server.memory_mb():.0f} MB, {server.descriptors()} descriptors"
+            )
         finally:
             server.end()
             rays.end()

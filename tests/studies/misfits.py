@@ -1,14 +1,16 @@
-"""Drawn contradictions between images and geometry: are they named, and are right scans left alone?
+"""Drawn contradictions between images and geometry: are they named, and are right scans left
+alone?
 
     python tests/studies/misfits.py --count 200 --seed 1
     python tests/studies/misfits.py --count 200 --seed 1 --right
 
-Scans of `bias_bound.py`, seen whole, whose images or geometry are then made wrong: mirrored, turned
-the other way, interlaced, in alphabetical order, a panel on the wrong side or moved by some pixels,
-motion. With `--right` they are made difficult instead: beam hardening, scatter, noise, few views,
-wires, foam, bodies that are almost symmetric. A contradiction counts as answered where its kind is
-named, where no accuracy is claimed, or where means of small balls are right within 10 %.
-Exits with 1 where less than 98 % are answered, or more than 1 % of right scans are told anything.
+Scans of `bias_bound.py`, seen whole, whose images or geometry are then made wrong: mirrored,
+turned the other way, interlaced, in alphabetical order, a panel on the wrong side or moved by
+some pixels, motion. With `--right` they are made difficult instead: beam hardening, scatter,
+noise, few views, wires, foam, bodies that are almost symmetric. A contradiction counts as
+answered where its kind is named, where no accuracy is claimed, or where means of small balls
+are right within 10 %. Exits with 1 where less than 98 % are answered, or more than 1 % of right
+scans are told anything.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ from flexdt.twin.reconstruction.bias import Bias
 
 MOST_OFF = 0.1
 """Error of a region above which no accuracy may be claimed."""
-Wrong = Callable[[np.ndarray, fx.ConeVec, np.random.Generator], tuple[np.ndarray, fx.ConeVec]]
+Wrong = Callable[
+    [np.ndarray, fx.ConeVec, np.random.Generator], tuple[np.ndarray, fx.ConeVec]
+]
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,9 @@ def backward(images, geometry, rng):
 
 def interlaced(images, geometry, rng):
     passes = int(rng.integers(2, 4))
-    order = np.concatenate([np.arange(first, len(images), passes) for first in range(passes)])
+    order = np.concatenate(
+        [np.arange(first, len(images), passes) for first in range(passes)]
+    )
     return images[order], geometry
 
 
@@ -92,7 +98,9 @@ def other_side(images, geometry, rng):
 
 def moving(images, geometry, rng):
     turn = np.arange(len(images)) / len(images) * 2.0 * np.pi
-    columns = np.round(rng.uniform(3.0, 6.0) * np.sin(rng.integers(2, 6) * turn)).astype(int)
+    columns = np.round(rng.uniform(3.0, 6.0) * np.sin(rng.integers(2, 6) * turn)).astype(
+        int
+    )
     return np.stack(
         [np.roll(one, k, axis=1) for one, k in zip(images, columns, strict=True)]
     ), geometry
@@ -122,7 +130,9 @@ def scattered(images, geometry, rng):
 
 def noisy(images, geometry, rng):
     counts = 10.0 ** rng.uniform(2.3, 4.0)
-    return -np.log(np.maximum(rng.poisson(counts * np.exp(-images)), 0.5) / counts), geometry
+    return -np.log(
+        np.maximum(rng.poisson(counts * np.exp(-images)), 0.5) / counts
+    ), geometry
 
 
 def sparse(images, geometry, rng):
@@ -148,11 +158,17 @@ CIRCULAR = ("whole", "turns", "short", "gap", "lost")
 def thing(scan: bias_bound.Scan, rng: np.random.Generator) -> bias_bound.Scan:
     """The scan of one of several kinds of objects in the drawn one's place."""
     body = scan.solids[0]
-    kind = str(rng.choice(["drawn", "wires", "foam", "bottle", "bricks"], p=[0.4] + [0.15] * 4))
+    kind = str(
+        rng.choice(["drawn", "wires", "foam", "bottle", "bricks"], p=[0.4] + [0.15] * 4)
+    )
     room = body.half
 
-    def part(shape: str, at: np.ndarray, half: np.ndarray, times: float) -> bias_bound.Solid:
-        return bias_bound.Solid(shape, at, half, float(rng.uniform(0.0, 3.0)), times * body.mu)
+    def part(
+        shape: str, at: np.ndarray, half: np.ndarray, times: float
+    ) -> bias_bound.Solid:
+        return bias_bound.Solid(
+            shape, at, half, float(rng.uniform(0.0, 3.0)), times * body.mu
+        )
 
     if kind == "drawn":
         return scan
@@ -200,8 +216,8 @@ def looked_at(case: Case) -> Bias | None:
 
 
 def worst_error(case: Case) -> float:
-    """Error that nine of ten small regions stay below, over their truth, of sorted means: a volume
-    that is turned or mirrored is not wrong.
+    """Error that nine of ten small regions stay below, over their truth, of sorted means: a
+    volume that is turned or mirrored is not wrong.
     """
     grid = field_of_view(case.geometry, case.scan.shape)
     with warnings.catch_warnings():
@@ -231,7 +247,9 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the first draw")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--right", action="store_true", help="right scans, made difficult")
+    parser.add_argument(
+        "--right", action="store_true", help="right scans, made difficult"
+    )
     chosen = parser.parse_args()
     counts: Counter[str] = Counter()
     tried = bad = 0
@@ -250,7 +268,9 @@ def main() -> int:
             print(f"{number}: {case.kind}: {verdict}: {case.scan.said}", flush=True)
     for verdict, count in sorted(counts.items()):
         print(f"{count:6} {verdict}")
-    print(f"{tried - bad} of {tried} as they should be; {time.process_time() - begun:.0f} CPU s")
+    print(
+        f"{tried - bad} of {tried} as they should be; {time.process_time() - begun:.0f} CPU s"
+    )
     return int(bad > (0.01 if chosen.right else 0.02) * max(tried, 1))
 
 
@@ -262,7 +282,11 @@ def judged(case: Case, bias: Bias | None) -> tuple[str, bool]:
     if found is not None:
         if case.names & set(found.kinds):
             return "named", True
-        return (f"named {'/'.join(found.kinds)}", False) if found.kinds else ("unexplained", True)
+        return (
+            (f"named {'/'.join(found.kinds)}", False)
+            if found.kinds
+            else ("unexplained", True)
+        )
     grid = field_of_view(case.geometry, case.scan.shape)
     accuracy = None if bias is None else bias.accuracy(grid)
     if accuracy is None or accuracy.cut_off:

@@ -1,13 +1,13 @@
 """Random motion under the eye of the oracle: `motion_campaign.py --requests 100000 --seed 1`.
 
 Four fifths of the requests go to the pure scanner, a fifth comes from three clients of a whole
-server in a simulation (`--wire`), with scans, scenes, control and clocks from real time to "max".
-Moves, jogs, stops, E-stops, resets, settings in flight, programmes that are paused, resumed and
-aborted, samples, corrections and restarts on three machines, aimed at where parts meet. Every
-motion that the scanner publishes is looked at by `motion_oracle`, which shares no code with the
-guard. Prints requests by verb and outcome, violations, and stop distances beside those of motors
-that would brake each by itself. Ends with 1 on any violation, with the seed and the shortest
-history that shows it.
+server in a simulation (`--wire`), with scans, scenes, control and clocks from real time to
+"max". Moves, jogs, stops, E-stops, resets, settings in flight, programmes that are paused,
+resumed and aborted, samples, corrections and restarts on three machines, aimed at where parts
+meet. Every motion that the scanner publishes is looked at by `motion_oracle`, which shares no
+code with the guard. Prints requests by verb and outcome, violations, and stop distances beside
+those of motors that would brake each by itself. Ends with 1 on any violation, with the seed and
+the shortest history that shows it.
 """
 
 from __future__ import annotations
@@ -63,7 +63,9 @@ class Tally:
     stops: list[tuple[float, float, float, float]] = field(default_factory=list)
     found: Counter[str] = field(default_factory=Counter)
     first: dict[str, tuple[int, Start, list[Request], str]] = field(default_factory=dict)
-    first_wire: dict[str, tuple[int, WireStart, list[Ask], str]] = field(default_factory=dict)
+    first_wire: dict[str, tuple[int, WireStart, list[Ask], str]] = field(
+        default_factory=dict
+    )
     slowest: tuple[float, str] = (0.0, "")
     least: float = np.inf
 
@@ -129,24 +131,35 @@ def main() -> int:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--requests", type=int, default=100_000)
     p.add_argument("--seed", type=int, default=1)
-    p.add_argument("--machine", action="append", choices=MACHINES, help="default: all three")
+    p.add_argument(
+        "--machine", action="append", choices=MACHINES, help="default: all three"
+    )
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--wire", type=float, default=0.2, help="share of the requests")
-    p.add_argument("--minutes", type=float, default=np.inf, help="end earlier, with fewer requests")
-    p.add_argument("--no-shrink", action="store_true", help="print histories as they were")
+    p.add_argument(
+        "--minutes", type=float, default=np.inf, help="end earlier, with fewer requests"
+    )
+    p.add_argument(
+        "--no-shrink", action="store_true", help="print histories as they were"
+    )
     options = p.parse_args()
     machines = options.machine or list(MACHINES)
     begun = time.monotonic()
     tally = Tally()
     store.mesh_apart = read_here
-    with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(options.jobs) as pool:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ProcessPoolExecutor(options.jobs) as pool,
+    ):
         samples = data_with_samples(Path(folder))
         plan: list[tuple[float, int, bool]] = []  # when, how many, whether over the wire
         for share, size, wire in ((1.0 - options.wire, BATCH, False),
                                   (options.wire, WIRE_BATCH, True)):  # fmt: skip
             wanted = round(share * options.requests)
             parts = -(-wanted // size)
-            plan += [(i / parts, min(size, wanted - i * size), wire) for i in range(parts)]
+            plan += [
+                (i / parts, min(size, wanted - i * size), wire) for i in range(parts)
+            ]
         work = []
         for i, (_, size, wire) in enumerate(sorted(plan)):
             machine, seed = machines[i % len(machines)], options.seed * 1_000_000 + i

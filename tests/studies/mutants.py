@@ -1,8 +1,8 @@
 """Small changes of code, one at a time: what `mutations.py` draws and puts in place.
 
-A mutant is one change of one operator, comparison, condition, constant or sign in one file. It is
-known by file, function, the text before and after, and a number where these are the same, so that
-a change elsewhere in the file neither renames it nor moves it in the draw.
+A mutant is one change of one operator, comparison, condition, constant or sign in one file. It
+is known by file, function, the text before and after, and a number where these are the same, so
+that a change elsewhere in the file neither renames it nor moves it in the draw.
 """
 
 from __future__ import annotations
@@ -24,9 +24,17 @@ SWAPS: dict[type[ast.AST], type[ast.AST]] = {
     ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
 }  # fmt: skip
 REVERSED = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt}
-NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
+NAMES = {
+    "min": "max",
+    "max": "min",
+    "any": "all",
+    "all": "any",
+    "sin": "cos",
+    "cos": "sin",
+}
 SKIPPED = (ast.JoinedStr, ast.Assert, ast.Import, ast.ImportFrom)
-"""Texts for people, and what only type checkers need; nor is `strict` of `zip`, an assertion."""
+"""Texts for people, and what only type checkers need; nor is `strict` of `zip`, an
+assertion."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,9 @@ def variants(node: ast.AST) -> list[ast.AST]:
         out.append(other)
 
     match node:
-        case ast.BinOp(op=op) | ast.BoolOp(op=op) | ast.AugAssign(op=op) if type(op) in SWAPS:
+        case ast.BinOp(op=op) | ast.BoolOp(op=op) | ast.AugAssign(op=op) if (
+            type(op) in SWAPS
+        ):
             changed(op=SWAPS[type(op)]())
         case ast.Compare(ops=[op]):
             for table in (SWAPS, REVERSED):
@@ -104,7 +114,10 @@ class Place:
 
 
 def places(
-    tree: ast.AST, function: str = "module", lines: range = range(1, 2), inside: bool = False
+    tree: ast.AST,
+    function: str = "module",
+    lines: range = range(1, 2),
+    inside: bool = False,
 ) -> Iterator[Place]:
     """Every expression and statement that runs, in order."""
     if isinstance(tree, ast.Assign | ast.AnnAssign) and _is_type(tree):
@@ -119,12 +132,15 @@ def places(
                 continue
             its_lines, its_function = lines, function
             its_inside = inside or (
-                isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef) and field == "body"
+                isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef)
+                and field == "body"
             )
             if isinstance(node, ast.stmt):
                 its_lines = _head(node)
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                its_function = node.name if function == "module" else f"{function}.{node.name}"
+                its_function = (
+                    node.name if function == "module" else f"{function}.{node.name}"
+                )
             yield Place(tree, field, node, its_function, its_lines, its_inside)
             yield from places(node, its_function, its_lines, its_inside)
 
@@ -132,10 +148,14 @@ def places(
 def _head(statement: ast.stmt) -> range:
     """The lines of a statement without those of the statements in it."""
     inner = [
-        s.lineno for s in ast.walk(statement) if isinstance(s, ast.stmt) and s is not statement
+        s.lineno
+        for s in ast.walk(statement)
+        if isinstance(s, ast.stmt) and s is not statement
     ]
     end = statement.end_lineno or statement.lineno
-    return range(statement.lineno, max(statement.lineno, min([end, *(n - 1 for n in inner)])) + 1)
+    return range(
+        statement.lineno, max(statement.lineno, min([end, *(n - 1 for n in inner)])) + 1
+    )
 
 
 def _is_type(statement: ast.Assign | ast.AnnAssign) -> bool:
@@ -158,7 +178,9 @@ def mutants_of(file: str, text: str) -> list[Mutant]:
         for choice, other in enumerate(variants(place.node)):
             named = place.function, _short(place.node), _short(other)
             found.append(
-                Mutant(file, *named, seen[named], index, choice, place.lines, place.inside)
+                Mutant(
+                    file, *named, seen[named], index, choice, place.lines, place.inside
+                )
             )
             seen[named] += 1
     return found

@@ -1,17 +1,19 @@
 """Small changes to the core that a test must notice: `python tests/studies/mutations.py`.
 
-Each mutant (see `mutants.py`) runs in a copy of the code against the tests that execute its line,
-in a process forked from this one, which holds the third-party libraries but nothing of flexdt. It
-is killed when a test fails or takes far too long, and it survives otherwise; so do those whose line
-no test executes. Survivors are printed, as are those that `mutants_equivalent.toml` explains as
-equivalent. Exit code 1 when fewer than 95 % of the others are killed.
+Each mutant (see `mutants.py`) runs in a copy of the code against the tests that execute its
+line, in a process forked from this one, which holds the third-party libraries but nothing of
+flexdt. It is killed when a test fails or takes far too long, and it survives otherwise; so do
+those whose line no test executes. Survivors are printed, as are those that
+`mutants_equivalent.toml` explains as equivalent. Exit code 1 when fewer than 95 % of the others
+are killed.
 
-Which tests execute which lines is found once, with coverage.py, and again for test files that have
-changed; of a source file that has changed, the tests that execute any line of it are taken. Tests
-that fail without any change in the copy, and `slow` ones, do not count. Compiled kernels cannot be
-traced, so files with kernels are not drawn from. Lines and fates are kept in the folder --work: an
-interrupted campaign goes on where it ended, and the draw is the same wherever the code is.
-Options: --count N, --seed N, --jobs N, --under PATH..., --seconds S, --list, --again, --work DIR.
+Which tests execute which lines is found once, with coverage.py, and again for test files that
+have changed; of a source file that has changed, the tests that execute any line of it are
+taken. Tests that fail without any change in the copy, and `slow` ones, do not count. Compiled
+kernels cannot be traced, so files with kernels are not drawn from. Lines and fates are kept in
+the folder --work: an interrupted campaign goes on where it ended, and the draw is the same
+wherever the code is. Options: --count N, --seed N, --jobs N, --under PATH..., --seconds S,
+--list, --again, --work DIR.
 """
 
 from __future__ import annotations
@@ -66,8 +68,9 @@ MEMORY = 12 << 30
 """Address space of a child [bytes]."""
 
 Lines = dict[str, Any]
-"""Of one test file: the processor seconds of its tests; the tests of each line as bits of a number,
-where the last bit stands for what the whole file does; the files it imports, with digests."""
+"""Of one test file: the processor seconds of its tests; the tests of each line as bits of a
+number, where the last bit stands for what the whole file does; the files it imports, with
+digests."""
 
 
 def digest(path: Path) -> str:
@@ -101,7 +104,8 @@ class Copy:
             link.symlink_to(folder / name)
 
     def put(self, mutant: Mutant) -> None:
-        """Put a mutant in place. Its time differs from all earlier ones, for what is compiled."""
+        """Put a mutant in place. Its time differs from all earlier ones, for what is
+        compiled."""
         path = self.folder / mutant.file
         self.original = path.read_bytes(), path.stat().st_mtime_ns
         path.write_text(mutated(mutant, self.original[0].decode()))
@@ -205,7 +209,9 @@ class Traced:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        for module in list(sys.modules.values()):  # what an earlier test left must run again
+        for module in list(
+            sys.modules.values()
+        ):  # what an earlier test left must run again
             if str(getattr(module, "__file__", "")).startswith(str(self.folder)):
                 for value in list(vars(module).values()):
                     if hasattr(value, "cache_clear"):
@@ -237,13 +243,19 @@ class Traced:
     def result(self) -> Lines:
         self.coverage.stop()
         tests = [name for name in self.seconds if name not in self.failed]
-        bit = {name: 1 << i for i, name in enumerate(tests)} | {self.file: 1 << len(tests)}
+        bit = {name: 1 << i for i, name in enumerate(tests)} | {
+            self.file: 1 << len(tests)
+        }
         data = self.coverage.get_data()
-        own = {m.__file__ for m in list(sys.modules.values()) if getattr(m, "__file__", None)}
+        own = {
+            m.__file__ for m in list(sys.modules.values()) if getattr(m, "__file__", None)
+        }
         used = [Path(os.path.realpath(f)).relative_to(self.folder)
                 for f in own if os.path.realpath(f).startswith(f"{self.folder}/")]  # fmt: skip
         return {
-            "digests": {str(f): digest(self.folder / f) for f in used if f.suffix == ".py"},
+            "digests": {
+                str(f): digest(self.folder / f) for f in used if f.suffix == ".py"
+            },
             "seconds": {name: round(self.seconds[name], 3) for name in tests},
             "lines": {
                 str(Path(path).relative_to(self.folder)): {
@@ -260,8 +272,12 @@ class Tests:
 
     def __init__(self, known: Path, copies: list[Copy], digests: dict[str, str]) -> None:
         self.digests = digests
-        entries: dict[str, Lines] = json.loads(known.read_text()) if known.exists() else {}
-        files = sorted({str(p.relative_to(ROOT)) for t in TESTS for p in (ROOT / "tests").glob(t)})
+        entries: dict[str, Lines] = (
+            json.loads(known.read_text()) if known.exists() else {}
+        )
+        files = sorted(
+            {str(p.relative_to(ROOT)) for t in TESTS for p in (ROOT / "tests").glob(t)}
+        )
         self.entries = {
             file: entry for file, entry in entries.items()
             if file in files and entry["digests"].get(file) == digest(ROOT / file)
@@ -276,7 +292,9 @@ class Tests:
             tests = len(self.entries.get(file, {"seconds": ()})["seconds"])
             print(f"lines of {count + 1}/{len(new)} {file}: {tests} tests", flush=True)
             known.write_text(json.dumps(self.entries))
-        for copy in copies:  # what was compiled in one copy need not be compiled in the next
+        for (
+            copy
+        ) in copies:  # what was compiled in one copy need not be compiled in the next
             for other in copies:
                 for path in copy.folder.rglob("__pycache__/*.nb?"):
                     there = other.folder / path.relative_to(copy.folder)
@@ -286,10 +304,14 @@ class Tests:
         self.weight = {file: _weight(entry) for file, entry in self.entries.items()}
 
     def of(self, mutant: Mutant, most_s: float) -> list[tuple[str, dict[str, float]]]:
-        """The tests of a mutant by file, with their seconds, those likely to kill it soon first."""
+        """The tests of a mutant by file, with their seconds, those likely to kill it soon
+        first."""
         ranked = []
         for file, entry in self.entries.items():
-            lines, shared = entry["lines"].get(mutant.file, {}), 1 << len(entry["seconds"])
+            lines, shared = (
+                entry["lines"].get(mutant.file, {}),
+                1 << len(entry["seconds"]),
+            )
             bits = shared if lines and not mutant.inside else 0
             same = entry["digests"].get(mutant.file) == self.digests[mutant.file]
             for line in map(str, mutant.lines) if same else lines:
@@ -298,7 +320,8 @@ class Tests:
             for i, (test, seconds) in enumerate(entry["seconds"].items()):
                 own = bool(bits & 1 << i)
                 if own or bits & shared:
-                    # Whoever imports a module first runs its own lines, and tests them no better.
+                    # Whoever imports a module first runs its own lines, and tests them no
+                    # better.
                     last = mutant.inside and not own
                     ranked.append((last, (0.02 + seconds) / weight, file, test, seconds))
         chosen: dict[str, dict[str, float]] = {}
@@ -348,7 +371,9 @@ def equivalents() -> dict[tuple[str, str, str, str], str]:
     return {(m["file"], m["function"], m["before"], m["after"]): m["why"] for m in table}
 
 
-def fate_of(mutant: Mutant, status: int, known: dict[tuple[str, str, str, str], str]) -> str:
+def fate_of(
+    mutant: Mutant, status: int, known: dict[tuple[str, str, str, str], str]
+) -> str:
     """What the end of a child means."""
     if os.WIFSIGNALED(status):
         late = os.WTERMSIG(status) in (signal.SIGPROF, signal.SIGKILL)
@@ -371,7 +396,9 @@ def table(fates: dict[Mutant, str]) -> str:
     rows = []
     for name in (*sorted(set(folders.values())), ""):
         its = Counter(fate for m, fate in fates.items() if folders[m].startswith(name))
-        words = ", ".join(f"{its[f]} {f}" for f in ("killed", "timeout", "survived", "equivalent"))
+        words = ", ".join(
+            f"{its[f]} {f}" for f in ("killed", "timeout", "survived", "equivalent")
+        )
         rows.append(f"{name or 'all':24} {words}: {100 * share(its.elements()):.1f} %")
     return "\n".join(rows)
 
@@ -383,7 +410,10 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--under", nargs="*", default=UNDER)
     parser.add_argument(
-        "--seconds", type=float, default=40.0, help="of a processor, for the tests of one mutant"
+        "--seconds",
+        type=float,
+        default=40.0,
+        help="of a processor, for the tests of one mutant",
     )
     parser.add_argument("--list", action="store_true", help="print the draw, run nothing")
     parser.add_argument("--again", action="store_true", help="judge survivors once more")
@@ -394,10 +424,14 @@ def main() -> int:
         for path in ([ROOT / under] if under.endswith(".py") else (ROOT / under).rglob("*.py"))
         if "numba" not in path.read_text()
     )  # fmt: skip
-    everything = [m for file in files for m in mutants_of(file, (ROOT / file).read_text())]
+    everything = [
+        m for file in files for m in mutants_of(file, (ROOT / file).read_text())
+    ]
     digests = {file: digest(ROOT / file) for file in files}
     drawn = draw(everything, options.count, options.seed)
-    print(f"{len(drawn)} of {len(everything)} mutants in {len(files)} files, seed {options.seed}")
+    print(
+        f"{len(drawn)} of {len(everything)} mutants in {len(files)} files, seed {options.seed}"
+    )
     if options.list:
         print("\n".join(str(m) for m in drawn))
         return 0
@@ -405,7 +439,9 @@ def main() -> int:
         os.environ[threads] = "1"
     for library in LIBRARIES:
         importlib.import_module(library)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # children end with this process
+    signal.signal(
+        signal.SIGTERM, signal.default_int_handler
+    )  # children end with this process
     begun, known = time.monotonic(), equivalents()
     copies = [Copy(options.work / f"copy-{i}") for i in range(options.jobs)]
     tests = Tests(options.work / "lines.json", copies, digests)

@@ -1,22 +1,22 @@
 """Does `align` tell gaps between tiles that are not there, or miss those that are?
 
-    python tests/studies/natural_objects.py [--count 200] [--seed 1] [--gaps] [--only foam,bottle]
-    python tests/studies/natural_objects.py --near [--count 64] [--seed 1]
+    python tests/studies/natural_objects.py [--count 200] [--seed 1] [--gaps] [--only
+    foam,bottle] python tests/studies/natural_objects.py --near [--count 64] [--seed 1]
     python tests/studies/natural_objects.py --fans [--count 40]
 
-Every scan is a full turn of an object as people scan them: foam in a cylinder, a bottle, a circuit
-board, toy bricks, a bone, a printed part, a stone, a bundle of wires; sizes, places, scanner,
-noise, hardening, blur, rings and numbers of views are drawn. `--gaps` sets the right part of the
-panel .8 to 2 px aside, `--near` does so within five columns of the axis, where both ends of rays
-say nothing: such a gap need not be named, but must be in the column's sigma. `--fans` are half
-turns and the fan of wires that harden the beam.
+Every scan is a full turn of an object as people scan them: foam in a cylinder, a bottle, a
+circuit board, toy bricks, a bone, a printed part, a stone, a bundle of wires; sizes, places,
+scanner, noise, hardening, blur, rings and numbers of views are drawn. `--gaps` sets the right
+part of the panel .8 to 2 px aside, `--near` does so within five columns of the axis, where both
+ends of rays say nothing: such a gap need not be named, but must be in the column's sigma.
+`--fans` are half turns and the fan of wires that harden the beam.
 `--json` prints a line for each scan.
 
 Exit code 1 where a scan without a gap is told of one or warned of repeated frames, where a gap
 (but of `--near`) is not named, or where a column is more than 4 sigma off.
 
-Line integrals are those of turned ellipsoids, cylinders and boxes whose densities add, in closed
-form along rays spread over each pixel, with kinematics of their own.
+Line integrals are those of turned ellipsoids, cylinders and boxes whose densities add, in
+closed form along rays spread over each pixel, with kinematics of their own.
 """
 
 from __future__ import annotations
@@ -62,7 +62,12 @@ class Solids:
     densities: list[float] = field(default_factory=list)
 
     def add(
-        self, kind: int, centre: Any, half: Any, density: float, turn: np.ndarray | None = None
+        self,
+        kind: int,
+        centre: Any,
+        half: Any,
+        density: float,
+        turn: np.ndarray | None = None,
     ) -> None:
         """Add a body of half axes `half`, turned by a rotation (3, 3)."""
         own = np.asarray(half, dtype=float)
@@ -109,13 +114,17 @@ def any_turn(rng: Rng) -> np.ndarray:
     return np.asarray(q * np.sign(np.diag(r)))
 
 
-def bubbles(rng: Rng, solids: Solids, count: int, wide: float, high: float, density: float) -> None:
+def bubbles(
+    rng: Rng, solids: Solids, count: int, wide: float, high: float, density: float
+) -> None:
     """Add balls in a cylinder that do not overlap."""
     places: list[tuple[np.ndarray, float]] = []
     for _ in range(8 * count):
         r = float(rng.lognormal(math.log(wide * 0.13), 0.35))
         far, turn = (wide - r) * math.sqrt(rng.random()), rng.uniform(0, 2 * math.pi)
-        at = np.array([far * math.cos(turn), far * math.sin(turn), rng.uniform(-high, high)])
+        at = np.array(
+            [far * math.cos(turn), far * math.sin(turn), rng.uniform(-high, high)]
+        )
         if far + r > wide - 0.3 or any(np.linalg.norm(at - p) < r + q for p, q in places):
             continue
         places.append((at, r))
@@ -133,11 +142,23 @@ def foam(rng: Rng) -> Solids:
     density = rng.uniform(0.005, 0.03)
     if rng.random() < 0.5:
         wall = rng.uniform(0.5, 2)
-        s.add(CYLINDER, (0, 0, 0), (wide + wall, wide + wall, high), density * rng.uniform(1, 3))
+        s.add(
+            CYLINDER,
+            (0, 0, 0),
+            (wide + wall, wide + wall, high),
+            density * rng.uniform(1, 3),
+        )
         s.add(CYLINDER, (0, 0, 0), (wide, wide, high + 1), density - s.densities[-1])
     else:
         s.add(CYLINDER, (0, 0, 0), (wide, wide, high), density)
-    bubbles(rng, s, int(rng.integers(30, 200)), wide, min(high, 28), -density * rng.uniform(0.6, 1))
+    bubbles(
+        rng,
+        s,
+        int(rng.integers(30, 200)),
+        wide,
+        min(high, 28),
+        -density * rng.uniform(0.6, 1),
+    )
     return s
 
 
@@ -158,7 +179,11 @@ def bottle(rng: Rng) -> Solids:
     inside, low = wide - wall, low + wall
     s.add(CYLINDER, (0, 0, (low + level) / 2), (inside, inside, (level - low) / 2), 0.02)
     for _ in range(int(rng.integers(0, 12))):
-        r, far, turn = rng.uniform(0.5, 3), rng.uniform(0, 0.7) * inside, rng.uniform(0, 6.3)
+        r, far, turn = (
+            rng.uniform(0.5, 3),
+            rng.uniform(0, 0.7) * inside,
+            rng.uniform(0, 6.3),
+        )
         at = (far * math.cos(turn), far * math.sin(turn), level - r * rng.random() * 5)
         s.add(ELLIPSOID, at, (r, r, r), 0.01)
     return s
@@ -181,7 +206,13 @@ def board(rng: Rng) -> Solids:
         s.add(BOX, (x, side * (thick + half[1]), z), half, rng.uniform(0.01, 0.08))
     for _ in range(int(rng.integers(5, 40))):
         x, z = rng.uniform(-wide, wide) * 0.95, rng.uniform(-high, high) * 0.95
-        s.add(CYLINDER, (x, 0, z), (0.4, 0.4, thick), -0.02, frame_along(np.array([0.0, 1.0, 0.0])))
+        s.add(
+            CYLINDER,
+            (x, 0, z),
+            (0.4, 0.4, thick),
+            -0.02,
+            frame_along(np.array([0.0, 1.0, 0.0])),
+        )
     return s
 
 
@@ -199,7 +230,11 @@ def bricks(rng: Rng) -> Solids:
         s.add(BOX, (x, y, z - 0.15 * unit), inner, -density)
         for i in range(nx):
             for j in range(ny):
-                at = (x + (i + 0.5) * unit - hx, y + (j + 0.5) * unit - hy, z + half + 0.1 * unit)
+                at = (
+                    x + (i + 0.5) * unit - hx,
+                    y + (j + 0.5) * unit - hy,
+                    z + half + 0.1 * unit,
+                )
                 s.add(CYLINDER, at, (0.3 * unit, 0.3 * unit, 0.1 * unit), density)
     return s
 
@@ -212,7 +247,10 @@ def bone(rng: Rng) -> Solids:
     s.add(CYLINDER, (0, 0, 0), (wide, wide * flat, high), 0.04)
     s.add(CYLINDER, (0, 0, 0), (wide - wall, wide * flat - wall, high + 1), -0.035)
     for _ in range(int(rng.integers(40, 150))):
-        far, turn = (wide - wall) * 0.8 * flat * math.sqrt(rng.random()), rng.uniform(0, 6.3)
+        far, turn = (
+            (wide - wall) * 0.8 * flat * math.sqrt(rng.random()),
+            rng.uniform(0, 6.3),
+        )
         at = np.array([far * math.cos(turn), far * math.sin(turn), rng.uniform(-24, 24)])
         along = any_turn(rng)[:, 0] * rng.uniform(1, 4)
         s.rod(at - along, at + along, rng.uniform(0.15, 0.5), 0.035)
@@ -271,13 +309,15 @@ def wires(rng: Rng) -> Solids:
 
 
 OBJECTS: Final[dict[str, Callable[[Rng], Solids]]] = {
-    draw.__name__: draw for draw in (foam, bottle, board, bricks, bone, printed, stone, wires)
+    draw.__name__: draw
+    for draw in (foam, bottle, board, bricks, bone, printed, stone, wires)
 }
 
 
 @dataclass
 class Scan:
-    """A scanner as it is [mm, rad, px]; the source is the origin, y goes along the beam, z up."""
+    """A scanner as it is [mm, rad, px]; the source is the origin, y goes along the beam, z
+    up."""
 
     kind: str
     solids: Solids
@@ -325,8 +365,11 @@ class Scan:
         return float(c0 - r0 * (c1 - c0) / (r1 - r0) + (self.shape[1] - 1) / 2)
 
     def lines(self, aside: float = 0.0) -> np.ndarray:
-        """Line integrals (views, rows, cols) of a panel that stands `aside` to the right [px]."""
-        at = (np.arange(self.shape[1] * ACROSS) + 0.5) / ACROSS - self.shape[1] / 2 + aside
+        """Line integrals (views, rows, cols) of a panel that stands `aside` to the right
+        [px]."""
+        at = (
+            (np.arange(self.shape[1] * ACROSS) + 0.5) / ACROSS - self.shape[1] / 2 + aside
+        )
         out = np.zeros((self.views, *self.shape))
         kinds, reaches = np.array(self.solids.kinds), np.array(self.solids.reaches)
         densities = np.array(self.solids.densities)
@@ -339,13 +382,23 @@ class Scan:
             middle = back @ self.centre()
             across, down = back @ u, back @ v
             _rays(
-                source, middle, across, down, at, kinds, centres, frames, reaches, densities, out[k]
+                source,
+                middle,
+                across,
+                down,
+                at,
+                kinds,
+                centres,
+                frames,
+                reaches,
+                densities,
+                out[k],
             )
         return out
 
     def light(self, aside: float = 0.0) -> np.ndarray:
-        """Light in front of a panel that stands `aside` to the right [px]: blurred there, not by
-        the panel, whose gap it does not know."""
+        """Light in front of a panel that stands `aside` to the right [px]: blurred there, not
+        by the panel, whose gap it does not know."""
         g = self.lines(aside)
         light = np.exp(-g * (1 - self.hardening * g / (1 + self.hardening * g)))
         return gaussian_filter(light, (0, self.blur, self.blur)) if self.blur else light
@@ -359,11 +412,19 @@ class Scan:
         flat = rng.poisson(self.photons, (20, *self.shape)).mean(axis=0)
         flat *= 1 + self.rings * rng.normal(size=flat.shape)
         step = min(4.0, 60_000 / self.photons)
-        counts = np.minimum(rng.poisson(self.photons * light) * step, 65535).astype(np.uint16)
-        cone = fx.ConeVec.circular(
-            sod=SOD_MM, sdd=SDD_MM, angles=self.degrees(), shape=self.shape, pixel=self.pitch
+        counts = np.minimum(rng.poisson(self.photons * light) * step, 65535).astype(
+            np.uint16
         )
-        return fx.DataSet.from_arrays(counts, cone, dark=np.zeros(self.shape), flat=flat * step)
+        cone = fx.ConeVec.circular(
+            sod=SOD_MM,
+            sdd=SDD_MM,
+            angles=self.degrees(),
+            shape=self.shape,
+            pixel=self.pitch,
+        )
+        return fx.DataSet.from_arrays(
+            counts, cone, dark=np.zeros(self.shape), flat=flat * step
+        )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -380,7 +441,10 @@ def _rays(  # type: ignore[no-untyped-def]
         foot = to * scale - middle
         wide = 1.2 * reaches[b] * scale / math.sqrt(uu) + 2
         c, r = (foot * u).sum() / uu, (foot * v).sum() / vv
-        top, end = max(0, int(r + rows / 2 - wide)), min(rows, int(r + rows / 2 + wide) + 2)
+        top, end = (
+            max(0, int(r + rows / 2 - wide)),
+            min(rows, int(r + rows / 2 + wide) + 2),
+        )
         # In the body's own frame a ray is p + t (m + x g + y h).
         p, m, g, h = -frames[b] @ to, frames[b] @ middle, frames[b] @ u, frames[b] @ v
         first, last = np.searchsorted(at, c - wide), np.searchsorted(at, c + wide)
@@ -401,7 +465,9 @@ def _rays(  # type: ignore[no-untyped-def]
                             + (middle[1] + x * u[1] + y * v[1]) ** 2
                             + (middle[2] + x * u[2] + y * v[2]) ** 2
                         )
-                        out[row, i // ACROSS] += densities[b] * chord * long / (ACROSS * DOWN)
+                        out[row, i // ACROSS] += (
+                            densities[b] * chord * long / (ACROSS * DOWN)
+                        )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -413,7 +479,8 @@ def _slab(p, d):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _chord(kind, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Give the part of t for which p + t d is in the unit ball (0), cylinder (1) or cube (2)."""
+    """Give the part of t for which p + t d is in the unit ball (0), cylinder (1) or cube
+    (2)."""
     low, high = -1e30, 1e30
     if kind != BOX:
         round_z = 1.0 if kind == ELLIPSOID else 0.0
@@ -470,7 +537,9 @@ def fan_of_wires(rng: Rng) -> Scan:
     return scan
 
 
-def tried(kind: str, seed: int, gap: bool, fan: bool = False, near: bool = False) -> dict[str, Any]:
+def tried(
+    kind: str, seed: int, gap: bool, fan: bool = False, near: bool = False
+) -> dict[str, Any]:
     """Align one scan, and say what is told and how far off."""
     ways = [1] if fan else [2] if near else []
     rng = np.random.default_rng([list(OBJECTS).index(kind), seed, gap, *ways])
@@ -485,7 +554,9 @@ def tried(kind: str, seed: int, gap: bool, fan: bool = False, near: bool = False
         "seconds": round(time.process_time() - begun, 2),
         "warnings": list(found.alignment.warnings),
     }  # fmt: skip
-    words = " ".join([*found.alignment.warnings, found.alignment.refused.get("axis_column_px", "")])
+    words = " ".join(
+        [*found.alignment.warnings, found.alignment.refused.get("axis_column_px", "")]
+    )
     told["named"] = "between two tiles" in words or found.alignment.panel is not None
     told["open"] = "do not exclude that a tile" in words
     told["repeats"] = "repeat the one before" in words
@@ -510,7 +581,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--near", action="store_true")
     parser.add_argument("--fans", action="store_true")
     parser.add_argument("--only", help="objects, with commas between them")
-    parser.add_argument("--json", action="store_true", help="one line for each scan as well")
+    parser.add_argument(
+        "--json", action="store_true", help="one line for each scan as well"
+    )
     o = parser.parse_args(words)
     turn_planes.find_height = untold  # type: ignore[assignment]
     names = ["wires"] if o.fans else o.only.split(",") if o.only else list(OBJECTS)
@@ -533,10 +606,12 @@ def summary(runs: list[dict[str, Any]], gaps: bool, near: bool = False) -> int:
     disagree = sum(run["disagree"] for run in runs)
     named, left_open = (sum(run[word] for run in runs) for word in ("named", "open"))
     print(
-        f"{len(pulls)} of {len(runs)} told, {len(wrong)} with a wrong word about gaps or repeats, "
+        f"{len(pulls)} of {len(runs)} told, {len(wrong)} with a wrong word about gaps or "
+        "repeats, "
         f"{named} told a gap, {left_open} that one is not excluded, {disagree} that two ways "
         f"disagree, {len(far)} columns beyond {SIGMAS:g} sigma; in sigmas "
-        f"{math.sqrt(float(np.square(pulls).mean())):.2f} rms, largest {np.abs(pulls).max():.2f}"
+        f"{math.sqrt(float(np.square(pulls).mean())):.2f} rms, largest "
+        f"{np.abs(pulls).max():.2f}"
     )
     return int(bool(wrong or far))
 

@@ -1,10 +1,10 @@
-"""What a volume's `sigma` and `bias_bound` cost: FDK without and with both, in turns; and of it the
-comparison of images and geometry, where they fit and where all explanations are tried.
+"""What a volume's `sigma` and `bias_bound` cost: FDK without and with both, in turns; and of it
+the comparison of images and geometry, where they fit and where all explanations are tried.
 
     python tests/studies/noise_cost.py [NUMBER OF CASES]
 
-Images of a cylinder that the panel sees whole, and of one that it cuts off. Processor seconds, the
-better of three.
+Images of a cylinder that the panel sees whole, and of one that it cuts off. Processor seconds,
+the better of three.
 """
 
 from __future__ import annotations
@@ -37,16 +37,24 @@ def image_of(radius: float, shape: tuple[int, int], pixel: float) -> Float32Arra
     up = ((np.arange(shape[0]) - (shape[0] - 1) / 2) * pixel)[:, None]
     away = SOD * np.sin(np.arctan2(beside, SDD))
     chord = 2.0 * np.sqrt(np.maximum(radius**2 - away**2, 0.0))
-    return np.asarray(0.02 * chord * np.sqrt(1.0 + up**2 / (SDD**2 + beside**2)), np.float32)
+    return np.asarray(
+        0.02 * chord * np.sqrt(1.0 + up**2 / (SDD**2 + beside**2)), np.float32
+    )
 
 
 def comparison_times(
     image: Float32Array, scan: fx.ConeVec, shape: tuple[int, int]
 ) -> tuple[str, str]:
-    """Processor seconds of a comparison: of images that fit, and of ones on a panel moved aside."""
+    """Processor seconds of a comparison: of images that fit, and of ones on a panel moved
+    aside."""
     pixel = float(np.linalg.norm(scan.u[0]))
     aside = fx.ConeVec.circular(
-        sod=SOD, sdd=SDD, angles=len(scan), shape=shape, pixel=pixel, offset=(5.0 * pixel, 0.0)
+        sod=SOD,
+        sdd=SDD,
+        angles=len(scan),
+        shape=shape,
+        pixel=pixel,
+        offset=(5.0 * pixel, 0.0),
     )
     found = []
     for geometry in (scan, aside):
@@ -63,12 +71,16 @@ def comparison_times(
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     for views, shape, pixel, grid in CASES[: int(sys.argv[1]) if sys.argv[1:] else None]:
-        scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=views, shape=shape, pixel=pixel)
+        scan = fx.ConeVec.circular(
+            sod=SOD, sdd=SDD, angles=views, shape=shape, pixel=pixel
+        )
         for what, radius in (("seen whole", 30.0), ("cut off", 55.0)):
             image = image_of(radius, shape, pixel)
             chunk = np.broadcast_to(image, (8, *shape))
 
-            def parts(chunk: Float32Array = chunk, views: int = views) -> Iterator[Float32Array]:
+            def parts(
+                chunk: Float32Array = chunk, views: int = views
+            ) -> Iterator[Float32Array]:
                 return (chunk.copy() for _ in range(views // 8))
 
             best = [np.inf, np.inf]

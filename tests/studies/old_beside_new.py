@@ -2,11 +2,11 @@
 
     python tests/studies/old_beside_new.py COMMIT --only C1,C2,FDK --rounds 3
 
-COMMIT's files are laid out in a temporary folder and run with this environment's libraries. Each
-round runs `flexdt bench` there and here, the other way round in every second one, so that both meet
-the machine's good and bad moments. The table has the best time of each, in ms a view, and their
-ratio. Both benchmarks must know the cases. Exit code 1 where a case takes more than --most times as
-long as before (1.25; measure where nothing else runs).
+COMMIT's files are laid out in a temporary folder and run with this environment's libraries.
+Each round runs `flexdt bench` there and here, the other way round in every second one, so that
+both meet the machine's good and bad moments. The table has the best time of each, in ms a view,
+and their ratio. Both benchmarks must know the cases. Exit code 1 where a case takes more than
+--most times as long as before (1.25; measure where nothing else runs).
 """
 
 from __future__ import annotations
@@ -45,14 +45,18 @@ class Code:
         archive = subprocess.run(
             ["git", "archive", commit], cwd=ROOT, check=True, capture_output=True
         ).stdout
-        subprocess.run(["tar", "--extract", f"--directory={source}"], input=archive, check=True)
+        subprocess.run(
+            ["tar", "--extract", f"--directory={source}"], input=archive, check=True
+        )
         if (source / "src").exists():  # newer states hold these links themselves
             package = source / "src" / "flexdt"
             paths = f"{package.parent}{os.pathsep}{source / 'extensions'}"
             return cls(source, {**SAFE, "PYTHONPATH": paths})
         for name in FOLDERS:
             (package / name).symlink_to(source / name)
-        for file in (source / "flexdt").glob("*"):  # the public face, which older states have not
+        for file in (source / "flexdt").glob(
+            "*"
+        ):  # the public face, which older states have not
             (package / file.name).symlink_to(file)
         (package / "__init__.py").touch()
         paths = f"{package.parent}{os.pathsep}{source / 'extensions'}"
@@ -66,7 +70,8 @@ class Code:
         ).stdout  # fmt: skip
 
     def measured(self, wanted: Sequence[str], out: Path) -> dict[str, float]:
-        """Case -> ms a view: by `flexdt bench`, or by the script for what is not a case of it."""
+        """Case -> ms a view: by `flexdt bench`, or by the script for what is not a case of
+        it."""
         listed = {line.split()[0] for line in self.run(*BENCH, "--list").splitlines()}
         of_bench = [name for name in wanted if name in listed]
         others = [name for name in wanted if name not in listed]
@@ -97,7 +102,9 @@ def main() -> int:
         best: dict[str, dict[str, float]] = {side: {} for side in codes}
         for turn in range(chosen.rounds):
             for side in sorted(codes, reverse=turn % 2 == 0):
-                for case, ms in codes[side].measured(wanted, Path(name) / f"{side}-{turn}").items():
+                for case, ms in (
+                    codes[side].measured(wanted, Path(name) / f"{side}-{turn}").items()
+                ):
                     best[side][case] = min(ms, best[side].get(case, ms))
         print(f"{'case':20} {'old ms':>10} {'new ms':>10} {'new / old':>10}")
         for case, old in best["old"].items():

@@ -1,15 +1,17 @@
-"""A flood of connections without the token at each port, and what pages and programs notice of it.
+"""A flood of connections without the token at each port, and what pages and programs notice of
+it.
 
     python tests/studies/port_floods.py [--count 200] [--a-minute 10000] [--real-time] [PORT...]
 
-Starts projector, twin, viewer and gateway with a token. A peer without it makes 10 000 connections
-a minute to one port after the other: silent ones, halves of requests, garbage, whole requests that
-are refused; seven of ten it keeps. Beside it, every other one from the peer's own address, pages
-are loaded (HTML, program, styles, the page's connection and its session with the twin) and press
-E-STOP, the pages for monitoring are read, users of the projector introduce themselves, and programs
-at the gateway connect and ask. Prints how many had an answer, how many within a second, and the
-times from before connecting [ms]. Exit code 1 where one had no answer; times are not judged.
-`--real-time` is for machines that are busy with other things.
+Starts projector, twin, viewer and gateway with a token. A peer without it makes 10 000
+connections a minute to one port after the other: silent ones, halves of requests, garbage,
+whole requests that are refused; seven of ten it keeps. Beside it, every other one from the
+peer's own address, pages are loaded (HTML, program, styles, the page's connection and its
+session with the twin) and press E-STOP, the pages for monitoring are read, users of the
+projector introduce themselves, and programs at the gateway connect and ask. Prints how many had
+an answer, how many within a second, and the times from before connecting [ms]. Exit code 1
+where one had no answer; times are not judged. `--real-time` is for machines that are busy with
+other things.
 """
 
 from __future__ import annotations
@@ -90,7 +92,9 @@ def started(folder: Path) -> Bench:
 def draw_http(rng: random.Random) -> Stranger:
     """A peer of an HTTP port."""
     host = b"Host: 127.0.0.1\r\n"
-    upgrade = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    upgrade = (
+        b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    )
     kinds: dict[str, tuple[bytes, ...]] = {
         "half a line": (b"GET / HT",),
         "half a head": (b"GET / HTTP/1.1\r\n" + host, b"Accept: *"),
@@ -135,7 +139,9 @@ def flood(port: int, a_minute: int, made: Any, alone: bool) -> None:
 
 async def fetched(port: int, path: str, source: str, *more: str) -> tuple[int, str]:
     """Status and head of an answer, read to its end."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(source, 0))
+    reader, writer = await asyncio.open_connection(
+        "127.0.0.1", port, local_addr=(source, 0)
+    )
     try:
         head = "".join(f"{line}\r\n" for line in (f"Host: 127.0.0.1:{port}", *more))
         writer.write(f"GET {path} HTTP/1.1\r\n{head}\r\n".encode())
@@ -162,7 +168,9 @@ async def page(bench: Bench, source: str) -> dict[str, float]:
         answer = json.loads(await until(shown, f'"id": {id},'))
         ended = time.perf_counter()
     times = {"page is loaded": 1000 * (loaded - begun)}
-    return times | ({"page's E-STOP": 1000 * (ended - loaded)} if "result" in answer else {})
+    return times | (
+        {"page's E-STOP": 1000 * (ended - loaded)} if "result" in answer else {}
+    )
 
 
 async def until(shown: Any, mark: str) -> str:
@@ -181,7 +189,9 @@ async def figures(bench: Bench, source: str) -> dict[str, float]:
             begun = time.perf_counter()
             status, _ = await fetched(port, "/metrics", source)
             if status == 200:
-                times[f"/metrics, {name.rpartition(' ')[2]}"] = 1000 * (time.perf_counter() - begun)
+                times[f"/metrics, {name.rpartition(' ')[2]}"] = 1000 * (
+                    time.perf_counter() - begun
+                )
     return times
 
 
@@ -216,7 +226,9 @@ async def program(bench: Bench, source: str) -> dict[str, float]:
                     heard: dict[str, Any] = {}
                     while heard.get("UUID") not in asked or heard["reply type"] != "ACK":
                         heard = json.loads(await hear.recv())
-                    return {"program at the gateway": 1000 * (time.perf_counter() - begun)}
+                    return {
+                        "program at the gateway": 1000 * (time.perf_counter() - begun)
+                    }
     finally:
         context.destroy(linger=0)
 
@@ -241,8 +253,11 @@ async def honest(bench: Bench, count: int) -> dict[str, list[float]]:
     return found
 
 
-async def trial(bench: Bench, name: str | None, count: int, a_minute: int, alone: bool) -> bool:
-    """A flood at one port (None: no flood); prints what came of it, and whether all had answers."""
+async def trial(
+    bench: Bench, name: str | None, count: int, a_minute: int, alone: bool
+) -> bool:
+    """A flood at one port (None: no flood); prints what came of it, and whether all had
+    answers."""
     made = PROCESSES.Value("l", 0)
     attacker = None
     if name is not None:
@@ -258,7 +273,11 @@ async def trial(bench: Bench, name: str | None, count: int, a_minute: int, alone
         attacker.kill()
         attacker.join()
     for what, ms in found.items():
-        shown = " | ".join(f"{percentile(ms, q):.0f}" for q in (0.5, 0.99, 1.0)) if ms else "| |"
+        shown = (
+            " | ".join(f"{percentile(ms, q):.0f}" for q in (0.5, 0.99, 1.0))
+            if ms
+            else "| |"
+        )
         print(f"| {name or 'none'} | {rate:.0f} | {what} | {len(ms)} of {count} | "
               f"{sum(t <= 1000.0 for t in ms)} | {shown} |", flush=True)  # fmt: skip
     return all(len(ms) == count for ms in found.values()) and all(
@@ -270,7 +289,9 @@ async def all_of_them(
     bench: Bench, names: list[str], count: int, a_minute: int, alone: bool
 ) -> bool:
     """Without a flood, and with one at each port."""
-    _, head = await fetched(bench.ports["viewer"], f"/?token={TOKEN.replace(' ', '%20')}", OTHER)
+    _, head = await fetched(
+        bench.ports["viewer"], f"/?token={TOKEN.replace(' ', '%20')}", OTHER
+    )
     bench.cookie = head.split("Set-Cookie: ")[1].split(";")[0]
     await honest(bench, 2)  # what the first answers need is loaded now
     for process in bench.processes if alone else ():
@@ -286,10 +307,16 @@ async def all_of_them(
 def main() -> int:
     """Run the floods; returns the exit code."""
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("names", nargs="*", metavar="PORT", help="as the table names them")
+    options.add_argument(
+        "names", nargs="*", metavar="PORT", help="as the table names them"
+    )
     options.add_argument("--count", type=int, default=200, help="of each that is honest")
-    options.add_argument("--a-minute", type=int, default=10_000, help="connections of the peer")
-    options.add_argument("--real-time", action="store_true", help="give all of this priority")
+    options.add_argument(
+        "--a-minute", type=int, default=10_000, help="connections of the peer"
+    )
+    options.add_argument(
+        "--real-time", action="store_true", help="give all of this priority"
+    )
     chosen = options.parse_args()
     with tempfile.TemporaryDirectory(prefix="flexdt-floods-") as folder:
         bench = started(Path(folder))

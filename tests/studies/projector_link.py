@@ -1,8 +1,8 @@
 """The projector's own link beside the twin's TCP shell: `projector_link.py [TURNS]`.
 
 Two processes on this machine answer the same requests, one over `server/projector/wire.py`, the
-other over `server/network/tcp.py`, in turns of ten. Prints round trips and the processor time of
-both ends. See docs/decisions/0017-two-shells.md.
+other over `server/network/tcp.py`, in turns of ten. Prints round trips and the processor time
+of both ends. See docs/decisions/0017-two-shells.md.
 """
 
 from __future__ import annotations
@@ -29,11 +29,14 @@ ARRAYS = {
     name: np.random.default_rng(0).random((n, 760, 956), dtype=np.float32)
     for name, n in VIEWS.items()
 }
-CHUNK = np.random.default_rng(1).integers(0, 255, 8 << 20, dtype=np.uint8).data.toreadonly()
+CHUNK = (
+    np.random.default_rng(1).integers(0, 255, 8 << 20, dtype=np.uint8).data.toreadonly()
+)
 GRID = {"shape": [128, 128, 128], "voxel_mm": [1.0, 1.0, 1.0]}
 CONE = np.zeros((1, 12)).tolist()
 CASES = {
-    name: ("project", {"volume": name, "cone_vec": CONE, "detector": [760, 956]}) for name in VIEWS
+    name: ("project", {"volume": name, "cone_vec": CONE, "detector": [760, 956]})
+    for name in VIEWS
 } | {"8 MiB up": ("volume.put", {"name": "v", "grid": GRID, "start": 0, "data": CHUNK})}
 
 
@@ -106,7 +109,10 @@ async def main(turns: int) -> None:
     transport = TcpTransport("127.0.0.1", ports[1])
     await transport.open()
     other = Link(transport, lambda _: None, lambda: None)
-    ways: dict[str, Any] = {"own link": own.ask, "shell": lambda m, p: other.request(m, p, 600.0)}
+    ways: dict[str, Any] = {
+        "own link": own.ask,
+        "shell": lambda m, p: other.request(m, p, 600.0),
+    }
     for name, (method, params) in CASES.items():
         taken, used = defaultdict[str, list[float]](list), defaultdict[str, float](float)
         for _ in range(turns):
@@ -118,7 +124,9 @@ async def main(turns: int) -> None:
                     if method == "project":
                         assert image.decode(answer).shape == ARRAYS[name].shape
                     taken[way].append(1e3 * (time.perf_counter() - begun))
-                used[way] += time.process_time() + (await ask("health", {}))["cpu"] - before
+                used[way] += (
+                    time.process_time() + (await ask("health", {}))["cpu"] - before
+                )
         for way, each in taken.items():
             print(f"{name:12} {way:9} least {min(each):6.2f} ms, median {np.median(each):6.2f} ms, "
                   f"processor time {1e3 * used[way] / len(each):6.2f} ms")  # fmt: skip

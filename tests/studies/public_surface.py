@@ -40,10 +40,14 @@ def _lines(name: str, what: Any) -> Iterator[str]:
     elif inspect.isclass(what):
         yield f"{name}{_parameters(what)}"
         ours = [base for base in what.__mro__ if base.__module__.startswith("flexdt")]
-        for inner in sorted({n for base in ours for n in vars(base) if not n.startswith("_")}):
+        for inner in sorted(
+            {n for base in ours for n in vars(base) if not n.startswith("_")}
+        ):
             if hasattr(what, inner):
                 member = inspect.getattr_static(what, inner)
-                called = callable(member) or isinstance(member, (classmethod, staticmethod))
+                called = callable(member) or isinstance(
+                    member, (classmethod, staticmethod)
+                )
                 yield f"{name}.{inner}{_parameters(getattr(what, inner)) if called else ''}"
     elif callable(what):
         yield f"{name}{_parameters(what)}"

@@ -1,13 +1,14 @@
-"""Drawn scans with and without errors of pixels: does `rings` help, and does it leave others alone?
+"""Drawn scans with and without errors of pixels: does `rings` help, and does it leave others
+alone?
 
     python tests/studies/ring_scans.py --count 200 --seed 7
 
-Scans of `bias_bound.py` in whole turns, of the objects of `misfits.py`, with noise. Pixels, a few
-of them, or whole columns add normally distributed errors of none, .3, 1 or 3 % to all views. The
-root mean square error of uniform regions is compared: with the errors, and with them corrected,
-over that of the scan without errors.
-Exits with 1 where a correction makes a volume worse by more than 5 %, or where it removes less than
-half of what errors of 1 % and more do, in the median.
+Scans of `bias_bound.py` in whole turns, of the objects of `misfits.py`, with noise. Pixels, a
+few of them, or whole columns add normally distributed errors of none, .3, 1 or 3 % to all
+views. The root mean square error of uniform regions is compared: with the errors, and with them
+corrected, over that of the scan without errors.
+Exits with 1 where a correction makes a volume worse by more than 5 %, or where it removes less
+than half of what errors of 1 % and more do, in the median.
 """
 
 from __future__ import annotations
@@ -66,8 +67,11 @@ class Outcome:
         return self.corrected > MOST_WORSE * self.ringed
 
 
-def drawn(seed: int, number: int) -> tuple[bias_bound.Scan, str, float, np.ndarray] | None:
-    """A scan, kind and size of its pixels' errors, and these (rows, cols); None of other scans."""
+def drawn(
+    seed: int, number: int
+) -> tuple[bias_bound.Scan, str, float, np.ndarray] | None:
+    """A scan, kind and size of its pixels' errors, and these (rows, cols); None of other
+    scans."""
     rng = np.random.default_rng([seed, number, 77])
     scan = bias_bound.drawn(seed, number)
     if not scan.said.startswith(("whole", "turns")) or " cut " in scan.said:
@@ -100,7 +104,11 @@ def judged(seed: int, number: int) -> Outcome | None:
 
     def error(images: np.ndarray) -> float:
         volume = fdk_parts(
-            lambda: [images.copy()], scan.geometry, scan.shape, grid, truncation=truncation
+            lambda: [images.copy()],
+            scan.geometry,
+            scan.shape,
+            grid,
+            truncation=truncation,
         )
         off = np.nan_to_num(volume.data)[uniform] - truth[uniform]
         return float(np.sqrt(np.square(off).mean()))
@@ -110,7 +118,9 @@ def judged(seed: int, number: int) -> Outcome | None:
     ringed = clean + errors
     found = scan_rings(ringed.__getitem__, scan.geometry, scan.shape)
     usual = error(clean)
-    return Outcome(scan.said, kind, gain, error(ringed) / usual, error(ringed - found) / usual)
+    return Outcome(
+        scan.said, kind, gain, error(ringed) / usual, error(ringed - found) / usual
+    )
 
 
 def main() -> int:

@@ -12,8 +12,8 @@ untold: one row of what tells no column: air, a grating wider than the panel, an
 half_turn: a panel of many rows, half a turn and the fan.
 
 The line integrals are chords in closed form, written out here with kinematics of their own.
-Errors are those of the column in px, and over the stated sigma. Exit code 1 where more than 1 % are
-off by more than 3 sigma, or the root mean square in sigmas is not within 0.7 and 1.2.
+Errors are those of the column in px, and over the stated sigma. Exit code 1 where more than 1 %
+are off by more than 3 sigma, or the root mean square in sigmas is not within 0.7 and 1.2.
 """
 
 from __future__ import annotations
@@ -96,7 +96,9 @@ class Scan:
                 frame /= np.array([a, b, c])[:, None]
                 d, m = rays @ frame.T, frame @ at
                 dd, dm = np.square(d).sum(axis=-1), d @ m
-                out[k] += 2 * density * np.sqrt(np.maximum(dm**2 - dd * (m @ m - 1), 0)) / dd
+                out[k] += (
+                    2 * density * np.sqrt(np.maximum(dm**2 - dd * (m @ m - 1), 0)) / dd
+                )
         return out.reshape(self.views, rows, cols, FINE).mean(axis=3)
 
     def data(self, rng: np.random.Generator) -> fx.DataSet:
@@ -109,7 +111,8 @@ class Scan:
 
 
 def ellipses(rng: np.random.Generator, tall: bool) -> np.ndarray:
-    """A body with holes and grains in it, or some that stand alone: ellipsoids, or cylinders."""
+    """A body with holes and grains in it, or some that stand alone: ellipsoids, or
+    cylinders."""
     n = int(rng.integers(3, 12))
     out = np.zeros((n, 8))
     far, turn = 24 * np.sqrt(rng.uniform(0, 1, n)), rng.uniform(0, 2 * math.pi, n)
@@ -118,7 +121,14 @@ def ellipses(rng: np.random.Generator, tall: bool) -> np.ndarray:
     out[:, 3:6] = rng.uniform(1, 7, (n, 3))
     out[:, 6], out[:, 7] = rng.uniform(0, math.pi, n), rng.choice([-0.01, 0.01, 0.03], n)
     if rng.random() < 0.7:
-        body = [*rng.uniform(-3, 3, 2), 0, *rng.uniform(18, 30, 2), 22, rng.uniform(0, 3), 0.02]
+        body = [
+            *rng.uniform(-3, 3, 2),
+            0,
+            *rng.uniform(18, 30, 2),
+            22,
+            rng.uniform(0, 3),
+            0.02,
+        ]
         out = np.vstack([body, out])
     else:
         out[:, 7] = np.abs(out[:, 7])
@@ -182,7 +192,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kind", choices=KINDS, default="one_row")
-    parser.add_argument("--json", action="store_true", help="one line for each scan as well")
+    parser.add_argument(
+        "--json", action="store_true", help="one line for each scan as well"
+    )
     o = parser.parse_args(words)
     runs = []
     for seed in range(o.seed, o.seed + o.count):
@@ -197,8 +209,10 @@ def main(words: list[str] | None = None) -> int:
     pull = error / sigma
     rms, far = math.sqrt(float(np.square(pull).mean())), int((np.abs(pull) > 3).sum())
     print(
-        f"{o.kind}: {len(good)} of {o.count} told; error {np.sqrt(np.square(error).mean()):.3f} px "
-        f"rms (median {np.median(np.abs(error)):.3f}, largest {np.abs(error).max():.3f}), sigma "
+        f"{o.kind}: {len(good)} of {o.count} told; error "
+        f"{np.sqrt(np.square(error).mean()):.3f} px "
+        f"rms (median {np.median(np.abs(error)):.3f}, largest "
+        f"{np.abs(error).max():.3f}), sigma "
         f"{np.median(sigma):.3f} px; in sigmas {rms:.2f} rms, {far} beyond 3"
     )
     if o.kind == "untold":

@@ -9,8 +9,8 @@
 The scenario of 2D-SW-1 is not public. Spherical wedges, steps and regions are those of the
 evaluation's documentation, thicknesses follow from its primary signals, the panel stands at
 1000 mm; the outer radius of the aluminium wedge (518 mm) and the inner radius of the iron one
-(250 mm) are assumed. One length is fitted to McRay's scatter, for both metals together: the size of
-the panel, at which the beam ends.
+(250 mm) are assumed. One length is fitted to McRay's scatter, for both metals together: the
+size of the panel, at which the beam ends.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def block(formula: str, density: float, size: tuple[float, float, float]) -> Obj
     n = 36
     edges = (size[0] / n, size[1] / n, size[2] / n)
     amounts = np.ones((n, n, n, 1), np.float32)
-    return Object(amounts, edges, (0.0, 0.0, 0.0), (Substance.of(formula, formula, density),))
+    return Object(
+        amounts, edges, (0.0, 0.0, 0.0), (Substance.of(formula, formula, density),)
+    )
 
 
 def ctsimu() -> None:
@@ -78,14 +80,19 @@ def ctsimu() -> None:
         data = pkgutil.get_data("ctsimu.evaluation.test2D_SW_1", path)
         assert data is not None
         table = np.loadtxt(data.decode().splitlines(), delimiter="\t")
-        references = {"ROSI": table[:, 1] - table[:, 9], "McRay": table[:, 4] - table[:, 12]}
+        references = {
+            "ROSI": table[:, 1] - table[:, 9],
+            "McRay": table[:, 4] - table[:, 12],
+        }
         metal = Substance.of(name, name, {"Al": 2.7, "Fe": 7.874}[name])
         at = int(np.argmin(np.abs(ENERGY - energy)))
         thick = -np.log(table[:9, 12] / 60000.0) / metal.attenuation()[at]
         image = wedge(metal, thick, *radii, mono(energy))
         rows = image.full()
         # Row 0 is in the free beam; 91 rows a strip, of which the evaluation takes the middle.
-        found = [rows[91 * k + 35 : 91 * k + 56, 445:465].mean() for k in range(9, -1, -1)]
+        found = [
+            rows[91 * k + 35 : 91 * k + 56, 445:465].mean() for k in range(9, -1, -1)
+        ]
         found = 100.0 * np.array(found)
         print(f"{name} {energy:g} keV: thickest {thick[0]:.2f} mm; error of a node "
               f"{100 * image.error.mean() / image.mean.mean():.2f} %")  # fmt: skip
@@ -96,10 +103,14 @@ def ctsimu() -> None:
 
 
 def wedge(
-    metal: Substance, thick: np.ndarray, inner: float | None, outer: float | None, beam: Beam
+    metal: Substance,
+    thick: np.ndarray,
+    inner: float | None,
+    outer: float | None,
+    beam: Beam,
 ) -> ScatterImage:
-    """Nine steps and a free strip, each a tenth of the panel high, as spherical shells about the
-    source; the lowest step is the thickest."""
+    """Nine steps and a free strip, each a tenth of the panel high, as spherical shells about
+    the source; the lowest step is the thickest."""
     low = inner or (outer or 0.0) - thick.max()
     high = low + thick.max()
     half = 0.51 * PANEL_MM / 1000.0 * high
@@ -107,14 +118,20 @@ def wedge(
     nz, ny, nx, sub = 90, 50, 110, 3
     z, y, x = (
         (np.arange(n * s) + 0.5) / (n * s) * (b - a) + a
-        for n, s, a, b in ((nz, sub, -half, half), (ny, sub, near, high), (nx, 2, -half, half))
+        for n, s, a, b in (
+            (nz, sub, -half, half),
+            (ny, sub, near, high),
+            (nx, 2, -half, half),
+        )
     )
     radius = np.sqrt(z[:, None, None] ** 2 + y[:, None] ** 2 + x**2)
     step = np.floor((z[:, None] / y * 1000.0 / PANEL_MM + 0.5) * 10.0).astype(int)
     here = np.where((step >= 0) & (step < 9), thick[np.clip(step, 0, 8)], 0.0)[:, :, None]
     start = inner if inner else (outer or 0.0) - here
     filled = (radius >= start) & (radius < start + here)
-    amounts = filled.reshape(nz, sub, ny, sub, nx, 2).mean(axis=(1, 3, 5), dtype=np.float32)
+    amounts = filled.reshape(nz, sub, ny, sub, nx, 2).mean(
+        axis=(1, 3, 5), dtype=np.float32
+    )
     edges = (2.0 * half / nx, (high - near) / ny, 2.0 * half / nz)
     middle = (0.0, (high + near) / 2.0, 0.0)
     thing = Object(np.ascontiguousarray(amounts[..., None]), edges, middle, (metal,))
@@ -129,7 +146,9 @@ def table() -> None:
     print("FleX-ray, SOD 600, SDD 1059, 45 keV, whole block lit: at the shadow's centre")
     for name, formula, density, size in BLOCKS:
         thing = block(formula, density, size)
-        image = scatter_image(thing, FLEXRAY, SHAPE, mono(45.0), ScatterSettings(error=0.005))
+        image = scatter_image(
+            thing, FLEXRAY, SHAPE, mono(45.0), ScatterSettings(error=0.005)
+        )
         scatter = float(image.full()[SHAPE[0] // 2, SHAPE[1] // 2])
         at = int(np.argmin(np.abs(ENERGY - 45.0)))
         depth = thing.substances[0].attenuation()[at] * size[1]
@@ -140,7 +159,8 @@ def table() -> None:
 
 
 def pulls() -> None:
-    """(image - truth) / error at all nodes over 100 seeds, truth from 100 times as many photons."""
+    """(image - truth) / error at all nodes over 100 seeds, truth from 100 times as many
+    photons."""
     thing, beam = block("C5H8O2", 1.18, (36, 36, 36)), mono(45.0)
     view = (0, -600, 0, 20, 459, 10, 0.1496, 0, 0, 0, 0, -0.1496)
 
@@ -159,7 +179,8 @@ def pulls() -> None:
     print(f"1 and {threads} threads: {'the same bytes' if same else 'another image'}")
     pull = np.array([(one.mean - truth) / one.error for one in found])
     print(f"100 seeds, {truth.size} nodes: pulls have mean {pull.mean():.3f} and standard "
-          f"deviation {pull.std():.3f} (Student's t with 31 degrees of freedom: 1.034); beyond 2: "
+          f"deviation {pull.std():.3f} (Student's t with 31 degrees of freedom: 1.034); "
+          "beyond 2: "
           f"{100 * np.mean(np.abs(pull) > 2):.1f} % (5.4 %)")  # fmt: skip
     balance = np.mean([one.balance for one in found], axis=0)
     print(f"photons absorbed and escaped over those that interact: {balance[1:3].sum():.4f}; "
@@ -189,17 +210,23 @@ def cost() -> None:
 def cupping() -> None:
     """Cupping and attenuation of cylinders in scans without scatter, with it and corrected.
 
-    Scatter is simulated with other photons, 100 000 voxels, 1500 nodes and to 1 %; the correction
-    takes its own defaults. Cupping: what the mean within a quarter of the radius lacks of the mean
-    between 0.7 and 0.85 of it, in the middle layer.
+    Scatter is simulated with other photons, 100 000 voxels, 1500 nodes and to 1 %; the
+    correction takes its own defaults. Cupping: what the mean within a quarter of the radius
+    lacks of the mean between 0.7 and 0.85 of it, in the middle layer.
     """
     detector = fx.Detector.ideal(bits=16, response=(), swank=0.9)  # caesium iodide
-    truth = ScatterSettings(seed=77, error=0.01, voxels=100_000, nodes=1500, step_deg=10.0)
-    for (sod, sdd), (material, radius), mono_keV in product(GAPS, CYLINDERS, (60.0, None)):
+    truth = ScatterSettings(
+        seed=77, error=0.01, voxels=100_000, nodes=1500, step_deg=10.0
+    )
+    for (sod, sdd), (material, radius), mono_keV in product(
+        GAPS, CYLINDERS, (60.0, None)
+    ):
         geometry = fx.ConeVec.circular(sod=sod, sdd=sdd, angles=360, shape=(152, 191),
                                        pixel=0.748)  # fmt: skip
         power = 40.0 * (sdd / 1059) ** 2
-        tube = fx.Tube(kV=120, power_W=power, filters=[("Cu@8.96", 0.25)], mono_keV=mono_keV)
+        tube = fx.Tube(
+            kV=120, power_W=power, filters=[("Cu@8.96", 0.25)], mono_keV=mono_keV
+        )
         sample = {"kind": "cylinder", "center": [0, 0, 0], "radius": radius, "height": 40,
                   "material": material}  # fmt: skip
         plain, scattered = (
@@ -218,7 +245,11 @@ def cupping() -> None:
         beam = "60 keV" if mono_keV else "120 kV"
         line = f"  {sod} and {sdd} mm, {material:9s} {2 * radius:g} mm, {beam}:"
         whole = None
-        for volume in (plain.reconstruct(**given), scattered.reconstruct(**given), corrected):
+        for volume in (
+            plain.reconstruct(**given),
+            scattered.reconstruct(**given),
+            corrected,
+        ):
             layer = volume.data[0]
             middle, rim = layer[r < 0.25].mean(), layer[(r > 0.7) & (r < 0.85)].mean()
             whole = middle if whole is None else whole

@@ -1,4 +1,5 @@
-"""JSON schemas as a fuzzer uses them: what they allow, values they allow, values they should not.
+"""JSON schemas as a fuzzer uses them: what they allow, values they allow, values they should
+not.
 
 Only the words that the servers' schemas use. Nothing of flexdt is imported.
 """
@@ -75,7 +76,9 @@ class Schemas:
             case "integer" | "number" as kind:
                 low = s.get("minimum", s.get("exclusiveMinimum", 0))
                 high = s.get("maximum", s.get("exclusiveMaximum", low + 100))
-                drawn = rng.choice([low + (high - low) * rng.random() ** 6, min(high, max(1, low))])
+                drawn = rng.choice(
+                    [low + (high - low) * rng.random() ** 6, min(high, max(1, low))]
+                )
                 return int(drawn) if kind == "integer" else float(drawn)
             case "string":
                 return "x" * max(3, s.get("minLength", 0))
@@ -149,8 +152,11 @@ class Schemas:
 
 
 def _members(s: Schema) -> Any:
-    """What members without a name of their own are: pydantic says so by a pattern of their keys."""
-    return next(iter(s.get("patternProperties", {}).values()), s.get("additionalProperties", True))
+    """What members without a name of their own are: pydantic says so by a pattern of their
+    keys."""
+    return next(
+        iter(s.get("patternProperties", {}).values()), s.get("additionalProperties", True)
+    )
 
 
 def _whole(pattern: str) -> str:
@@ -190,12 +196,15 @@ def _array(schemas: Schemas, s: Schema, value: Any) -> bool:
     first = s.get("prefixItems", [])
     items = s.get("items", {})
     return all(
-        schemas.allows(first[i] if i < len(first) else items, one) for i, one in enumerate(value)
+        schemas.allows(first[i] if i < len(first) else items, one)
+        for i, one in enumerate(value)
     )
 
 
 def _object(schemas: Schemas, s: Schema, value: Any) -> bool:
-    if not isinstance(value, dict) or not all(name in value for name in s.get("required", ())):
+    if not isinstance(value, dict) or not all(
+        name in value for name in s.get("required", ())
+    ):
         return False
     if not s.get("minProperties", 0) <= len(value) <= s.get("maxProperties", len(value)):
         return False

@@ -2,14 +2,14 @@
 
     python tests/studies/silent_cases.py [COMMIT] [--views 360]
 
-Gaps among the views, listed in any order; a pixel size that changes between views; a panel moved
-aside until a column or two see the axis; objects wider than the panel; turns that are not whole.
-The projections are chords that this file computes itself. A line has the worst mean error of the
-regions that its object has and the worst root mean square, in per cent, and `w` where the
-reconstruction warned; `refused` where it declined.
+Gaps among the views, listed in any order; a pixel size that changes between views; a panel
+moved aside until a column or two see the axis; objects wider than the panel; turns that are not
+whole. The projections are chords that this file computes itself. A line has the worst mean
+error of the regions that its object has and the worst root mean square, in per cent, and `w`
+where the reconstruction warned; `refused` where it declined.
 COMMIT's files are laid out in a temporary folder and run with this environment's libraries, as
-`old_beside_new.py` does; RTK (`pip install itk-rtk`) has its filters for displaced panels and short
-scans, and for objects wider than the panel its correction of truncation.
+`old_beside_new.py` does; RTK (`pip install itk-rtk`) has its filters for displaced panels and
+short scans, and for objects wider than the panel its correction of truncation.
 """
 
 from __future__ import annotations
@@ -60,13 +60,16 @@ class Column:
             return np.asarray(2.0 * np.sqrt(np.maximum(b**2 - a * c, 0.0)) / a)
         with np.errstate(divide="ignore"):
             ends = [
-                np.sort(np.stack([(-1 - p) / d, (1 - p) / d]), 0) for p, d in ((px, dx), (py, dy))
+                np.sort(np.stack([(-1 - p) / d, (1 - p) / d]), 0)
+                for p, d in ((px, dx), (py, dy))
             ]
         return np.maximum(
             np.minimum(*(e[1] for e in ends)) - np.maximum(*(e[0] for e in ends)), 0.0
         )
 
-    def holds(self, x: FloatArray, y: FloatArray, part: float = 1.0) -> npt.NDArray[np.bool_]:
+    def holds(
+        self, x: FloatArray, y: FloatArray, part: float = 1.0
+    ) -> npt.NDArray[np.bool_]:
         u, v = self._own(x, y, self.at)
         far = np.hypot(u, v) if self.round else np.maximum(np.abs(u), np.abs(v))
         return np.asarray(far < part)
@@ -88,7 +91,9 @@ class Case:
     def rows(self) -> FloatArray:
         """cone_vec (n, 12) [mm]: the stage turns clockwise under a camera that stands."""
         out = []
-        for a, p in np.broadcast(np.radians(self.degrees), PITCH * np.asarray(self.pitch)):
+        for a, p in np.broadcast(
+            np.radians(self.degrees), PITCH * np.asarray(self.pitch)
+        ):
             c, s = math.cos(a), math.sin(a)
             turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
             parts = (
@@ -105,7 +110,9 @@ class Case:
         for k, row in enumerate(self.rows()):
             source, detector, u, v = row.reshape(4, 3)
             to = (
-                detector + (j[..., None] - (COLS - 1) / 2) * u + (i[..., None] - (ROWS - 1) / 2) * v
+                detector
+                + (j[..., None] - (COLS - 1) / 2) * u
+                + (i[..., None] - (ROWS - 1) / 2) * v
             )
             way = to - source
             chords = (c.mu * c.chord(source[:2], way[..., :2]) for c in self.columns)
@@ -125,7 +132,9 @@ class Case:
             flat = column.holds(x, y, 0.85) & inside
             for other in self.columns[k + 1 :]:
                 flat &= ~other.holds(x, y, 1.2)
-            value = sum(c.mu for c in self.columns[: k + 1] if c.holds(*np.array(column.at)))
+            value = sum(
+                c.mu for c in self.columns[: k + 1] if c.holds(*np.array(column.at))
+            )
             if flat.sum() >= 4 and value > 0.0:
                 off = layer[flat] / value - 1.0
                 means.append(float(off.mean()))
@@ -148,29 +157,50 @@ def cases(views: int) -> list[Case]:
         out.append(Case(f"gap of {gap:g} deg, listed from behind it", ball, behind))
     zoom = np.where(np.arange(views) % 2, 1.1, 1.0)
     out.append(Case("pitch alternating by 1.1", ball, turn, pitch=zoom))
-    out.append(Case("pitch growing to 1.3", ball, turn, pitch=np.linspace(1.0, 1.3, views)))
+    out.append(
+        Case("pitch growing to 1.3", ball, turn, pitch=np.linspace(1.0, 1.3, views))
+    )
     small = (Column((0.0, 0.0), (0.9 * FIELD, 0.9 * FIELD), 0.02),)
     for part in (0.90, 0.96, 0.99):
         aside = part * HALF
         name = f"panel aside by {part:g} of its half width: the axis"
         out.append(Case(name, small, turn, aside=aside, radius=0.04 * FIELD))
-    out.append(Case("source aside by 20 mm", small, turn, source_aside=20.0, radius=0.5 * FIELD))
+    out.append(
+        Case("source aside by 20 mm", small, turn, source_aside=20.0, radius=0.5 * FIELD)
+    )
     thin = (
         Column((0.0, 0.0), (1.4 * FIELD, 1.4 * FIELD), 0.002),
         Column((4.0, 2.0), (8.0, 8.0), 0.298),
     )
-    out.append(Case("thin jacket wider than the panel", thin, turn, wide=True, radius=0.5 * FIELD))
+    out.append(
+        Case(
+            "thin jacket wider than the panel", thin, turn, wide=True, radius=0.5 * FIELD
+        )
+    )
     heavy = (Column((0.0, 0.0), (1.3 * FIELD, 1.1 * FIELD), 0.02, 0.3),
              Column((9.0, -5.0), (8.0, 8.0), -0.012))  # fmt: skip
-    out.append(Case("jacket with a lighter core", heavy, turn, wide=True, radius=0.5 * FIELD))
-    voids = Column((10.0, 6.0), (6.0, 5.0), -0.02, 0.9), Column((-14.0, 2.0), (5.0, 7.0), -0.02)
+    out.append(
+        Case("jacket with a lighter core", heavy, turn, wide=True, radius=0.5 * FIELD)
+    )
+    voids = (
+        Column((10.0, 6.0), (6.0, 5.0), -0.02, 0.9),
+        Column((-14.0, 2.0), (5.0, 7.0), -0.02),
+    )
     box = (Column((0.0, 0.0), (1.3 * FIELD, 0.8 * FIELD), 0.02, 0.4, False), *voids)
     out.append(
-        Case("box with voids, wider than the panel", box, turn, wide=True, radius=0.5 * FIELD)
+        Case(
+            "box with voids, wider than the panel",
+            box,
+            turn,
+            wide=True,
+            radius=0.5 * FIELD,
+        )
     )
     clamp = (Column((0.0, 0.0), (0.6 * FIELD, 0.6 * FIELD), 0.02),
              Column((1.3 * FIELD, 0.0), (0.2 * FIELD, 0.1 * FIELD), 0.1, 0.2, False))  # fmt: skip
-    out.append(Case("clamp beyond the panel's edge", clamp, turn, wide=True, radius=0.5 * FIELD))
+    out.append(
+        Case("clamp beyond the panel's edge", clamp, turn, wide=True, radius=0.5 * FIELD)
+    )
     for degrees in (422.0, 722.0, 1250.0):
         many = np.arange(round(views * degrees / 360.0)) * 360.0 / views
         out.append(Case(f"{degrees:g} degrees", ball, many))
@@ -238,7 +268,9 @@ def told(case: Case, layer: FloatArray | None, word: str) -> str:
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("commit", nargs="?", help="an older state, to stand beside today's")
+    parser.add_argument(
+        "commit", nargs="?", help="an older state, to stand beside today's"
+    )
     parser.add_argument("--views", type=int, default=360)
     parser.add_argument("--asked", type=Path, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -252,11 +284,19 @@ def main() -> int:
     columns: dict[str, Sequence[str]] = {}
     with tempfile.TemporaryDirectory(prefix="flexdt-old-") as name:
         asked = Path(name) / "asked"
-        asked.write_bytes(pickle.dumps([(c.rows(), c.images(), c.voxel_mm) for c in tried]))
-        codes = {chosen.commit[:7]: Code.of(chosen.commit, Path(name))} if chosen.commit else {}
+        asked.write_bytes(
+            pickle.dumps([(c.rows(), c.images(), c.voxel_mm) for c in tried])
+        )
+        codes = (
+            {chosen.commit[:7]: Code.of(chosen.commit, Path(name))}
+            if chosen.commit
+            else {}
+        )
         for side, code in {**codes, "now": Code(ROOT, SAFE)}.items():
             subprocess.run(
-                [sys.executable, __file__, "--asked", asked], env=code.environment, check=True
+                [sys.executable, __file__, "--asked", asked],
+                env=code.environment,
+                check=True,
             )
             found = pickle.loads(asked.with_suffix(".out").read_bytes())
             columns[side] = [told(c, *f) for c, f in zip(tried, found, strict=True)]
@@ -265,11 +305,15 @@ def main() -> int:
         try:
             theirs.append(told(case, by_rtk(case), ""))
         except (ValueError, RuntimeError, ImportError) as error:
-            theirs.append("refused" if not isinstance(error, ImportError) else "not installed")
+            theirs.append(
+                "refused" if not isinstance(error, ImportError) else "not installed"
+            )
     columns["itk-rtk"] = theirs
     print(f"{'':48}" + "".join(f"{side:>18}" for side in columns))
     for k, case in enumerate(tried):
-        print(f"{case.name:48}" + "".join(f"{column[k]:>18}" for column in columns.values()))
+        print(
+            f"{case.name:48}" + "".join(f"{column[k]:>18}" for column in columns.values())
+        )
     return 0
 
 

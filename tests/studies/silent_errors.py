@@ -2,12 +2,12 @@
 
     python tests/studies/silent_errors.py --count 1000 --seed 1
 
-Sample, geometry, tube and exposure are drawn from wide ranges of what a user could sensibly want.
-A call is right where the mean of each even region that the volume holds is within 5 % of the
-truth. Otherwise there must have been a Python warning or a refusal. Half of the calls use one
-energy, where the truth is the tabulated attenuation (NIST XCOM, typed in below). In the others the
-truth is an interval: between the slope of attenuation over thickness at the object's largest
-chord and the one at no thickness, both measured on plates in one radiograph. Prints
+Sample, geometry, tube and exposure are drawn from wide ranges of what a user could sensibly
+want. A call is right where the mean of each even region that the volume holds is within 5 % of
+the truth. Otherwise there must have been a Python warning or a refusal. Half of the calls use
+one energy, where the truth is the tabulated attenuation (NIST XCOM, typed in below). In the
+others the truth is an interval: between the slope of attenuation over thickness at the object's
+largest chord and the one at no thickness, both measured on plates in one radiograph. Prints
 every call that is wrong in silence, and exits with 1 if there is one.
 """
 
@@ -31,7 +31,8 @@ ATTENUATION = {
     "pmma": (1.19, (0.3032, 0.2350, 0.1924, 0.1751)),
     "aluminium": (2.70, (1.128, 0.5685, 0.2778, 0.2018)),
 }
-"""Material -> density [g/cm3], mass attenuation with coherent scattering [cm2/g] (NIST XCOM)."""
+"""Material -> density [g/cm3], mass attenuation with coherent scattering [cm2/g] (NIST
+XCOM)."""
 TOLERANCE = 0.05
 SPARED = 3.0
 """Voxels from an edge that belong to no even region."""
@@ -56,7 +57,9 @@ class Call:
 def drawn(rng: np.random.Generator) -> Call:
     """A call that somebody could make."""
     material = str(rng.choice(list(ATTENUATION)))
-    fill = float(rng.choice([rng.uniform(0.3, 0.9), rng.uniform(0.9, 1.3)], p=[0.85, 0.15]))
+    fill = float(
+        rng.choice([rng.uniform(0.3, 0.9), rng.uniform(0.9, 1.3)], p=[0.85, 0.15])
+    )
     density, table = ATTENUATION[material]
     depth = float(np.exp(rng.uniform(np.log(0.05), np.log(6.0))))
     radius = depth / (0.2 * density * table[2])
@@ -67,7 +70,9 @@ def drawn(rng: np.random.Generator) -> Call:
     rows, columns = (int(rng.integers(24, 56)), int(rng.integers(40, 80)))
     pixel = 2.0 * half * magnification / columns
     tall = 0.5 * rows * pixel / magnification
-    turn = rng.choice(["whole", "short", "half", "gap", "part"], p=[0.6, 0.15, 0.08, 0.07, 0.1])
+    turn = rng.choice(
+        ["whole", "short", "half", "gap", "part"], p=[0.6, 0.15, 0.08, 0.07, 0.1]
+    )
     views = int(rng.integers(60, 160))
     fan = 2.0 * np.degrees(np.arctan(half / sod))
     arc = {"whole": 360.0, "short": 180.0 + fan + 20.0, "half": 180.0, "gap": 360.0,
@@ -77,11 +82,20 @@ def drawn(rng: np.random.Generator) -> Call:
         lost = int(rng.integers(2, views // 3))
         first = int(rng.integers(0, views - lost))
         angles = np.delete(angles, np.arange(first, first + lost))
-    aside = float(rng.choice([0.0, 1.0], p=[0.8, 0.2]) * rng.uniform(-0.45, 0.45) * columns * pixel)
-    geometry = fx.ConeVec.circular(
-        sod=sod, sdd=sdd, angles=angles, shape=(rows, columns), pixel=pixel, offset=(aside, 0.0)
+    aside = float(
+        rng.choice([0.0, 1.0], p=[0.8, 0.2]) * rng.uniform(-0.45, 0.45) * columns * pixel
     )
-    middle = rng.uniform(-0.3, 0.3, 3) * np.array([half, half, tall]) * max(0.0, 1.0 - fill)
+    geometry = fx.ConeVec.circular(
+        sod=sod,
+        sdd=sdd,
+        angles=angles,
+        shape=(rows, columns),
+        pixel=pixel,
+        offset=(aside, 0.0),
+    )
+    middle = (
+        rng.uniform(-0.3, 0.3, 3) * np.array([half, half, tall]) * max(0.0, 1.0 - fill)
+    )
     solids: list[dict[str, object]] = []
     kind = str(rng.choice(["sphere", "cylinder", "box"]))
     height = 2.0 * tall * float(rng.uniform(0.3, 1.4))
@@ -99,9 +113,15 @@ def drawn(rng: np.random.Generator) -> Call:
         if rng.random() < 0.5
         else fx.Tube(kV=float(rng.uniform(40, 120)), power_W=float(rng.uniform(5, 80)))
     )
-    exposure = None if rng.random() < 0.6 else float(np.exp(rng.uniform(np.log(1), np.log(5000))))
+    exposure = (
+        None
+        if rng.random() < 0.6
+        else float(np.exp(rng.uniform(np.log(1), np.log(5000))))
+    )
     said = f"{turn} turn, {len(angles)} views, magnification {magnification:.2f}, fill {fill:.2f}"
-    said += f", aside {aside / pixel:.1f} of {columns} columns, {kind} of {material}, {tube}"
+    said += (
+        f", aside {aside / pixel:.1f} of {columns} columns, {kind} of {material}, {tube}"
+    )
     voxel = pixel / magnification
     noise = int(rng.integers(1 << 30)) if rng.random() < 0.7 else None
     return Call(solids, geometry, tube, said, noise, exposure, voxel)
@@ -135,7 +155,9 @@ def truth(call: Call) -> tuple[float, float]:
         mu = 0.1 * density * table[ENERGIES.index(call.tube.mono_keV)]
         return mu, mu
     chord = largest_chord(solid)
-    if through(1.0, call) * chord < 0.05:  # it hardens nothing, and counts are whole numbers
+    if (
+        through(1.0, call) * chord < 0.05
+    ):  # it hardens nothing, and counts are whole numbers
         chord = 0.05 / through(1.0, call)
     thin = float(np.clip(0.05 / through(chord, call), 0.02, 0.5)) * chord
     slope = (through(chord, call) - through(0.95 * chord, call)) / (0.05 * chord)
@@ -148,7 +170,9 @@ def through(thick: float, call: Call) -> float:
     plate = {"kind": "box", "center": [0, 0, 0], "size": [500, thick, 500],
              "material": call.solids[0]["material"]}  # fmt: skip
     away = 20.0 * thick
-    far = fx.ConeVec.from_vectors([0, -away, 0], [0, away, 0], [0.01, 0, 0], [0, 0, -0.01])
+    far = fx.ConeVec.from_vectors(
+        [0, -away, 0], [0, away, 0], [0.01, 0, 0], [0, 0, -0.01]
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scan = fx.simulate(plate, far, tube=call.tube, shape=(3, 3))
@@ -196,7 +220,9 @@ def judged(call: Call) -> Judged:
     error = off(found, least, most)
     if error <= TOLERANCE:
         return Judged("right, warned" if texts else "right", "; ".join(texts))
-    text = f"{found:.5f} where [{least:.5f}, {most:.5f}]: {100 * error:.1f} % off; {texts}"
+    text = (
+        f"{found:.5f} where [{least:.5f}, {most:.5f}]: {100 * error:.1f} % off; {texts}"
+    )
     if texts or call.noise is None:
         return Judged("warned" if texts else "SILENT", text)
     # A volume of noise says so to everybody who looks at it. What noise does not do is a bias.

@@ -4,14 +4,14 @@
 
 speed   1, 2 and 4 worker processes of one thread: seconds, and whether the bytes are equal.
 kills   SIGKILL of workers, client and scheduler at random moments; what is killed is started again,
-        until the volume is there. It is compared byte for byte, and so is each slab that is there
-        at a kill. Options: --kills N, --seed N.
+        until the volume is there. It is compared byte for byte, and so is each slab that is
+        there at a kill. Options: --kills N, --seed N.
 memory  a volume of four times the address space (`ulimit -v`) that each process is allowed:
         --limit MIB.
 
 All is compared with what one undisturbed worker made. Exit code 1 when anything differs or
-is lost. --views, --panel ROWS,COLS and --side choose the scan and the volume's voxels a side; the
-default, that of docs/evidence/reconstruction.json, is 360 views of 380 x 478 into 256.
+is lost. --views, --panel ROWS,COLS and --side choose the scan and the volume's voxels a side;
+the default, that of docs/evidence/reconstruction.json, is 360 views of 380 x 478 into 256.
 Processes are started and judged from outside; the scan alone is made by flexdt.
 """
 
@@ -34,7 +34,9 @@ from pathlib import Path
 from lab import machine
 
 SINGLE = {
-    **dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
+    **dict.fromkeys(
+        ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+    ),
     "MALLOC_ARENA_MAX": "1",  # each thread's arena takes 64 MiB of address space, used or not
 }
 WITHIN_S = 1200.0
@@ -60,10 +62,15 @@ class Cluster:
         child = self._start("scheduler", "--host", "127.0.0.1", "--port", str(self.port))
         until = time.monotonic() + WITHIN_S
         while child.poll() is None and time.monotonic() < until:
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self.port)):
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection(("127.0.0.1", self.port)),
+            ):
                 return child
             time.sleep(0.1)
-        raise RuntimeError(f"no scheduler: {(self.folder / 'dask.log').read_text()[-2000:]}")
+        raise RuntimeError(
+            f"no scheduler: {(self.folder / 'dask.log').read_text()[-2000:]}"
+        )
 
     def _worker(self) -> subprocess.Popen[bytes]:
         return self._start(
@@ -105,10 +112,16 @@ def command(scan: Path, out: Path, side: int, *more: str) -> list[str]:
             "--shape", f"{side},{side},{side}", "--voxel", f"{48.0 / side:.6g}", *more]  # fmt: skip
 
 
-def start(words: list[str], log: Path, limit: int | None = None) -> subprocess.Popen[bytes]:
+def start(
+    words: list[str], log: Path, limit: int | None = None
+) -> subprocess.Popen[bytes]:
     with log.open("wb") as file:
         return subprocess.Popen(
-            words, stdout=file, stderr=file, env={**os.environ, **SINGLE}, preexec_fn=limiter(limit)
+            words,
+            stdout=file,
+            stderr=file,
+            env={**os.environ, **SINGLE},
+            preexec_fn=limiter(limit),
         )
 
 
@@ -134,7 +147,9 @@ def make_scan(folder: Path, views: int, panel: tuple[int, int]) -> Path:
     geometry = fx.ConeVec.circular(
         sod=600, sdd=1059, angles=views, shape=panel, pixel=105.0 / max(rows, cols)
     )
-    fx.simulate(fx.Volume(values.astype(np.float32), 1.4), geometry, noise=1).save(folder / "scan")
+    fx.simulate(fx.Volume(values.astype(np.float32), 1.4), geometry, noise=1).save(
+        folder / "scan"
+    )
     return folder / "scan"
 
 
@@ -147,7 +162,9 @@ def speed(folder: Path, scan: Path, side: int) -> bool:
         try:
             out = folder / f"by-{count}.zarr"
             # A first one on a coarse grid, so that imports and compiled kernels are loaded.
-            warm = command(scan, folder / f"warm-{count}.zarr", 32, "--scheduler", cluster.address)
+            warm = command(
+                scan, folder / f"warm-{count}.zarr", 32, "--scheduler", cluster.address
+            )
             subprocess.run(warm, check=True, capture_output=True)
             begun = time.monotonic()
             words = command(scan, out, side, "--scheduler", cluster.address)
@@ -214,7 +231,11 @@ def kills(folder: Path, scan: Path, side: int, count: int, seed: int) -> bool:
             code = client.wait()
             codes[code] = codes.get(code, 0) + 1
             said = log.read_text()
-            if "Traceback" in said or "internal error" in said or code not in (0, 1, 4, -9):
+            if (
+                "Traceback" in said
+                or "internal error" in said
+                or code not in (0, 1, 4, -9)
+            ):
                 wrong += 1
                 print(f"exit code {code}: {said[:700]} ... {said[-700:]}", flush=True)
             if code == 1 and "workers died" not in said:
@@ -258,7 +279,9 @@ def memory(folder: Path, scan: Path, limit: int) -> bool:
     try:
         begun = time.monotonic()
         out = folder / "large.zarr"
-        client = start(command(scan, out, side, "--scheduler", cluster.address), log, limit)
+        client = start(
+            command(scan, out, side, "--scheduler", cluster.address), log, limit
+        )
         try:
             code = client.wait()
         finally:

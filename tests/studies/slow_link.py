@@ -1,9 +1,9 @@
 """How far behind a page is on a slow link: `python tests/studies/slow_link.py`.
 
-A whole lab on this machine, a browser, and between the two a proxy that lets so many bytes a second
-through in all, with a delay each way and small buffers, as a bad wireless link does. While the
-stage turns, the page's state is compared with the twin's own, at the same moment; then E-stop is
-pressed on the page. Needs Debian's chromium and playwright.
+A whole lab on this machine, a browser, and between the two a proxy that lets so many bytes a
+second through in all, with a delay each way and small buffers, as a bad wireless link does.
+While the stage turns, the page's state is compared with the twin's own, at the same moment;
+then E-stop is pressed on the page. Needs Debian's chromium and playwright.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ from typing import Any
 from flexdt.clients.client.client import TwinClient
 
 CHROMIUM = "/usr/bin/chromium"
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
+FLAGS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+]
 BUFFER = 32_768
 CHUNK = 4096
 
@@ -64,7 +69,9 @@ class SlowLink:
         self._ready.set()
         await server.serve_forever()
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         end = socket.socket()
         end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
         end.setblocking(False)
@@ -122,7 +129,16 @@ def study(rate: float, delay_s: float, seconds: float) -> dict[str, float]:
     from playwright.sync_api import sync_playwright
 
     with tempfile.TemporaryDirectory() as folder:
-        words = ["--port", "0", "--projector-port", "0", "--viewer-port", "0", "--data", folder]
+        words = [
+            "--port",
+            "0",
+            "--projector-port",
+            "0",
+            "--viewer-port",
+            "0",
+            "--data",
+            folder,
+        ]
         lab = subprocess.Popen(
             [sys.executable, "-m", "flexdt.clients.launch.up", *words],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
@@ -137,7 +153,9 @@ def study(rate: float, delay_s: float, seconds: float) -> dict[str, float]:
                 page = browser.new_page(viewport={"width": 1280, "height": 800})
                 page.set_default_timeout(120_000)
                 page.goto(f"http://127.0.0.1:{link.port}?view=none&theme=light")
-                page.wait_for_function("window.flexdt?.store.image && flexdt.store.session")
+                page.wait_for_function(
+                    "window.flexdt?.store.image && flexdt.store.session"
+                )
                 rest = behind(page, twin, 8)
                 page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 3000}})")
                 page.wait_for_timeout(2000)

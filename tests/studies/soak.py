@@ -1,10 +1,10 @@
 """A day of mixed use, accelerated: `python tests/studies/soak.py [--hours 24]`.
 
-One twin and one projector, left running while clients come and go: moves, jogs, projections, scans
-(finished, aborted, paused), uploads, corrections, scenes, subscriptions, clients that vanish, stops
-and E-stops. Memory and descriptors of both are read after every simulated hour; the first quarter
-counts as warming up. Prints a line an hour and fails when memory grows by more than 5 % or a
-descriptor is left after that.
+One twin and one projector, left running while clients come and go: moves, jogs, projections,
+scans (finished, aborted, paused), uploads, corrections, scenes, subscriptions, clients that
+vanish, stops and E-stops. Memory and descriptors of both are read after every simulated hour;
+the first quarter counts as warming up. Prints a line an hour and fails when memory grows by
+more than 5 % or a descriptor is left after that.
 """
 
 from __future__ import annotations
@@ -34,14 +34,20 @@ def use(port: int, rng: random.Random, number: int) -> None:
             case 0:
                 wire.call("state.subscribe", topics=["state", "projection", "job", "log"],
                           projection_binning=8)  # fmt: skip
-                wire.call("axes.move", targets={"rot_obj": rng.uniform(-180, 180)}, wait=True)
+                wire.call(
+                    "axes.move", targets={"rot_obj": rng.uniform(-180, 180)}, wait=True
+                )
             case 1:
-                wire.call("axes.jog", axis="tra_obj", velocity=rng.uniform(-2, 2), lease_s=0.5)
+                wire.call(
+                    "axes.jog", axis="tra_obj", velocity=rng.uniform(-2, 2), lease_s=0.5
+                )
                 wire.call("axes.stop")
             case 2:
                 wire.call("projection.get", kind="counts", binning=rng.choice([1, 4, 16]))
             case 3:
-                job = wire.call("script.submit", text=fly_script(31), speed_up="max")["job"]
+                job = wire.call("script.submit", text=fly_script(31), speed_up="max")[
+                    "job"
+                ]
                 if rng.random() < 0.5:
                     wire.wait(job, "done", "failed")
                 else:
@@ -62,7 +68,9 @@ def use(port: int, rng: random.Random, number: int) -> None:
                 wire.call("scene.load", document=document)
                 wire.call("safety.estop")
             case 8:
-                wire.socket.sendall(b'{"jsonrpc":"2.0","id":1,"method":"projection.get"}\n{"half')
+                wire.socket.sendall(
+                    b'{"jsonrpc":"2.0","id":1,"method":"projection.get"}\n{"half'
+                )
     except Refused:
         pass  # refused for a reason (an E-stop, a contact): also a use
     finally:
@@ -103,7 +111,9 @@ def main() -> int:
                     far = min(7000.0, max(2.0, until - now))
                     here = watch.call("state.get")["axes"]["rot_obj"]["position"]
                     watch.call(
-                        "axes.move", targets={"rot_obj": -far if here > 0 else far}, wait=True
+                        "axes.move",
+                        targets={"rot_obj": -far if here > 0 else far},
+                        wait=True,
                     )
                 watch.call("axes.set", axis="rot_obj", speed=22.5)
                 watch.call("session.control", action="release")
@@ -138,7 +148,8 @@ def main() -> int:
               f"{few[1]} descriptors")  # fmt: skip
         failed |= late > 1.05 * early + 2.0 or few[1] - few[0] > 4
     print(
-        f"{options.hours:g} simulated hours, {number} clients, in {time.monotonic() - begun:.0f} s;"
+        f"{options.hours:g} simulated hours, {number} clients, in "
+        f"{time.monotonic() - begun:.0f} s;"
         f" {len(bad)} unhandled exceptions. {machine()}."
     )
     return 1 if failed else 0

@@ -14,7 +14,9 @@ KEPT_S = 30.0
 
 def hello(token: str | None) -> bytes:
     """A line that introduces a client."""
-    said = {"protocol": "1.0", "client": "flood"} | ({} if token is None else {"token": token})
+    said = {"protocol": "1.0", "client": "flood"} | (
+        {} if token is None else {"token": token}
+    )
     return request("session.hello", said)
 
 
@@ -62,7 +64,8 @@ def draw(rng: random.Random) -> Stranger:
 
 
 async def play(stranger: Stranger, host: str, port: int, source: str) -> bytes:
-    """Be that peer; returns what the server said. Ends when the server ends it, or in the end."""
+    """Be that peer; returns what the server said. Ends when the server ends it, or in the
+    end."""
     said = b""
     with contextlib.suppress(OSError, TimeoutError):
         reader, writer = await asyncio.open_connection(host, port, local_addr=(source, 0))

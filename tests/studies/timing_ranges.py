@@ -1,16 +1,18 @@
 """Do the 90 % ranges of a fitted machine hold 90 % of the times of its next scan?
 
-    python tests/studies/timing_ranges.py [--machines 50] [--seed 17] [--families NAME ...] [--json]
+    python tests/studies/timing_ranges.py [--machines 50] [--seed 17] [--families NAME ...]
+    [--json]
 
-Each simulated machine has limits, rates and times of its own and runs one to four scans, whose logs
-are fitted, and then another one, whose lines and total are compared with their ranges. Where its
-axes stand before that scan is known. Its times follow a family that the fit does not know:
-lognormal, bimodal (some commands of a kind take much longer) or drifting (everything becomes slower
+Each simulated machine has limits, rates and times of its own and runs one to four scans, whose
+logs are fitted, and then another one, whose lines and total are compared with their ranges.
+Where its axes stand before that scan is known. Its times follow a family that the fit does not
+know: lognormal, bimodal (some commands of a kind take much longer) or drifting (everything
+    becomes slower
 from line to line). Not among the 50 unless asked for are `daily`: all times of a scan share a
 factor; and those of `COMPARED` and `UNSEEN`.
 
-The logs are written here, byte by byte, with kinematics and times of this file; of flexdt only the
-reader, the fit and the comparison are used.
+The logs are written here, byte by byte, with kinematics and times of this file; of flexdt only
+the reader, the fit and the comparison are used.
 
 Each share has two standard errors: binomial, as if all lines were independent, and from how the
 machines differ, since the lines of a machine share its fit.
@@ -100,7 +102,10 @@ class Rig:
         if self.family == "waiting":  # a fixed part, and an exponential one
             return middle * (1.0 - width + self.rng.expovariate(1.0 / width))
         if self.family == "tails":  # Student's t of three degrees, in the logarithm
-            normal, square = self.rng.gauss(0.0, 1.0), self.rng.gammavariate(1.5, 2.0 / 3.0)
+            normal, square = (
+                self.rng.gauss(0.0, 1.0),
+                self.rng.gammavariate(1.5, 2.0 / 3.0),
+            )
             return middle * math.exp(min(5.0, 0.6 * width * normal / math.sqrt(square)))
         if self.family == "weibull":
             return middle * self.rng.weibullvariate(1.0, 1.2 / width)
@@ -112,7 +117,9 @@ class Rig:
         if self.family == "triangular":
             return middle * self.rng.triangular(1.0 - width, 1.0 + 2.0 * width, 1.0)
         if self.family == "pareto":
-            return middle * (1.0 - 0.5 * width) * self.rng.paretovariate(1.0 + 1.0 / width)
+            return (
+                middle * (1.0 - 0.5 * width) * self.rng.paretovariate(1.0 + 1.0 / width)
+            )
         return middle * noise * (1.0 + 2.0 * width * self.lines / 300.0)
 
     def reply(self, axis: str, target: float) -> bytes:
@@ -147,7 +154,9 @@ class Scan:
         minutes, ms = divmod(self.rig.clock_ms, 60_000)
         hours, minutes = divmod(minutes, 60)
         moment = f"{hours % 24:02d}:{minutes:02d}:{ms // 1000:02d}.{ms % 1000:03d}"
-        script = "\t".join((component, command, first, second, "ACK", "", str(2 * own), str(own)))
+        script = "\t".join(
+            (component, command, first, second, "ACK", "", str(2 * own), str(own))
+        )
         self.log += script.encode() + b"\t" + reply + f"\t{moment}\r\n".encode()
         self.rig.clock_ms += own
 
@@ -156,7 +165,9 @@ class Scan:
         time = travel(target - self.rig.at[axis], *self.rig.rates[axis])
         kind = "move" if target != self.rig.at[axis] else "standing"
         self.rig.at[axis] = target
-        self.put(f"{axis}|move absolute|{target}", kind, time, self.rig.reply(axis, target))
+        self.put(
+            f"{axis}|move absolute|{target}", kind, time, self.rig.reply(axis, target)
+        )
 
     def set_rate(self, axis: str, which: int, value: float) -> None:
         value = round(min(value, 0.99 * self.rig.limits[axis][2 + which]), 4)
@@ -228,11 +239,13 @@ def lines(log: bytes) -> tuple[Executed, ...]:
 
 
 def next_scan(rig: Rig, logs: int) -> tuple[LogComparison, int]:
-    """The scan after `logs` others, beside its prediction; and how many limits are fitted wrong."""
+    """The scan after `logs` others, beside its prediction; and how many limits are fitted
+    wrong."""
     read = [lines(Scan(rig).run()) for _ in range(logs)]
     machine = fit_machine(read, base(), "simulated").machine
     wrong = sum(
-        (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration) != rig.limits[name]
+        (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration)
+        != rig.limits[name]
         for name, axis in machine.axes.items()
         if name in rig.limits
     )
@@ -258,7 +271,8 @@ def share(parts: list[list[bool]]) -> dict[str, float]:
 
 
 def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[str, Any]:
-    """Lines and totals inside their range: of all machines, by family, number of logs and kind."""
+    """Lines and totals inside their range: of all machines, by family, number of logs and
+    kind."""
     held: dict[str, list[list[bool]]] = defaultdict(list)
     relative: dict[str, list[float]] = defaultdict(list)
     widths, wrong = [], 0
@@ -284,12 +298,16 @@ def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[
             known = timing.spread.get(kind)
             if known is not None and known.n >= FEW:
                 held[f"lines, kind {kind}, n >= {FEW}"].append(parts)
-                relative[kind].append((known.p95_s - known.p5_s) / max(timing.seconds(kind), 1e-3))
+                relative[kind].append(
+                    (known.p95_s - known.p5_s) / max(timing.seconds(kind), 1e-3)
+                )
     return {
         "machines": machines,
         "seed": seed,
         "inside": {group: share(parts) for group, parts in sorted(held.items())},
-        "width_percent": {k: 100.0 * statistics.median(w) for k, w in sorted(relative.items())},
+        "width_percent": {
+            k: 100.0 * statistics.median(w) for k, w in sorted(relative.items())
+        },
         "total_width_percent": 100.0 * statistics.median(widths),
         "limits_wrong": wrong,
     }
@@ -300,7 +318,10 @@ def main() -> None:
     parser.add_argument("--machines", type=int, default=50)
     parser.add_argument("--seed", type=int, default=17)
     parser.add_argument(
-        "--families", nargs="+", choices=(*FAMILIES, DAILY, *COMPARED, *UNSEEN), default=FAMILIES
+        "--families",
+        nargs="+",
+        choices=(*FAMILIES, DAILY, *COMPARED, *UNSEEN),
+        default=FAMILIES,
     )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -309,15 +330,21 @@ def main() -> None:
         print(json.dumps(found, indent=2))
         return
     print(
-        f"{found['machines']} machines, seed {found['seed']}; {found['limits_wrong']} limits wrong"
+        f"{found['machines']} machines, seed {found['seed']}; {found['limits_wrong']} "
+        "limits wrong"
     )
-    print(f"median width of a total's range: {found['total_width_percent']:.0f} % of the total")
+    print(
+        f"median width of a total's range: {found['total_width_percent']:.0f} % of the total"
+    )
     for kind, width in found["width_percent"].items():
         print(f"median width of {kind}, n >= {FEW}: {width:.0f} % of its median")
-    print(f"{'inside the 90 % range':36} {'%':>6} {'binomial':>9} {'machines':>9} {'n':>6}")
+    print(
+        f"{'inside the 90 % range':36} {'%':>6} {'binomial':>9} {'machines':>9} {'n':>6}"
+    )
     for group, x in found["inside"].items():
         print(
-            f"{group:36} {x['percent']:6.1f} {x['binomial']:9.1f} {x['machines']:9.1f} {x['n']:6d}"
+            f"{group:36} {x['percent']:6.1f} {x['binomial']:9.1f} {x['machines']:9.1f} "
+            f"{x['n']:6d}"
         )
 
 

@@ -1,9 +1,10 @@
 """How views are walked, timed: `python tests/studies/walks.py [--count 150] [--seed 1]`.
 
 Volumes, detectors and sources are drawn: flat and long volumes, single rows, sources beside and
-above, detectors turned about their normal. Each view is projected on one core in fans along z, x
-and y, and ray by ray. Prints how much longer what `level_axes` chooses takes than the quickest way
-(mean, 90 %), and how much shorter than fans along z always; and the geometries it loses most at.
+above, detectors turned about their normal. Each view is projected on one core in fans along z,
+x and y, and ray by ray. Prints how much longer what `level_axes` chooses takes than the
+quickest way (mean, 90 %), and how much shorter than fans along z always; and the geometries it
+loses most at.
 """
 
 from __future__ import annotations
@@ -31,11 +32,19 @@ def drawn(draw: np.random.Generator) -> tuple[Volume, ConeVec, tuple[int, int]]:
     volume = Volume(draw.random(tuple(sides), dtype=np.float32), 25.6 / sides.max())
     rows = 1 if draw.random() < 0.2 else int(2 ** draw.uniform(0, 9.6))
     shape = (rows, int(2 ** draw.uniform(5, 9.9)))
-    above = math.radians(draw.choice([0, 0, 10, 30, 45, 60, 80, 90]) + draw.choice([0, 1.3]))
-    turn, roll = draw.uniform(0, np.pi / 2), math.radians(draw.choice([0, 0, 0.4, 30, 90]))
+    above = math.radians(
+        draw.choice([0, 0, 10, 30, 45, 60, 80, 90]) + draw.choice([0, 1.3])
+    )
+    turn, roll = (
+        draw.uniform(0, np.pi / 2),
+        math.radians(draw.choice([0, 0, 0.4, 30, 90])),
+    )
     beam = np.array([0, math.cos(above), -math.sin(above)])
     u, v = np.array([1.0, 0, 0]), np.array([0, -math.sin(above), -math.cos(above)])
-    u, v = math.cos(roll) * u + math.sin(roll) * v, math.cos(roll) * v - math.sin(roll) * u
+    u, v = (
+        math.cos(roll) * u + math.sin(roll) * v,
+        math.cos(roll) * v - math.sin(roll) * u,
+    )
     c, s = math.cos(turn), math.sin(turn)
     about = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     pitch = 60 / max(shape)
@@ -79,7 +88,8 @@ def main() -> None:
         rows.append((times[chosen] / min(times), times[0] / times[chosen], what))
     lost, gained = np.log([[r[0], r[1]] for r in rows]).T
     print(f"{len(rows)} views: {np.exp(lost.mean()):.2f} times the quickest way's time (90 %: "
-          f"{np.exp(np.quantile(lost, 0.9)):.2f}), {np.exp(gained.mean()):.2f} times as fast as "
+          f"{np.exp(np.quantile(lost, 0.9)):.2f}), {np.exp(gained.mean()):.2f} times as "
+          "fast as "
           "along z")  # fmt: skip
     for loss, _, what in sorted(rows, reverse=True)[:5]:
         print(f"{loss:.1f} times: {what}")

@@ -2,10 +2,10 @@
 
     python tests/studies/weighted_iterations.py --photons 300
 
-The phantom's voxels are projected by this file's own sums over rays, photons are counted, and both
-methods run to a ladder of iterations on images with noise and without. Sharpness is the part of the
-bricks' edges that the volume without noise has, noise the rms difference of the two volumes inside
-bricks. Exits with 1 where weights make the noise larger.
+The phantom's voxels are projected by this file's own sums over rays, photons are counted, and
+both methods run to a ladder of iterations on images with noise and without. Sharpness is the
+part of the bricks' edges that the volume without noise has, noise the rms difference of the two
+volumes inside bricks. Exits with 1 where weights make the noise larger.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def voxels(n: int) -> tuple[np.ndarray, np.ndarray]:
     """A stack of bricks of ABS with five steel balls, (n, n, n) of 0.5 mm, and its bricks."""
     z, y, x = np.mgrid[:n, :n, :n] * 0.5 - 0.25 * (n - 1)
     brick = (np.abs(x) < 12.0) & (np.abs(y) < 8.0) & (np.abs(z) < 9.6)
-    brick &= ~((np.abs(x) < 10.5) & (np.abs(y) < 6.5) & (np.abs((z + 9.6) % 9.6 - 3.8) < 3.0))
+    brick &= ~(
+        (np.abs(x) < 10.5) & (np.abs(y) < 6.5) & (np.abs((z + 9.6) % 9.6 - 3.8) < 3.0)
+    )
     out = np.where(brick, 0.02, 0.0)
     for at in ((9, 6, 7), (-9, 6, 0), (9, -6, -3), (-9, -6, -7), (0, 7, 4)):
         out[(x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2 < 4.0] = STEEL
@@ -62,7 +64,11 @@ def main() -> int:
     o = parser.parse_args()
     truth, brick = voxels(72)
     scan = fx.ConeVec.circular(
-        sod=SOD, sdd=SDD, angles=np.arange(VIEWS) * 360.0 / VIEWS, shape=SHAPE, pixel=PIXEL
+        sod=SOD,
+        sdd=SDD,
+        angles=np.arange(VIEWS) * 360.0 / VIEWS,
+        shape=SHAPE,
+        pixel=PIXEL,
     )
     clean = projected(truth, scan)
     light = o.photons * np.exp(-clean.astype(float))
@@ -77,7 +83,15 @@ def main() -> int:
         for passes in LADDER:
             # Smaller variances of the same ratios: none ends before its iterations are done.
             found = [
-                sart(p, scan, grid, iterations=passes - done, subsets=6, start=v, variances=weights)
+                sart(
+                    p,
+                    scan,
+                    grid,
+                    iterations=passes - done,
+                    subsets=6,
+                    start=v,
+                    variances=weights,
+                )
                 for p, v in zip((clean, noisy), found, strict=True)
             ]
             done = passes
@@ -89,10 +103,14 @@ def main() -> int:
                   flush=True)  # fmt: skip
         curves[name] = np.array(curve)
     even, weighted = curves.values()
-    common = np.linspace(max(even[0, 0], weighted[0, 0]), min(even[-1, 0], weighted[-1, 0]), 4)
+    common = np.linspace(
+        max(even[0, 0], weighted[0, 0]), min(even[-1, 0], weighted[-1, 0]), 4
+    )
     noise = [np.interp(common, c[:, 0], c[:, 1]) for c in (even, weighted)]
     for sharp, one, other in zip(common, *noise, strict=True):
-        print(f"edges {sharp:.3f}: noise {one:.5f} even, {other:.5f} weighted, {other / one:.2f}")
+        print(
+            f"edges {sharp:.3f}: noise {one:.5f} even, {other:.5f} weighted, {other / one:.2f}"
+        )
     return int(bool((noise[1] > 1.02 * noise[0]).any()))
 
 

@@ -14,7 +14,8 @@ from flexdt.twin.projection import project_scene
 def radiographs(
     phantom: Phantom, cone: ConeVec, counts: float | None = 20_000.0, seed: int = 0
 ) -> Float32Array:
-    """Line integrals (n, rows, cols), with the noise of `counts` open-beam photons or without."""
+    """Line integrals (n, rows, cols), with the noise of `counts` open-beam photons or
+    without."""
     clean = project_scene(phantom.scene, cone, SHAPE)
     if counts is None:
         return clean

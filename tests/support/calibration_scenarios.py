@@ -39,10 +39,14 @@ def scenario(name: str, frames: int) -> tuple[Poses, Offsets]:
     return poses, Offsets.from_edge(edge)
 
 
-def spiral(size: tuple[float, float, float], beads: int, radius: float = 2.0) -> BeadModel:
+def spiral(
+    size: tuple[float, float, float], beads: int, radius: float = 2.0
+) -> BeadModel:
     """Beads on the spiral of calibration.md; size is width, breadth, height."""
     k = np.arange(beads)
-    height = (k / (beads - 1) - 0.5) * (size[2] - 2 * radius) if beads > 1 else np.zeros(1)
+    height = (
+        (k / (beads - 1) - 0.5) * (size[2] - 2 * radius) if beads > 1 else np.zeros(1)
+    )
     angle = 2 * math.pi * k / beads
     return BeadModel(
         np.stack(
@@ -63,7 +67,12 @@ def exact_tracks(poses: Poses, truth: Offsets, model: BeadModel) -> FloatArray:
 
 
 def shadows(
-    tracks: FloatArray, seed: int, *, missing: float = 0.0, false: int = 0, noise: float = 0.05
+    tracks: FloatArray,
+    seed: int,
+    *,
+    missing: float = 0.0,
+    false: int = 0,
+    noise: float = 0.05,
 ) -> list[Detections]:
     """Detections in random order, some left out, some invented."""
     rng = np.random.default_rng(seed)

@@ -41,7 +41,9 @@ class Geometry:
 
 
 class ImageGeometry(Geometry):
-    def __init__(self, voxel_num_x: int, voxel_num_y: int, voxel_num_z: int, **sizes: float):
+    def __init__(
+        self, voxel_num_x: int, voxel_num_y: int, voxel_num_z: int, **sizes: float
+    ):
         assert set(sizes) == {f"voxel_size_{a}" for a in "xyz"}
         self.sizes = sizes
         self.shape = (voxel_num_z, voxel_num_y, voxel_num_x)
@@ -49,7 +51,9 @@ class ImageGeometry(Geometry):
 
 class AcquisitionGeometry(Geometry):
     @classmethod
-    def create_Cone3D(cls, source_position: Any, detector_position: Any) -> AcquisitionGeometry:
+    def create_Cone3D(
+        cls, source_position: Any, detector_position: Any
+    ) -> AcquisitionGeometry:
         made = cls()
         made.source, made.detector = source_position, detector_position
         return made

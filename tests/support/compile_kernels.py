@@ -1,7 +1,7 @@
 """Run the kernels that many tests share, so that numba's disk cache holds them: `make kernels`.
 
-Workers that start together, and every server that one of them starts, would each compile the same
-kernels: more than a minute of processor time each.
+Workers that start together, and every server that one of them starts, would each compile the
+same kernels: more than a minute of processor time each.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ def main() -> None:
         detect_beads(image)
     fx.simulate("lego", scan, scatter="mc").reconstruct(voxel=4.0, shape=(4, 8, 8))
     seen = scan.project_points(load_phantom("lego").beads)
-    marks = [(i, str(k), *seen[i, k].tolist(), None) for i, k in np.ndindex(seen.shape[:2])]
+    marks = [
+        (i, str(k), *seen[i, k].tolist(), None) for i, k in np.ndindex(seen.shape[:2])
+    ]
     fx.calibrate(None, "lego", geometry=scan, markers=marks)
 
 

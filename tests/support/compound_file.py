@@ -1,7 +1,7 @@
 """OLE2 files (Microsoft's compound file format, [MS-CFB]), written for tests of their reader.
 
-Version 3: sectors of 512 bytes, small streams in mini sectors of 64, a file allocation table for
-each. At most 7 MB, so that the header lists all sectors of the table.
+Version 3: sectors of 512 bytes, small streams in mini sectors of 64, a file allocation table
+for each. At most 7 MB, so that the header lists all sectors of the table.
 """
 
 from __future__ import annotations
@@ -91,7 +91,9 @@ def compound_file(streams: Mapping[str, bytes]) -> bytes:
     return head + struct.pack("<109I", *places) + bytes(sectors)
 
 
-def _entry(name: str, kind: int, left: int, right: int, child: int, first: int, size: int) -> bytes:
+def _entry(
+    name: str, kind: int, left: int, right: int, child: int, first: int, size: int
+) -> bytes:
     text = name.encode("utf-16-le")
     black = 1
     return struct.pack(

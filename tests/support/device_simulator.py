@@ -32,7 +32,9 @@ def two_devices() -> list[int]:
     from numba.cuda.simulator.kernel import FakeCUDAKernel
 
     inside, launches = [0], []
-    owners: dict[int, tuple[Any, int]] = {}  # by the array whose memory it is, which is kept
+    owners: dict[
+        int, tuple[Any, int]
+    ] = {}  # by the array whose memory it is, which is kept
 
     class Device:
         def __init__(self, number: int) -> None:
@@ -50,7 +52,11 @@ def two_devices() -> list[int]:
             root = root.base
         return owners.setdefault(id(root), (root, inside[-1]))
 
-    begin, fetch, call = FakeCUDAArray.__init__, FakeCUDAArray.copy_to_host, FakeCUDAKernel.__call__
+    begin, fetch, call = (
+        FakeCUDAArray.__init__,
+        FakeCUDAArray.copy_to_host,
+        FakeCUDAKernel.__call__,
+    )
 
     def begun(self: Any, *arguments: Any, **options: Any) -> None:
         begin(self, *arguments, **options)
@@ -76,9 +82,9 @@ def two_devices() -> list[int]:
 def as_on_a_device(block: tuple[int, int] = (32, 4)) -> None:
     """In the simulator: run kernels as a device does, and refuse what a device only breaks at.
 
-    Warps are 32 lanes that exchange values, which all of them have to reach; the threads of a block
-    wait for each other there and at `syncthreads`. Every index of an array has to be inside it.
-    Threads run one at a time, each until it waits: a run is the same every time.
+    Warps are 32 lanes that exchange values, which all of them have to reach; the threads of a
+    block wait for each other there and at `syncthreads`. Every index of an array has to be
+    inside it. Threads run one at a time, each until it waits: a run is the same every time.
 
     Args:
         block: threads a block of the projector's kernels; rows have to fill warps.
@@ -140,7 +146,11 @@ class CheckedArray:
 
     def __init__(self, item: Any) -> None:
         self._ary = item._ary
-        self.dtype, self.shape, self.size = self._ary.dtype, self._ary.shape, self._ary.size
+        self.dtype, self.shape, self.size = (
+            self._ary.dtype,
+            self._ary.shape,
+            self._ary.size,
+        )
 
     def _inside(self, index: Any) -> Any:
         places = index if isinstance(index, tuple) else (index,)
@@ -164,7 +174,9 @@ class CheckedArray:
 class Lane(threading.Thread):
     """A thread of a kernel, which runs when it is let, until it waits or ends."""
 
-    def __init__(self, block: Block, block_index: Any, thread_index: Any, number: int) -> None:
+    def __init__(
+        self, block: Block, block_index: Any, thread_index: Any, number: int
+    ) -> None:
         super().__init__(daemon=True)
         self.block, self.blockIdx, self.threadIdx = block, block_index, thread_index
         self.thread_id, self.exchanges = number, 0

@@ -1,11 +1,12 @@
 """A plugin of pytest: tests run as on a machine with a CUDA device, without one.
 
-    NUMBA_ENABLE_CUDASIM=1 PYTHONPATH=tests/support pytest -p device_stand_in -m 'not slow' tests
+    NUMBA_ENABLE_CUDASIM=1 PYTHONPATH=tests/support pytest -p device_stand_in -m 'not slow'
+    tests
 
-Projections, their transpose and FDK are computed where `gpu` would send them to a device, by the
-processor, with the last bits that a device gives: others than the processor's, and those of the
-transpose different at every call, as sums are that atomics add in any order. A test that compares
-bytes of such sums, or expects the processor's, fails.
+Projections, their transpose and FDK are computed where `gpu` would send them to a device, by
+the processor, with the last bits that a device gives: others than the processor's, and those of
+the transpose different at every call, as sums are that atomics add in any order. A test that
+compares bytes of such sums, or expects the processor's, fails.
 """
 
 from __future__ import annotations
@@ -23,15 +24,17 @@ from flexdt.twin.reconstruction import fdk
 LAST_BITS = 2.0**-22
 """By how much a number of a device differs, of itself."""
 MOVED_FROM = 7
-"""Views for which a volume of the host is moved: those of a device beside 16 threads, so that few
-views stay on the processor whatever this machine has."""
+"""Views for which a volume of the host is moved: those of a device beside 16 threads, so that
+few views stay on the processor whatever this machine has."""
 _draw = np.random.default_rng()
 
 
 def rounded(values: Any) -> Any:
     """Values as a device rounds them: the same for the same value, and not the processor's."""
     bits = values.view(np.uint32) * np.uint32(2654435761) >> np.uint32(30)
-    return values * (1 + LAST_BITS * (bits.astype(np.float32) / 2 - 0.75)).astype(np.float32)
+    return values * (1 + LAST_BITS * (bits.astype(np.float32) / 2 - 0.75)).astype(
+        np.float32
+    )
 
 
 def added(values: Any) -> Any:
@@ -54,9 +57,13 @@ def launcher(
             pixels[...] = rounded(out)
             return
         sums = np.zeros(voxels._ary.size, np.float32)
-        cpu.spread(box._replace(flat=sums), views, np.ascontiguousarray(pixels), fans=False)
+        cpu.spread(
+            box._replace(flat=sums), views, np.ascontiguousarray(pixels), fans=False
+        )
         exact = voxels._ary.dtype.kind == "i"
-        voxels._ary[...] += np.rint(sums * factor).astype(np.int64) if exact else added(sums)
+        voxels._ary[...] += (
+            np.rint(sums * factor).astype(np.int64) if exact else added(sums)
+        )
 
     return launch
 
@@ -118,4 +125,6 @@ def pytest_configure(config: Any) -> None:
     kernels.clear = Kernel(lambda values: values.fill(0))
 
 
-assert config.ENABLE_CUDASIM, "set NUMBA_ENABLE_CUDASIM=1: arrays of a device are the simulator's"
+assert config.ENABLE_CUDASIM, (
+    "set NUMBA_ENABLE_CUDASIM=1: arrays of a device are the simulator's"
+)

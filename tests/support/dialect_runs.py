@@ -20,7 +20,8 @@ class Listener:
     """A session on a clock of its own.
 
     Args:
-        stalls: (from, to) in which the listener does not read: what comes then is read at its end.
+        stalls: (from, to) in which the listener does not read: what comes then is read at its
+            end.
         machine: what is known.
     """
 
@@ -53,7 +54,11 @@ class Listener:
 def measured(overhead: tuple[float, float], n: int = 30) -> Machine:
     """The machine with times of this median and spread, as known from n of each kind."""
     median, spread = overhead
-    ends = {"p5_s": median * exp(-1.645 * spread), "p95_s": median * exp(1.645 * spread), "n": n}
+    ends = {
+        "p5_s": median * exp(-1.645 * spread),
+        "p95_s": median * exp(1.645 * spread),
+        "n": n,
+    }
     kinds = ("move", "move_standing", "set_tube", "set_camera", "command")
     timing = {**{f"{kind}_s": median for kind in kinds}, "source": "measured",
               "spread": dict.fromkeys(kinds, ends)}  # fmt: skip
@@ -67,7 +72,9 @@ def missed(made: Conversation, stalls: Iterable[tuple[float, float]] = ()) -> li
     listener.wait(max((f.at_s for f in made.faults), default=listener.now) + AFTER_S)
     wrong = []
     for fault in made.faults:
-        found = [a for a in listener.alarms if a.kind in fault.kinds and a.about == fault.about]
+        found = [
+            a for a in listener.alarms if a.kind in fault.kinds and a.about == fault.about
+        ]
         soon = [a for a in found if a.at_s <= fault.at_s + TOLD_S]
         if not soon:
             wrong.append(f"{made.dialect.name}: not told in time: {fault}; told: {found}")

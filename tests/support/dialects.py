@@ -1,10 +1,11 @@
-"""Conversations of message servers that differ, with faults in them, and what must be told of them.
+"""Conversations of message servers that differ, with faults in them, and what must be told of
+them.
 
-Ten dialects of one interface: its description to the letter, and as its own last pages have it; the
-public client `acquila_zmq` in two versions and the log that its monitor recorded; Dexter, whose
-JSON has no whole numbers; and what servers leave out or say twice. A conversation is a machine of
-this file's own that moves by the textbook's trapezium, written as JSON by hand: nothing here is
-shared with what reads it.
+Ten dialects of one interface: its description to the letter, and as its own last pages have it;
+the public client `acquila_zmq` in two versions and the log that its monitor recorded; Dexter,
+whose JSON has no whole numbers; and what servers leave out or say twice. A conversation is a
+machine of this file's own that moves by the textbook's trapezium, written as JSON by hand:
+nothing here is shared with what reads it.
 """
 
 from __future__ import annotations
@@ -33,11 +34,13 @@ class Dialect:
 
     Attributes:
         send: what a command says where a reply says what it is.
-        tick: of a reply: `copied` from the command, `renewed`, `renewed FDB`, `none`, `constant`.
+        tick: of a reply: `copied` from the command, `renewed`, `renewed FDB`, `none`,
+            `constant`.
         uuid: `whole` (64 bits), `text`, `float` (replies lose digits), `count`, `zero`.
         arguments: whether replies repeat those of the command; `numbers` not as text.
         feedback: `position`, `text`, `empty`, or `none` at all.
-        end: what the reply at the end has: `cluster`, `position`; or `none`, and no end is told.
+        end: what the reply at the end has: `cluster`, `position`; or `none`, and no end is
+            told.
         received, doubled, indented, topic, raw: RCV; everything twice; JSON of many lines; text
             before it; messages that are no JSON.
     """
@@ -60,7 +63,14 @@ DIALECTS = (
     Dialect("description", arguments="none"),
     Dialect("description, last pages", tick="renewed", arguments="none"),
     Dialect("acquila_zmq", "SENT", "renewed FDB", "text", end="position"),
-    Dialect("acquila_zmq, early", "SENT", "renewed", "text", arguments="numbers", end="position"),
+    Dialect(
+        "acquila_zmq, early",
+        "SENT",
+        "renewed",
+        "text",
+        arguments="numbers",
+        end="position",
+    ),
     Dialect("monitor log", "SENT", "renewed FDB", "text", feedback="text", raw=True),
     Dialect("Dexter", tick="constant", uuid="float", feedback="empty", indented=True),
     Dialect("no ticks", "SEND", "none", "count", feedback="none", received=False),
@@ -73,7 +83,8 @@ Message = tuple[float, bytes]
 
 @dataclass(frozen=True)
 class Fault:
-    """What must be told: some of `kinds` about something, `TOLD_S` after `at_s` at the latest."""
+    """What must be told: some of `kinds` about something, `TOLD_S` after `at_s` at the
+    latest."""
 
     at_s: float
     kinds: frozenset[str]
@@ -87,8 +98,8 @@ class Conversation:
     Attributes:
         messages: (when [s], bytes), in the order of the commands.
         faults: of the machine and of the server.
-        overhead: (median [s], spread of its logarithm) of what each command takes beside; None for
-            a few hundredths of a second.
+        overhead: (median [s], spread of its logarithm) of what each command takes beside; None
+            for a few hundredths of a second.
     """
 
     dialect: Dialect
@@ -97,7 +108,9 @@ class Conversation:
     messages: list[Message] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
     overhead: tuple[float, float] | None = None
-    positions: dict[str, float] = field(default_factory=lambda: {n: a[2] for n, a in AXES.items()})
+    positions: dict[str, float] = field(
+        default_factory=lambda: {n: a[2] for n, a in AXES.items()}
+    )
     _count: int = 0
     _ticks: int = 1_380_210_404
 
@@ -127,7 +140,8 @@ class Conversation:
 
         Args:
             fault: of the machine: `slow`, `offset`, `limits`, `beyond`, `hangs`.
-            slip: of the server: `dropped`, `doubled`, `late`, `lost end`, `late end`, `overtaken`.
+            slip: of the server: `dropped`, `doubled`, `late`, `lost end`, `late end`,
+                `overtaken`.
         """
         rng, dialect = self.rng, self.dialect
         axis = rng.choice(list(AXES))
@@ -156,7 +170,10 @@ class Conversation:
         pick = rng.randint(1, max(1, count))
         last = travelled(count * FEEDBACK_S - starts, way, speed * factor, acceleration)
         if fault == "offset" and dialect.end == "none" and way - last < 0.05:
-            fault, ends_at = "", target  # a last reading aside may as well be one overtaken
+            fault, ends_at = (
+                "",
+                target,
+            )  # a last reading aside may as well be one overtaken
         for k in range(1, count + 1):
             t = k * FEEDBACK_S
             if fault == "hangs" and t > nominal / 2:
@@ -206,13 +223,17 @@ class Conversation:
             if slip == "doubled":
                 self._say(say, told + rng.uniform(0.0, 5.0), "ACK", reply)
         if fault == "offset":
-            self.faults.append(Fault(told, frozenset({"offset", "off_path", "slow"}), axis))
+            self.faults.append(
+                Fault(told, frozenset({"offset", "off_path", "slow"}), axis)
+            )
         if fault == "limits" and dialect.end != "position":
             self.faults.append(Fault(told, frozenset({"limits"}), axis))
         self.positions[axis] = ends_at
         self.now = told + 0.002 + gap
 
-    def _short(self, component: str, command: str, argument: str, reply: str = "") -> None:
+    def _short(
+        self, component: str, command: str, argument: str, reply: str = ""
+    ) -> None:
         say = self._begin(component, command, argument)
         self.now += self._more()
         if self.dialect.end != "none":
@@ -283,7 +304,9 @@ class Conversation:
         return 7 if self.dialect.tick == "constant" else self._ticks + round(1000 * at)
 
     def _write(self, at: float, told: dict[str, Any]) -> None:
-        text = json.dumps(told, indent=4 if self.dialect.indented else None, ensure_ascii=False)
+        text = json.dumps(
+            told, indent=4 if self.dialect.indented else None, ensure_ascii=False
+        )
         data = (self.dialect.topic + text).encode()
         self.messages.append((at, data))
         if self.dialect.doubled:
@@ -295,7 +318,8 @@ SLIPS = ("dropped", "doubled", "late", "lost end", "late end", "overtaken")
 
 
 def conversation(dialect: Dialect, seed: int, commands: int = 8) -> Conversation:
-    """A drawn one: some commands, then a fault of the machine, and one of the server before it."""
+    """A drawn one: some commands, then a fault of the machine, and one of the server before
+    it."""
     rng = random.Random(f"{dialect.name} {seed}")
     made = Conversation(dialect, rng)
     fault, slip = rng.choice(("", *FAULTS)), rng.choice(("", *SLIPS))
@@ -312,10 +336,15 @@ def conversation(dialect: Dialect, seed: int, commands: int = 8) -> Conversation
 
 
 def healthy(
-    dialect: Dialect, seed: int, seconds: float, overhead: tuple[float, float] | None = None
+    dialect: Dialect,
+    seed: int,
+    seconds: float,
+    overhead: tuple[float, float] | None = None,
 ) -> Iterator[Message]:
     """So many seconds of a machine and a server without a fault, nearly in order."""
-    made = Conversation(dialect, random.Random(f"{dialect.name} healthy {seed}"), overhead=overhead)
+    made = Conversation(
+        dialect, random.Random(f"{dialect.name} healthy {seed}"), overhead=overhead
+    )
     while made.now < seconds:
         made.command()
         made.now += made.rng.choice((0.0, 0.0, made.rng.uniform(0.0, 20.0)))
@@ -359,5 +388,10 @@ def cluster(
     """A motor's status as the scanner flattens it, one character for each byte."""
     head = (position, target, speed, 0.0, acceleration, upper, lower, 0.0, most_speed, 0.0,
             most_acceleration, *[0.0] * 6)  # fmt: skip
-    data = struct.pack(">17d", *head) + bytes(7) + struct.pack(">2d", upper, lower) + bytes(108)
+    data = (
+        struct.pack(">17d", *head)
+        + bytes(7)
+        + struct.pack(">2d", upper, lower)
+        + bytes(108)
+    )
     return data.decode("latin-1")

@@ -1,7 +1,7 @@
 """Line integrals through voxels and their transpose in double precision, by sorted crossings.
 
-Shares nothing with the kernels: every plane that a ray crosses is a number, these are sorted, and
-the voxel of each piece is the one that holds its middle.
+Shares nothing with the kernels: every plane that a ray crosses is a number, these are sorted,
+and the voxel of each piece is the one that holds its middle.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class VoxelGrid:
 
 
 def ray_ends(rows: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Sources and pixel centres [mm], each (n * rows * cols, 3), of rows (n, 12) of a geometry."""
+    """Sources and pixel centres [mm], each (n * rows * cols, 3), of rows (n, 12) of a
+    geometry."""
     r, c = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
     across, down = (c - (shape[1] - 1) / 2).ravel(), (r - (shape[0] - 1) / 2).ravel()
     pixels = (
@@ -62,7 +63,9 @@ def pieces(
             planes = low[axis] + np.arange(grid.counts[axis] + 1) * grid.voxel_mm[axis]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (planes - start[:, axis, None]) / way[:, axis, None]
-            cuts.append(np.clip(np.nan_to_num(t, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
+            cuts.append(
+                np.clip(np.nan_to_num(t, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+            )
         t = np.sort(np.concatenate(cuts, axis=1), axis=1)
         middle = start[:, None] + 0.5 * (t[:, 1:] + t[:, :-1])[:, :, None] * way[:, None]
         index = np.floor((middle - low) / grid.voxel_mm).astype(np.int64)

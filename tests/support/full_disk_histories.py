@@ -1,7 +1,8 @@
-"""Drawn histories of a twin whose disk becomes full, and is killed: what was acknowledged stays.
+"""Drawn histories of a twin whose disk becomes full, and is killed: what was acknowledged
+stays.
 
-The disk is simulated (`simulated_disk`): what needs a new block or a new name is refused, what is
-written in place is not. The judge compares what clients see before and after each kill.
+The disk is simulated (`simulated_disk`): what needs a new block or a new name is refused, what
+is written in place is not. The judge compares what clients see before and after each kill.
 """
 
 from __future__ import annotations
@@ -86,7 +87,9 @@ def run_history(root: Path, seed: int) -> Outcome:
         sim.start()
         client = sim.client()
         for name in ("one", "two"):
-            sim.call(client, "calibration.apply", parameters={"dD_x": rng.random()}, name=name)
+            sim.call(
+                client, "calibration.apply", parameters={"dD_x": rng.random()}, name=name
+            )
         for _ in range(STATES):
             full = Fault(at=rng.randint(0, MOST_WRITES), error=errno.ENOSPC, lasting=True)
             sim.disk.set(full)

@@ -1,7 +1,7 @@
 """What the text at the head of `gpu_kernels` and of `gpu` claims, one function for each claim.
 
-Runs in numba's simulator, with warps that vote: `python tests/support/gpu_assumptions.py` prints
-for each claim what was found wrong, or null.
+Runs in numba's simulator, with warps that vote: `python tests/support/gpu_assumptions.py`
+prints for each claim what was found wrong, or null.
 """
 
 from __future__ import annotations
@@ -57,7 +57,12 @@ def no_rounding_adds_up_in_fixed_point(draw: Draw) -> None:
         for k in (0, 1, slabs // 2, slabs):
             found = Fraction(int(position) + k * int(rate), 2**kernels.BITS)
             off = abs(found - Fraction(start) - k * Fraction(slope))
-            assert off <= Fraction(1, 2**44) + k * Fraction(1, 2**45), (start, slope, k, float(off))
+            assert off <= Fraction(1, 2**44) + k * Fraction(1, 2**45), (
+                start,
+                slope,
+                k,
+                float(off),
+            )
         assert abs(int(position)) + gpu.SIDE * int(rate) < 2**63
 
 
@@ -80,15 +85,25 @@ def a_crossing_is_off_by_1e_5_slabs_whatever_the_slope(draw: Draw) -> None:
         for k in range(kernels.ANCHORED):
             t = np.float32(k + 1)
             bits, share = kernels.crossing.fn(t, slope_32, distance, steps)
-            before, after = (Fraction(start) + (begin + j) * Fraction(slope) for j in (k, k + 1))
+            before, after = (
+                Fraction(start) + (begin + j) * Fraction(slope) for j in (k, k + 1)
+            )
             behind = (after - math.floor(after)) / Fraction(slope)
             ahead = (math.floor(after) + 1 - after) / Fraction(slope)
             if min(behind, ahead) <= CROSSING:
                 continue  # at the slab's end, either side
-            assert kernels.narrow(bits + plane) == math.floor(after), (start, slope, begin + k)
+            assert kernels.narrow(bits + plane) == math.floor(after), (
+                start,
+                slope,
+                begin + k,
+            )
             if math.floor(before) != math.floor(after):
                 crossed += 1
-            assert abs(Fraction(float(share)) - min(behind, 1)) <= CROSSING, (start, slope, k)
+            assert abs(Fraction(float(share)) - min(behind, 1)) <= CROSSING, (
+                start,
+                slope,
+                k,
+            )
     assert crossed > 100, crossed
 
 
@@ -98,11 +113,18 @@ def a_ray_enters_and_leaves_within_the_margin(draw: Draw) -> None:
         found = kernels.fixed_line.fn(start, slope, across)
         if found[1] == 0:
             continue
-        exact = [-Fraction(start) / Fraction(slope), (across - Fraction(start)) / Fraction(slope)]
+        exact = [
+            -Fraction(start) / Fraction(slope),
+            (across - Fraction(start)) / Fraction(slope),
+        ]
         for place, wanted in zip(found[4:], exact, strict=True):
             if 0 <= wanted <= slabs:
                 off = abs(Fraction(float(place)) - wanted)
-                assert off < Fraction(float(kernels.MARGIN)) / 2, (start, slope, float(off))
+                assert off < Fraction(float(kernels.MARGIN)) / 2, (
+                    start,
+                    slope,
+                    float(off),
+                )
 
 
 @claim
@@ -115,7 +137,10 @@ def floor_is_in_the_lowest_bits_of_a_sum_that_is_rounded_down(draw: Draw) -> Non
         assert float(np.nextafter(moved, np.float32(np.inf))) == float(moved) + 1
         assert int(moved.view(np.int32)) == kernels.MAGIC_BITS + n
         y = np.float32(n + draw.uniform(0, 1) * (abs(n) < 2**20))
-        assert kernels.floor_bits(y) == (math.floor(y), kernels.MAGIC_BITS + math.floor(y))
+        assert kernels.floor_bits(y) == (
+            math.floor(y),
+            kernels.MAGIC_BITS + math.floor(y),
+        )
 
 
 @claim
@@ -146,7 +171,9 @@ def drawn_views(draw: Draw) -> Any:
     ):
         for _ in range(15):
             counts = draw.integers(1, 30, 3)
-            volume = Volume(np.ones(counts[::-1], np.float32), tuple(draw.uniform(0.3, 1, 3)))
+            volume = Volume(
+                np.ones(counts[::-1], np.float32), tuple(draw.uniform(0.3, 1, 3))
+            )
             layout, shape = blank_layout(volume), tuple(draw.integers(1, 12, 2).tolist())
             radius = float(np.linalg.norm(counts * volume.voxel_xyz)) / 2
             row = drawn_view(draw, kind, radius, shape)
@@ -185,7 +212,9 @@ def lanes_of_both_axes_keep_to_their_own_slabs(draw: Draw) -> None:
         # One warp: a column of few pixels, from one corner of the detector to the other.
         shape = (int(draw.integers(8, 33)), 1)
         rows[0, 9:12] *= case.shape[0] / shape[0]
-        data, values = (draw.random(some, dtype=np.float32) for some in (counts[::-1], (1, *shape)))
+        data, values = (
+            draw.random(some, dtype=np.float32) for some in (counts[::-1], (1, *shape))
+        )
         case = replace(case, rows=rows, shape=shape, data=data, values=values)
         start, end = ray_ends(rows, shape)
         way = np.abs((end - start) / case.voxel_mm)
@@ -203,7 +232,9 @@ def lanes_beyond_the_detector_write_nothing(draw: Draw) -> None:
     rays = voxel_rays(view, layout, shape)
     assert gpu.by_slabs(box_of(layout), rays, shape).all()
     room = gpu.upload(np.full(15 + 200, 7, np.float32))
-    gpu.launcher(box_of(layout), gpu.upload(layout.flat), rays, room, shape, transposed=False)()
+    gpu.launcher(
+        box_of(layout), gpu.upload(layout.flat), rays, room, shape, transposed=False
+    )()
     images = room.copy_to_host()
     assert (images[15:] == 7).all()
     assert (images[:15] != 7).all()
@@ -228,7 +259,9 @@ def a_ray_in_a_plane_belongs_above_or_below_where_it_moves_down(draw: Draw) -> N
 def integers_of_a_deterministic_sum_stay_below_2_to_the_62(draw: Draw) -> None:
     box = box_of(Volume(np.ones((2, 2, 2), np.float32), (0.3, 2.0, 0.7)).layout)
     for size in (1, 7, 4000):
-        values = (10 ** draw.uniform(-20, 20) * draw.uniform(-1, 1, size)).astype(np.float32)
+        values = (10 ** draw.uniform(-20, 20) * draw.uniform(-1, 1, size)).astype(
+            np.float32
+        )
         factor = gpu.whole_factor(box, values)
         assert math.frexp(factor)[0] == 0.5
         most = float(np.abs(values).max()) * math.hypot(0.3, 2.0, 0.7) * size

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
+from flexdt.protocol import (
+    METHODS,
+    Codec,
+    Connection,
+    Message,
+    Prepared,
+    RpcError,
+    parse_params,
+)
 from flexdt.protocol.messages import Encoded
 from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.wire_errors import ProjectorUnavailable
@@ -54,7 +62,9 @@ class PointProjector:
     async def remove(self, name: str) -> None:
         self.names.remove(name)
 
-    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    async def project(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
+    ) -> Float32Array:
         assert name in self.names
         if self.down:
             raise ProjectorUnavailable("no projector at test")
@@ -67,8 +77,13 @@ class PointProjector:
         out = np.zeros((len(cone_vec), *shape), dtype=np.float32)
         spots = cone_vec.project_points(self.POINT, shape)[:, 0]
         for frame, (column, row) in zip(out, spots, strict=True):
-            c, r = int(np.clip(column, 0, shape[1] - 1)), int(np.clip(row, 0, shape[0] - 1))
-            frame[r, c] = 1.0 + (column % 1.0) + (row % 1.0)  # the sub-pixel place shows too
+            c, r = (
+                int(np.clip(column, 0, shape[1] - 1)),
+                int(np.clip(row, 0, shape[0] - 1)),
+            )
+            frame[r, c] = (
+                1.0 + (column % 1.0) + (row % 1.0)
+            )  # the sub-pixel place shows too
         return out
 
 
@@ -146,7 +161,11 @@ class Lab:
 
 
 def run(
-    root: Path, body: Callable[[Lab], Awaitable[None]], *, virtual: bool = False, **options: Any
+    root: Path,
+    body: Callable[[Lab], Awaitable[None]],
+    *,
+    virtual: bool = False,
+    **options: Any,
 ) -> None:
     """Run `body` with a lab of its own.
 
@@ -190,5 +209,6 @@ def script(frames: int = 9, speed: float = 22.5, exposure: float = 2000.0) -> st
 
 def digest(folder: Path) -> dict[str, str]:
     return {
-        f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in sorted(folder.glob("*.tif"))
+        f.name: hashlib.sha256(f.read_bytes()).hexdigest()
+        for f in sorted(folder.glob("*.tif"))
     }

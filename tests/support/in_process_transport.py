@@ -20,7 +20,9 @@ class InProcessTransport:
     """
 
     def __init__(
-        self, handler: Callable[[Message], Iterable[Message]], codec: Codec = Codec.MSGPACK
+        self,
+        handler: Callable[[Message], Iterable[Message]],
+        codec: Codec = Codec.MSGPACK,
     ) -> None:
         self.handler, self.codec = handler, codec
         self.opened = 0

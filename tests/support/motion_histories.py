@@ -1,9 +1,9 @@
 """Long histories of one small request, and a search for the worst one, on machines drawn anew.
 
-Each step of a history may keep its contract while the sequence does not. What is watched here is
-the gap that a pair had when it came near, and what all steps together took from it. The judge is
-`motion_oracle`: its own reading of the machine file, kinematics and distances. `dense_moves`
-compares what the scanner accepts with a dense sweep of profiles worked out here.
+Each step of a history may keep its contract while the sequence does not. What is watched here
+is the gap that a pair had when it came near, and what all steps together took from it. The
+judge is `motion_oracle`: its own reading of the machine file, kinematics and distances.
+`dense_moves` compares what the scanner accepts with a dense sweep of profiles worked out here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from flexdt.twin.collision.convex_solids import hull
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import CollisionError, TwinError
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.machine.description import Machine, Profile, builtin_profile, parse_machine
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_profile,
+    parse_machine,
+)
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
@@ -51,7 +56,9 @@ def drawn_machine(rng: Rng) -> str:
         gear = 1.0
         if motor not in ("m0", "m1"):
             gear = float(rng.choice([1.0, 1e-3]))
-            for quantity in rng.choice(quantities, int(rng.integers(1, 4)), replace=False).tolist():
+            for quantity in rng.choice(
+                quantities, int(rng.integers(1, 4)), replace=False
+            ).tolist():
                 shares[quantity][motor] = gear * float(rng.choice([-1.0, -0.5, 0.3, 1.0]))
         elif rng.random() < 0.4:  # at a slant
             shares[str(rng.choice(["object_x", "detector_z"]))][motor] = 0.2
@@ -72,7 +79,8 @@ def drawn_machine(rng: Rng) -> str:
         hard = round(speed * float(rng.uniform(0.5, 4.0)), 4)
         text += (
             f'[axes.{motor}]\nkind = "{"rotation" if motor == "turn" else "linear"}"\n'
-            f"lower = {-wide}\nupper = {wide}\nhome = 0.0\nspeed = {speed}\nmax_speed = {speed}\n"
+            f"lower = {-wide}\nupper = {wide}\nhome = 0.0\nspeed = {speed}\nmax_speed = "
+            f"{speed}\n"
             f"acceleration = {hard}\nmax_acceleration = {hard}\n"
         )
     text += "[geometry]\nangle = { turn = 1.0 }\n"
@@ -82,7 +90,9 @@ def drawn_machine(rng: Rng) -> str:
     for anchor, part, role in (("source", "tube", "tube"), ("object", "table", "sample_holder"),
                                ("detector", "panel", "panel")):  # fmt: skip
         parent = ""
-        carried_by = sorted({m for q in quantities if q.startswith(anchor) for m in shares[q]})
+        carried_by = sorted(
+            {m for q in quantities if q.startswith(anchor) for m in shares[q]}
+        )
         for motor in [*carried_by, *(["turn"] if anchor == "object" else [])]:
             text += (
                 f'[[components]]\nname = "{anchor}_{motor}"\nparent = "{parent}"\n'
@@ -92,7 +102,11 @@ def drawn_machine(rng: Rng) -> str:
             parent = f"{anchor}_{motor}"
         size, centre, shape = {
             "tube": ([150.0, 100.0, 150.0], [0.0, -50.0, 0.0], "box"),
-            "table": ([80.0, 80.0, 40.0], [0.0, 0.0, -60.0], str(rng.choice(["box", "cylinder"]))),
+            "table": (
+                [80.0, 80.0, 40.0],
+                [0.0, 0.0, -60.0],
+                str(rng.choice(["box", "cylinder"])),
+            ),
             "panel": ([200.0, 40.0, 240.0], [0.0, 20.0, 0.0], "box"),
         }[part]
         text += (
@@ -100,7 +114,9 @@ def drawn_machine(rng: Rng) -> str:
             f'shape = "{shape}"\nrole = "{role}"\nsize_mm = {size}\ncenter_mm = {centre}\n'
         )
     # The dots that carry the motors of one part may meet those of another: they are far below.
-    names = [line.split('"')[1] for line in text.splitlines() if line.startswith('name = "')][1:]
+    names = [
+        line.split('"')[1] for line in text.splitlines() if line.startswith('name = "')
+    ][1:]
     dots = [n for n in names if n not in ("tube", "table", "panel")]
     contacts = [[a, b] for i, a in enumerate(dots) for b in dots[i + 1 :]]
     return text.replace("allowed_contacts = []", f"allowed_contacts = {contacts}")
@@ -126,7 +142,8 @@ class Judge:
 
     Attributes:
         margin: the machine's [mm].
-        loss: the most that any pair lost of the largest gap it had since it came within the margin.
+        loss: the most that any pair lost of the largest gap it had since it came within the
+            margin.
         least: the least gap of pairs that were free, above the margin [mm].
         found: violations, in words.
     """
@@ -200,7 +217,10 @@ class Subject:
         s.place(positions, self.now)
         put = _correction(self.correction)
         s.initialise_stage(
-            self._value(self.which)[0], put, self._guard(self.which, self.correction), self.now
+            self._value(self.which)[0],
+            put,
+            self._guard(self.which, self.correction),
+            self.now,
         )
         return s
 
@@ -210,7 +230,9 @@ class Subject:
         if key not in self.stages:
             if len(self.stages) > 20:
                 self.stages.clear()
-            self.stages[key] = Stage(self.model, Placed(*self.samples[self.which]), self.correction)
+            self.stages[key] = Stage(
+                self.model, Placed(*self.samples[self.which]), self.correction
+            )
         return self.stages[key]
 
     def least(self) -> float:
@@ -222,7 +244,9 @@ class Subject:
         state = self.scanner.state(self.now).safety.state
         self.judge.look(self.stage, pose, state, what, forget=forget)
 
-    def do(self, what: str, ask: Callable[[ScannerTwin], object], *, rest: bool = True) -> bool:
+    def do(
+        self, what: str, ask: Callable[[ScannerTwin], object], *, rest: bool = True
+    ) -> bool:
         """One request, then rest; whether it was accepted."""
         accepted = True
         try:
@@ -241,12 +265,16 @@ class Subject:
         def ask(s: ScannerTwin) -> None:
             guard = self._guard(which, correction)
             value, put = self._value(which)[0], _correction(correction)
-            s.take_stage(s.stage_change(value, put, guard, self.now).certified(), self.now)
+            s.take_stage(
+                s.stage_change(value, put, guard, self.now).certified(), self.now
+            )
 
         accepted = self.do("change", ask, rest=False)
         if accepted:
             if which != self.which:  # another body has no history
-                self.judge.peaks = {p: g for p, g in self.judge.peaks.items() if "sample" not in p}
+                self.judge.peaks = {
+                    p: g for p, g in self.judge.peaks.items() if "sample" not in p
+                }
             self.which, self.correction = which, correction
             self._look("change")
         return accepted
@@ -271,7 +299,9 @@ class Subject:
             self.change(int(self.rng.integers(3)), {})
         for _ in range(20):
             pose = self.draw_pose()
-            if self.rng.random() < 0.6:  # the two that lead along the beam, towards each other
+            if (
+                self.rng.random() < 0.6
+            ):  # the two that lead along the beam, towards each other
                 some = [str(self.rng.choice(self.model.motors[:2]))]
             else:
                 some = self.rng.choice(list(pose), 2, replace=False).tolist()
@@ -289,7 +319,9 @@ class Subject:
             pose = dict(here)
             motor = str(self.rng.choice(self.model.motors[:2]))
             i = self.model.motors.index(motor)
-            pose[motor] = float(self.rng.uniform(self.model.lower[i], self.model.upper[i]))
+            pose[motor] = float(
+                self.rng.uniform(self.model.lower[i], self.model.upper[i])
+            )
             if 0.0 < self.stage.least(pose)[0] < self.model.margin:
                 self.scanner = self._fresh(pose)
                 self._look("enter", forget=True)
@@ -303,7 +335,8 @@ class Subject:
 
         def move(axis: str, step: float) -> Callable[[], bool]:
             return lambda: self.do(
-                f"move {axis} {step:.3g}", lambda s: s.move({axis: step}, self.now, relative=True)
+                f"move {axis} {step:.3g}",
+                lambda s: s.move({axis: step}, self.now, relative=True),
             )
 
         def jog(axis: str, speed: float, lease: float) -> Callable[[], bool]:
@@ -315,7 +348,9 @@ class Subject:
             def ask() -> bool:
                 name = f"{verb} in move {axis} {step:.3g}"
                 accepted = self.do(
-                    name, lambda s: s.move({axis: step}, self.now, relative=True), rest=False
+                    name,
+                    lambda s: s.move({axis: step}, self.now, relative=True),
+                    rest=False,
                 )
                 end = self.scanner.rest_time(self.now)
                 self.now += part * max(end - self.now, 0.0)
@@ -349,13 +384,22 @@ class Subject:
             for sign in (-1.0, 1.0):
                 step = sign * float(10.0 ** rng.uniform(-6.0, -1.0)) / min(per, 1.0)
                 out.append((f"move {axis} {step:.2g}", move(axis, step)))
-                speed = sign * float(m.fastest[i]) * float(10.0 ** rng.uniform(-5.0, -1.0))
+                speed = (
+                    sign * float(m.fastest[i]) * float(10.0 ** rng.uniform(-5.0, -1.0))
+                )
                 out.append(
-                    (f"jog {axis} {speed:.2g}", jog(axis, speed, float(rng.uniform(0.01, 0.2))))
+                    (
+                        f"jog {axis} {speed:.2g}",
+                        jog(axis, speed, float(rng.uniform(0.01, 0.2))),
+                    )
                 )
             verb = str(rng.choice(["stop", "estop"]))
-            step = float(rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-3.0, 0.0)) / min(per, 1.0)
-            out.append((f"{verb} {axis}", halted(axis, step, float(rng.uniform(0.1, 0.9)), verb)))
+            step = float(rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-3.0, 0.0)) / min(
+                per, 1.0
+            )
+            out.append(
+                (f"{verb} {axis}", halted(axis, step, float(rng.uniform(0.1, 0.9)), verb))
+            )
         for name in rng.choice(["dO_x", "dO_y", "dO_z", "dD_x", "dD_z", "alpha", "tau_x"], 2,
                                replace=False).tolist():  # fmt: skip
             size = float(rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-5.0, -1.5))
@@ -366,7 +410,9 @@ class Subject:
 
 def _correction(values: Mapping[str, float]) -> NamedCorrection | None:
     return (
-        NamedCorrection("drawn", "2026-01-01", Offsets.from_edge(dict(values))) if values else None
+        NamedCorrection("drawn", "2026-01-01", Offsets.from_edge(dict(values)))
+        if values
+        else None
     )
 
 
@@ -386,8 +432,8 @@ def run_histories(rng: Rng, runs: int, repeats: int) -> Outcome:
     """Long runs on one drawn machine, each of the arm that took most from the gap when tried.
 
     A bandit: every arm is tried a few times where parts have just come near, the one with the
-    greatest reward (gap taken, or the published state's distance from the oracle's) is repeated,
-    with others of its kind in between; blocked states are reset as a person would.
+    greatest reward (gap taken, or the published state's distance from the oracle's) is
+    repeated, with others of its kind in between; blocked states are reset as a person would.
     """
     subject = Subject(rng)
     accepted = made = 0
@@ -431,7 +477,9 @@ def _release(subject: Subject) -> None:
 
 def _outcome(subject: Subject, made: int, accepted: int) -> Outcome:
     judge = subject.judge
-    return Outcome(subject.requests, made, accepted, judge.loss, judge.least, judge.found[:1])
+    return Outcome(
+        subject.requests, made, accepted, judge.loss, judge.least, judge.found[:1]
+    )
 
 
 # What is safe must be allowed --------------------------------------------------------------------
@@ -485,7 +533,11 @@ def densest(stage: Stage, model: MachineModel, here: Mapping[str, float],
         gaps = pair.distances(poses)
         near = gaps < model.margin + CLEAR_MM + hidden
         away = int(np.argmin(near)) if not near.all() else len(gaps) - 1
-        if near[0] and not near[away:-1].any() and bool(np.all(np.diff(gaps[: away + 1]) >= 0.0)):
+        if (
+            near[0]
+            and not near[away:-1].any()
+            and bool(np.all(np.diff(gaps[: away + 1]) >= 0.0))
+        ):
             continue
         k = int(np.argmin(gaps))
         if gaps[k] < least:
@@ -512,16 +564,22 @@ def dense_moves(rng: Rng, moves: int) -> Verdicts:
         if number % 3 == 0:
             subject.approach()
             for _ in range(int(rng.integers(20))):  # worn: small steps, some nearer
-                axis, step = str(rng.choice(subject.model.motors)), float(rng.normal(0.0, 2e-3))
+                axis, step = (
+                    str(rng.choice(subject.model.motors)),
+                    float(rng.normal(0.0, 2e-3)),
+                )
                 subject.do(
-                    "wear", lambda s, a=axis, x=step: s.move({a: x}, subject.now, relative=True)
+                    "wear",
+                    lambda s, a=axis, x=step: s.move({a: x}, subject.now, relative=True),
                 )
         s = subject.scanner
         if s.safety.state != "ready":
             s.reset(subject.now)
         here = s.positions(subject.now)
         pose = subject.draw_pose()
-        names = rng.choice(list(pose), int(rng.integers(1, len(pose) + 1)), replace=False).tolist()
+        names = rng.choice(
+            list(pose), int(rng.integers(1, len(pose) + 1)), replace=False
+        ).tolist()
         part = float(rng.choice([1.0, rng.uniform(0.0, 0.3)]))
         targets = {m: here[m] + part * (pose[m] - here[m]) for m in names}
         least, doubt = densest(subject.stage, subject.model, here, targets)

@@ -1,12 +1,13 @@
 """What the motion that a scanner published did: contacts, limits, speeds, accelerations.
 
-It shares no code with the guard that it watches. It reads the machine file itself (tomllib), builds
-its own forward kinematics, recovers the motion from positions and velocities asked of the scanner
-(`recover`), and measures distances between the exact shapes: closed forms for upright boxes, prisms
-and cylinders, python-fcl for what is tilted, with a second opinion before anything is reported.
+It shares no code with the guard that it watches. It reads the machine file itself (tomllib),
+builds its own forward kinematics, recovers the motion from positions and velocities asked of
+the scanner (`recover`), and measures distances between the exact shapes: closed forms for
+upright boxes, prisms and cylinders, python-fcl for what is tilted, with a second opinion before
+anything is reported.
 
-mm, deg and s throughout; angles turn clockwise seen from above. A pose is a row of an array, its
-columns are the machine's motors in the order of the file.
+mm, deg and s throughout; angles turn clockwise seen from above. A pose is a row of an array,
+its columns are the machine's motors in the order of the file.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ class Prism:
     radius: float = 0.0
 
     @classmethod
-    def box(cls, size: Sequence[float], centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Prism:
+    def box(
+        cls, size: Sequence[float], centre: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Prism:
         (x, y, z), (a, b, c) = centre, (0.5 * s for s in size)
         corners = [(x - a, y - b), (x + a, y - b), (x + a, y + b), (x - a, y + b)]
         return cls(z - c, z + c, np.array(corners))
@@ -97,13 +100,17 @@ class Prism:
         return Prism(self.low + z, self.high + z, self.outline + [x, y])
 
     def corners(self, ring: int = 360) -> Array:
-        """All corners; a disc is given by a polygon around it (outside, by 4e-5 of its radius)."""
+        """All corners; a disc is given by a polygon around it (outside, by 4e-5 of its
+        radius)."""
         outline = self.outline
         if outline is None:
             angles = 2.0 * np.pi * np.arange(ring) / ring
             around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
             outline = self.radius / math.cos(math.pi / ring) * around + self.centre
-        flat = [np.column_stack([outline, np.full(len(outline), z)]) for z in (self.low, self.high)]
+        flat = [
+            np.column_stack([outline, np.full(len(outline), z)])
+            for z in (self.low, self.high)
+        ]
         return np.concatenate(flat)
 
 
@@ -143,8 +150,8 @@ class Placed:
 
     Attributes:
         shape: centred as the phantom is; None is an empty stage.
-        offset: x, y, z [mm], rx, ry, rz [deg]: turned about x, then y, then z (right-handed), then
-            shifted.
+        offset: x, y, z [mm], rx, ry, rz [deg]: turned about x, then y, then z (right-handed),
+            then shifted.
     """
 
     shape: Prism | None = None
@@ -216,7 +223,11 @@ class MachineModel:
 
     def moves(self, axis: str) -> dict[str, float]:
         """Motor -> its share of `axis`."""
-        return {axis: 1.0} if axis in self.data["axes"] else dict(self.virtual[axis]["moves"])
+        return (
+            {axis: 1.0}
+            if axis in self.data["axes"]
+            else dict(self.virtual[axis]["moves"])
+        )
 
     def _lineage(self, part: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
         out = []
@@ -229,7 +240,10 @@ class MachineModel:
         """Change of a quantity of [geometry] per unit of each motor."""
         factors = self.data["geometry"].get(name, {})
         return np.array(
-            [factors.get(m, 0.0) if only is None or m in only else 0.0 for m in self.motors]
+            [
+                factors.get(m, 0.0) if only is None or m in only else 0.0
+                for m in self.motors
+            ]
         )
 
     def _offset(self, quantity: str, correction: Mapping[str, float]) -> float:
@@ -260,7 +274,9 @@ class MachineModel:
     def bodies(self, sample: Placed, correction: Mapping[str, float]) -> list[Body]:
         """Every part, and the sample."""
         out = [self._part(part, correction) for part in self._parts.values()]
-        holder = next((p for p in self._parts.values() if p.get("role") == "sample_holder"), None)
+        holder = next(
+            (p for p in self._parts.values() if p.get("role") == "sample_holder"), None
+        )
         if sample.shape is not None and holder is not None:
             out.append(self._sample(sample, holder, correction))
         return out
@@ -275,9 +291,11 @@ class MachineModel:
     def _part(self, part: Mapping[str, Any], correction: Mapping[str, float]) -> Body:
         motors, group = self._mounting(part)
         anchor = part.get("anchor", "world")
-        slides = np.stack([self._quantity(f"{anchor}_{k}", motors) for k in "xyz"], axis=1)
-        # What stands for the focal spot, the active area or the sample's holder goes with the X-ray
-        # geometry; other parts go where their motors move them.
+        slides = np.stack(
+            [self._quantity(f"{anchor}_{k}", motors) for k in "xyz"], axis=1
+        )
+        # What stands for the focal spot, the active area or the sample's holder goes with the
+        # X-ray geometry; other parts go where their motors move them.
         goes = bool(part.get("role"))
         origin = np.array(
             [
@@ -288,7 +306,9 @@ class MachineModel:
             ]
         )
         turns = (
-            self._quantity("angle", motors) if anchor == "object" else np.zeros(len(self.motors))
+            self._quantity("angle", motors)
+            if anchor == "object"
+            else np.zeros(len(self.motors))
         )
         size, centre = part["size_mm"], part["center_mm"]
         shape: Shape
@@ -301,16 +321,30 @@ class MachineModel:
             if not np.array_equal(turn, np.eye(3)):
                 shape = Hull(shape.corners() @ turn.T)
         up = np.array([0.0, 0.0, 1.0])
-        return Body(part["name"], group, shape, origin, slides, turns, up, isinstance(shape, Prism))
+        return Body(
+            part["name"],
+            group,
+            shape,
+            origin,
+            slides,
+            turns,
+            up,
+            isinstance(shape, Prism),
+        )
 
     def _panel_turn(self, correction: Mapping[str, float]) -> Array:
-        """Roll of the profile, then yaw about the rows' direction, pitch, roll about the normal."""
+        """Roll of the profile, then yaw about the rows' direction, pitch, roll about the
+        normal."""
         u, v = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
         roll = float(self.profile.get("det_roll_deg", 0.0))
-        yaw, pitch, more = (correction.get(f"det_{k}", 0.0) for k in ("yaw", "pitch", "roll"))
+        yaw, pitch, more = (
+            correction.get(f"det_{k}", 0.0) for k in ("yaw", "pitch", "roll")
+        )
         turn = np.eye(3)
         for which, angle in (("n", roll), ("v", yaw), ("u", pitch), ("n", more)):
-            about = {"u": turn @ u, "v": turn @ v, "n": np.cross(turn @ u, turn @ v)}[which]
+            about = {"u": turn @ u, "v": turn @ v, "n": np.cross(turn @ u, turn @ v)}[
+                which
+            ]
             if angle:
                 turn = _turn(about, angle) @ turn
         return turn
@@ -326,11 +360,13 @@ class MachineModel:
         origin[2] += float(self.data.get("sample_height_mm", 0.0))
         turns = self._quantity("angle", motors) * correction.get("angle_scale", 1.0)
         tau = np.array([correction.get("tau_x", 0.0), correction.get("tau_z", 0.0), 0.0])
-        tilt = _turn(np.array([0.0, 1.0, 0.0]), correction.get("axis_tilt_z", 0.0)) @ _turn(
-            np.array([1.0, 0.0, 0.0]), correction.get("axis_tilt_x", 0.0)
-        )
+        tilt = _turn(
+            np.array([0.0, 1.0, 0.0]), correction.get("axis_tilt_z", 0.0)
+        ) @ _turn(np.array([1.0, 0.0, 0.0]), correction.get("axis_tilt_x", 0.0))
         alpha = -correction.get("alpha", 0.0)
-        o = {k: float(sample.offset.get(k, 0.0)) for k in ("x", "y", "z", "rx", "ry", "rz")}
+        o = {
+            k: float(sample.offset.get(k, 0.0)) for k in ("x", "y", "z", "rx", "ry", "rz")
+        }
         up = np.array([0.0, 0.0, 1.0])
         level = np.array_equal(tilt, np.eye(3))
         if level and o["rx"] == 0.0 and o["ry"] == 0.0:
@@ -345,7 +381,9 @@ class MachineModel:
         put = _turn(z, o["rz"]) @ _turn(y, o["ry"]) @ _turn(x, o["rx"])
         points = sample.shape.corners(64) @ put.T + [o["x"], o["y"], o["z"]]
         points = (points - tau) @ (tilt @ _turn(up, alpha)).T
-        return Body("sample", group, Hull(points), origin, slides, turns, tilt @ up, False)
+        return Body(
+            "sample", group, Hull(points), origin, slides, turns, tilt @ up, False
+        )
 
 
 def _turn(axis: Array, degrees: float) -> Array:
@@ -392,9 +430,15 @@ class PairModel:
 
     @cached_property
     def _extent(self) -> tuple[Array, Array, Array, Array]:
-        """For two plain boxes: slides, origin, and the places at which they begin to overlap."""
+        """For two plain boxes: slides, origin, and the places at which they begin to
+        overlap."""
         (a0, a1), (b0, b1) = self.a.shape.bounds, self.b.shape.bounds
-        return self.a.slides - self.b.slides, self.a.origin - self.b.origin, b1 - a0, a1 - b0
+        return (
+            self.a.slides - self.b.slides,
+            self.a.origin - self.b.origin,
+            b1 - a0,
+            a1 - b0,
+        )
 
     def distances(self, poses: Array) -> Array:
         """(n,): below zero where they overlap (how deep, for upright bodies; else -1)."""
@@ -416,7 +460,8 @@ class PairModel:
         dz = np.maximum(at_a[:, 2] + a.low - at_b[:, 2] - b.high,
                         at_b[:, 2] + b.low - at_a[:, 2] - a.high)  # fmt: skip
         flat = _flat(
-            _laid(a, at_a[:, :2], poses @ self.a.turns), _laid(b, at_b[:, :2], poses @ self.b.turns)
+            _laid(a, at_a[:, :2], poses @ self.a.turns),
+            _laid(b, at_b[:, :2], poses @ self.b.turns),
         )
         apart = np.hypot(np.maximum(dz, 0.0), np.maximum(flat, 0.0))
         return np.where(apart > 0.0, apart, np.maximum(dz, flat))
@@ -433,22 +478,30 @@ class PairModel:
         made = []
         for (shape, shift), body in zip(self._fcl, (self.a, self.b), strict=True):
             turn, at = self._frame(body, pose)
-            made.append(fcl.CollisionObject(shape, fcl.Transform(turn, at + turn @ shift)))
+            made.append(
+                fcl.CollisionObject(shape, fcl.Transform(turn, at + turn @ shift))
+            )
         found = fcl.distance(*made, fcl.DistanceRequest(), fcl.DistanceResult())
         return float(found) if found > 0.0 else -1.0
 
     def second_opinion(self, pose: Array) -> float:
-        """The same distance by another method: the nearest points of two hulls, by projection."""
+        """The same distance by another method: the nearest points of two hulls, by
+        projection."""
         points = []
         for body in (self.a, self.b):
             turn, at = self._frame(body, pose)
-            corners = body.shape.points if isinstance(body.shape, Hull) else body.shape.corners()
+            corners = (
+                body.shape.points
+                if isinstance(body.shape, Hull)
+                else body.shape.corners()
+            )
             points.append(corners @ turn.T + at)
         return hull_distance(*points)
 
 
 def hull_distance(a: Array, b: Array) -> float:
-    """Distance of two convex hulls (0 where they overlap), by Wolfe's least-norm point of a - b."""
+    """Distance of two convex hulls (0 where they overlap), by Wolfe's least-norm point of a -
+    b."""
     direction = a.mean(axis=0) - b.mean(axis=0)
     simplex: list[Array] = []
 
@@ -466,13 +519,19 @@ def hull_distance(a: Array, b: Array) -> float:
         weights = np.append(weights, 0.0)
         while True:
             s = np.array(simplex)
-            gram = np.block([[s @ s.T, np.ones((len(s), 1))], [np.ones((1, len(s))), 0.0]])
-            affine = np.linalg.lstsq(gram, np.append(np.zeros(len(s)), 1.0), rcond=None)[0][:-1]
+            gram = np.block(
+                [[s @ s.T, np.ones((len(s), 1))], [np.ones((1, len(s))), 0.0]]
+            )
+            affine = np.linalg.lstsq(gram, np.append(np.zeros(len(s)), 1.0), rcond=None)[
+                0
+            ][:-1]
             if (affine > 1e-12).all():
                 weights = affine
                 break
             falling = affine < 1e-12
-            ratios = np.where(falling, weights / np.maximum(weights - affine, 1e-300), 1.0)
+            ratios = np.where(
+                falling, weights / np.maximum(weights - affine, 1e-300), 1.0
+            )
             weights = weights + min(1.0, ratios.min()) * (affine - weights)
             keep = weights > 1e-12
             if keep.all():
@@ -545,7 +604,10 @@ def _heights(ring: Array, points: Array) -> Array:
     edge = np.concatenate([ring[:, 1:], ring[:, :1]], axis=1) - ring
     out = np.stack([edge[..., 1], -edge[..., 0]], axis=2)
     out = out / np.sqrt((out * out).sum(axis=2, keepdims=True))
-    gap = np.einsum("nek,npk->nep", out, points) - np.einsum("nek,nek->ne", out, ring)[:, :, None]
+    gap = (
+        np.einsum("nek,npk->nep", out, points)
+        - np.einsum("nek,nek->ne", out, ring)[:, :, None]
+    )
     return np.asarray(gap)
 
 
@@ -553,13 +615,17 @@ def _to_edges(points: Array, ring: Array) -> Array:
     """Least distance of any of (n, p, 2) points from any edge of (n, k, 2) rings."""
     edge = np.concatenate([ring[:, 1:], ring[:, :1]], axis=1) - ring
     way = points[:, :, None, :] - ring[:, None, :, :]
-    share = np.einsum("npek,nek->npe", way, edge) / np.einsum("nek,nek->ne", edge, edge)[:, None]
+    share = (
+        np.einsum("npek,nek->npe", way, edge)
+        / np.einsum("nek,nek->ne", edge, edge)[:, None]
+    )
     foot = way - np.clip(share, 0.0, 1.0)[..., None] * edge[:, None]
     return np.asarray(np.sqrt(np.einsum("npek,npek->npe", foot, foot)).min(axis=(1, 2)))
 
 
 def interval_gaps(place: Array, below: Array, above: Array) -> Array:
-    """Clearances (...) of boxes at relative places (..., 3); negative by how far they overlap."""
+    """Clearances (...) of boxes at relative places (..., 3); negative by how far they
+    overlap."""
     gap = np.maximum(place - below, -place - above)
     out = np.maximum(gap, 0.0)
     apart = np.sqrt((out * out).sum(axis=-1))
@@ -588,14 +654,21 @@ class Stage:
         if not self.pairs:
             return
         boxes = {id(b): _box_of(b) for b in bodies}
-        self._slides = np.array([p.a.slides - p.b.slides for p in self.pairs])  # (p, axes, 3)
+        self._slides = np.array(
+            [p.a.slides - p.b.slides for p in self.pairs]
+        )  # (p, axes, 3)
         self._origin = np.array([p.a.origin - p.b.origin for p in self.pairs])
-        self._below = np.array([boxes[id(p.b)][1] - boxes[id(p.a)][0] for p in self.pairs])
-        self._above = np.array([boxes[id(p.a)][1] - boxes[id(p.b)][0] for p in self.pairs])
+        self._below = np.array(
+            [boxes[id(p.b)][1] - boxes[id(p.a)][0] for p in self.pairs]
+        )
+        self._above = np.array(
+            [boxes[id(p.a)][1] - boxes[id(p.b)][0] for p in self.pairs]
+        )
         self._plain = np.array([p.plain for p in self.pairs])
 
     def boxes_apart(self, low: Array, high: Array) -> Array:
-        """Lower bounds (n, pairs) of clearances, from ranges (n, pairs, 3) of relative places."""
+        """Lower bounds (n, pairs) of clearances, from ranges (n, pairs, 3) of relative
+        places."""
         gap = np.maximum(np.maximum(low - self._below, -high - self._above), 0.0)
         return np.asarray(np.sqrt((gap * gap).sum(axis=2)))
 
@@ -673,8 +746,8 @@ def recover(
 ) -> Motion:
     """The motion between two times, from what the scanner says of single moments.
 
-    A stretch counts as a parabola when positions and velocities in its middle and at its end are
-    those of one; else it is halved, until it is KNOT_S long.
+    A stretch counts as a parabola when positions and velocities in its middle and at its end
+    are those of one; else it is halved, until it is KNOT_S long.
     """
 
     hardest = machine.hardest
@@ -699,7 +772,9 @@ def recover(
         parabola = (
             (np.abs(middle[1] - x0 - 0.5 * h * (v0 + 0.25 * h * a)) < slack).all()
             and (np.abs(x1 - x0 - 0.5 * h * (v0 + v1)) < slack).all()
-            and (np.abs(middle[2] - 0.5 * (v0 + v1)) < 1e-6 + 8.0 * math.ulp(t1) * hardest).all()
+            and (
+                np.abs(middle[2] - 0.5 * (v0 + v1)) < 1e-6 + 8.0 * math.ulp(t1) * hardest
+            ).all()
         )
         if parabola or h <= KNOT_S:
             rows.append((t0, h, x0, v0, a, x1, v1, not parabola))
@@ -713,7 +788,8 @@ class Violation:
     """Something that must not be.
 
     Attributes:
-        kind: contact, margin, limit, speed, acceleration, jump, state, changed, coupling, unrest.
+        kind: contact, margin, limit, speed, acceleration, jump, state, changed, coupling,
+            unrest.
         time: when [s].
         what: a pair, or a motor, with figures.
         amount: by how much.
@@ -733,7 +809,8 @@ class Watch:
 
     Args:
         stage: what stands there at first.
-        reading: where the motors are, so that what begins too near may stay, but not come nearer.
+        reading: where the motors are, so that what begins too near may stay, but not come
+            nearer.
     """
 
     def __init__(self, stage: Stage, reading: Reading) -> None:
@@ -745,11 +822,13 @@ class Watch:
     def put(self, stage: Stage, reading: Reading, *, anew: bool = True) -> None:
         """Another stage from now on; pairs that are too near there may be so (see `begun`).
 
-        With `anew` false it is the same parts that stand a little elsewhere, and what they may not
-        fall below stays.
+        With `anew` false it is the same parts that stand a little elsewhere, and what they may
+        not fall below stays.
         """
         kept = (
-            {} if anew else dict(zip((p.names for p in self.stage.pairs), self._floor, strict=True))
+            {}
+            if anew
+            else dict(zip((p.names for p in self.stage.pairs), self._floor, strict=True))
         )
         self.stage = stage
         self.machine = stage.machine
@@ -761,7 +840,8 @@ class Watch:
         self._last = None
 
     def begun(self, reading: Reading) -> None:
-        """A command was given: what is too near now may not come nearer; what is free must stay."""
+        """A command was given: what is too near now may not come nearer; what is free must
+        stay."""
         clear = self.stage.clearances(self.machine.vector(reading))
         free = self.machine.margin - ALLOWED_MM
         self._floor = np.maximum(self._floor, np.minimum(free, clear - ALLOWED_MM))
@@ -773,7 +853,9 @@ class Watch:
         clear = self.stage.clearances(pose)
         pairs = [self.stage.pairs[i] for i in np.flatnonzero(clear < near).tolist()]
         return [
-            p.names for p in pairs if (p.a.upright and p.b.upright) or p.second_opinion(pose) < near
+            p.names
+            for p in pairs
+            if (p.a.upright and p.b.upright) or p.second_opinion(pose) < near
         ]
 
     def look(
@@ -789,7 +871,8 @@ class Watch:
         Args:
             positions, velocities: the scanner's, at any time.
             start, end: [s]; no command came in between.
-            accelerations: motor -> the most its programme may use; the machine's where left out.
+            accelerations: motor -> the most its programme may use; the machine's where left
+                out.
         """
         if not end > start:
             return []
@@ -820,7 +903,9 @@ class Watch:
         """Limits of travel, speed and acceleration, and jumps."""
         machine, out = self.machine, []
 
-        def report(kind: str, over: Array, value: Array, allowed: Array, slack: float) -> None:
+        def report(
+            kind: str, over: Array, value: Array, allowed: Array, slack: float
+        ) -> None:
             excess = over.max(axis=0)
             for j in np.flatnonzero(excess > slack * (1.0 + np.abs(allowed))).tolist():
                 i = int(np.argmax(over[:, j]))
@@ -833,8 +918,15 @@ class Watch:
         report("limit", machine.lower - low - off, low, machine.lower, 1e-7)
         report("limit", high - machine.upper - off, high, machine.upper, 1e-7)
         top = np.maximum(np.abs(m.v), np.abs(m.v_end))
-        report("speed", top - machine.fastest - tick * machine.hardest, top, machine.fastest, 1e-7)
-        # A stretch too short for a parabola: its mean acceleration bounds nothing, its mean is one.
+        report(
+            "speed",
+            top - machine.fastest - tick * machine.hardest,
+            top,
+            machine.fastest,
+            1e-7,
+        )
+        # A stretch too short for a parabola: its mean acceleration bounds nothing, its mean is
+        # one.
         a = np.abs(m.a)
         h = m.lengths[:, None]
         slack = 1e-6 + tick * machine.hardest / h
@@ -877,14 +969,18 @@ class Watch:
                     continue
             kind = "contact" if depth <= 0.0 else "margin"
             reading = ", ".join(
-                f"{k} {x:.4f}" for k, x in zip(self.machine.motors, pose.tolist(), strict=True)
+                f"{k} {x:.4f}"
+                for k, x in zip(self.machine.motors, pose.tolist(), strict=True)
             )
             what = f"{' and '.join(pair.names)} {depth:.4f} mm, allowed {floor:.4f}, at {reading}"
             out.append(Violation(kind, time, what, floor - depth))
         return out
 
-    def _worst(self, m: Motion, p: int, stretches: list[int]) -> tuple[float, float, Array] | None:
-        """Where a pair is nearest, if it may be nearer than its floor: (distance, time, pose)."""
+    def _worst(
+        self, m: Motion, p: int, stretches: list[int]
+    ) -> tuple[float, float, Array] | None:
+        """Where a pair is nearest, if it may be nearer than its floor: (distance, time,
+        pose)."""
         pair, floor = self.stage.pairs[p], float(self._floor[p])
         slides, swing = pair.a.slides - pair.b.slides, pair.swing
         best: tuple[float, float, Array] | None = None
@@ -915,7 +1011,9 @@ class Watch:
             far = np.sqrt(((step @ slides) ** 2).sum(axis=1)) + np.abs(step) @ swing
             far = far + 2.0 * (bow @ (np.abs(slides).sum(axis=1) + swing))
             doubt = (np.minimum(d_low, d_high) - 0.5 * far < floor) & (far > fine)
-            low, high, d_low, d_high, k = (c[doubt] for c in (low, high, d_low, d_high, k))
+            low, high, d_low, d_high, k = (
+                c[doubt] for c in (low, high, d_low, d_high, k)
+            )
         if best is not None and floor > 0.0:
             self.least = min(self.least, best[0])
         return best

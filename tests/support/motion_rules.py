@@ -1,8 +1,8 @@
 """Random use of the pure scanner under the eye of the motion oracle, and the shortest history.
 
-An `Episode` is one scanner from its start on: requests are plain values, so that a history can be
-printed, replayed and shortened. `draw` makes requests that aim at trouble. The oracle sees only
-what the scanner publishes (positions and velocities at any time) and the machine file.
+An `Episode` is one scanner from its start on: requests are plain values, so that a history can
+be printed, replayed and shortened. `draw` makes requests that aim at trouble. The oracle sees
+only what the scanner publishes (positions and velocities at any time) and the machine file.
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def product(machine: str) -> tuple[Any, Any]:
 
 
 def shape(sample: Json | None) -> Prism | None:
-    """A sample of the tests: a box, or an upright prism of 32 sides that stands for a cylinder."""
+    """A sample of the tests: a box, or an upright prism of 32 sides that stands for a
+    cylinder."""
     if sample is None:
         return None
     if sample["kind"] == "box":
@@ -117,8 +118,8 @@ def pieces(sample: Json | None) -> tuple[Polytope, ...]:
 
 @contextmanager
 def _patience() -> Iterator[None]:
-    """TimeoutError after PATIENCE_S of the processor's time, so that a busy machine makes no hangs;
-    in the main thread alone, where there are signals."""
+    """TimeoutError after PATIENCE_S of the processor's time, so that a busy machine makes no
+    hangs; in the main thread alone, where there are signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -175,7 +176,9 @@ class Episode:
 
     def _guard(self, sample: Json | None, correction: Json | None) -> Any:
         parameters = Offsets.from_edge(correction or {})
-        return SceneGuard(build_scene(self.machine, self.profile, pieces(sample), parameters))
+        return SceneGuard(
+            build_scene(self.machine, self.profile, pieces(sample), parameters)
+        )
 
     def stage(self) -> Stage:
         return Stage(self.model, placed(self.sample), self.correction)
@@ -200,13 +203,17 @@ class Episode:
             halts = error.data.get("halts_at") or {}
             outcome = "halted" if halts else "refused"
             self._said(
-                request.verb, halts, self.scanner.positions(self.scanner.rest_time(self.now))
+                request.verb,
+                halts,
+                self.scanner.positions(self.scanner.rest_time(self.now)),
             )
         except TwinError:
             outcome = "refused"
         except Exception as error:
             at = traceback.extract_tb(error.__traceback__)[-1]
-            what = f"{request.verb} raised {error!r} in {Path(at.filename).name}:{at.lineno}"
+            what = (
+                f"{request.verb} raised {error!r} in {Path(at.filename).name}:{at.lineno}"
+            )
             self.found.append(Violation("raised", self.now, what, 0.0))
             return "raised"
         else:
@@ -235,7 +242,9 @@ class Episode:
             case "reset":
                 s.reset(now)
             case "set":
-                s.set_axis(a["axis"], speed=a.get("speed"), acceleration=a.get("acceleration"))
+                s.set_axis(
+                    a["axis"], speed=a.get("speed"), acceleration=a.get("acceleration")
+                )
             case "sample":
                 return self._change(a["sample"], self.correction, a.get("late", False))
             case "correction":
@@ -254,7 +263,10 @@ class Episode:
 
     def _change(self, sample: Json | None, correction: Json | None, late: bool) -> str:
         change = self.scanner.stage_change(
-            _sample(sample), _correction(correction), self._guard(sample, correction), self.now
+            _sample(sample),
+            _correction(correction),
+            self._guard(sample, correction),
+            self.now,
         )
         change.certified()
         if late:
@@ -322,7 +334,8 @@ class Episode:
                 return "nothing"
 
     def _restart(self, args: Json) -> None:
-        """Killed and started again: motors stand where they were, perhaps with another sample."""
+        """Killed and started again: motors stand where they were, perhaps with another
+        sample."""
         if "sample" in args:
             self.sample, self._changed = args["sample"], True
         self.scanner = self._fresh(self.scanner.positions(self.now))
@@ -347,11 +360,15 @@ class Episode:
         if not alone:
             return
         way = max(abs(there[m] - here[m]) for m in here)
-        self.stops.append((end - now, way, max(a[0] for a in alone), max(a[1] for a in alone)))
+        self.stops.append(
+            (end - now, way, max(a[0] for a in alone), max(a[1] for a in alone))
+        )
 
     # The oracle ---------------------------------------------------------------------------------
 
-    def _said(self, what: str, said: Mapping[str, float], is_: Mapping[str, float]) -> None:
+    def _said(
+        self, what: str, said: Mapping[str, float], is_: Mapping[str, float]
+    ) -> None:
         for m, x in said.items():
             if abs(x - is_[m]) > 1e-6:
                 text = f"{what} says {m} {x}, it is {is_[m]}"
@@ -379,7 +396,9 @@ class Episode:
         if self._jog is not None and until >= self._jog[0]:
             self.counts["lease end", self._jog[1]] += 1
             self._jog = None
-        self.found += self.watch.look(s.positions, s.velocities, self.now, until, self.budget)
+        self.found += self.watch.look(
+            s.positions, s.velocities, self.now, until, self.budget
+        )
         for t in (0.5 * (self.now + until), until):
             self._in_step(s.positions(t), t)
         self.now = until
@@ -389,10 +408,14 @@ class Episode:
     def _in_step(self, reading: Mapping[str, float], time: float) -> None:
         """Motors of one virtual axis keep in step, however they are stopped."""
         for axis, begun in self._coupled.items():
-            gone = {m: (reading[m] - begun[m]) / f for m, f in self.model.moves(axis).items()}
+            gone = {
+                m: (reading[m] - begun[m]) / f for m, f in self.model.moves(axis).items()
+            }
             spread = max(gone.values()) - min(gone.values())
             if spread > 1e-6:
-                what = f"{axis}: " + ", ".join(f"{m} went {x:.6f}" for m, x in gone.items())
+                what = f"{axis}: " + ", ".join(
+                    f"{m} went {x:.6f}" for m, x in gone.items()
+                )
                 self.found.append(Violation("coupling", time, what, spread))
 
     def _couple(self, request: Request, outcome: str, moving: set[str]) -> None:
@@ -413,7 +436,11 @@ class Episode:
             for other in list(self._coupled):
                 if other != axis and motors & set(self.model.moves(other)):
                     del self._coupled[other]
-            if axis in self.model.virtual and axis not in self._coupled and not motors & moving:
+            if (
+                axis in self.model.virtual
+                and axis not in self._coupled
+                and not motors & moving
+            ):
                 here = self.scanner.positions(self.now)
                 self._coupled[axis] = {m: here[m] for m in motors}
 
@@ -437,7 +464,9 @@ class Episode:
                 for m, x in reading.items():
                     if there[m] != x:
                         what = f"{request.verb} was refused, yet {m} goes to {there[m]}, not {x}"
-                        self.found.append(Violation("changed", t, what, abs(there[m] - x)))
+                        self.found.append(
+                            Violation("changed", t, what, abs(there[m] - x))
+                        )
                         break
                 else:
                     continue
@@ -492,7 +521,9 @@ class Episode:
         """All comes to rest, and stays."""
         end = self.scanner.rest_time(self.now)
         if not math.isfinite(end):
-            self.found.append(Violation("unrest", self.now, "a motion without an end", 0.0))
+            self.found.append(
+                Violation("unrest", self.now, "a motion without an end", 0.0)
+            )
             return
         self._pass(end)
         self._pass(end + 1.0)
@@ -500,13 +531,20 @@ class Episode:
         for dt in (0.1, 5.0, 1e3):
             later = self.scanner.positions(end + dt)
             for m, x in rest.items():
-                if abs(later[m] - x) > 1e-9 or self.scanner.velocities(end + dt)[m] != 0.0:
-                    self.found.append(Violation("unrest", end + dt, f"{m} does not rest", 0.0))
+                if (
+                    abs(later[m] - x) > 1e-9
+                    or self.scanner.velocities(end + dt)[m] != 0.0
+                ):
+                    self.found.append(
+                        Violation("unrest", end + dt, f"{m} does not rest", 0.0)
+                    )
 
 
 def _sample(sample: Json | None) -> Sample:
     return (
-        Sample() if sample is None else Sample(sample["kind"], StagePlacement(**sample["offset"]))
+        Sample()
+        if sample is None
+        else Sample(sample["kind"], StagePlacement(**sample["offset"]))
     )
 
 
@@ -529,7 +567,9 @@ def draw_start(rng: Rng, machine: str) -> Start:
         for _ in range(20):
             positions = draw_pose(rng, m)
             if stage.least(positions)[0] > m.margin + 0.05:
-                late = float(10.0 ** rng.uniform(3.0, 7.5)) if rng.random() < 0.15 else 0.0
+                late = (
+                    float(10.0 ** rng.uniform(3.0, 7.5)) if rng.random() < 0.15 else 0.0
+                )
                 return Start(machine, positions, sample, correction, late)
 
 
@@ -551,7 +591,9 @@ def draw_place(rng: Rng, m: MachineModel, motor: str) -> float:
     """A position of a motor: anywhere, at an end, or where parts of the machine meet."""
     low, high = _travel(m, motor)
     if m.turns(motor):
-        angle = float(rng.choice([rng.uniform(-400.0, 400.0), 90.0 * rng.integers(-4, 5)]))
+        angle = float(
+            rng.choice([rng.uniform(-400.0, 400.0), 90.0 * rng.integers(-4, 5)])
+        )
         return float(np.clip(angle, low, high))
     kind = rng.random()
     if kind < 0.05:
@@ -574,7 +616,11 @@ def draw_sample(rng: Rng) -> Json:
         offset |= {k: round(float(rng.uniform(-40.0, 40.0)), 3) for k in ("rx", "ry")}
     if rng.random() < 0.15:
         offset["x"] = round(float(rng.uniform(-80.0, 80.0)), 3)
-    return {"kind": kind, "size": [round(k, 3) for k in (wide, deep, tall)], "offset": offset}
+    return {
+        "kind": kind,
+        "size": [round(k, 3) for k in (wide, deep, tall)],
+        "offset": offset,
+    }
 
 
 def draw_correction(rng: Rng) -> Json:
@@ -619,7 +665,9 @@ def draw(rng: Rng, episode: Episode) -> Request:
     verbs = {"move": 0.30, "jog": 0.22, "stop": 0.08, "set": 0.08, "sample": 0.09,
              "correction": 0.07, "programme": 0.10, "estop": 0.02, "reset": 0.02,
              "restart": 0.02}  # fmt: skip
-    verb = str(rng.choice(list(verbs), p=np.array(list(verbs.values())) / sum(verbs.values())))
+    verb = str(
+        rng.choice(list(verbs), p=np.array(list(verbs.values())) / sum(verbs.values()))
+    )
     axes = [*m.motors, *m.virtual]
     late = {"late": True} if rng.random() < 0.15 else {}
     match verb:
@@ -629,7 +677,9 @@ def draw(rng: Rng, episode: Episode) -> Request:
             axis = str(rng.choice(axes))
             share = m.moves(axis)
             top = min(m.fastest[m.motors.index(k)] / abs(f) for k, f in share.items())
-            velocity = float(rng.choice([-1.0, 1.0]) * top * rng.choice([1.0, rng.uniform(0, 1)]))
+            velocity = float(
+                rng.choice([-1.0, 1.0]) * top * rng.choice([1.0, rng.uniform(0, 1)])
+            )
             lease = float(rng.choice([rng.uniform(0.05, 1.0), rng.uniform(0.5, 6.0)]))
             return Request(wait, "jog", {"axis": axis, "velocity": round(velocity, 4),
                                          "lease_s": round(lease, 4)})  # fmt: skip
@@ -694,7 +744,9 @@ def draw_legs(rng: Rng, episode: Episode) -> list[dict[str, float]]:
     """Targets of one to four motors, one leg after the other, as scripts have them."""
     m, s = episode.model, episode.scanner
     here = dict(s.positions(s.rest_time(episode.now)))
-    chosen = rng.choice(m.motors, int(rng.integers(1, min(4, len(m.motors)) + 1)), replace=False)
+    chosen = rng.choice(
+        m.motors, int(rng.integers(1, min(4, len(m.motors)) + 1)), replace=False
+    )
     legs = []
     for _ in range(int(rng.integers(1, 6))):
         some = [k for k in chosen.tolist() if rng.random() < 0.7] or chosen[:1].tolist()
@@ -707,7 +759,11 @@ def draw_legs(rng: Rng, episode: Episode) -> list[dict[str, float]]:
 def draw_move(rng: Rng, episode: Episode) -> Json:
     m, s = episode.model, episode.scanner
     count = int(rng.choice([1, 2, 3, 4], p=[0.35, 0.35, 0.2, 0.1]))
-    here = s.positions(s.rest_time(episode.now)) if rng.random() < 0.5 else s.positions(episode.now)
+    here = (
+        s.positions(s.rest_time(episode.now))
+        if rng.random() < 0.5
+        else s.positions(episode.now)
+    )
     axes = rng.permutation([*m.motors, *m.virtual]).tolist()
     targets: dict[str, float] = {}
     taken: set[str] = set()
@@ -736,7 +792,9 @@ def draw_move(rng: Rng, episode: Episode) -> Json:
     return {"targets": targets}
 
 
-def draw_target(rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]) -> float:
+def draw_target(
+    rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]
+) -> float:
     m = episode.model
     low, high = _travel(m, motor)
     kind = rng.random()
@@ -746,7 +804,9 @@ def draw_target(rng: Rng, episode: Episode, motor: str, here: Mapping[str, float
         met = _meeting(rng, episode, motor, here)
         if met is not None:
             return float(
-                np.clip(round(met + rng.choice([0.0, rng.normal(0.0, 2.0)]), 4), low, high)
+                np.clip(
+                    round(met + rng.choice([0.0, rng.normal(0.0, 2.0)]), 4), low, high
+                )
             )
     near, far = m.along("object"), m.along("detector")
     if kind < 0.6 and near is not None and far is not None and motor in (near, far):
@@ -757,7 +817,9 @@ def draw_target(rng: Rng, episode: Episode, motor: str, here: Mapping[str, float
     return float(np.clip(round(here[motor] + rng.normal(0.0, wide), 4), low, high))
 
 
-def _meeting(rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]) -> float | None:
+def _meeting(
+    rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]
+) -> float | None:
     """Where a motor, going one way alone, would first bring something to the margin."""
     m, stage = episode.model, episode.watch.stage
     low, high = _travel(m, motor)

@@ -1,8 +1,9 @@
-"""A laboratory's past: folders of scans with a hidden machine behind them, written byte by byte.
+"""A laboratory's past: folders of scans with a hidden machine behind them, written byte by
+byte.
 
-Kinematics, X-rays, texts and logs are this file's and `timing_ranges`'s own; of flexdt nothing is
-used. Motors are the FleX-ray's; the script's tra_det is positive to the left. Contradictions are
-planted, each with what a report has to name.
+Kinematics, X-rays, texts and logs are this file's and `timing_ranges`'s own; of flexdt nothing
+is used. Motors are the FleX-ray's; the script's tra_det is positive to the left. Contradictions
+are planted, each with what a report has to name.
 """
 
 from __future__ import annotations
@@ -122,7 +123,8 @@ class Laboratory:
     # What is, in world coordinates seen from the source: x right, y along the beam, z up [mm].
 
     def _where(self, p: Past, *, true: bool) -> tuple[float, float, float, float, float]:
-        """x of the axis, SOD, SDD, x and z of the image's centre on the panel, from the source."""
+        """x of the axis, SOD, SDD, x and z of the image's centre on the panel, from the
+        source."""
         left, top, right, bottom = p.roi
         aside = ((left + right) / 2 - (COLUMNS - 1) / 2) * PITCH
         up = -((top + bottom) / 2 - (ROWS - 1) / 2) * PITCH
@@ -142,7 +144,11 @@ class Laboratory:
         _, _, sdd, x, z = self._where(p, true=True)
         c, s = math.cos(self.roll), math.sin(self.roll)
         pixel = PITCH * p.binning
-        return np.array([x, sdd, z]), pixel * np.array([c, 0, -s]), pixel * np.array([-s, 0, -c])
+        return (
+            np.array([x, sdd, z]),
+            pixel * np.array([c, 0, -s]),
+            pixel * np.array([-s, 0, -c]),
+        )
 
     def true_column(self, p: Past) -> float:
         axis, sod, *_ = self._where(p, true=True)
@@ -167,7 +173,9 @@ class Laboratory:
             a = 2 * math.pi * k / (FRAMES - 1)
             turn = np.array([[math.cos(a), math.sin(a)], [-math.sin(a), math.cos(a)]])
             for x, y, z, *half, density in self.bodies:
-                at = np.array([*(turn @ [x, y] * size + [axis, sod]), z * size * 0.8 + high])
+                at = np.array(
+                    [*(turn @ [x, y] * size + [axis, sod]), z * size * 0.8 + high]
+                )
                 q = np.zeros((3, 3))
                 q[:2, :2] = turn @ np.diag([1 / half[0] ** 2, 1 / half[1] ** 2]) @ turn.T
                 q[2, 2] = 1 / (0.8 * half[2]) ** 2
@@ -194,7 +202,9 @@ class Laboratory:
             counts = rng.poisson(light * np.exp(-lines)) + dark
             rows = SHAPE[0] - 2 * ("roi" in p.plants)
             files = {"di000000": np.full(SHAPE, dark), "io000000": flat}
-            files |= {f"scan_{k:06d}": counts[k] for k in range(FRAMES - ("count" in p.plants))}
+            files |= {
+                f"scan_{k:06d}": counts[k] for k in range(FRAMES - ("count" in p.plants))
+            }
             for name, image in files.items():
                 tifffile.imwrite(folder / f"{name}.tif", image[:rows].astype(np.uint16))
             folders.append(folder)
@@ -260,7 +270,8 @@ class Laboratory:
         return "\r\n".join(out) + "\r\n"
 
     def _plant(self, p: Past, plant: str) -> None:
-        """Put a contradiction into a scan; the texts and the log look at `plants` themselves."""
+        """Put a contradiction into a scan; the texts and the log look at `plants`
+        themselves."""
         p.plants.append(plant)
         self.planted.append((NAMED[plant], p.name))
         if plant == "axis":

@@ -11,7 +11,9 @@ from flexdt.twin.geometry.poses import Poses
 SHAPE = (76, 96)
 PITCH = 0.7
 # No mirror image of these points can be turned into themselves.
-CHIRAL = np.array([[0, 0, 0], [14, 0, 0], [0, 9, 0], [0, 0, 5], [6, -4, 11], [-8, 3, -12.0]])
+CHIRAL = np.array(
+    [[0, 0, 0], [14, 0, 0], [0, 9, 0], [0, 0, 5], [6, -4, 11], [-8, 3, -12.0]]
+)
 
 
 def some_parameters(rng: np.random.Generator, size: float = 1.0) -> Offsets:

@@ -44,7 +44,8 @@ class Seen:
 
 
 def read(text: str) -> Seen:
-    """What RTK's own reader makes of a file; it checks the matrices against the nine numbers."""
+    """What RTK's own reader makes of a file; it checks the matrices against the nine
+    numbers."""
     return _seen(_read(text))
 
 
@@ -64,7 +65,11 @@ def write_circle(views: int) -> tuple[str, Seen]:
 
 
 def joseph(
-    text: str, volume: NDArray[np.float32], voxel: float, shape: tuple[int, int, int], pitch: float
+    text: str,
+    volume: NDArray[np.float32],
+    voxel: float,
+    shape: tuple[int, int, int],
+    pitch: float,
 ) -> NDArray[np.float32]:
     """RTK's Joseph projector on a volume in RTK's own axes; shape is views, rows, columns."""
     itk = _itk()

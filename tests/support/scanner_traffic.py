@@ -27,8 +27,8 @@ def event(key: int, words: tuple[str, ...], what: str = "", reply: str = "") -> 
 def replay(log: bytes, lines: tuple[Executed, ...]) -> Iterator[tuple[float, bytes]]:
     """(time, message) of a recorded scan: what a listener would have heard, by its own stamps.
 
-    The stamp of a repeated question was written after its wait, so what lasts into the next line
-    began before its stamp.
+    The stamp of a repeated question was written after its wait, so what lasts into the next
+    line began before its stamp.
     """
     columns = _columns(log, lines)
     for key, (line, words) in enumerate(zip(lines, columns, strict=True), 1):
@@ -48,7 +48,9 @@ def _columns(log: bytes, lines: tuple[Executed, ...]) -> list[tuple[str, ...]]:
     for line in lines:
         head = rest.split(b"\t", 5)
         found.append(tuple(part.decode("latin-1").strip("\r\n") for part in head[:5]))
-        at = rest.index(line.reply + b"\t" if line.reply else b"\t", len(b"\t".join(head[:5])))
+        at = rest.index(
+            line.reply + b"\t" if line.reply else b"\t", len(b"\t".join(head[:5]))
+        )
         end = rest.index(b"\n", at + len(line.reply) + 10)
         rest = rest[end + 1 :]
     return found
@@ -85,7 +87,9 @@ class Motor:
             done = way - 0.5 * self.acceleration * (total - t) ** 2
         return self.start + math.copysign(done, self.target - self.start)
 
-    def messages(self, key: int, at: float, offset: float = 0.0) -> Iterator[tuple[float, bytes]]:
+    def messages(
+        self, key: int, at: float, offset: float = 0.0
+    ) -> Iterator[tuple[float, bytes]]:
         """(time, message) of a move that begins at `at`; `offset` is added to what it reads."""
         words = (self.name, "move absolute", repr(self.target))
         yield at, event(key, words)

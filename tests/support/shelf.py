@@ -22,7 +22,9 @@ POSES = SCANNER.poses_at(SCANNER.positions(0.0), CAMERA)
 
 def block(value: float, size: int = 8) -> Phantom:
     """A cube of one attenuation [1/mm], wider than the image."""
-    return voxel_phantom(np.full((size,) * 3, value, np.float32), 24.0 / size, name="thing")
+    return voxel_phantom(
+        np.full((size,) * 3, value, np.float32), 24.0 / size, name="thing"
+    )
 
 
 class Shelf:

@@ -2,9 +2,9 @@
 
 Between the servers' file operations and a real directory: every change (open to write, write,
 fsync, rename, link, mkdir, unlink) is counted and noted in `ops`, and may fail with any error.
-After a power cut only what was made safe is there for certain: a file's bytes since its fsync, a
-name since its directory's; of the rest, directory by directory, the last changes are lost, as many
-as drawn.
+After a power cut only what was made safe is there for certain: a file's bytes since its fsync,
+a name since its directory's; of the rest, directory by directory, the last changes are lost, as
+many as drawn.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Kind = Literal["open", "write", "fsync", "replace", "link", "unlink", "mkdir"]
 NUMBERED = re.compile(r"(\.(?:part|before)-)([\d-]+)")
 """Temporary names of `runtime/files/directory.py`."""
 TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "link", "mkdir")
-"""What a full disk refuses: new files, bytes beyond a file's end, and names that a directory has
-not had (a name that it had leaves its place there)."""
+"""What a full disk refuses: new files, bytes beyond a file's end, and names that a directory
+has not had (a name that it had leaves its place there)."""
 REAL: dict[str, Callable[..., Any]] = {
     name: getattr(os, name)
     for name in ("open", "close", "write", "pwrite", "ftruncate", "fsync", "replace", "rename",
@@ -78,7 +78,8 @@ class Disk:
         self._bytes: set[int] = set()
         """Inodes of files whose bytes are not safe."""
         self._names: list[tuple[Path, Callable[[], None]]] = []
-        """Changes of names that are not safe: directory, and how to take it back; oldest first."""
+        """Changes of names that are not safe: directory, and how to take it back; oldest
+        first."""
         self._kept = root.parent / f".{root.name}-before"
         self._count = itertools.count()
 
@@ -124,14 +125,18 @@ class Disk:
 
     # The system's calls -------------------------------------------------------------------------
 
-    def _open(self, path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
+    def _open(
+        self, path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None
+    ) -> int:
         real = self._path(path, dir_fd)
         writes = bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
         new = real is not None and writes and not os.path.lexists(real)
         if real is not None and writes:
             self._change("open", real, new)
         fd: int = REAL["open"](path, flags, mode, dir_fd=dir_fd)
-        if real is not None and (writes or real.is_dir()):  # others close files behind our back
+        if real is not None and (
+            writes or real.is_dir()
+        ):  # others close files behind our back
             self._paths[fd] = real
             if new and real.exists():
                 self._names.append((real.parent, lambda: _unlink(real)))
@@ -174,10 +179,17 @@ class Disk:
         self._change("fsync", path)
         self._bytes.discard(os.fstat(fd).st_ino)
         if path.is_dir():
-            self._names = [(folder, back) for folder, back in self._names if folder != path]
+            self._names = [
+                (folder, back) for folder, back in self._names if folder != path
+            ]
 
     def _replace(
-        self, src: Any, dst: Any, *, src_dir_fd: int | None = None, dst_dir_fd: int | None = None
+        self,
+        src: Any,
+        dst: Any,
+        *,
+        src_dir_fd: int | None = None,
+        dst_dir_fd: int | None = None,
     ) -> None:
         source, target = self._path(src, src_dir_fd), self._path(dst, dst_dir_fd)
         if source is not None and target is not None:
@@ -211,7 +223,11 @@ class Disk:
             self._change("link", target, len(self.named) > before)
             self._names.append((target.parent, lambda: _unlink(target)))
         REAL["link"](
-            src, dst, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd, follow_symlinks=follow_symlinks
+            src,
+            dst,
+            src_dir_fd=src_dir_fd,
+            dst_dir_fd=dst_dir_fd,
+            follow_symlinks=follow_symlinks,
         )
 
     def _unlink(self, path: Any, *, dir_fd: int | None = None) -> None:
@@ -229,7 +245,9 @@ class Disk:
         real = self._path(path, dir_fd)
         if real is not None and not os.path.lexists(real):
             self._change("mkdir", real)
-            self._names.append((real.parent, lambda: shutil.rmtree(real, ignore_errors=True)))
+            self._names.append(
+                (real.parent, lambda: shutil.rmtree(real, ignore_errors=True))
+            )
         REAL["mkdir"](path, mode, dir_fd=dir_fd)
 
     def _path(self, path: Any, dir_fd: int | None) -> Path | None:
@@ -276,9 +294,15 @@ class Disk:
         if self.off:
             raise OSError(errno.EIO, "the power is cut")
         number = len(self.ops) - self._from
-        self.ops.append((kind, NUMBERED.sub(self._ordinal, str(path.relative_to(self.root)))))
+        self.ops.append(
+            (kind, NUMBERED.sub(self._ordinal, str(path.relative_to(self.root))))
+        )
         fault = self.fault
-        if fault is None or number < fault.at or (number > fault.at and not fault.lasting):
+        if (
+            fault is None
+            or number < fault.at
+            or (number > fault.at and not fault.lasting)
+        ):
             return False
         if fault.short:
             return number == fault.at and kind == "write"

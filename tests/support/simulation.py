@@ -1,7 +1,8 @@
 """A whole twin server and its clients in one process, on a virtual clock and a disk that fails.
 
-After FoundationDB: handlers, jobs, storage and clients are the real ones; time, threads and disk
-are simulated and everything random comes from one seed, so that a seed that fails is a test.
+After FoundationDB: handlers, jobs, storage and clients are the real ones; time, threads and
+disk are simulated and everything random comes from one seed, so that a seed that fails is a
+test.
 
     sim = Simulation(tmp_path, seed=7)          # a data directory, a clock; nothing runs yet
     with sim:                                   # ends whatever runs
@@ -18,10 +19,11 @@ are simulated and everything random comes from one seed, so that a seed that fai
         sim.stop(); sim.start()                 # SIGTERM
         sim.disk.set(Fault(at=3))               # the 4th change of the disk from now fails (ENOSPC)
 
-`sim.run(coroutine)` runs anything else inside the loop. A client made before a kill is of no use
-after it. A fault without `error` cuts the power in the middle of whatever runs: calls then raise
-`Crashed`; go on with `sim.start()`. Options of `TwinServer` (`speed_up`, `limits`, `seed` as
-`noise`, ...) are the constructor's; `speed_up` is 1 unless given, "max" for scans at full speed.
+`sim.run(coroutine)` runs anything else inside the loop. A client made before a kill is of no
+use after it. A fault without `error` cuts the power in the middle of whatever runs: calls then
+raise `Crashed`; go on with `sim.start()`. Options of `TwinServer` (`speed_up`, `limits`, `seed`
+as `noise`, ...) are the constructor's; `speed_up` is 1 unless given, "max" for scans at full
+speed.
 """
 
 from __future__ import annotations
@@ -212,7 +214,8 @@ class Simulation:
 
     def advance(self, seconds: float) -> None:
         """Let virtual time pass, and whatever happens in it happen."""
-        # Two timers of one instant have no order: Python 3.12 takes the one of the patience first.
+        # Two timers of one instant have no order: Python 3.12 takes the one of the patience
+        # first.
         self.run(asyncio.sleep(seconds), seconds + PATIENCE_S)
 
     def run(self, work: Awaitable[T], patience_s: float = PATIENCE_S) -> T:

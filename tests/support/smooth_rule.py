@@ -1,4 +1,5 @@
-"""The smooth-scan rule applied to a number of images: what a script of that many should hold."""
+"""The smooth-scan rule applied to a number of images: what a script of that many should
+hold."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from flexdt.twin.script.planning.planned_images import FULL_TURN_DEG, run_up
 
 @dataclass(frozen=True)
 class SmoothScan:
-    """A fly scan that follows the rule; `start` and `end` are where the motion starts and ends."""
+    """A fly scan that follows the rule; `start` and `end` are where the motion starts and
+    ends."""
 
     frames: int
     period_s: float

@@ -16,9 +16,10 @@ from hypothesis import HealthCheck, settings
 
 from flexdt.clients.launch.processes import Servers
 
-# Idle threads of OpenMP (numba's loops) and OpenBLAS spin until there is more to do. Beside another
-# process they take the cores from it: FDK's tests took 138 s of processor time instead of 36 s. Set
-# before either library is loaded, and inherited by the workers and by every process of a test.
+# Idle threads of OpenMP (numba's loops) and OpenBLAS spin until there is more to do. Beside
+# another process they take the cores from it: FDK's tests took 138 s of processor time instead
+# of 36 s. Set before either library is loaded, and inherited by the workers and by every
+# process of a test.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -26,8 +27,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # here would inherit that; the tests of Ctrl-C need it to arrive.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The same examples every time, and none refused for being slow on a busy machine: what fails here
-# fails everywhere. `pytest --hypothesis-profile=default` looks for new ones.
+# The same examples every time, and none refused for being slow on a busy machine: what fails
+# here fails everywhere. `pytest --hypothesis-profile=default` looks for new ones.
 settings.register_profile(
     "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -67,19 +68,23 @@ def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules that may take longest begin first, then those with slow tests, then those with many:
-    no worker is left with one at the end."""
+    """Modules that may take longest begin first, then those with slow tests, then those with
+    many: no worker is left with one at the end."""
     spread_out(items)
     for item in items:
         if item.get_closest_marker("browser") and item.path.parent.name != "viewer":
-            raise pytest.UsageError(f"{item.nodeid}: `make page` looks in tests/viewer alone")
+            raise pytest.UsageError(
+                f"{item.nodeid}: `make page` looks in tests/viewer alone"
+            )
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
     count = Counter(item.path for item in items)
     allowed_s: dict[Path, float] = {}
     for item in items:
         if (mark := item.get_closest_marker("timeout")) is not None:
             allowed_s[item.path] = max(mark.args[0], allowed_s.get(item.path, 0.0))
-    items.sort(key=lambda i: (-allowed_s.get(i.path, 0.0), i.path not in slow, -count[i.path]))
+    items.sort(
+        key=lambda i: (-allowed_s.get(i.path, 0.0), i.path not in slow, -count[i.path])
+    )
 
 
 BEGUN = pytest.StashKey[float]()
@@ -98,9 +103,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
-    """What a test takes of the processor, fixtures included, goes into the file of durations."""
+    """What a test takes of the processor, fixtures included, goes into the file of
+    durations."""
     if call.when == "teardown":
-        item.user_properties.append(("processor_s", round(processor_s() - item.stash[BEGUN], 2)))
+        item.user_properties.append(
+            ("processor_s", round(processor_s() - item.stash[BEGUN], 2))
+        )
 
 
 @dataclass
@@ -113,7 +121,8 @@ class SharedServers:
     """As they started."""
 
     def as_new(self) -> None:
-        """No scan, stop, correction or data set is left, and everything stands where it stood."""
+        """No scan, stop, correction or data set is left, and everything stands where it
+        stood."""
         from flexdt.clients import TwinClient
         from flexdt.clients.client.twin_methods import FINAL_STATES
 
@@ -138,7 +147,9 @@ def shared_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedS
     from flexdt.clients import TwinClient
 
     data = tmp_path_factory.mktemp("shared") / "data"
-    with Servers({"data": data, "speed-up": "max"}, data.parent / "servers.log") as running:
+    with Servers(
+        {"data": data, "speed-up": "max"}, data.parent / "servers.log"
+    ) as running:
         with TwinClient(*running.address) as twin:
             scene = twin.save_scene()
         yield SharedServers(running, data, scene)

@@ -8,7 +8,10 @@ from flexdt.twin.motion.profiles import Trajectory
 
 
 def sweep(
-    scene: CollisionScene, trajectories: Mapping[str, Trajectory], start: float, end: float
+    scene: CollisionScene,
+    trajectories: Mapping[str, Trajectory],
+    start: float,
+    end: float,
 ) -> SweepResult:
     """The first contact; without one the least clearance, refined."""
     search = PathSearch(scene, scene.path(trajectories, start, end))

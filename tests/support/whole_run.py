@@ -1,8 +1,9 @@
 """A whole run of a twin, part by part, beside the same run with a disk that fails once.
 
-Each part goes on from where the undisturbed run was at its beginning. `Part` compares what clients
-see with the undisturbed run, whatever the disk did meanwhile: what answered an error has changed
-nothing, what answered well is there after a kill, and the data sets are the same byte for byte.
+Each part goes on from where the undisturbed run was at its beginning. `Part` compares what
+clients see with the undisturbed run, whatever the disk did meanwhile: what answered an error
+has changed nothing, what answered well is there after a kill, and the data sets are the same
+byte for byte.
 """
 
 from __future__ import annotations
@@ -63,7 +64,10 @@ def job(name: str) -> Step:
             for _ in range(2000):
                 jobs = run.sim.call(run.client, "job.list")["jobs"]
                 status = next(j for j in jobs if j["name"] == name)
-                if status["state"] not in ("running", "queued") and status["retry_s"] is None:
+                if (
+                    status["state"] not in ("running", "queued")
+                    and status["retry_s"] is None
+                ):
                     break
                 run.sim.advance(0.05)
             if status["state"] == "done":
@@ -96,7 +100,8 @@ def abort(run: Part) -> None:
 
 
 def load(run: Part) -> None:
-    """The scene as it is, with another sample, another correction, other settings and positions."""
+    """The scene as it is, with another sample, another correction, other settings and
+    positions."""
     document = run.sim.call(run.client, "scene.save")["document"]
     document["sample"] = {"name": "chiral"}
     document["correction"] = {
@@ -133,7 +138,13 @@ PARTS: dict[str, list[Step]] = {
         ask("sample.upload", **voxels(0.03)),
     ],
     "poses": [
-        ask("trajectory.submit", poses=[{"rot_obj": 5.0}], exposure_ms=50.0, name="second", seed=4),
+        ask(
+            "trajectory.submit",
+            poses=[{"rot_obj": 5.0}],
+            exposure_ms=50.0,
+            name="second",
+            seed=4,
+        ),
         job("second"),
     ],
     "abort": [
@@ -155,7 +166,9 @@ class Part:
         seed: of the simulation.
     """
 
-    def __init__(self, name: str, root: Path, before: Path | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, name: str, root: Path, before: Path | None = None, seed: int = 0
+    ) -> None:
         if before is not None:
             shutil.copytree(before, root / "data")
         self.steps = PARTS[name]
@@ -196,7 +209,9 @@ class Part:
         correction = state["correction"]
         return {
             "sample": state["sample"],
-            "paces": {n: (a["speed"], a["acceleration"]) for n, a in state["axes"].items()},
+            "paces": {
+                n: (a["speed"], a["acceleration"]) for n, a in state["axes"].items()
+            },
             "tube": (state["tube"]["kV"], state["tube"]["power_W"]),
             "camera": state["camera"],
             "correction": None if correction is None else correction["name"],
@@ -218,7 +233,9 @@ class Part:
         self.start()
         before = self.look()
         for number, step in enumerate(self.steps):
-            before = self._step(number, step, before, None if right is None else right.seen[number])
+            before = self._step(
+                number, step, before, None if right is None else right.seen[number]
+            )
         try:
             self.sim.stop()
         except Crashed:
@@ -246,7 +263,9 @@ class Part:
                 assert known <= now_known
                 assert len(now_known - known) <= 1
                 after = before if right is None else right
-                assert any(self._same(step, now, seen, "corrections") for seen in (before, after))
+                assert any(
+                    self._same(step, now, seen, "corrections") for seen in (before, after)
+                )
                 self.answers.append(f"{number}: crashed")
                 self.cut = True
                 if now == after and now != before:
@@ -275,7 +294,9 @@ class Part:
                 self.sim.advance(FAR_S + 1.0)  # after a failure it is not tried at once
             self.again()
             begins = hasattr(step, "begins")  # the job goes on meanwhile
-            assert self._same(step, self.look(), now) if begins else self.look() == now, number
+            assert self._same(step, self.look(), now) if begins else self.look() == now, (
+                number
+            )
         self.seen.append(now)
         return now
 

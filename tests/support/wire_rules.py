@@ -1,7 +1,7 @@
 """Several clients of one twin server, in any order, under the eye of the motion oracle.
 
-The server is the real one, simulated (`simulation`): virtual time, one seed. The oracle looks at
-what the server's scanner publishes, at any time, from one change of its motion to the next.
+The server is the real one, simulated (`simulation`): virtual time, one seed. The oracle looks
+at what the server's scanner publishes, at any time, from one change of its motion to the next.
 """
 
 from __future__ import annotations
@@ -41,7 +41,14 @@ from flexdt.server.storage import stored_samples as store
 from flexdt.twin.errors import TwinError
 
 SPEED_UPS = (1.0, 7.3, 60.0, 1000.0, "max")
-BOXES = ((20, 30, 40), (180, 20, 30), (300, 20, 20), (90, 90, 90), (120, 260, 60), (40, 60, 220))
+BOXES = (
+    (20, 30, 40),
+    (180, 20, 30),
+    (300, 20, 20),
+    (90, 90, 90),
+    (120, 260, 60),
+    (40, 60, 220),
+)
 DRUMS = ((30, 40), (140, 60), (260, 30), (60, 200))
 WATCHED = (
     "move",
@@ -85,7 +92,9 @@ def stl(shape: Prism) -> bytes:
         if 0 < i < n - 1:
             faces.append(((*ring[0], low), (c, d, low), (a, b, low)))
             faces.append(((*ring[0], high), (a, b, high), (c, d, high)))
-    body = b"".join(struct.pack("<12fH", 0, 0, 0, *(x for p in f for x in p), 0) for f in faces)
+    body = b"".join(
+        struct.pack("<12fH", 0, 0, 0, *(x for p in f for x in p), 0) for f in faces
+    )
     return b"\0" * 80 + struct.pack("<I", len(faces)) + body
 
 
@@ -95,7 +104,8 @@ def _read(raw: bytes, unit: str, material: str, file_type: str, name: str) -> Ph
 
 
 def read_here(raw: bytes, **how: Any) -> Phantom:
-    """In place of `mesh_apart`: no process of its own for what the tests themselves have made."""
+    """In place of `mesh_apart`: no process of its own for what the tests themselves have
+    made."""
     return _read(raw, **{k: how[k] for k in ("unit", "material", "file_type", "name")})
 
 
@@ -245,7 +255,9 @@ class WireEpisode:
         assert self._watch is not None
         old, new, scanner = self._watch.stage, self._stage(), self.sim.twin.scanner
         pose = self.model.vector(scanner.positions(now))
-        before = dict(zip((p.names for p in old.pairs), old.clearances(pose).tolist(), strict=True))
+        before = dict(
+            zip((p.names for p in old.pairs), old.clearances(pose).tolist(), strict=True)
+        )
         for pair, d in zip(new.pairs, new.clearances(pose).tolist(), strict=True):
             free = self.model.margin - 0.02
             was = before.get(pair.names, math.inf)
@@ -280,8 +292,12 @@ class WireEpisode:
         """Whether a job may move the motors by itself; one that waits begins when it likes."""
         jobs = self.sim.twin.jobs
         waits = any(job.phase == "queued" for job in jobs.all())
-        legs = self.sim.twin.detours._task  # of a planned move: the next begins when it is due
-        return bool(jobs.busy or jobs.running or waits or (legs is not None and not legs.done()))
+        legs = (
+            self.sim.twin.detours._task
+        )  # of a planned move: the next begins when it is due
+        return bool(
+            jobs.busy or jobs.running or waits or (legs is not None and not legs.done())
+        )
 
     def do(self, ask: Ask) -> str:
         """Let time pass, ask, look; returns what came of it."""
@@ -309,9 +325,13 @@ class WireEpisode:
             outcome = self._refused(ask, error)
         except TimeoutError as error:
             outcome = "hang"
-            self.found.append(Violation("hang", clock.now(), f"{ask.method}: {error!r}", 0.0))
+            self.found.append(
+                Violation("hang", clock.now(), f"{ask.method}: {error!r}", 0.0)
+            )
         seconds = time.perf_counter() - asked
-        self.slowest = max(self.slowest, (seconds, f"{ask.method} {str(ask.params)[:200]}"))
+        self.slowest = max(
+            self.slowest, (seconds, f"{ask.method} {str(ask.params)[:200]}")
+        )
         if answer is not None:
             outcome = self._answered(ask, answer)
             if ask.method == "sample.upload" and self._incoming is not None:
@@ -349,7 +369,9 @@ class WireEpisode:
             self.jobs.append(answer["job"])
         if ask.method == "scene.save":
             self.scenes.append(answer["document"])
-        halted = any("halt" in w or "ends before" in w for w in answer.get("warnings") or [])
+        halted = any(
+            "halt" in w or "ends before" in w for w in answer.get("warnings") or []
+        )
         if ask.method == "axes.jog":
             end = self.sim.twin.clock.now() + ask.params["lease_s"]
             self._leases.append((end, "halted" if halted else "accepted"))
@@ -406,10 +428,15 @@ class WireEpisode:
                 )
                 return
             self._wait(end - twin.clock.now() + 1.0)
-            if twin.scanner.rest_time(twin.clock.now()) <= twin.clock.now() and not self.busy:
+            if (
+                twin.scanner.rest_time(twin.clock.now()) <= twin.clock.now()
+                and not self.busy
+            ):
                 break
         else:
-            self.found.append(Violation("unrest", twin.clock.now(), "it does not rest", 0.0))
+            self.found.append(
+                Violation("unrest", twin.clock.now(), "it does not rest", 0.0)
+            )
 
 
 # Drawing ----------------------------------------------------------------------------------------
@@ -457,23 +484,35 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
     wait = round(wait, 6)
     holder = e.sim.twin.control.holder
     names = [c.name for c in e.clients]
-    who = names.index(holder) if holder in names and rng.random() < 0.9 else int(rng.integers(3))
+    who = (
+        names.index(holder)
+        if holder in names and rng.random() < 0.9
+        else int(rng.integers(3))
+    )
     if view.scanner.safety.state != "ready" and rng.random() < 0.6:
         return Ask(wait, who, "reset", "safety.reset")
     status = e.sim.twin.jobs.current
     state = None if status is None else status.phase
     if state in ("running", "paused"):
-        wait = round(float(rng.choice([0.0, rng.uniform(0.0, 3.0), rng.uniform(0.0, 20.0)])), 6)
+        wait = round(
+            float(rng.choice([0.0, rng.uniform(0.0, 3.0), rng.uniform(0.0, 20.0)])), 6
+        )
     if state == "running" and rng.random() < 0.7:
-        method = str(rng.choice(["job.pause", "job.abort", "axes.stop"], p=[0.6, 0.25, 0.15]))
+        method = str(
+            rng.choice(["job.pause", "job.abort", "axes.stop"], p=[0.6, 0.25, 0.15])
+        )
         return Ask(wait, who, method.rsplit(".", 1)[-1], method)
     if state == "paused" and rng.random() < 0.6:
-        method = str(rng.choice(["job.resume", "job.step", "job.abort"], p=[0.65, 0.15, 0.2]))
+        method = str(
+            rng.choice(["job.resume", "job.step", "job.abort"], p=[0.65, 0.15, 0.2])
+        )
         return Ask(wait, who, method.rsplit(".", 1)[-1], method)
     verbs = {"move": 24, "jog": 18, "stop": 7, "set": 6, "sample": 10, "correction": 8, "script": 5,
              "trajectory": 5, "estop": 1, "reset": 1, "control": 4, "clock": 3, "scene": 3,
              "restart": 1, "resume": 2, "pause": 2, "abort": 1}  # fmt: skip
-    verb = str(rng.choice(list(verbs), p=np.array(list(verbs.values())) / sum(verbs.values())))
+    verb = str(
+        rng.choice(list(verbs), p=np.array(list(verbs.values())) / sum(verbs.values()))
+    )
     axes = [*m.motors, *m.virtual]
     match verb:
         case "move":
@@ -481,12 +520,16 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
             if rng.random() < 0.08:
                 params = {**params, "plan": True}
             waits = rng.random() < 0.2
-            return Ask(wait, who, verb, "axes.move", {**params, "wait": bool(waits)}, bool(waits))
+            return Ask(
+                wait, who, verb, "axes.move", {**params, "wait": bool(waits)}, bool(waits)
+            )
         case "jog":
             axis = str(rng.choice(axes))
             share = m.moves(axis).items()
             top = min(m.fastest[m.motors.index(k)] / abs(f) for k, f in share)
-            velocity = float(rng.choice([-1.0, 1.0]) * top * rng.choice([1.0, rng.uniform(0, 1)]))
+            velocity = float(
+                rng.choice([-1.0, 1.0]) * top * rng.choice([1.0, rng.uniform(0, 1)])
+            )
             params = {"axis": axis, "velocity": round(velocity, 4),
                       "lease_s": round(float(rng.uniform(0.1, 5.0)), 4)}  # fmt: skip
             return Ask(wait, who, verb, "axes.jog", params)
@@ -507,7 +550,9 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
                       "data": base64.b64encode(raw).decode()}  # fmt: skip
             return Ask(wait, who, verb, "sample.upload", params)
         case "sample":
-            return Ask(wait, who, verb, "sample.set", draw_sample_set(rng), rng.random() < 0.15)
+            return Ask(
+                wait, who, verb, "sample.set", draw_sample_set(rng), rng.random() < 0.15
+            )
         case "correction":
             if rng.random() < 0.3:
                 return Ask(wait, who, verb, "calibration.revert")
@@ -521,14 +566,18 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
             return Ask(wait, who, verb, "trajectory.submit", draw_poses(rng, view))
         case "control":
             action = str(rng.choice(["acquire", "release", "force"]))
-            return Ask(wait, int(rng.integers(3)), verb, "session.control", {"action": action})
+            return Ask(
+                wait, int(rng.integers(3)), verb, "session.control", {"action": action}
+            )
         case "clock":
             speed_up = SPEED_UPS[int(rng.integers(len(SPEED_UPS)))]
             return Ask(wait, who, verb, "clock.set", {"speed_up": speed_up})
         case "scene":
             if e.scenes and rng.random() < 0.6:
                 scene = e.scenes[int(rng.integers(len(e.scenes)))]
-                return Ask(wait, who, verb, "scene.load", {"document": scene}, rng.random() < 0.3)
+                return Ask(
+                    wait, who, verb, "scene.load", {"document": scene}, rng.random() < 0.3
+                )
             return Ask(wait, who, verb, "scene.save")
         case "restart":
             return Ask(wait, who, verb)
@@ -595,7 +644,12 @@ def replay_wire(
 
 
 def shortest_wire(
-    start: WireStart, history: Sequence[Ask], kind: str, root: Path, samples: Path, tries: int = 60
+    start: WireStart,
+    history: Sequence[Ask],
+    kind: str,
+    root: Path,
+    samples: Path,
+    tries: int = 60,
 ) -> list[Ask]:
     """A shorter history that still ends in a violation of that kind."""
     history = list(history)
@@ -606,7 +660,9 @@ def shortest_wire(
         if tries < 0:
             return False
         with suppress(Exception):
-            return any(v.kind == kind for v in replay_wire(start, candidate, root, samples))
+            return any(
+                v.kind == kind for v in replay_wire(start, candidate, root, samples)
+            )
         return False
 
     size = max(1, len(history) // 2)

@@ -45,7 +45,8 @@ def programme(given: list[tuple[float, float, float, float, bool]]) -> Drive:
 def distance_to_path(
     drives: Mapping[str, Drive], stop: Mapping[str, Trajectory], now: float
 ) -> float:
-    """How far the stop strays from the path, seen by itself: programme time is found by a search.
+    """How far the stop strays from the path, seen by itself: programme time is found by a
+    search.
 
     For each moment of the stop the pose is compared with the poses that the programme passes,
     first on a grid, then between the neighbours of the nearest.
@@ -62,7 +63,10 @@ def distance_to_path(
         for _ in range(60):  # golden section
             a, b = low + 0.382 * (high - low), low + 0.618 * (high - low)
             away = [
-                max(abs(drives[n].at(s).position(s) - x) for n, x in zip(names, pose, strict=True))
+                max(
+                    abs(drives[n].at(s).position(s) - x)
+                    for n, x in zip(names, pose, strict=True)
+                )
                 for s in (a, b)
             ]
             low, high = (low, b) if away[0] < away[1] else (a, high)
@@ -89,7 +93,9 @@ def test_a_stop_along_the_path_stays_on_it_and_within_each_motors_limits(
         assert way.velocity(now) == pytest.approx(before.velocity(now), abs=1e-5)
         legs_ahead = drives[name].trajectories
         allowed = 120.0 if hard else max(t.acceleration(0.0) for t in legs_ahead)
-        assert max(abs(p.acceleration) for p in way.pieces) <= allowed * (1.0 + 1e-4) + 1e-6
+        assert (
+            max(abs(p.acceleration) for p in way.pieces) <= allowed * (1.0 + 1e-4) + 1e-6
+        )
         times = np.linspace(now, way.end, 200)
         fastest = max(t.top_speed for t in legs_ahead)
         assert max(abs(way.velocity(t)) for t in times) <= fastest + 1e-6
@@ -126,9 +132,14 @@ def test_while_a_motor_brakes_at_its_limit_the_others_go_on_along_the_path() -> 
     now = 13.0  # mag_det has begun to brake at 12 s, for 10 s
     stop = braked_along(drives, now)
     assert stop["mag_det"].end == pytest.approx(22.0, abs=1e-6)
-    assert stop["mag_det"].pieces[-1].acceleration != 0.0  # no piece for the rest that follows
+    assert (
+        stop["mag_det"].pieces[-1].acceleration != 0.0
+    )  # no piece for the rest that follows
     assert stop["mag_obj"].end == pytest.approx(23.0, abs=1e-6)
-    assert braked_along(drives, now, {"mag_obj": 125.0, "mag_det": 125.0})["mag_obj"].end < 14.0
+    assert (
+        braked_along(drives, now, {"mag_obj": 125.0, "mag_det": 125.0})["mag_obj"].end
+        < 14.0
+    )
 
 
 def test_a_stop_while_all_stand_in_a_programme_is_at_once() -> None:
@@ -147,7 +158,10 @@ def test_a_motor_that_pauses_during_a_stop_stands_until_it_goes_on(hair: float) 
     knot = there.end + hair
     pieces = Piece(0.0, 0.0, 0.0, 5.0), Piece(knot, 2.5 * knot * knot, 5.0 * knot, 0.0)
     slow = Trajectory(pieces, knot + 30.0, 2.5 * knot * knot + 150.0 * knot)
-    drives = {"rot_obj": Drive(60.0, 30.0, (there, back)), "mag_obj": Drive(50.0, 5.0, (slow,))}
+    drives = {
+        "rot_obj": Drive(60.0, 30.0, (there, back)),
+        "mag_obj": Drive(50.0, 5.0, (slow,)),
+    }
     for now in np.linspace(0.5 * there.end, there.end, 23).tolist():
         way = braked_along(drives, now, {"rot_obj": 30.0, "mag_obj": 5.0})["rot_obj"]
         for one, following in pairwise(way.pieces):
@@ -167,7 +181,9 @@ def drawn_programme(rng: np.random.Generator) -> Drive:
     ])  # fmt: skip
 
 
-def soonest(drives: Mapping[str, Drive], now: float, most: Mapping[str, float] | None) -> float:
+def soonest(
+    drives: Mapping[str, Drive], now: float, most: Mapping[str, float] | None
+) -> float:
     """When all rest, by small steps: programme time slows as fast as some motor can brake."""
     s, rate, time, step = now, 1.0, now, 5e-4
     while rate > 0.0:
@@ -196,15 +212,21 @@ def test_a_stop_is_as_short_as_the_weakest_motor_allows(seed: int, hard: bool) -
     stop = braked_along(drives, now, most)
     end = max(way.end for way in stop.values())
     least = soonest(drives, now, most) - now
-    assert 0.99 * least - 0.005 <= end - now <= 1.08 * least + 0.01  # in cells of even slowing
+    assert (
+        0.99 * least - 0.005 <= end - now <= 1.08 * least + 0.01
+    )  # in cells of even slowing
     for name, way in stop.items():
         times = np.linspace(now, end, 400)
         at, step = way.positions(times), times[1] - times[0]
         fastest = max(t.top_speed for t in drives[name].trajectories) + 1e-3
         assert np.abs(np.diff(at)).max() <= fastest * step + 1e-6
-        assert way.position(now) == pytest.approx(drives[name].at(now).position(now), abs=1e-7)
+        assert way.position(now) == pytest.approx(
+            drives[name].at(now).position(now), abs=1e-7
+        )
         assert way.position(end) == way.target
-        low, high = (f([t.target for t in drives[name].trajectories] + [0.0]) for f in (min, max))
+        low, high = (
+            f([t.target for t in drives[name].trajectories] + [0.0]) for f in (min, max)
+        )
         assert low - 1e-6 <= at.min() <= at.max() <= high + 1e-6
 
 
@@ -229,7 +251,9 @@ def test_a_stop_while_motors_speed_up_is_cut_no_finer_than_its_error_asks(
     acceleration: float, most: float
 ) -> None:
     drives = {
-        "mag_obj": Drive(50.0, 50.0, (motion.move(0.0, 0.0, 4000.0, 400.0, acceleration, 0.0),)),
+        "mag_obj": Drive(
+            50.0, 50.0, (motion.move(0.0, 0.0, 4000.0, 400.0, acceleration, 0.0),)
+        ),
         "mag_det": Drive(50.0, 50.0, (motion.move(0.0, 0.0, -3000.0, 30.0, 50.0, 0.0),)),
     }
     stop = braked_along(drives, 2.0, {"mag_obj": most, "mag_det": most})
@@ -240,6 +264,8 @@ def test_a_stop_shorter_than_the_clock_tells_is_a_rest() -> None:
     """Thirty years on, a time has steps of 0.1 us; half of one is left of the way."""
     way = motion.move(0.0, 0.0, 100.0, 50.0, 50.0, 1e9)
     now = float(np.nextafter(way.end, 0.0))
-    stop = braked_along({"mag_obj": Drive(50.0, 50.0, (way,))}, now, {"mag_obj": 500.0})["mag_obj"]
+    stop = braked_along({"mag_obj": Drive(50.0, 50.0, (way,))}, now, {"mag_obj": 500.0})[
+        "mag_obj"
+    ]
     assert (stop.start, stop.end, stop.top_speed) == (now, now, 0.0)
     assert stop.target == pytest.approx(100.0, abs=1e-6)

@@ -1,4 +1,5 @@
-"""Camera modes are the machine file's: drawn files, and one sentence from all who take a mode."""
+"""Camera modes are the machine file's: drawn files, and one sentence from all who take a
+mode."""
 
 from __future__ import annotations
 
@@ -12,12 +13,18 @@ import flexdt as fx
 from flexdt.phantoms.exposure_forecast import expose
 from flexdt.twin.errors import LimitError, MachineFileError
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.machine.description import Machine, builtin_machine, parse_machine, profile_of
+from flexdt.twin.machine.description import (
+    Machine,
+    builtin_machine,
+    parse_machine,
+    profile_of,
+)
 from flexdt.twin.scanner.state import changed_camera
 from flexdt.twin.script import ScanRequest, compose_script, plan_script
 
 SMALL = Roi(900, 700, 963, 763)
-"""Read out for a prediction: the sentence does not depend on it, and the whole panel costs much."""
+"""Read out for a prediction: the sentence does not depend on it, and the whole panel costs
+much."""
 
 
 def sentences(machine: Machine, mode: str) -> set[str]:
@@ -29,7 +36,9 @@ def sentences(machine: Machine, mode: str) -> set[str]:
     for ask in (
         lambda: changed_camera(spec, spec.camera, {"mode": mode}),
         lambda: compose_script(ScanRequest(mode=mode), machine, profile_of(machine)),
-        lambda: expose("normal-5", machine=machine, mode=mode, roi=SMALL, images=1, kV=[80.0]),
+        lambda: expose(
+            "normal-5", machine=machine, mode=mode, roi=SMALL, images=1, kV=[80.0]
+        ),
     ):
         try:
             ask()
@@ -43,7 +52,9 @@ def sentences(machine: Machine, mode: str) -> set[str]:
 def test_the_modes_that_a_file_lists_exist_and_no_others(seed: int) -> None:
     rng = np.random.default_rng(600 + seed)
     factors = [1, 2, 3, 4, 8]
-    hardware, software = (sorted({1, *(int(x) for x in rng.choice(factors, 2))}) for _ in range(2))
+    hardware, software = (
+        sorted({1, *(int(x) for x in rng.choice(factors, 2))}) for _ in range(2)
+    )
     gains = [["High"], ["Low"], ["High", "Low"]][seed % 3]
     machine = parse_machine(
         f'base = "flexray"\n[detector]\nhardware_binning = {hardware}\n'
@@ -51,7 +62,9 @@ def test_the_modes_that_a_file_lists_exist_and_no_others(seed: int) -> None:
     )
     known = {f"HW{a}SW{b}{g}" for a, b, g in product(hardware, software, gains)}
     assert set(machine.detector.mode_names) == known
-    asked = [f"HW{a}SW{b}{g}" for a, b, g in product([1, 3, 13], [1, 2, 7], ["High", "Low"])]
+    asked = [
+        f"HW{a}SW{b}{g}" for a, b, g in product([1, 3, 13], [1, 2, 7], ["High", "Low"])
+    ]
     for mode in asked:
         [said] = sentences(machine, mode)
         assert (said == "") == (mode in known), (mode, said)
@@ -85,7 +98,8 @@ def test_files_without_the_lists_keep_their_modes() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_region_is_judged_on_the_line_that_sets_it(seed: int) -> None:
-    """Against counts of whole binned pixels; the rest of the script goes on with the old one."""
+    """Against counts of whole binned pixels; the rest of the script goes on with the old
+    one."""
     rng = np.random.default_rng(seed)
     machine = builtin_machine("flexray")
     a, b = int(rng.choice([1, 2, 4])), int(rng.choice([1, 2, 4]))

@@ -1,4 +1,5 @@
-"""Parts with meshes: the convex bodies around them, beside linear programs and least squares."""
+"""Parts with meshes: the convex bodies around them, beside linear programs and least
+squares."""
 
 from __future__ import annotations
 
@@ -43,13 +44,17 @@ def drawn(rng: np.random.Generator, many: int, size: float = 60.0) -> Points:
     """Points all over a lopsided ellipsoid."""
     points = rng.normal(size=(many, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return np.asarray(size * rng.uniform(0.3, 1.0, 3) * points + rng.uniform(-5.0, 5.0, 3))
+    return np.asarray(
+        size * rng.uniform(0.3, 1.0, 3) * points + rng.uniform(-5.0, 5.0, 3)
+    )
 
 
 def inside(point: Points, corners: Points) -> bool:
     """Whether a point is a mean of corners with some weights: a linear program."""
     system = np.vstack([corners.T, np.ones(len(corners))])
-    found = linprog(np.zeros(len(corners)), A_eq=system, b_eq=[*point, 1.0], bounds=(0.0, None))
+    found = linprog(
+        np.zeros(len(corners)), A_eq=system, b_eq=[*point, 1.0], bounds=(0.0, None)
+    )
     return bool(found.status == 0)
 
 
@@ -73,7 +78,9 @@ def machine_with(meshes: Mapping[str, Points]) -> Machine:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("many", [40, 1500])
-def test_a_body_around_points_leaves_none_outside_and_is_tight(seed: int, many: int) -> None:
+def test_a_body_around_points_leaves_none_outside_and_is_tight(
+    seed: int, many: int
+) -> None:
     rng = np.random.default_rng(seed)
     points = drawn(rng, many)
     body = outer_hull(points)
@@ -89,7 +96,8 @@ def test_a_body_around_points_leaves_none_outside_and_is_tight(seed: int, many: 
 def test_planes_that_cut_different_corners_are_taken_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each plane adds about two corners, so that 256 take 120 rounds one by one, 15 by eights."""
+    """Each plane adds about two corners, so that 256 take 120 rounds one by one, 15 by
+    eights."""
     rounds = []
 
     def counted(planes: list[Points], inside: Points) -> Points:
@@ -111,13 +119,17 @@ def test_flat_faces_of_a_turned_part_stay_flat() -> None:
     assert volume == pytest.approx(np.pi * 40.0**2 * 120.0, rel=1e-3)
     # A plate without thickness is a body, too.
     angle = np.linspace(0.0, 6.2, 600)
-    plate = outer_hull(np.column_stack([50 * np.cos(angle), 50 * np.sin(angle), 0 * angle]))
+    plate = outer_hull(
+        np.column_stack([50 * np.cos(angle), 50 * np.sin(angle), 0 * angle])
+    )
     assert np.ptp(plate.vertices[:, 2]) < 0.01
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("many", [30, 1200])
-def test_clearance_of_parts_with_meshes_is_that_of_their_hulls(seed: int, many: int) -> None:
+def test_clearance_of_parts_with_meshes_is_that_of_their_hulls(
+    seed: int, many: int
+) -> None:
     """Of few points it is exact, of many it is on the safe side."""
     rng = np.random.default_rng(100 * seed + many)
     meshes = {"arm.stl": drawn(rng, many), "shield.stl": drawn(rng, many)}
@@ -143,7 +155,9 @@ def test_a_document_of_a_machine_with_meshes_is_read_without_them() -> None:
     part = next(p for p in machine.components if p.name == "shield")
     points = np.array(part.points_mm)
     np.testing.assert_allclose(part.size_mm, np.ptp(points, axis=0), atol=1e-9)
-    np.testing.assert_allclose(part.center_mm, (points.max(0) + points.min(0)) / 2, atol=1e-9)
+    np.testing.assert_allclose(
+        part.center_mm, (points.max(0) + points.min(0)) / 2, atol=1e-9
+    )
     assert Machine.model_validate_json(machine.model_dump_json(by_alias=True)) == machine
 
 
@@ -180,5 +194,7 @@ def test_what_does_not_hold_of_a_mesh_is_told_with_file_and_part(
 
 
 def test_where_no_files_are_read_a_mesh_is_refused() -> None:
-    with pytest.raises(MachineFileError, match=r"arm\.mesh: must be left out: no files are read"):
+    with pytest.raises(
+        MachineFileError, match=r"arm\.mesh: must be left out: no files are read"
+    ):
         parse_machine(TEXT)

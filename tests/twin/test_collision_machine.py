@@ -13,7 +13,9 @@ from flexdt.twin.errors import MachineFileError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, parse_machine, profile_of
 
-FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
+FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text(
+    "utf-8"
+)
 
 
 @pytest.mark.parametrize(
@@ -22,7 +24,8 @@ FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_t
         ('parent = "source_platform"', 'parent = "source_platfrom"',
          r"source_tower.parent: must be a known earlier component: .*value: 'source_platfrom'"),
         ('parent = "source_platform"', 'parent = "detector"',
-         "components.source_tower.parent: must be a known earlier component: .*value: 'detector'"),
+         "components.source_tower.parent: must be a known earlier component: .*value: "
+         "'detector'"),
         ('axis = "tra_tube"', 'axis = "tra_tub"',
          "components.source_tower.axis: must be a known axis: ver_tube, .*value: 'tra_tub'"),
         ('axis = "tra_tube"', 'axis = "tra_det"',
@@ -53,7 +56,8 @@ def test_chains_of_the_flexray() -> None:
 
 
 def test_what_a_stage_on_the_turntable_carries_is_as_large_as_its_travel() -> None:
-    """By hand, from micro_ct: CX and CY go 5 mm either way; the axis is 150 mm from the source."""
+    """By hand, from micro_ct: CX and CY go 5 mm either way; the axis is 150 mm from the
+    source."""
     machine = builtin_machine("micro_ct")
     bodies = {b.name: b for b in stage_bodies(machine, profile_of(machine))}
     [sample] = sample_bodies(machine, profile_of(machine), (box((10.0, 20.0, 30.0)),))
@@ -65,7 +69,9 @@ def test_what_a_stage_on_the_turntable_carries_is_as_large_as_its_travel() -> No
     ):
         lower, upper = body.solid.bounds()
         np.testing.assert_allclose(body.origin, [0.0, 150.0, 0.0])
-        np.testing.assert_allclose((upper - lower) / 2, half, atol=0.15)  # round ones are prisms
+        np.testing.assert_allclose(
+            (upper - lower) / 2, half, atol=0.15
+        )  # round ones are prisms
         np.testing.assert_allclose((upper + lower) / 2, [0.0, 0.0, middle], atol=0.15)
         assert body.turns.any()
     assert bodies["panel"].origin.tolist() == [0.0, 300.0, 0.0]
@@ -79,7 +85,8 @@ CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
     ("text", "message"),
     [
         ("[axes.D]\n{axis}[geometry]\ndetector_y = {{ D = 1.0 }}",
-         "components.panel.axis: must be carried by every motor that .geometry. gives the detector"
+         "components.panel.axis: must be carried by every motor that .geometry. gives "
+         "the detector"
          ".*say axis = 'D'"),
         ("[axes.S]\n{axis}[geometry]\nsource_x = {{ S = 1.0 }}", "components.source.axis.*'S'"),
         ("[axes.S]\n{axis}[geometry]\nobject_y = {{ Z = 1.0, S = 1.0 }}",
@@ -109,12 +116,14 @@ CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
         ("[geometry]\ndetector_y = {{ Z = -1.0 }}\n[fixed]\ndetector_y = 1600.0\n[[components]]\n"
          'name = "panel"\naxis = "Z"\n[[components]]\nname = "table"\nparent = "panel"\n'
          'anchor = "object"\nsize_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]',
-         "components.table.anchor: must be 'detector', as that of the part that carries it, panel"),
+         "components.table.anchor: must be 'detector', as that of the part that carries "
+         "it, panel"),
         ("[fixed]\nmount_x = 200.0", "fixed.mount_x: must be left out where no stage"),
         ("[axes.S]\n{axis}[geometry]\nmount_x = {{ S = 1.0 }}\n[[components]]\nname = 'lift'\n"
          "axis = 'S'\n", "components.lift.axis: must be carried by the turntable"),
         ("[axes.S]\n{axis}[geometry]\nmount_x = {{ S = 1.0 }}\nobject_z = {{ }}\n[[components]]\n"
-         "name = 'lift'\naxis = 'R'\n[[components]]\nname = 'turntable'\naxis = 'S'\nrole = ''\n"
+         "name = 'lift'\naxis = 'R'\n[[components]]\nname = 'turntable'\naxis = "
+         "'S'\nrole = ''\n"
          "[[components]]\nname = 'x_carriage'\naxis = 'S'\n",
          "components.x_carriage.axis: must be carried by the turntable"),
         ('[[components]]\nname = "source"\nshape = "cylinder"\nsize_mm = [200.0, 200.0, 200.0]\n'
@@ -142,7 +151,9 @@ def test_what_moves_the_image_moves_the_body(text: str, message: str) -> None:
         "acceleration = 5.0\nmax_acceleration = 5.0\n"
     )
     with pytest.raises(MachineFileError, match=message):
-        parse_machine(CABINET + text.replace("{axis}", axis).replace("{{", "{").replace("}}", "}"))
+        parse_machine(
+            CABINET + text.replace("{axis}", axis).replace("{{", "{").replace("}}", "}")
+        )
 
 
 def test_nothing_takes_away_what_the_base_has() -> None:
@@ -176,7 +187,11 @@ def drawn_file(rng: np.random.Generator) -> tuple[str, dict[str, dict[str, float
             f"[axes.{motor}]\nlower = -50.0\nupper = 50.0\nhome = 0.0\nspeed = 5.0\n"
             "max_speed = 9.0\nacceleration = 5.0\nmax_acceleration = 9.0\n"
         )
-    for anchor, part in (("source", "source"), ("object", "turntable"), ("detector", "panel")):
+    for anchor, part in (
+        ("source", "source"),
+        ("object", "turntable"),
+        ("detector", "panel"),
+    ):
         used = {m for q in quantities if q.startswith(anchor) for m in shares[q]}
         parent = ""
         for motor in sorted(used):
@@ -191,7 +206,8 @@ def drawn_file(rng: np.random.Generator) -> tuple[str, dict[str, dict[str, float
 
 
 def renamed(text: str) -> str:
-    """The same file with parts of its own instead of the base's, after those that carry them."""
+    """The same file with parts of its own instead of the base's, after those that carry
+    them."""
     base = builtin_machine("xyzr_cabinet")
     parts = {c.name: c for c in base.components}
     for name in ("source", "turntable", "panel"):
@@ -212,7 +228,10 @@ def test_bodies_of_drawn_machines_stand_where_own_sums_put_them(seed: int) -> No
     text, shares = drawn_file(rng)
     machine = parse_machine(renamed(text))
     profile = profile_of(machine).model_copy(
-        update={n: float(rng.uniform(-3, 3)) for n in ("det_tan", "src_ort", "axs_tan", "c_det")}
+        update={
+            n: float(rng.uniform(-3, 3))
+            for n in ("det_tan", "src_ort", "axs_tan", "c_det")
+        }
     )
     at = {m: float(rng.uniform(-50, 50)) for m in machine.axes if m != "R"}
     offset = {"source_z": profile.src_ort, "object_x": profile.axs_tan,
@@ -263,7 +282,9 @@ def test_a_motor_of_the_turntables_stage_leaves_the_panel_as_it_is() -> None:
         'upper = 305.0\nhome = 300.0\n[[components]]\nname = "panel"\naxis = "CX"\n'
     )
     machine = parse_machine(text)
-    panel = next(b for b in stage_bodies(machine, profile_of(machine)) if b.name == "panel")
+    panel = next(
+        b for b in stage_bodies(machine, profile_of(machine)) if b.name == "panel"
+    )
     lower, upper = panel.solid.bounds()
     np.testing.assert_allclose([lower[0], upper[0]], [-70.0, 70.0])
     # The sample: 5 mm from its middle, which goes from -2 + 295 - 300 to 8 + 305 - 300 along x.

@@ -1,4 +1,5 @@
-"""The FleX-ray's bodies: Table 4.1's sizes, free where the thesis scanned, touching where not."""
+"""The FleX-ray's bodies: Table 4.1's sizes, free where the thesis scanned, touching where
+not."""
 
 from __future__ import annotations
 
@@ -13,14 +14,23 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from swept import sweep
 
-from flexdt.twin.collision.collision_scene import CollisionScene, PairStack, build_scene, scene_of
+from flexdt.twin.collision.collision_scene import (
+    CollisionScene,
+    PairStack,
+    build_scene,
+    scene_of,
+)
 from flexdt.twin.collision.convex_solids import UprightCylinder, box
 from flexdt.twin.collision.first_contact import clearance, touching
 from flexdt.twin.collision.relative import Limits
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, Offsets
-from flexdt.twin.machine.description import builtin_machine, builtin_profile, builtin_profiles
+from flexdt.twin.machine.description import (
+    builtin_machine,
+    builtin_profile,
+    builtin_profiles,
+)
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.motion import profiles as motion
 
@@ -73,7 +83,9 @@ TABLE_6_2 = {
 }  # fmt: skip
 
 
-def geometry(source: tuple, detector: tuple, obj: tuple) -> tuple[dict[str, float], float]:
+def geometry(
+    source: tuple, detector: tuple, obj: tuple
+) -> tuple[dict[str, float], float]:
     """Motors for a geometry of the tables without zero offsets, and the sample's height."""
     motors = {
         "tra_tube": source[0], "ver_tube": source[1],
@@ -83,7 +95,9 @@ def geometry(source: tuple, detector: tuple, obj: tuple) -> tuple[dict[str, floa
     return {n: float(v) for n, v in motors.items()}, float(obj[1])
 
 
-def scene(profile: str = "thesis", *samples: object, margin: float | None = None) -> CollisionScene:
+def scene(
+    profile: str = "thesis", *samples: object, margin: float | None = None
+) -> CollisionScene:
     return build_scene(M, builtin_profile(profile), samples, margin_mm=margin)  # type: ignore[arg-type]
 
 
@@ -192,10 +206,13 @@ def test_poses_within_the_travel_that_collide(name: str) -> None:
 
 @pytest.mark.parametrize("profile", ["thesis", M.default_profile, "cwi-2022-05-31"])
 def test_bodies_sit_where_the_x_ray_geometry_is(profile: str) -> None:
-    """Focal spot, panel and sample of the scene against `kinematics.poses`, from random motors."""
+    """Focal spot, panel and sample of the scene against `kinematics.poses`, from random
+    motors."""
     p = builtin_profile(profile)
     rng = np.random.default_rng(3)
-    marks = np.array([[3.0, 7.0, -11.0], [-20.0, 1.0, 4.0], [5.0, -6.0, 30.0], [1.0, 2.0, 3.0]])
+    marks = np.array(
+        [[3.0, 7.0, -11.0], [-20.0, 1.0, 4.0], [5.0, -6.0, 30.0], [1.0, 2.0, 3.0]]
+    )
     s = build_scene(M, p, [box((2, 2, 2), mark) for mark in marks])
     sensor = M.detector.pixels
     for _ in range(20):
@@ -224,7 +241,9 @@ def test_bodies_sit_where_the_x_ray_geometry_is(profile: str) -> None:
         for mark, (name, centre) in zip(
             marks, [c for c in centres.items() if c[0].startswith("sample ")], strict=True
         ):
-            assert_allclose(centre, seen.axis[0] + clockwise @ mark, atol=1e-9, err_msg=name)
+            assert_allclose(
+                centre, seen.axis[0] + clockwise @ mark, atol=1e-9, err_msg=name
+            )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -254,7 +273,9 @@ def test_bodies_follow_the_correction_in_force(seed: int) -> None:
     q = s.vector(motors)
     world: dict[str, list[FloatArray]] = {}
     for body in s.bodies:
-        points = body.solid.vertices if hasattr(body.solid, "vertices") else np.zeros((1, 3))
+        points = (
+            body.solid.vertices if hasattr(body.solid, "vertices") else np.zeros((1, 3))
+        )
         turned = points @ body.rotation(float(q @ body.turns)).T
         world.setdefault(body.name, []).append(body.origin + q @ body.slides + turned)
     tip = world["xray_source"][0].mean(axis=0) + [0, 50, 0]
@@ -278,8 +299,12 @@ def test_a_cylinder_sample_off_the_axis_is_held_by_its_prism() -> None:
     s = build_scene(
         M, builtin_profile("thesis"), [UprightCylinder((0, 0, 0), 30.0, 40.0)], correction
     )
-    plain = build_scene(M, builtin_profile("thesis"), [UprightCylinder((0, 0, 0), 30.0, 40.0)])
-    moved, upright = (next(b for b in x.bodies if b.name == "sample").solid for x in (s, plain))
+    plain = build_scene(
+        M, builtin_profile("thesis"), [UprightCylinder((0, 0, 0), 30.0, 40.0)]
+    )
+    moved, upright = (
+        next(b for b in x.bodies if b.name == "sample").solid for x in (s, plain)
+    )
     angle = math.radians(2.0)
     for x, y, z in np.random.default_rng(0).normal(size=(50, 3)):
         # The tilt turns about x, after the shift by -tau along x.
@@ -316,7 +341,9 @@ def test_pairs_set_aside_cannot_touch_anywhere_in_the_travel() -> None:
     rng = np.random.default_rng(0)
     corners = itertools.product(*((a.lower, a.upper) for a in M.axes.values()))
     some = [dict(zip(M.axes, c, strict=True)) for c in corners]
-    some += [{n: rng.uniform(a.lower, a.upper) for n, a in M.axes.items()} for _ in range(100)]
+    some += [
+        {n: rng.uniform(a.lower, a.upper) for n, a in M.axes.items()} for _ in range(100)
+    ]
     for motors in some:
         q = s.vector(motors)
         for i, j in s.distant:
@@ -328,7 +355,9 @@ def test_pairs_set_aside_cannot_touch_anywhere_in_the_travel() -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.tuples(*[st.floats(0.1, 500.0)] * 3), st.tuples(*[st.floats(-900.0, 900.0)] * 3))
+@given(
+    st.tuples(*[st.floats(0.1, 500.0)] * 3), st.tuples(*[st.floats(-900.0, 900.0)] * 3)
+)
 def test_the_triangles_of_a_box_are_its_surface_seen_from_outside(
     size: tuple[float, float, float], centre: tuple[float, float, float]
 ) -> None:
@@ -356,7 +385,8 @@ def drawn_bodies(rng: np.random.Generator, axes: int) -> list[Body]:
 
 
 def apart_along(a: Body, b: Body, reach: FloatArray) -> FloatArray:
-    """(3,) gaps along x, y and z that no position within reach closes: those of all its corners."""
+    """(3,) gaps along x, y and z that no position within reach closes: those of all its
+    corners."""
     corners = np.array(list(itertools.product(*reach)))
     (low_a, high_a), (low_b, high_b) = (
         [x.origin + corners @ x.slides + end for end in x.solid.bounds()] for x in (a, b)
@@ -389,11 +419,17 @@ def test_pairs_of_one_stage_or_at_different_levels_are_set_aside_where_they_stay
         a, b = bodies[i], bodies[j]
         gaps = apart_along(a, b, reach)
         still = (a.slides == b.slides).all(axis=0)
-        built_in = a.stage == b.stage or "world" in (a.stage, b.stage) or (gaps[still] > 0.0).any()
+        built_in = (
+            a.stage == b.stage
+            or "world" in (a.stage, b.stage)
+            or (gaps[still] > 0.0).any()
+        )
         if built_in and np.linalg.norm(np.maximum(gaps, 0.0)) > 0.11:
             wanted.add((i, j))
     assert set(made.distant) == wanted
-    assert sorted((*made.pairs, *made.distant)) == list(itertools.combinations(range(9), 2))
+    assert sorted((*made.pairs, *made.distant)) == list(
+        itertools.combinations(range(9), 2)
+    )
 
 
 def test_the_least_clearance_of_a_machine_is_right_to_a_tenth_or_two_percent() -> None:

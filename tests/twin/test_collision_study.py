@@ -46,8 +46,11 @@ def test_short_study(study: ModuleType, tmp_path: Path) -> None:
 
 
 def test_the_reference_itself(study: ModuleType) -> None:
-    """Its separating axis test: cubes of 2 mm at 1.9 and 2.1 mm, and one turned by 45 degrees."""
-    cube = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    """Its separating axis test: cubes of 2 mm at 1.9 and 2.1 mm, and one turned by 45
+    degrees."""
+    cube = np.array(
+        [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float
+    )
     places = np.array([[1.9, 0, 0], [2.1, 0, 0], [2.3, 0, 0], [2.5, 0, 0]])
     c = np.sqrt(0.5)
     turn = np.array([[c, -c, 0], [c, c, 0], [0, 0, 1.0]])

@@ -17,7 +17,13 @@ from scipy.spatial import ConvexHull
 from swept import sweep
 
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
+from flexdt.twin.collision.convex_solids import (
+    ConvexSolid,
+    Polytope,
+    UprightCylinder,
+    box,
+    hull,
+)
 from flexdt.twin.collision.first_contact import (
     SweepResult,
     clearance,
@@ -46,7 +52,8 @@ from flexdt.twin.motion.profiles import AxisPath, Piece, Trajectory
 AXES = ("x", "y", "turn")
 MARGIN, TOLERANCE = 1.0, 0.01
 KEPT = 0.0049
-"""What is free keeps so much more than the margin: one rung of the floors less rounding [mm]."""
+"""What is free keeps so much more than the margin: one rung of the floors less rounding
+[mm]."""
 RUNG = 0.0052
 """What all that is accepted may take from a gap within the margin [mm]."""
 
@@ -61,7 +68,9 @@ def one_against(
     """`moving` on x, y and turn (right-handed about `spin`); `fixed` around it."""
     slides = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]])
     turns = np.array([0.0, 0.0, math.radians(1.0)])
-    carried = Body("thing", moving, np.zeros(3), slides, turns, "thing", "object", np.array(spin))
+    carried = Body(
+        "thing", moving, np.zeros(3), slides, turns, "thing", "object", np.array(spin)
+    )
     still = [
         Body(f"wall {i}", s, np.zeros(3), np.zeros((3, 3)), np.zeros(3), "", "detector")
         for i, s in enumerate(fixed)
@@ -80,7 +89,9 @@ def go(scene: CollisionScene, targets: Mapping[str, float],
        start: Mapping[str, float] | None = None, speed: float = 50.0) -> SweepResult:  # fmt: skip
     begin = start or {}
     trajectories = {
-        n: motion.move(begin.get(n, 0.0), 0.0, targets.get(n, begin.get(n, 0.0)), speed, 50.0, 0.0)
+        n: motion.move(
+            begin.get(n, 0.0), 0.0, targets.get(n, begin.get(n, 0.0)), speed, 50.0, 0.0
+        )
         for n in AXES
     }
     return sweep(scene, trajectories, 0.0, max(t.end for t in trajectories.values()))
@@ -112,7 +123,9 @@ def test_contact_during_speeding_up_and_braking() -> None:
     far = one_against(box((2, 2, 2)), [box((1, 9, 9), (86.5 + KEPT, 0, 0))])
     result = go(far, {"x": 100.0})
     assert result.contact is not None
-    assert result.contact.time == pytest.approx(3.0 - 0.8, abs=1e-9)  # 84 of 100 mm in 3 s
+    assert result.contact.time == pytest.approx(
+        3.0 - 0.8, abs=1e-9
+    )  # 84 of 100 mm in 3 s
     assert result.contact.positions["x"] == pytest.approx(84.0, abs=1e-6)
 
 
@@ -144,11 +157,14 @@ def test_two_motors_at_once_meet_only_because_of_their_timing() -> None:
         assert go(scene, half).contact is None
         assert go(scene, {**half, second: 120.0}, half).contact is None
     # By hand: corner (p+5, p+5) to the post's centre, sqrt(2) (55 - p) = 5 + 1.
-    assert together.contact.positions["x"] == pytest.approx(55 - 6 / math.sqrt(2), abs=0.02)
+    assert together.contact.positions["x"] == pytest.approx(
+        55 - 6 / math.sqrt(2), abs=0.02
+    )
 
 
 def test_a_turning_bar_meets_a_wall_at_the_angle_of_trigonometry() -> None:
-    """Half length 150, half width 5, wall at 100 mm: its corner comes to 99 mm from the axis."""
+    """Half length 150, half width 5, wall at 100 mm: its corner comes to 99 mm from the
+    axis."""
     bar, wall = box((300, 10, 10)), box((500, 1, 50), (0, 100.5, 0))
     scene = one_against(bar, [wall])
     result = go(scene, {"turn": 720.0}, speed=45.0)
@@ -165,7 +181,9 @@ def test_a_turning_bar_meets_a_wall_at_the_angle_of_trigonometry() -> None:
 
 
 def test_a_cylinder_turns_on_the_spot() -> None:
-    scene = one_against(UprightCylinder((0, 0, 0), 50.0, 20.0), [box((10, 100, 100), (56.2, 0, 0))])
+    scene = one_against(
+        UprightCylinder((0, 0, 0), 50.0, 20.0), [box((10, 100, 100), (56.2, 0, 0))]
+    )
     result = go(scene, {"turn": 7200.0}, speed=90.0)
     assert result.contact is None
     assert result.looks <= 3
@@ -253,7 +271,9 @@ def test_a_path_that_turns_round_in_mid_piece_is_cut_there() -> None:
 
 
 def test_a_motor_that_jumps_is_refused() -> None:
-    jump = Trajectory((Piece(0.0, 0.0, 10.0, 0.0), Piece(1.0, 50.0, 10.0, 0.0)), 2.0, 60.0)
+    jump = Trajectory(
+        (Piece(0.0, 0.0, 10.0, 0.0), Piece(1.0, 50.0, 10.0, 0.0)), 2.0, 60.0
+    )
     with pytest.raises(ValueError, match="x jumps from 10 to 50 at 1 s"):
         path_of(("x",), {"x": AxisPath.along(jump)}, 0.0, 2.0)
     rests = Trajectory((Piece(0.0, 0.0, 0.0, 0.0), Piece(1.0, 5.0, 0.0, 0.0)), 2.0, 5.0)
@@ -263,8 +283,12 @@ def test_a_motor_that_jumps_is_refused() -> None:
 
 def test_pauses_cost_nothing() -> None:
     """Two moves with an hour between, as one path."""
-    out, back = (motion.move(a, 0.0, b, 50.0, 50.0, s) for a, b, s in ((0, 90, 0), (90, 0, 3600)))
-    both = Trajectory((*out.pieces, Piece(out.end, 90.0, 0.0, 0.0), *back.pieces), back.end, 0.0)
+    out, back = (
+        motion.move(a, 0.0, b, 50.0, 50.0, s) for a, b, s in ((0, 90, 0), (90, 0, 3600))
+    )
+    both = Trajectory(
+        (*out.pieces, Piece(out.end, 90.0, 0.0, 0.0), *back.pieces), back.end, 0.0
+    )
     scene = one_against(box((10, 10, 10)), [box((1, 50, 50), (120, 0, 0))])
     result = sweep(scene, {"x": both}, 0.0, both.end)
     assert result.contact is None
@@ -336,7 +360,9 @@ def test_the_certified_clearance_is_the_distance_and_never_more(seed: int) -> No
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(0.01, 20.0), st.sampled_from([-1.0, 0.0, 1.0]))
+@given(
+    st.integers(0, 2**32 - 1), st.floats(0.01, 20.0), st.sampled_from([-1.0, 0.0, 1.0])
+)
 def test_a_turn_within_its_bound_never_comes_nearer(
     seed: int, allowance: float, sense: float
 ) -> None:
@@ -344,7 +370,9 @@ def test_a_turn_within_its_bound_never_comes_nearer(
     spin = rng.normal(size=3)
     spin /= np.linalg.norm(spin)
     solid = hull(rng.normal(size=(8, 3)) * 20 + rng.normal(size=3) * 20)
-    body = Body("b", solid, np.zeros(3), np.zeros((1, 3)), np.ones(1), "b", "object", spin)
+    body = Body(
+        "b", solid, np.zeros(3), np.zeros((1, 3)), np.ones(1), "b", "object", spin
+    )
     toward = rng.normal(size=3)
     toward /= np.linalg.norm(toward)
     turn = min(body.turn_until(toward, allowance, sense), 20.0)
@@ -374,8 +402,8 @@ def test_bounds_of_many_pairs_are_lower_bounds() -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.daily(2)
 def test_a_turn_that_begins_the_other_way_meets_what_it_turns_into(seed: int) -> None:
-    """What rounding leaves of the velocity where a motor turns round pointed the old way, and the
-    rest of the turn counted as turning back: a contact was passed unseen."""
+    """What rounding leaves of the velocity where a motor turns round pointed the old way, and
+    the rest of the turn counted as turning back: a contact was passed unseen."""
     rng = np.random.default_rng(seed)
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
@@ -403,8 +431,8 @@ def test_a_hair_s_breadth_before_touching_it_never_overlaps(gap: float) -> None:
 
 
 def test_a_contact_s_clearance_is_never_reported_below_what_the_bound_proves() -> None:
-    """A distance that comes out 0.004 mm short at the contact does not lower the least clearance:
-    the bound from the look before proves the margin itself."""
+    """A distance that comes out 0.004 mm short at the contact does not lower the least
+    clearance: the bound from the look before proves the margin itself."""
     looks = []
 
     def short(
@@ -419,7 +447,9 @@ def test_a_contact_s_clearance_is_never_reported_below_what_the_bound_proves() -
     )
     move = motion.move(-50.0, 0.0, 0.0, 50.0, 50.0, 0.0)
     path = path_of(("x",), {"x": AxisPath.along(move)}, 0.0, move.end)
-    result = sweep_pair(RelativeMotion(a, b, path), short, Limits(MARGIN, TOLERANCE, (0.1, 0.02)))
+    result = sweep_pair(
+        RelativeMotion(a, b, path), short, Limits(MARGIN, TOLERANCE, (0.1, 0.02))
+    )
     assert result.contact is not None
     assert result.looks == 2
     assert result.least == pytest.approx(MARGIN + KEPT, abs=1e-9)
@@ -427,7 +457,12 @@ def test_a_contact_s_clearance_is_never_reported_below_what_the_bound_proves() -
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.floats(-500.0, 500.0), st.floats(1.0, 15.0), st.floats(0.0, 1e4), st.floats(0.01, 0.99))
+@given(
+    st.floats(-500.0, 500.0),
+    st.floats(1.0, 15.0),
+    st.floats(0.0, 1e4),
+    st.floats(0.01, 0.99),
+)
 def test_what_is_left_of_a_path_ends_exactly_where_it_did(
     start: float, distance: float, time: float, share: float
 ) -> None:
@@ -442,7 +477,9 @@ def test_what_is_left_of_a_path_ends_exactly_where_it_did(
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(1e-3, 15.0), st.floats(0.1, 0.9), st.booleans())
-def test_an_overlap_is_measured_where_that_is_asked(depth: float, gap: float, deep: bool) -> None:
+def test_an_overlap_is_measured_where_that_is_asked(
+    depth: float, gap: float, deep: bool
+) -> None:
     scene = one_against(box((20, 20, 20)), [box((20, 200, 200), (60, 0, 0))])
     touching = SceneGuard(scene).touching
     pair = ("thing", "wall 0")
@@ -495,7 +532,9 @@ def test_drawn_motions_against_distances_at_many_times(seed: int) -> None:
         walls += [wall] if apart(0.0, [wall]) > 2 * MARGIN else []
     times = np.linspace(0.0, max(t.end for t in ways.values()), 1200)
     gaps = np.array([apart(time, walls) for time in times])
-    fastest = 60.0 + math.radians(quick) * 12.0  # two motors at 40 mm/s, and corners 12 mm out
+    fastest = (
+        60.0 + math.radians(quick) * 12.0
+    )  # two motors at 40 mm/s, and corners 12 mm out
     exact = Limits(MARGIN, TOLERANCE, (1e-3, 0.0))
     scene = dataclasses.replace(one_against(moving, walls), limits=exact)
     found = sweep(scene, ways, 0.0, times[-1])
@@ -505,7 +544,9 @@ def test_drawn_motions_against_distances_at_many_times(seed: int) -> None:
         assert low - 1e-3 <= found.min_clearance_mm <= gaps.min() + 2e-3
     else:
         assert gaps[times <= found.contact.time].min() > MARGIN - 1e-3
-        assert MARGIN - 1e-3 <= apart(found.contact.time, walls) <= MARGIN + TOLERANCE + 1e-3
+        assert (
+            MARGIN - 1e-3 <= apart(found.contact.time, walls) <= MARGIN + TOLERANCE + 1e-3
+        )
         assert found.contact.last_free_time <= found.contact.time
         assert apart(found.contact.last_free_time, walls) >= MARGIN + TOLERANCE
         assert MARGIN <= found.min_clearance_mm <= MARGIN + TOLERANCE
@@ -541,7 +582,9 @@ def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) ->
     scene = one_against(centred_solid(rng), [centred_solid(rng)])
     [pair] = scene.all.pairs
     a, b = (scene.bodies[i] for i in pair)
-    polygon = 0.0023 * sum(s.solid.radius for s in (a, b) if isinstance(s.solid, UprightCylinder))
+    polygon = 0.0023 * sum(
+        s.solid.radius for s in (a, b) if isinstance(s.solid, UprightCylinder)
+    )
 
     def truth(q: FloatArray) -> float:
         points = [solid_points(x.solid) @ x.rotation(float(q @ x.turns)).T + q @ x.slides
@@ -561,7 +604,9 @@ def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) ->
             q = begin + (share, -0.7 * share, turn)
             assert overlap.separation(q) <= truth(q) + 1e-6
             if turn == 0.0 and truth(q) < 0.0:
-                assert overlap.separation(q) >= truth(q) - polygon - (1.0 if polygon else 1e-6)
+                assert overlap.separation(q) >= truth(q) - polygon - (
+                    1.0 if polygon else 1e-6
+                )
 
 
 def flat_gaps(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -574,8 +619,13 @@ def flat_gaps(a: FloatArray, b: FloatArray) -> FloatArray:
         outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
         outward /= np.linalg.norm(outward, axis=-1)[..., None]
         from_edge = q[:, None] - p[:, :, None]
-        slabs.append(np.einsum("nekc,nec->nek", from_edge, outward).min(axis=2).max(axis=1))
-        share = np.einsum("nekc,nec->nek", from_edge, along) / (along**2).sum(axis=2)[..., None]
+        slabs.append(
+            np.einsum("nekc,nec->nek", from_edge, outward).min(axis=2).max(axis=1)
+        )
+        share = (
+            np.einsum("nekc,nec->nek", from_edge, along)
+            / (along**2).sum(axis=2)[..., None]
+        )
         to = from_edge - np.clip(share, 0.0, 1.0)[..., None] * along[:, :, None]
         squared.append((to**2).sum(axis=3).min(axis=(1, 2)))
     widest = np.maximum(*slabs)
@@ -602,7 +652,9 @@ def gaps_along(
     """Of a polygon on x, y and turn from `WALL`, at each of `times`."""
     x, y, turn = (np.array([ways[n].position(t) for t in times.tolist()]) for n in AXES)
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-    turned = np.einsum("nij,kj->nki", np.array([[c, -s], [s, c]]).transpose(2, 0, 1), outline)
+    turned = np.einsum(
+        "nij,kj->nki", np.array([[c, -s], [s, c]]).transpose(2, 0, 1), outline
+    )
     return flat_gaps(turned + np.stack([x, y], axis=1)[:, None], WALL)
 
 
@@ -619,11 +671,19 @@ def gaps_along(
 def test_an_overlap_never_deepens_and_once_free_keeps_the_margin(
     corners: int, off: float, depth: float, turn: float, slide: float, seed: int
 ) -> None:
-    """Whatever the motion: edges and corners of polygons, looked at 4 000 times, say the same."""
+    """Whatever the motion: edges and corners of polygons, looked at 4 000 times, say the
+    same."""
     rng = np.random.default_rng(seed)
     outline = regular(corners, float(rng.uniform(5.0, 60.0))) + (off, 0.0)
-    begin = {"x": 0.0, "y": float(rng.uniform(-9, 9)), "turn": float(rng.uniform(-360, 360))}
-    toward = [math.cos(math.radians(begin["turn"])), -math.sin(math.radians(begin["turn"]))]
+    begin = {
+        "x": 0.0,
+        "y": float(rng.uniform(-9, 9)),
+        "turn": float(rng.uniform(-360, 360)),
+    }
+    toward = [
+        math.cos(math.radians(begin["turn"])),
+        -math.sin(math.radians(begin["turn"])),
+    ]
     begin["x"] = depth - float((outline @ toward).max())
     ways = {}
     for name, reach in (("x", -slide), ("y", slide), ("turn", turn)):
@@ -648,7 +708,8 @@ def test_an_overlap_never_deepens_and_once_free_keeps_the_margin(
 
 
 def test_a_turn_of_one_corner_a_look_is_no_way_past_the_corners() -> None:
-    """At 400 even moments of it no corner of a decagon seems nearer to the wall than at first."""
+    """At 400 even moments of it no corner of a decagon seems nearer to the wall than at
+    first."""
     outline, begin = regular(10, 125.0), -8.9995
     x = 0.3 - 125.0 * math.cos(math.radians(begin))
     way = motion.move(begin, 0.0, begin + 398 * 36.0, 45.0, 45.0**2 / 36.0, 0.0)
@@ -658,10 +719,14 @@ def test_a_turn_of_one_corner_a_look_is_no_way_past_the_corners() -> None:
     assert gaps_along(outline, ways, densely).min() < -1.8
     found = SceneGuard(one_against(upright(outline), [upright(WALL)]))(ways, 0.0)
     assert found is not None
-    assert gaps_along(outline, ways, np.array([found.time]))[0] == pytest.approx(-0.3, abs=RUNG)
+    assert gaps_along(outline, ways, np.array([found.time]))[0] == pytest.approx(
+        -0.3, abs=RUNG
+    )
 
 
-@pytest.mark.parametrize("corners", [np.zeros(3), np.zeros((4, 2)), np.full((4, 3), np.nan)])
+@pytest.mark.parametrize(
+    "corners", [np.zeros(3), np.zeros((4, 2)), np.full((4, 3), np.nan)]
+)
 def test_corners_that_are_none_are_refused(corners: FloatArray) -> None:
     with pytest.raises(ValueError, match=r"allowed: \(k, 3\), finite"):
         Polytope(corners, np.zeros((1, 3), dtype=np.intp))
@@ -672,9 +737,14 @@ def test_a_solid_reaches_as_far_from_an_axis_as_its_farthest_point(seed: int) ->
     rng = np.random.default_rng(seed)
     for axis in (np.array([0.0, 0.0, 1.0]), rng.normal(size=3)):
         way = axis / np.linalg.norm(axis)
-        for solid in (random_solid(rng), UprightCylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)):
+        for solid in (
+            random_solid(rng),
+            UprightCylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0),
+        ):
             points = solid_points(solid)
-            rounding = 0.0023 * solid.radius if isinstance(solid, UprightCylinder) else 1e-9
+            rounding = (
+                0.0023 * solid.radius if isinstance(solid, UprightCylinder) else 1e-9
+            )
             held = points
             if isinstance(solid, UprightCylinder) and way[2] != 1.0:  # the box around it
                 half = np.array([solid.radius, solid.radius, solid.height / 2])
@@ -738,7 +808,9 @@ def test_what_is_left_of_a_path_is_the_same_motion(seed: int) -> None:
             one.v + 0.5 * np.diff(one.times)[:, None] * one.a
         )
         assert_allclose(here, one.q[1:], atol=1e-7)
-    assert path.positions(float(times[7])) == pytest.approx(dict(zip(AXES, truth[7], strict=True)))
+    assert path.positions(float(times[7])) == pytest.approx(
+        dict(zip(AXES, truth[7], strict=True))
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -759,8 +831,11 @@ def test_upright_boxes_are_as_far_apart_as_their_corners_say(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_two_turntables_on_each_other_meet_a_wall_where_trigonometry_says(seed: int) -> None:
-    """The farthest of a bar's corners, as high above the axis as sine and cosine of both turns."""
+def test_two_turntables_on_each_other_meet_a_wall_where_trigonometry_says(
+    seed: int,
+) -> None:
+    """The farthest of a bar's corners, as high above the axis as sine and cosine of both
+    turns."""
     rng = np.random.default_rng(seed)
     half, wide = rng.uniform(40, 90), rng.uniform(2, 20)
     ways = {name: drawn_motion(rng, 60.0) for name in ("first", "second")}
@@ -807,7 +882,9 @@ def test_a_bound_in_pieces_falls_first_where_it_has_the_level_and_had_more_befor
             here = found is not None and found.segment == j
             stop = found.dt if found is not None and here else lengths[j]
             dt = np.linspace(since, stop, 500)
-            seen.append(height + rate[j] * (dt - since) + growth[j] * (dt**2 - since**2) / 2.0)
+            seen.append(
+                height + rate[j] * (dt - since) + growth[j] * (dt**2 - since**2) / 2.0
+            )
             height, since = float(seen[-1][-1]), 0.0
             if here:
                 assert height == pytest.approx(level, abs=1e-9)
@@ -823,8 +900,12 @@ def test_a_bound_that_only_dips_below_the_level_falls_there(seed: int) -> None:
     lengths, depths = rng.uniform(0.3, 3.0, count), rng.uniform(0.1, 0.4, count)
     dip = int(rng.integers(6, count))
     depths[dip] = rng.uniform(0.6, 0.9)
-    growth = 8.0 * depths / lengths**2  # a parabola that starts and ends at the same height
-    found = _Bound(-growth * lengths / 2.0, growth).first_fall(Moment(0, 0.0), lengths, 1.0, 0.5)
+    growth = (
+        8.0 * depths / lengths**2
+    )  # a parabola that starts and ends at the same height
+    found = _Bound(-growth * lengths / 2.0, growth).first_fall(
+        Moment(0, 0.0), lengths, 1.0, 0.5
+    )
     assert found is not None
     assert found.segment == dip
     down = lengths[dip] / 2.0 * (1.0 - np.sqrt(1.0 - 0.5 / depths[dip]))
@@ -855,7 +936,11 @@ def test_the_end_that_is_nearest_along_a_direction_is_found(seed: int) -> None:
 def test_the_farthest_point_along_a_direction_is_one_of_the_solid(seed: int) -> None:
     rng = np.random.default_rng(seed)
     round_one = UprightCylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)
-    for direction in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), rng.normal(size=3)):
+    for direction in (
+        np.array([0.0, 0.0, 1.0]),
+        np.array([0.0, -1.0, 0.0]),
+        rng.normal(size=3),
+    ):
         for solid in (random_solid(rng), round_one):
             point = solid.farthest(direction)
             assert point @ direction >= (solid_points(solid) @ direction).max() - 1e-9
@@ -877,7 +962,11 @@ def test_a_path_begun_before_or_during_its_motions_is_where_they_are(seed: int) 
         legs = [motion.at_rest(float(rng.uniform(-9, 9)), begin)]
         for now in (begin + np.cumsum([0.0, *rng.uniform(0.3, 2.0, 3)])).tolist():
             here = legs[-1].position(now), legs[-1].velocity(now)
-            wanted, lease, pace = rng.uniform(-30, 30), rng.uniform(0.5, 4), rng.uniform(5, 40)
+            wanted, lease, pace = (
+                rng.uniform(-30, 30),
+                rng.uniform(0.5, 4),
+                rng.uniform(5, 40),
+            )
             legs.append(motion.jog(*here, float(wanted), float(lease), float(pace), now))
         ways[name] = motion.joined(legs)
     end = max(way.end for way in ways.values())
@@ -896,17 +985,26 @@ def test_a_solid_that_turns_about_a_direction_never_comes_nearer_along_it() -> N
     for sense in (-1.0, 0.0, 1.0):
         solid = hull(rng.normal(size=(8, 3)) * 20)
         up = np.array([0.0, 0.0, 1.0])
-        body = Body("b", solid, np.zeros(3), np.zeros((1, 3)), np.ones(1), "b", "object", up)
+        body = Body(
+            "b", solid, np.zeros(3), np.zeros((1, 3)), np.ones(1), "b", "object", up
+        )
         assert body.turn_until(up, 0.5, sense) >= (1e3 if sense == 0.0 else math.pi)
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_the_clearance_of_a_pose_is_that_of_the_turned_corners(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    moving, wall = box(rng.uniform(5, 30, 3)), box(rng.uniform(5, 30, 3), (45.0, 0.0, 0.0))
+    moving, wall = (
+        box(rng.uniform(5, 30, 3)),
+        box(rng.uniform(5, 30, 3), (45.0, 0.0, 0.0)),
+    )
     x, y, turn = rng.uniform(-20, 5), rng.uniform(-9, 9), rng.uniform(10, 80)
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
-    points = moving.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0)
+    points = moving.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (
+        x,
+        y,
+        0,
+    )
     near = clearance(one_against(moving, [wall]), {"x": x, "y": y, "turn": turn})
     assert near.mm == pytest.approx(true_distance(points, wall.vertices), abs=1e-4)
 

@@ -1,6 +1,7 @@
 """Turntables: what two of them carry turns round while neither does; long spins cost no more.
 
-The witness is a bar as a row of points, turned by the sum of both angles, and the tube as a box.
+The witness is a bar as a row of points, turned by the sum of both angles, and the tube as a
+box.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ BAR = np.array([(x, y) for x in np.linspace(-HALF, HALF, 151) for y in (-WIDE, W
 
 
 def machine(rng: np.random.Generator) -> Machine:
-    """A small turntable upon the shipped one, each with a speed and an acceleration of its own."""
+    """A small turntable upon the shipped one, each with a speed and an acceleration of its
+    own."""
     quick, slow = rng.uniform(15, 39), rng.uniform(2, 10)
     if rng.random() < 0.5:
         quick, slow = slow, quick
@@ -82,7 +84,9 @@ def test_what_turns_round_between_two_turntables_is_seen(seed: int) -> None:
         for _ in range(2):
             start = twin.rest_time(0.0)
             try:
-                twin.move({"R": rng.uniform(-120, 120), "F": rng.uniform(-400, 400)}, start)
+                twin.move(
+                    {"R": rng.uniform(-120, 120), "F": rng.uniform(-400, 400)}, start
+                )
             except CollisionError:
                 stopped += 1
             end = twin.rest_time(start)
@@ -94,7 +98,9 @@ def test_what_turns_round_between_two_turntables_is_seen(seed: int) -> None:
     assert stopped >= 4
 
 
-def test_turns_after_the_first_are_not_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_turns_after_the_first_are_not_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A long spin costs what a short one does, and ends or is refused as it would be."""
     looks = 0
     look = RelativeMotion.look
@@ -114,7 +120,9 @@ def test_turns_after_the_first_are_not_looked_at_again(monkeypatch: pytest.Monke
     bar = box((2 * HALF, 2 * WIDE, 20.0))
     results, most = [], 0
     for trial in range(30):
-        if trial % 2:  # a disc that passes the tube's corner, 100 mm aside, within some mm
+        if (
+            trial % 2
+        ):  # a disc that passes the tube's corner, 100 mm aside, within some mm
             sample, aside = disc, 160.0
             place = math.sqrt(rng.uniform(82.1, 84.0) ** 2 - 60.0**2)
             free = True

@@ -1,4 +1,5 @@
-"""Collisions in use: samples as convex pieces, the scanner's guard, reports of scripts, detours."""
+"""Collisions in use: samples as convex pieces, the scanner's guard, reports of scripts,
+detours."""
 
 from __future__ import annotations
 
@@ -56,20 +57,29 @@ def inside_torus(rng: np.random.Generator) -> FloatArray:
     around, r = rng.uniform(0, 2 * math.pi, (2, 500)), 4.9 * np.sqrt(rng.random(500))
     radius = 30 + r * np.cos(around[1])
     return np.stack(
-        [radius * np.cos(around[0]), radius * np.sin(around[0]), r * np.sin(around[1])], axis=1
+        [radius * np.cos(around[0]), radius * np.sin(around[0]), r * np.sin(around[1])],
+        axis=1,
     )
 
 
 def inside_ball(rng: np.random.Generator) -> FloatArray:
     v = rng.normal(size=(500, 3))
-    return 19.7 * v / np.linalg.norm(v, axis=1, keepdims=True) * rng.random((500, 1)) ** (1 / 3)
+    return (
+        19.7
+        * v
+        / np.linalg.norm(v, axis=1, keepdims=True)
+        * rng.random((500, 1)) ** (1 / 3)
+    )
 
 
 @pytest.mark.parametrize(
     ("mesh", "inside"),
     [
         (angle_bracket(), inside_l),
-        (trimesh.creation.torus(30, 5, major_sections=64, minor_sections=32), inside_torus),
+        (
+            trimesh.creation.torus(30, 5, major_sections=64, minor_sections=32),
+            inside_torus,
+        ),
         (trimesh.creation.icosphere(4, 20), inside_ball),
         (load_phantom("lego").mesh(), lambda rng: np.empty((0, 3))),
     ],
@@ -79,7 +89,8 @@ def inside_ball(rng: np.random.Generator) -> FloatArray:
 def test_pieces_hold_the_whole_solid(
     mesh: Mesh, inside: Callable[[np.random.Generator], FloatArray]
 ) -> None:
-    """Points on the surface and inside lie in a piece; without that, free would mean nothing."""
+    """Points on the surface and inside lie in a piece; without that, free would mean
+    nothing."""
     pieces = convex_pieces(mesh)
     rng = np.random.default_rng(0)
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
@@ -118,7 +129,10 @@ def test_a_plane_cuts_a_convex_solid_into_two_that_fill_it(seed: int) -> None:
             points = half.reshape(-1, 3)
             volume += ConvexHull(points).volume
         assert volume == pytest.approx(float(whole.volume), rel=1e-9)
-        beside = [_clip(np.asarray(whole.triangles), axis, low - 1.0, side) for side in (-1.0, 1.0)]
+        beside = [
+            _clip(np.asarray(whole.triangles), axis, low - 1.0, side)
+            for side in (-1.0, 1.0)
+        ]
         assert [len(half) for half in beside] == [0, len(whole.triangles)]
 
 
@@ -139,7 +153,9 @@ def test_three_planes_cut_a_convex_solid_into_eight_that_fill_it(seed: int) -> N
 def test_a_sample_is_turned_first_and_then_shifted() -> None:
     mesh = trimesh.creation.box((2, 4, 6))
     (piece,) = convex_pieces(
-        mesh, rotation=rotation_z(math.pi / 2) @ rotation_x(math.pi / 2), offset=(10, 0, 0)
+        mesh,
+        rotation=rotation_z(math.pi / 2) @ rotation_x(math.pi / 2),
+        offset=(10, 0, 0),
     )
     lower, upper = piece.bounds()
     np.testing.assert_allclose(upper - lower, (6, 2, 4), atol=1e-9)
@@ -147,12 +163,16 @@ def test_a_sample_is_turned_first_and_then_shifted() -> None:
 
 
 def test_flat_and_bad_meshes() -> None:
-    sheet = trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [0, 10, 0]], [[0, 1, 2]], process=False)
+    sheet = trimesh.Trimesh(
+        [[0, 0, 0], [10, 0, 0], [0, 10, 0]], [[0, 1, 2]], process=False
+    )
     (piece,) = convex_pieces(sheet)
     assert ConvexHull(piece.vertices).volume > 0
     with pytest.raises(GeometryError, match="0 faces"):
         convex_pieces(trimesh.Trimesh())
-    broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, math.nan, 0]], [[0, 1, 2]], process=False)
+    broken = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, math.nan, 0]], [[0, 1, 2]], process=False
+    )
     with pytest.raises(GeometryError, match="finite"):
         convex_pieces(broken)
 
@@ -168,12 +188,15 @@ def test_a_move_into_the_detector_halts_free_and_blocks_the_third_time() -> None
     s, scene = scanner(), build_scene(M, P, [LEGO])
     now = 0.0
     for attempt in (1, 2, 3):
-        with pytest.raises(CollisionError, match=f"blocked attempt {attempt} of 3") as error:
+        with pytest.raises(
+            CollisionError, match=f"blocked attempt {attempt} of 3"
+        ) as error:
             s.move({"mag_det": 500.0}, now)
         assert error.value.data["pair"] == ["sample_base", "detector_platform"]
         now = s.rest_time(now)
         assert touching(scene, s.positions(now)) == []
-    # Base ends 100 mm behind the axis, the platform begins 20 mm behind the panel; 1 mm stays free.
+    # Base ends 100 mm behind the axis, the platform begins 20 mm behind the panel; 1 mm stays
+    # free.
     halted = s.positions(now)["mag_det"] + P.c_det + 20.0 - (600.0 + P.c_obj + 100.0)
     assert 1.0 <= halted <= 1.05
     assert s.safety.state == "blocked"
@@ -253,7 +276,9 @@ def script(*moves: str) -> str:
 
 
 def test_every_collision_of_a_script_with_its_line_and_time() -> None:
-    text = script("mag_det 500", "mag_det 900", "tra_obj 100", "mag_obj 900", "mag_obj 600")
+    text = script(
+        "mag_det 500", "mag_det 900", "tra_obj 100", "mag_obj 900", "mag_obj 600"
+    )
     plan = plan_script(parse_script(text), M, P)
     found = collision_check([LEGO])(plan, M, P, None)
     assert {(c.line, *sorted(c.pair)) for c in found.collisions} >= {
@@ -280,9 +305,13 @@ def test_every_collision_of_a_script_with_its_line_and_time() -> None:
 @pytest.mark.parametrize("other", ["rot_obj 3600", "ver_tube 320"])
 def test_the_line_of_a_collision_is_the_one_that_moves_its_parts(other: str) -> None:
     """Turntable and tube are under way then too, and do not move base, holder and panel."""
-    slow = "".join(f"{axis}\tset speed\t3\t\tACK\t\t\r\n" for axis in ("mag_obj", "ver_tube"))
+    slow = "".join(
+        f"{axis}\tset speed\t3\t\tACK\t\t\r\n" for axis in ("mag_obj", "ver_tube")
+    )
     text = slow + script("mag_det 700", "mag_obj 500", "mag_obj 690 no_wait", other)
-    found = collision_check()(plan_script(parse_script(text), M, P), M, P, None).collisions
+    found = collision_check()(
+        plan_script(parse_script(text), M, P), M, P, None
+    ).collisions
     assert found
     assert {c.line for c in found} == {6}, found
     report = check_script(text, M, P, collision=collision_check())
@@ -293,7 +322,9 @@ def test_moves_without_wait_are_swept_together() -> None:
     """Alone each is free; together they meet because they start together."""
     apart = script("mag_obj 300", "mag_det 500")
     together = script("mag_obj 300 no_wait", "mag_det 500 ACK", "mag_obj 300")
-    slow = together.replace("scanner\t", "mag_obj\tset speed\t5.0\t\tACK\t\t\r\nscanner\t")
+    slow = together.replace(
+        "scanner\t", "mag_obj\tset speed\t5.0\t\tACK\t\t\r\nscanner\t"
+    )
     check = collision_check([LEGO])
     for text, count in ((apart, 0), (together, 0), (slow, 1)):
         plan = plan_script(parse_script(text), M, P)
@@ -302,7 +333,9 @@ def test_moves_without_wait_are_swept_together() -> None:
 
 
 def test_least_clearance_of_a_free_script_is_that_of_dense_sampling() -> None:
-    text = script("mag_obj 300", "mag_det 440", "rot_obj 360", "tra_obj 150", "tra_obj -100")
+    text = script(
+        "mag_obj 300", "mag_det 440", "rot_obj 360", "tra_obj 150", "tra_obj -100"
+    )
     plan = plan_script(parse_script(text), M, P)
     found = collision_check([BAR])(plan, M, P, None)
     assert found.collisions == ()
@@ -310,7 +343,8 @@ def test_least_clearance_of_a_free_script_is_that_of_dense_sampling() -> None:
     times = np.linspace(0.0, plan.duration_s, 3000)
     at = plan.positions(times)
     dense = min(
-        clearance(scene, {n: float(x[i]) for n, x in at.items()}).mm for i in range(len(times))
+        clearance(scene, {n: float(x[i]) for n, x in at.items()}).mm
+        for i in range(len(times))
     )
     assert found.min_clearance_mm is not None
     assert dense - 1e-2 <= found.min_clearance_mm <= dense + max(0.1, 0.02 * dense)
@@ -347,9 +381,13 @@ def test_the_trace_of_a_script_that_does_not_move_is_its_beginning_and_end() -> 
     assert (times[0], times[-1]) == (0.0, moved.duration_s)
     assert 110 <= len(times) <= 120
     moving = [s for s in moved.steps if s.command.line in (3, 4)]
-    along = [t for t in times for s in moving if s.start_s <= t <= s.start_s + s.duration_s]
+    along = [
+        t for t in times for s in moving if s.start_s <= t <= s.start_s + s.duration_s
+    ]
     shares = [s.duration_s / moved.duration_s for s in moving]
-    assert len(along) >= 60 + 55 * sum(shares)  # half of them follow the way, half the time
+    assert len(along) >= 60 + 55 * sum(
+        shares
+    )  # half of them follow the way, half the time
 
 
 def test_a_machine_without_components_has_nothing_to_touch() -> None:
@@ -385,7 +423,10 @@ def test_a_pair_that_comes_free_for_a_moment_counts_anew() -> None:
     first -= math.degrees(math.atan2(10, 150))
     panel = [c for c in found.collisions if set(c.pair) == {"detector", "sample"}]
     turns = [c.last_free["rot_obj"] for c in panel]
-    assert turns == [pytest.approx(first, abs=0.04), pytest.approx(first + 180.0, abs=0.04)]
+    assert turns == [
+        pytest.approx(first, abs=0.04),
+        pytest.approx(first + 180.0, abs=0.04),
+    ]
 
 
 # Planning ---------------------------------------------------------------------------------------
@@ -401,7 +442,9 @@ def walk(scene: object, start: dict[str, float], moves: list[dict[str, float]],
                            *paces.get(n, (a.speed, a.acceleration)), 0.0)
             for n, a in M.axes.items()
         }  # fmt: skip
-        result = sweep(scene, trajectories, 0.0, max(t.end for t in trajectories.values()))  # type: ignore[arg-type]
+        result = sweep(
+            scene, trajectories, 0.0, max(t.end for t in trajectories.values())
+        )  # type: ignore[arg-type]
         assert result.contact is None
         at |= step
     return at
@@ -474,18 +517,23 @@ def random_script(rng: np.random.Generator) -> str:
         if rng.random() < 0.15:
             lines.append(f"{axis}\tset speed\t{rng.uniform(1, 45):.3f}\t\tACK\t\t")
             continue
-        low, high = (M.axes[axis].lower, M.axes[axis].upper) if axis in M.axes else (100, 300)
+        low, high = (
+            (M.axes[axis].lower, M.axes[axis].upper) if axis in M.axes else (100, 300)
+        )
         low, high = (-400, 800) if axis == "rot_obj" else (low, high)
         wait = str(rng.choice(["ACK", "no wait", "no wait", "POS"]))
         trigger = f"{rng.uniform(low, high):.3f}" if wait == "POS" else ""
-        lines.append(f"{axis}\tmove absolute\t{rng.uniform(low, high):.4f}\t{trigger}\t{wait}\t\t")
+        lines.append(
+            f"{axis}\tmove absolute\t{rng.uniform(low, high):.4f}\t{trigger}\t{wait}\t\t"
+        )
     return "\r\n".join(lines) + "\r\n"
 
 
 @pytest.mark.parametrize("seed", range(40))
 @pytest.mark.daily(26)
 def test_random_scripts_against_dense_sampling(seed: int) -> None:
-    """Whatever starts while what else still runs: no pose of a passed plan is within the margin."""
+    """Whatever starts while what else still runs: no pose of a passed plan is within the
+    margin."""
     plan = plan_script(parse_script(random_script(np.random.default_rng(seed))), M, P)
     sample = box((60, 40, 50))
     found = collision_check([sample])(plan, M, P, None)
@@ -493,12 +541,15 @@ def test_random_scripts_against_dense_sampling(seed: int) -> None:
     times = np.linspace(0.0, plan.duration_s, 150)
     at = plan.positions(times)
     dense = min(
-        clearance(scene, {n: float(x[i]) for n, x in at.items()}).mm for i in range(len(times))
+        clearance(scene, {n: float(x[i]) for n, x in at.items()}).mm
+        for i in range(len(times))
     )
     if dense < M.safety_margin_mm - 1e-6:
         assert found.collisions
     if not found.collisions:
-        assert found.min_clearance_mm is None or found.min_clearance_mm >= M.safety_margin_mm
+        assert (
+            found.min_clearance_mm is None or found.min_clearance_mm >= M.safety_margin_mm
+        )
     for contact in found.collisions:
         (step,) = (s for s in plan.steps if s.line == contact.line)
         assert isinstance(step.command, MoveAbsolute)

@@ -41,7 +41,9 @@ def test_beer_lambert_without_noise() -> None:
     [({"kV": 45.0}, 0.5), ({"power_W": 25.0}, 0.5), ({"exposure_ms": 10.0}, 0.1)],
 )
 def test_the_open_beam_scales_with_kv_power_and_exposure(change, factor) -> None:
-    settings = ExposureSettings(**{"kV": 90.0, "power_W": 50.0, "exposure_ms": 100.0, **change})
+    settings = ExposureSettings(
+        **{"kV": 90.0, "power_W": 50.0, "exposure_ms": 100.0, **change}
+    )
     assert open_beam(MODEL, settings) == pytest.approx(12_000.0 * factor)
     assert expose(MODEL, full(0.0), settings)[0, 0] == round(100 + 12_000 * factor)
 
@@ -64,7 +66,9 @@ def test_xrays_off_gives_dark_whatever_stands_in_the_way() -> None:
 
 @pytest.mark.parametrize("averages", [1, 10])
 @pytest.mark.parametrize("attenuation", [0.0, 2.0, 8.0])
-def test_noise_has_the_poisson_and_read_variance(averages: int, attenuation: float) -> None:
+def test_noise_has_the_poisson_and_read_variance(
+    averages: int, attenuation: float
+) -> None:
     settings = ExposureSettings(90.0, 50.0, 100.0, averages)
     counts = np.stack(
         [expose(MODEL, full(attenuation), settings, frame_rng(5, i)) for i in range(4)]
@@ -72,7 +76,9 @@ def test_noise_has_the_poisson_and_read_variance(averages: int, attenuation: flo
     signal = 12_000.0 * math.exp(-attenuation)
     variance = signal / (MODEL.photons_per_count * averages) + 4.0 / averages + 1.0 / 12.0
     n = counts.size
-    assert counts.mean() == pytest.approx(100.0 + signal, abs=5 * math.sqrt(variance / n) + 0.01)
+    assert counts.mean() == pytest.approx(
+        100.0 + signal, abs=5 * math.sqrt(variance / n) + 0.01
+    )
     assert counts.var() == pytest.approx(variance, rel=5 * math.sqrt(2.0 / n) + 0.01)
 
 

@@ -65,7 +65,9 @@ def test_unity_swap_changes_handedness_and_is_its_own_inverse() -> None:
 def test_correction_moves_points_as_equation_5_4_says() -> None:
     """Equation 5.4 written out in Unity's axes, projected by hand, against ConeVec."""
     m = builtin_machine()
-    nominal = poses(m, builtin_profile("thesis"), m.detector.camera, {"rot_obj": [0, 40, 200]})
+    nominal = poses(
+        m, builtin_profile("thesis"), m.detector.camera, {"rot_obj": [0, 40, 200]}
+    )
     edge = {
         "dO_x": -10.0, "dO_y": 5.0, "dO_z": -19.0, "alpha": 10.0, "tau_x": 1.5, "tau_z": -2.5,
         "dD_x": 3.0, "dD_y": -4.0, "dD_z": 6.0, "dS_x": 0.5, "dS_y": -0.25, "angle_scale": 1.01,
@@ -76,7 +78,9 @@ def test_correction_moves_points_as_equation_5_4_says() -> None:
     seen = cone.project_points(from_unity(b)[None], (rows, cols))[:, 0]
     for i, phi in enumerate(np.radians([0, 40, 200])):
         a = math.radians(10.0) + 1.01 * phi
-        r_y = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+        r_y = np.array(
+            [[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]]
+        )
         tau = np.array([1.5, 0, -2.5])
         o = to_unity(nominal.axis[i]) + [-10, 5, -19]
         q = tau + r_y @ (b - tau) + o
@@ -90,7 +94,9 @@ def test_correction_moves_points_as_equation_5_4_says() -> None:
 
 def test_cone_vec_is_a_value() -> None:
     m = builtin_machine()
-    cone = poses(m, builtin_profile("thesis"), m.detector.camera, {"rot_obj": [0, 33.0]}).cone_vec()
+    cone = poses(
+        m, builtin_profile("thesis"), m.detector.camera, {"rot_obj": [0, 33.0]}
+    ).cone_vec()
     assert eval(repr(cone), {"ConeVec": ConeVec}) == cone
     assert hash(ConeVec(cone.rows.copy())) == hash(cone)
     assert ConeVec.concatenate([cone[0:1], cone[1]]) == cone

@@ -32,7 +32,14 @@ def test_rows_equal_astra_geom_2vec_with_v_negated() -> None:
     )  # fmt: skip
     rows, cols = camera.shape
     geometry = astra.create_proj_geom(
-        "cone", 0.1496, 0.1496, rows, cols, [math.radians(a) for a in angles_deg], 600.0, 459.0
+        "cone",
+        0.1496,
+        0.1496,
+        rows,
+        cols,
+        [math.radians(a) for a in angles_deg],
+        600.0,
+        459.0,
     )
     expected = np.array(astra.geom_2vec(geometry)["Vectors"])
     expected[:, 9:12] *= -1

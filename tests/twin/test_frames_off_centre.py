@@ -1,7 +1,9 @@
-"""Where pixels lie in the world for regions of interest anywhere on the sensor, and when binned.
+"""Where pixels lie in the world for regions of interest anywhere on the sensor, and when
+binned.
 
-The shipped region of interest is centred in rows, so that it holds no sign of the row shift. Here
-each pixel is placed by hand from the sensor's own pixels: neither the shift nor u and v are used.
+The shipped region of interest is centred in rows, so that it holds no sign of the row shift.
+Here each pixel is placed by hand from the sensor's own pixels: neither the shift nor u and v
+are used.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ def cameras(draw: st.DrawFn) -> CameraSettings:
     top = draw(st.integers(0, SENSOR.rows - size))
     right = draw(st.integers(left + size - 1, SENSOR.columns - 1))
     bottom = draw(st.integers(top + size - 1, SENSOR.rows - 1))
-    return CameraSettings(f"HW{binning[0]}SW{binning[1]}High", Roi(left, top, right, bottom))
+    return CameraSettings(
+        f"HW{binning[0]}SW{binning[1]}High", Roi(left, top, right, bottom)
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -41,7 +45,9 @@ def cameras(draw: st.DrawFn) -> CameraSettings:
 def test_a_pixel_lies_where_the_sensor_s_pixels_it_is_made_of_lie(
     camera: CameraSettings, roll_deg: float, across: float, down: float
 ) -> None:
-    profile = builtin_profile("cwi-2022-05-31").model_copy(update={"det_roll_deg": roll_deg})
+    profile = builtin_profile("cwi-2022-05-31").model_copy(
+        update={"det_roll_deg": roll_deg}
+    )
     positions = {"tra_det": 12.5, "ver_det": 60.0, "mag_det": 900.0}
     pose = poses(MACHINE, profile, camera, positions)
     rows, cols = camera.shape
@@ -55,7 +61,9 @@ def test_a_pixel_lies_where_the_sensor_s_pixels_it_is_made_of_lie(
     b = camera.binning
     # Mean of the unbinned pixels left + b column ... left + b column + b - 1, counted from the
     # sensor's middle; growing columns go to the right (+x), growing rows down (-z).
-    right = np.mean(camera.roi.left + b * column + np.arange(b)) - (SENSOR.columns - 1) / 2
+    right = (
+        np.mean(camera.roi.left + b * column + np.arange(b)) - (SENSOR.columns - 1) / 2
+    )
     below = np.mean(camera.roi.top + b * row + np.arange(b)) - (SENSOR.rows - 1) / 2
     x, z = right * SENSOR.pitch_mm, -below * SENSOR.pitch_mm
     c, s = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
@@ -80,7 +88,9 @@ def test_a_region_of_interest_above_the_middle_lies_above_it() -> None:
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 4])
 @pytest.mark.parametrize("shape", [(8, 12), (7, 11), (9, 10), (11, 13)])
-def test_a_binned_pixel_is_the_mean_of_its_fine_ones(factor: int, shape: tuple[int, int]) -> None:
+def test_a_binned_pixel_is_the_mean_of_its_fine_ones(
+    factor: int, shape: tuple[int, int]
+) -> None:
     rng = np.random.default_rng(factor + 100 * shape[0] + shape[1])
     fine = ConeVec(rng.normal(size=(3, 12)))
     rows, cols = shape[0] // factor, shape[1] // factor

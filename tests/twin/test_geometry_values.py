@@ -31,7 +31,8 @@ SCAN = {"sod": 600.0, "sdd": 1059.0, "shape": (76, 96), "pixel": 1.496}
 def astra_geom_2vec(
     angles: list[float], origin: float, detector: float, pixel: tuple[float, float]
 ):  # type: ignore[no-untyped-def]
-    """ASTRA's documentation, "3D geometries", cone: written out view by view, v upwards there."""
+    """ASTRA's documentation, "3D geometries", cone: written out view by view, v upwards
+    there."""
     vectors = []
     for a in angles:
         s, c = math.sin(a), math.cos(a)
@@ -61,7 +62,9 @@ def test_a_circle_is_astras_with_v_downwards(
     }  # fmt: skip
     read = ConeVec.from_astra(of_astra)
     assert read.shape == (len(angles), 5, 7)
-    assert_allclose(read.rows, expected, atol=1e-9)  # as ASTRA has it: row 0 is the lowest
+    assert_allclose(
+        read.rows, expected, atol=1e-9
+    )  # as ASTRA has it: row 0 is the lowest
     expected[:, 9:12] *= -1
     assert_allclose(circle.rows, expected, atol=1e-9)
 
@@ -70,22 +73,29 @@ def test_a_number_of_views_is_a_full_turn() -> None:
     many = ConeVec.circular(angles=8, **SCAN)
     assert many == ConeVec.circular(angles=[0, 45, 90, 135, 180, 225, 270, 315], **SCAN)
     assert many.shape == (8, 76, 96)
-    assert ConeVec.circular(angles=1, **SCAN) == many[:1] == ConeVec.circular(angles=[0.0], **SCAN)
+    assert (
+        ConeVec.circular(angles=1, **SCAN)
+        == many[:1]
+        == ConeVec.circular(angles=[0.0], **SCAN)
+    )
     for none in (0, [], np.zeros((2, 2)), math.nan):
         with pytest.raises(GeometryError, match="allowed: a number of views from 1"):
             ConeVec.circular(angles=none, **SCAN)
     with pytest.raises(GeometryError) as error:
         ConeVec.circular(angles="all" * 500, **SCAN)
-    assert len(error.value.data["asked"]) == 100  # an answer is not as long as any question
+    assert (
+        len(error.value.data["asked"]) == 100
+    )  # an answer is not as long as any question
 
 
 def pixel_of(  # type: ignore[no-untyped-def]
     point, angle_deg, *, sod, sdd, shape, pixel, offset=(0.0, 0.0), roll=0.0, height=0.0
 ):
-    """Where a point of the object lands, (column, row): plane trigonometry in the world's frame.
+    """Where a point of the object lands, (column, row): plane trigonometry in the world's
+    frame.
 
-    The object has turned clockwise by the angle; x is to the right seen from the source, y along
-    the beam, z up. The panel's own axes are turned by roll about the beam, right-handed.
+    The object has turned clockwise by the angle; x is to the right seen from the source, y
+    along the beam, z up. The panel's own axes are turned by roll about the beam, right-handed.
     """
     x, y, z = point
     a = -math.radians(angle_deg)  # clockwise from above
@@ -95,7 +105,10 @@ def pixel_of(  # type: ignore[no-untyped-def]
     side, down = side - offset[0], -up - offset[1]
     # Right-handed about +y: x turns towards -z, which is down.
     r = math.radians(roll)
-    columns, rows = side * math.cos(r) + down * math.sin(r), down * math.cos(r) - side * math.sin(r)
+    columns, rows = (
+        side * math.cos(r) + down * math.sin(r),
+        down * math.cos(r) - side * math.sin(r),
+    )
     return columns / pixel + (shape[1] - 1) / 2, rows / pixel + (shape[0] - 1) / 2
 
 
@@ -121,20 +134,27 @@ def test_beads_off_centre_land_where_trigonometry_says(case: dict[str, object]) 
     # And in images: the brightest pixel of a bead by itself is the nearest one.
     for k, bead in enumerate(beads):
         scene = Scene((Solid(Sphere(bead, 1.5), "lead", 1.0),))
-        for image, (column, row) in zip(project_scene(scene, scan), expected[:, k], strict=True):
+        for image, (column, row) in zip(
+            project_scene(scene, scan), expected[:, k], strict=True
+        ):
             found_row, found_column = np.unravel_index(np.argmax(image), image.shape)
             assert_allclose((found_column, found_row), (column, row), atol=0.6)
 
 
 def test_yaw_and_pitch_of_the_detector_are_right_handed_about_v_and_u() -> None:
-    """v points down: growing yaw takes the right-hand columns towards the source... in the world
-    at angle 0, rotating +x right-handed about -z gives -y times sine, so nearer to the source."""
+    """v points down: growing yaw takes the right-hand columns towards the source... in the
+    world at angle 0, rotating +x right-handed about -z gives -y times sine, so nearer to the
+    source."""
     small = math.radians(3.0)
     yawed = ConeVec.circular(angles=[0], tilts=(0, 0, 3.0), **SCAN)
-    assert_allclose(yawed.u[0] / 1.496, [math.cos(small), -math.sin(small), 0], atol=1e-12)
+    assert_allclose(
+        yawed.u[0] / 1.496, [math.cos(small), -math.sin(small), 0], atol=1e-12
+    )
     pitched = ConeVec.circular(angles=[0], tilts=(0, 3.0, 0), **SCAN)
     # About u = +x, right-handed: -z goes to +y.
-    assert_allclose(pitched.v[0] / 1.496, [0, math.sin(small), -math.cos(small)], atol=1e-12)
+    assert_allclose(
+        pitched.v[0] / 1.496, [0, math.sin(small), -math.cos(small)], atol=1e-12
+    )
 
 
 def test_a_helix_rises_with_the_angle() -> None:
@@ -166,11 +186,16 @@ def test_a_helix_rises_with_the_angle() -> None:
         ({"offset": 3.0}, "offset"),
         ({"tilts": (1, 2)}, "tilts"),
         ({"shape": (0, 3)}, "detector shape"),
-        ({"shape": (1.5, 3)}, r"shape is \(1.5, 3\); allowed: \(a whole number, a whole number\)"),
+        (
+            {"shape": (1.5, 3)},
+            r"shape is \(1.5, 3\); allowed: \(a whole number, a whole number\)",
+        ),
         ({"shape": 7}, r"shape is 7; allowed: \(a whole number, a whole number\)"),
     ],
 )
-def test_numbers_that_no_scanner_has_are_named(wrong: dict[str, object], said: str) -> None:
+def test_numbers_that_no_scanner_has_are_named(
+    wrong: dict[str, object], said: str
+) -> None:
     with pytest.raises(GeometryError, match=said):
         ConeVec.circular(**{"angles": 4, **SCAN, **wrong})  # type: ignore[arg-type]
 
@@ -178,7 +203,9 @@ def test_numbers_that_no_scanner_has_are_named(wrong: dict[str, object], said: s
 def test_a_shape_that_contradicts_the_geometrys_own_is_an_error() -> None:
     scan = ConeVec.circular(angles=3, **SCAN)
     volume = Volume(np.ones((4, 4, 4)), 2.0)
-    assert forward(volume, scan).shape == forward(volume, scan, (76, 96)).shape == scan.shape
+    assert (
+        forward(volume, scan).shape == forward(volume, scan, (76, 96)).shape == scan.shape
+    )
     for use in (
         lambda: forward(volume, scan, (76, 97)),
         lambda: scan.project_points([[0, 0, 0]], (1, 1)),
@@ -210,14 +237,17 @@ def test_arrays_of_geometries_and_volumes_are_their_numbers() -> None:
 
 def test_an_array_for_a_volume_is_an_error_that_says_what_lacks() -> None:
     with pytest.raises(
-        GeometryError, match=r"array of shape .*; allowed: a Volume.*Volume\(data, voxel_mm\)"
+        GeometryError,
+        match=r"array of shape .*; allowed: a Volume.*Volume\(data, voxel_mm\)",
     ):
         forward(np.ones((4, 4, 4)), ConeVec.circular(angles=3, **SCAN))  # type: ignore[arg-type]
 
 
 def rotations() -> st.SearchStrategy[Rigid]:
     number = st.floats(-50, 50)
-    direction = st.tuples(number, number, number).filter(lambda d: np.linalg.norm(d) > 1.0)
+    direction = st.tuples(number, number, number).filter(
+        lambda d: np.linalg.norm(d) > 1.0
+    )
     return st.builds(
         lambda axis, turn, about, shift: Rigid.translate(*shift) @ Rigid.rotate(axis, turn, about),
         direction, st.floats(-360, 360), st.tuples(number, number, number),
@@ -226,7 +256,9 @@ def rotations() -> st.SearchStrategy[Rigid]:
 
 
 @given(rotations(), rotations(), st.integers(0, 2**32 - 1))
-def test_rigid_motions_are_a_group_that_acts_on_geometries(a: Rigid, b: Rigid, seed: int) -> None:
+def test_rigid_motions_are_a_group_that_acts_on_geometries(
+    a: Rigid, b: Rigid, seed: int
+) -> None:
     scan = ConeVec(np.random.default_rng(seed).normal(size=(3, 12)) * 100, (5, 7))
     points = np.random.default_rng(seed + 1).normal(size=(4, 3)) * 10
     near = {"atol": 1e-8}
@@ -239,7 +271,9 @@ def test_rigid_motions_are_a_group_that_acts_on_geometries(a: Rigid, b: Rigid, s
     assert_allclose(after[sane], before[sane], rtol=1e-5, atol=1e-4)
     for value in (a, b, a @ b):
         assert (
-            eval(repr(value)) == value == Rigid.from_dict(json.loads(json.dumps(value.to_dict())))
+            eval(repr(value))
+            == value
+            == Rigid.from_dict(json.loads(json.dumps(value.to_dict())))
         )
 
 
@@ -262,7 +296,11 @@ def test_geometries_go_through_json_repr_and_slices(
     assert "\n" not in repr(scan)
     if n <= 2:
         assert eval(repr(scan)) == scan
-    assert ConeVec.concatenate([scan[:1], scan[1:]]) == scan == ConeVec.concatenate(list(scan))
+    assert (
+        ConeVec.concatenate([scan[:1], scan[1:]])
+        == scan
+        == ConeVec.concatenate(list(scan))
+    )
     assert hash(scan) == hash(scan[:])
     assert "<table>" in scan._repr_html_()
 
@@ -299,9 +337,13 @@ def test_files_that_do_not_hold_are_typed_errors(tmp_path: Path) -> None:
     with pytest.raises(TwinError, match="pixel"):
         ConeVec.from_rtk(tmp_path / "g.xml", pixel=-1.0)
     with pytest.raises(GeometryError, match="parallel3d"):
-        ConeVec.from_astra({"type": "parallel3d", "DetectorRowCount": 1, "DetectorColCount": 1})
+        ConeVec.from_astra(
+            {"type": "parallel3d", "DetectorRowCount": 1, "DetectorColCount": 1}
+        )
     with pytest.raises(GeometryError, match="lacks 'Vectors'"):
-        ConeVec.from_astra({"type": "cone_vec", "DetectorRowCount": 1, "DetectorColCount": 1})
+        ConeVec.from_astra(
+            {"type": "cone_vec", "DetectorRowCount": 1, "DetectorColCount": 1}
+        )
     numbers = dict.fromkeys(("DistanceOriginSource", "DistanceOriginDetector"), 5.0)
     with pytest.raises(GeometryError, match="'x'"):
         ConeVec.from_astra({"type": "cone", "DetectorRowCount": 1, "DetectorColCount": 1,
@@ -317,7 +359,9 @@ def test_documents_that_hold_no_geometry(document: Any) -> None:
 
 @pytest.mark.parametrize("factor", [0, -1, 1.5, 77, "x"])
 def test_binning_leaves_pixels(factor: Any) -> None:
-    with pytest.raises(GeometryError, match=r"1 to 76|factor is (1\.5|'x'); allowed: a whole"):
+    with pytest.raises(
+        GeometryError, match=r"1 to 76|factor is (1\.5|'x'); allowed: a whole"
+    ):
         ConeVec.circular(angles=5, **SCAN).binned(factor)
 
 
@@ -328,10 +372,18 @@ def test_nothing_cannot_be_stacked() -> None:
 
 @pytest.mark.parametrize(
     ("shape", "edge"),
-    [((1.5, 1, 1), 1.0), ((1, 1), 1.0), ((2, 2, 2), (1, 1, 2.0)), ((2, 2, 2), np.nan), (3, 1.0)],
+    [
+        ((1.5, 1, 1), 1.0),
+        ((1, 1), 1.0),
+        ((2, 2, 2), (1, 1, 2.0)),
+        ((2, 2, 2), np.nan),
+        (3, 1.0),
+    ],
 )
 def test_grids_have_three_whole_numbers_and_one_edge(shape: Any, edge: Any) -> None:
-    with pytest.raises(GeometryError, match=r"allowed: .*whole number|voxel_mm is .*: a number"):
+    with pytest.raises(
+        GeometryError, match=r"allowed: .*whole number|voxel_mm is .*: a number"
+    ):
         Grid(shape, edge)
 
 
@@ -340,16 +392,26 @@ class TomosipoCone:
 
     def __init__(self, shape, src_pos, det_pos, det_v, det_u) -> None:  # type: ignore[no-untyped-def]
         self.det_shape = shape
-        self.src_pos, self.det_pos, self.det_v, self.det_u = src_pos, det_pos, det_v, det_u
+        self.src_pos, self.det_pos, self.det_v, self.det_u = (
+            src_pos,
+            det_pos,
+            det_v,
+            det_u,
+        )
 
     def to_vec(self) -> TomosipoCone:
         return self
 
 
 def test_tomosipos_vectors_are_z_y_x() -> None:
-    x, z = np.array([[0.0, 0.0, 1.496]]), np.array([[-1.496, 0.0, 0.0]])  # written (z, y, x)
+    x, z = (
+        np.array([[0.0, 0.0, 1.496]]),
+        np.array([[-1.496, 0.0, 0.0]]),
+    )  # written (z, y, x)
     found = ConeVec.from_tomosipo(
-        TomosipoCone((76, 96), np.array([[0.0, -600, 0]]), np.array([[0.0, 459, 0]]), z, x)
+        TomosipoCone(
+            (76, 96), np.array([[0.0, -600, 0]]), np.array([[0.0, 459, 0]]), z, x
+        )
     )
     assert found == ConeVec.circular(angles=[0], **SCAN)
 
@@ -401,8 +463,12 @@ def test_a_stage_on_the_turntable_moves_a_point_by_hand() -> None:
         gone = [sum(machine.geometry[q].values()) * v for q, v in
                 (("mount_x", 3.0), ("mount_y", -4.0))]  # fmt: skip
         # The sample's frame goes along: source and panel are seen the other way in it.
-        assert_allclose(there.source - here.source, [[-gone[0], -gone[1], 0.0]], atol=1e-9)
-        assert_allclose(there.detector - here.detector, [[-gone[0], -gone[1], 0.0]], atol=1e-9)
+        assert_allclose(
+            there.source - here.source, [[-gone[0], -gone[1], 0.0]], atol=1e-9
+        )
+        assert_allclose(
+            there.detector - here.detector, [[-gone[0], -gone[1], 0.0]], atol=1e-9
+        )
         assert_allclose(there.u, here.u)
 
 
@@ -427,7 +493,10 @@ def test_motion_of_a_scan_goes_to_its_document_and_back() -> None:
 
 
 def test_estimates_of_a_motion_are_near_within_a_hundredth_of_a_sigma() -> None:
-    values, sigma = np.array([[1.0, 5.0], [-1.0, 5.0]]), np.array([[0.1, np.nan], [0.2, np.nan]])
+    values, sigma = (
+        np.array([[1.0, 5.0], [-1.0, 5.0]]),
+        np.array([[0.1, np.nan], [0.2, np.nan]]),
+    )
     motion = Motion(("dO_x", "dO_y"), values, sigma, (1.0, 1.0))
     for i, step, near in ((0, 0.0009, True), (0, 0.0011, False), (1, -0.0019, True),
                           (1, -0.0021, False)):  # fmt: skip
@@ -445,12 +514,21 @@ GOOD = {"values": [1.0, 2.0], "sigmas": [0.1, 0.1], "evidence": 1.0}
     ("document", "said"),
     [
         ({"src_ort": GOOD}, "'src_ort' cannot differ from frame to frame; allowed: dO_x"),
-        ({"dO_x": {**GOOD, "values": [[1.0], [2.0]], "sigmas": [[1.0], [2.0]]}}, "number a frame"),
+        (
+            {"dO_x": {**GOOD, "values": [[1.0], [2.0]], "sigmas": [[1.0], [2.0]]}},
+            "number a frame",
+        ),
         ({"dO_x": {**GOOD, "values": [1.0]}}, "motion of dO_x: values and sigmas"),
-        ({"dO_x": {**GOOD, "values": [1.0, math.nan]}}, "motion of dO_x: values and sigmas"),
+        (
+            {"dO_x": {**GOOD, "values": [1.0, math.nan]}},
+            "motion of dO_x: values and sigmas",
+        ),
         ({"dO_x": {**GOOD, "evidence": "much"}}, "motion of dO_x: could not convert"),
         ({"dO_x": {"values": [1.0]}}, "motion of dO_x: 'sigmas'"),
-        ({"dO_x": GOOD, "dO_y": {**GOOD, "values": [1.0], "sigmas": [1.0]}}, "different numbers"),
+        (
+            {"dO_x": GOOD, "dO_y": {**GOOD, "values": [1.0], "sigmas": [1.0]}},
+            "different numbers",
+        ),
         ({}, "different numbers of frames, or there is none"),
     ],
 )
@@ -473,11 +551,16 @@ def test_up_to_two_poses_print_as_python_and_more_in_a_line(views: int) -> None:
 
 
 @pytest.mark.parametrize("pixel", [0.03, 4.0])
-def test_pixels_are_checked_to_a_millionth_and_axes_to_their_right_angle(pixel: float) -> None:
+def test_pixels_are_checked_to_a_millionth_and_axes_to_their_right_angle(
+    pixel: float,
+) -> None:
     scan = ConeVec.circular(sod=300.0, sdd=900.0, angles=3, pixel=pixel)
     check_cone_vec(scan, pixel)
     check_cone_vec(scan, (pixel * (1 + 0.9e-6), pixel * (1 - 0.9e-6)))
-    for pitches, name in (((pixel * (1 + 1.1e-6), pixel), "u"), ((pixel, pixel * 1.1), "v")):
+    for pitches, name in (
+        ((pixel * (1 + 1.1e-6), pixel), "u"),
+        ((pixel, pixel * 1.1), "v"),
+    ):
         with pytest.raises(GeometryError, match=rf"row 0: \|{name}\| is {pixel:g}"):
             check_cone_vec(scan, pitches)
     for skew, sound in ((0.9e-6, True), (1.1e-6, False)):

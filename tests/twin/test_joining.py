@@ -1,4 +1,5 @@
-"""How motion joins what is under way, on a stage that may change: one swept programme, always."""
+"""How motion joins what is under way, on a stage that may change: one swept programme,
+always."""
 
 from __future__ import annotations
 
@@ -42,16 +43,21 @@ def moments(s: ScannerTwin, now: float) -> FloatArray:
 
 
 def least(scene: CollisionScene, s: ScannerTwin, now: float) -> float:
-    """Least clearance of the poses that the scanner will take, each looked at by itself [mm]."""
+    """Least clearance of the poses that the scanner will take, each looked at by itself
+    [mm]."""
     return min(clearance(scene, s.positions(t)).mm for t in moments(s, now).tolist())
 
 
 def programme(rng: np.random.Generator, s: ScannerTwin, now: float) -> None:
     """A few moves one after the other on each of some motors, with waits between."""
     out: dict[str, tuple[Trajectory, ...]] = {}
-    for name in rng.choice(["rot_obj", "mag_det", "tra_obj"], rng.integers(1, 4), replace=False):
+    for name in rng.choice(
+        ["rot_obj", "mag_det", "tra_obj"], rng.integers(1, 4), replace=False
+    ):
         x, time, ways = s.positions(now)[name], rng.uniform(0.0, 2.0), []
-        middle, width = {"rot_obj": (0, 180), "mag_det": (735, 50), "tra_obj": (0, 20)}[name]
+        middle, width = {"rot_obj": (0, 180), "mag_det": (735, 50), "tra_obj": (0, 20)}[
+            name
+        ]
         for _ in range(rng.integers(1, 5)):
             target = middle + rng.uniform(-width, width)
             ways.append(motion.move(x, 0.0, target, *s.settings(name), time))
@@ -64,7 +70,9 @@ def set_off(rng: np.random.Generator, s: ScannerTwin, now: float) -> None:
     """Something free on the stage as it is."""
     match rng.integers(3):
         case 0:
-            s.move({"rot_obj": rng.uniform(-200, 200), "mag_obj": rng.uniform(550, 605)}, now)
+            s.move(
+                {"rot_obj": rng.uniform(-200, 200), "mag_obj": rng.uniform(550, 605)}, now
+            )
         case 1:
             s.jog("rot_obj", rng.choice([-40.0, 10.0, 40.0]), rng.uniform(1, 8), now)
         case _:
@@ -105,7 +113,10 @@ def test_what_is_under_way_is_free_of_a_new_stage_or_halted_or_the_stage_refused
         assert (after, s.sample, s.correction) == (before, Sample(), None)
         return
     assert least(scene, s, now) >= MARGIN - 1e-6
-    assert (s.sample, s.safety.blocked_attempts) == (Sample("bar"), int(outcome == "halted"))
+    assert (s.sample, s.safety.blocked_attempts) == (
+        Sample("bar"),
+        int(outcome == "halted"),
+    )
     if outcome == "free":
         assert after == before
         return
@@ -129,7 +140,9 @@ def test_a_programme_is_swept_whole_before_it_is_taken_over() -> None:
     away = motion.move(0.0, 0.0, 30.0, 45.0, 22.5, 1.0)
     into = motion.move(30.0, 0.0, 90.0, 45.0, 22.5, 50.0)
     for attempt in (1, 2):
-        with pytest.raises(CollisionError, match=r"programme: .* would collide in 5[0-9]") as e:
+        with pytest.raises(
+            CollisionError, match=r"programme: .* would collide in 5[0-9]"
+        ) as e:
             s.follow(s.prepared({"rot_obj": (away, into)}, 0.0).certified(), 0.0)
         assert set(e.value.data["pair"]) == {"detector", "sample"}
         assert s.safety.blocked_attempts == attempt
@@ -137,11 +150,15 @@ def test_a_programme_is_swept_whole_before_it_is_taken_over() -> None:
     s.follow(s.prepared({"rot_obj": (away,)}, 0.0).certified(), 0.0)
     assert s.positions(60.0)["rot_obj"] == 30.0
     # As if it stood elsewhere: there the same programme is free.
-    elsewhere = s.prepared({"rot_obj": (away, into)}, 0.0, {"rot_obj": 0.0, "mag_det": 900.0})
+    elsewhere = s.prepared(
+        {"rot_obj": (away, into)}, 0.0, {"rot_obj": 0.0, "mag_det": 900.0}
+    )
     assert elsewhere.certified().contact is None
 
 
-def test_a_programme_is_not_taken_over_where_the_world_has_changed_since_its_sweep() -> None:
+def test_a_programme_is_not_taken_over_where_the_world_has_changed_since_its_sweep() -> (
+    None
+):
     turn = {"rot_obj": (motion.move(0.0, 0.0, 90.0, 45.0, 22.5, 0.0),)}
 
     def stop(s: ScannerTwin) -> None:
@@ -175,7 +192,9 @@ def test_a_start_that_touches_is_blocked_until_motion_has_brought_it_apart() -> 
     assert (state.state, "sample" in (state.contact or ())) == ("blocked", True)
     s.reset(0.0)
     assert s.state(0.0).safety.state == "blocked"
-    free = s.stage_change(Sample(), None, SceneGuard(build_scene(M, P, ())), 0.0).certified()
+    free = s.stage_change(
+        Sample(), None, SceneGuard(build_scene(M, P, ())), 0.0
+    ).certified()
     assert s.take_stage(free, 0.0) is None
     with pytest.raises(SafetyError, match="come apart"):
         s.move({"mag_det": 900.0}, 0.0)
@@ -201,7 +220,9 @@ def test_a_retarget_of_one_of_two_that_are_free_only_together_stays_free() -> No
 
 @pytest.mark.parametrize("at", [0.3, 2.0, 5.0, 8.0, 10.5])
 @pytest.mark.parametrize("slow", ["mag_obj", "mag_det"])
-def test_a_stop_of_two_that_are_free_only_together_stays_free(slow: str, at: float) -> None:
+def test_a_stop_of_two_that_are_free_only_together_stays_free(
+    slow: str, at: float
+) -> None:
     """The second: each braked by itself, and what was free together met."""
     s = scanner()
     scene = build_scene(M, P, ())
@@ -220,7 +241,9 @@ def test_motors_of_one_virtual_axis_brake_in_step() -> None:
         update={
             "axes": {
                 **M.axes,
-                "ver_det": M.axes["ver_det"].model_copy(update={"max_acceleration": 60.0}),
+                "ver_det": M.axes["ver_det"].model_copy(
+                    update={"max_acceleration": 60.0}
+                ),
             }
         }
     )
@@ -263,7 +286,9 @@ def test_coasting_ends_at_the_end_of_the_travel() -> None:
     s.estop(2.0)
     end = s.rest_time(2.0)
     assert s.positions(end)["tra_obj"] == 194.0
-    assert max(s.positions(t)["tra_obj"] for t in np.linspace(2.0, end + 1.0, 200)) <= 194.0
+    assert (
+        max(s.positions(t)["tra_obj"] for t in np.linspace(2.0, end + 1.0, 200)) <= 194.0
+    )
 
 
 def test_a_jog_that_is_cut_short_runs_no_faster_than_it_was_asked_to() -> None:
@@ -271,16 +296,21 @@ def test_a_jog_that_is_cut_short_runs_no_faster_than_it_was_asked_to() -> None:
     s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
     s.jog("rot_obj", 2.0, 100.0, 0.0)
     assert 50.0 < s.targets(0.0)["rot_obj"] < 60.0
-    assert max(s.velocities(t)["rot_obj"] for t in np.linspace(0.0, 40.0, 500)) <= 2.0 + 1e-9
+    assert (
+        max(s.velocities(t)["rot_obj"] for t in np.linspace(0.0, 40.0, 500)) <= 2.0 + 1e-9
+    )
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.tuples(st.floats(-50, 50), st.floats(0.0, 6.0)), min_size=1, max_size=6))
+@given(
+    st.lists(st.tuples(st.floats(-50, 50), st.floats(0.0, 6.0)), min_size=1, max_size=6)
+)
 @pytest.mark.slow
 def test_joined_trajectories_do_what_they_do_one_after_the_other(
     legs: list[tuple[float, float]],
 ) -> None:
-    """Waits between them and retargets in flight included; looked up one by one for comparison."""
+    """Waits between them and retargets in flight included; looked up one by one for
+    comparison."""
     x, v, time, ways = 0.0, 0.0, 0.0, []
     for target, later in legs:
         ways.append(motion.move(x, v, target, 10.0, 5.0, time))
@@ -324,7 +354,8 @@ def test_a_second_jog_is_swept_with_the_first() -> None:
 
 
 def test_a_stage_change_that_is_one_halt_too_many_takes_the_halt_that_is_free() -> None:
-    """A stop along the old path, at the last blocked attempt, was never swept on the new stage."""
+    """A stop along the old path, at the last blocked attempt, was never swept on the new
+    stage."""
     turned = 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
@@ -334,7 +365,8 @@ def test_a_stage_change_that_is_one_halt_too_many_takes_the_halt_that_is_free() 
             with pytest.raises(CollisionError):
                 s.follow(
                     s.prepared(
-                        {"mag_det": (motion.move(710.0, 0.0, 300.0, 50.0, 50.0, 0.0),)}, 0.0
+                        {"mag_det": (motion.move(710.0, 0.0, 300.0, 50.0, 50.0, 0.0),)},
+                        0.0,
                     ).certified(),
                     0.0,
                 )
@@ -342,7 +374,9 @@ def test_a_stage_change_that_is_one_halt_too_many_takes_the_halt_that_is_free() 
         now = rng.uniform(0.5, 4.0)
         scene = build_scene(M, P, [box((rng.uniform(250, 320), 20.0, 30.0))])
         with suppress(CollisionError):
-            change = s.stage_change(Sample("bar"), None, SceneGuard(scene), now).certified()
+            change = s.stage_change(
+                Sample("bar"), None, SceneGuard(scene), now
+            ).certified()
             if s.take_stage(change, now) is not None:
                 turned += 1
                 assert s.safety.state == "blocked"
@@ -357,8 +391,11 @@ def plan_rotation(s: ScannerTwin, rng: np.random.Generator) -> dict[str, Drive]:
 
 
 def test_a_reset_waits_until_coasting_motors_rest() -> None:
-    """Reset in motion, the state was ready when parts met, and a move passed its travel's end."""
-    estop = M.estop.model_copy(update={"category": 0, "coasting": dict.fromkeys(M.axes, 10.0)})
+    """Reset in motion, the state was ready when parts met, and a move passed its travel's
+    end."""
+    estop = M.estop.model_copy(
+        update={"category": 0, "coasting": dict.fromkeys(M.axes, 10.0)}
+    )
     machine = M.model_copy(update={"estop": estop})
     s = ScannerTwin(machine, P, guard=SceneGuard(build_scene(M, P, ())))
     s.move({"mag_obj": 996.0}, 0.0)
@@ -389,7 +426,8 @@ def test_a_certificate_of_another_stage_says_nothing_of_this_one() -> None:
 
 
 def test_a_motor_that_passes_from_one_leg_to_the_next_never_shows_rest() -> None:
-    """At the very moment at which one leg ends in motion the next has begun, whatever rounding."""
+    """At the very moment at which one leg ends in motion the next has begun, whatever
+    rounding."""
     rng = np.random.default_rng(5)
     for _ in range(2000):
         end, origin = float(rng.uniform(0.1, 3.0)), float(10.0 ** rng.uniform(-2.0, 5.0))
@@ -403,11 +441,17 @@ def test_a_motor_that_passes_from_one_leg_to_the_next_never_shows_rest() -> None
         assert drive.at(moment).velocity(moment) == 15.0 * end
 
 
-def test_a_stage_that_overlaps_may_change_into_one_that_overlaps_less_and_no_deeper() -> None:
+def test_a_stage_that_overlaps_may_change_into_one_that_overlaps_less_and_no_deeper() -> (
+    None
+):
     """Overlaps had no depth: any other sample, or a correction, could go any deeper."""
 
     def bar(length: float) -> tuple[Sample, None, Guard]:
-        return Sample(f"{length}"), None, SceneGuard(build_scene(M, P, [box((20, length, 20))]))
+        return (
+            Sample(f"{length}"),
+            None,
+            SceneGuard(build_scene(M, P, [box((20, length, 20))])),
+        )
 
     s = ScannerTwin(M, P)
     s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
@@ -444,7 +488,9 @@ def test_a_long_programme_is_not_swept_again_where_a_stage_takes_over() -> None:
     asked = 0
 
     class Counted(SceneGuard):
-        def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+        def __call__(
+            self, trajectories: Mapping[str, Trajectory], now: float
+        ) -> Contact | None:
             nonlocal asked
             asked += 1
             return super().__call__(trajectories, now)
@@ -469,7 +515,8 @@ def test_a_long_programme_is_not_swept_again_where_a_stage_takes_over() -> None:
 
 
 def test_what_was_stopped_by_a_late_clock_is_swept() -> None:
-    """After 62 years the steps of a slowed programme's time were taken for jumps of the motor."""
+    """After 62 years the steps of a slowed programme's time were taken for jumps of the
+    motor."""
     rng = np.random.default_rng(3)
     for _ in range(60):
         now = 1.975e9 + rng.uniform(0.0, 1e6)

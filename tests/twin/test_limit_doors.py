@@ -35,22 +35,26 @@ from tests.support.scanner_traffic import event
 
 TARGETS = 60
 Outcome = tuple[str, float | None]
-"""`arrives`, `told` (it arrives at a limit and says so) or `refused`; and where the motor rests,
-None where it has not moved."""
+"""`arrives`, `told` (it arrives at a limit and says so) or `refused`; and where the motor
+rests, None where it has not moved."""
 
 
 def variants() -> Iterator[Machine]:
     """The shipped machines, with either kind of limit, and with a tolerance on every axis."""
     for name in builtin_machines():
         machine = builtin_machine(name)
-        wide = {n: a.model_copy(update={"arrival_tolerance": 0.5}) for n, a in machine.axes.items()}
+        wide = {
+            n: a.model_copy(update={"arrival_tolerance": 0.5})
+            for n, a in machine.axes.items()
+        }
         for on_limit in ("clamp", "reject"):
             yield machine.model_copy(update={"on_limit": on_limit})
             yield machine.model_copy(update={"on_limit": on_limit, "axes": wide})
 
 
 def targets(machine: Machine, seed: int) -> Iterator[tuple[str, float]]:
-    """Targets within the travel, at its ends, and beyond them by rounding, tolerance and more."""
+    """Targets within the travel, at its ends, and beyond them by rounding, tolerance and
+    more."""
     rng = random.Random(seed)
     for _ in range(TARGETS):
         name, axis = rng.choice(list(machine.axes.items()))
@@ -102,7 +106,9 @@ def by_trajectory(machine: Machine, name: str, target: float) -> Outcome:
 
 def by_following(machine: Machine, name: str, target: float) -> Outcome:
     follower = Follower(machine, profile_of(machine))
-    said = heard(event(1, (name, "move absolute", repr(target))), machine.axes, "00:00:03.000")
+    said = heard(
+        event(1, (name, "move absolute", repr(target))), machine.axes, "00:00:03.000"
+    )
     mirror = follower.hear(Mirror.of(machine), said, 3.0)
     alarms = {a.severity for a in mirror.alarms if a.kind == "limit"}
     assert len(alarms) <= 1
@@ -147,7 +153,9 @@ class _Twin:
 def through_gateway(machine: Machine, command: c.Command) -> tuple[str, ScannerTwin]:
     """The reply to a line, and the scanner afterwards."""
     twin: Any = _Twin(machine)
-    return asyncio.run(ACTIONS[type(command)](twin, command, CommandProgress())), twin.scanner
+    return asyncio.run(
+        ACTIONS[type(command)](twin, command, CommandProgress())
+    ), twin.scanner
 
 
 def by_gateway(machine: Machine, name: str, target: float) -> Outcome:
@@ -235,7 +243,8 @@ def test_what_is_no_number_is_refused_by_every_request(value: float) -> None:
 
 @pytest.mark.parametrize("seed", range(40))
 def test_decimal_steps_arrive_at_the_limit(seed: int) -> None:
-    """Walks of decimal steps that end at a limit by decimal sums, of motors and coupled axes."""
+    """Walks of decimal steps that end at a limit by decimal sums, of motors and coupled
+    axes."""
     rng = random.Random(seed)
     machine = builtin_machine(rng.choice(builtin_machines()))
     name, axis = rng.choice([*machine.axes.items()])
@@ -258,7 +267,10 @@ def test_decimal_steps_arrive_at_the_limit(seed: int) -> None:
 
 def test_a_coupled_axis_beyond_its_tolerance_keeps_its_motors_in_step() -> None:
     machine = builtin_machine("flexray")
-    wide = {n: a.model_copy(update={"arrival_tolerance": 1.0}) for n, a in machine.axes.items()}
+    wide = {
+        n: a.model_copy(update={"arrival_tolerance": 1.0})
+        for n, a in machine.axes.items()
+    }
     machine = machine.model_copy(update={"axes": wide})
     scanner = ScannerTwin(machine, profile_of(machine))
     before = scanner.final_positions()
@@ -285,20 +297,27 @@ def models(model: type[BaseModel], seen: set[type[BaseModel]]) -> set[type[BaseM
         while pending:
             kind = pending.pop()
             pending += get_args(kind)
-            if isinstance(kind, type) and issubclass(kind, BaseModel) and kind not in seen:
+            if (
+                isinstance(kind, type)
+                and issubclass(kind, BaseModel)
+                and kind not in seen
+            ):
                 models(kind, seen)
     return seen
 
 
 def unread(model: type[BaseModel], read: set[str], words: set[str]) -> set[str]:
-    """Keys that no code reads. A key of one allowed value is read by its check, and the times of
-    `Timing` by the kind of command, a word."""
+    """Keys that no code reads. A key of one allowed value is read by its check, and the times
+    of `Timing` by the kind of command, a word."""
     return {
         name
         for each in models(model, set())
         for name, field in each.model_fields.items()
         if not (name in read or name.removesuffix("_s") in words - {name})
-        and (get_origin(field.annotation) is not Literal or len(get_args(field.annotation)) > 1)
+        and (
+            get_origin(field.annotation) is not Literal
+            or len(get_args(field.annotation)) > 1
+        )
     }
 
 

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
-from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi, binning_of, check_roi
+from flexdt.twin.machine.camera import (
+    CameraSettings,
+    PixelGrid,
+    Roi,
+    binning_of,
+    check_roi,
+)
 from flexdt.twin.machine.description import (
     Axis,
     Component,
@@ -130,7 +136,11 @@ def test_what_a_file_leaves_out() -> None:
     assert (tube.min_kV, tube.cold_after_s, tube.warm_up_s) == (0.0, 8 * 3600.0, 300.0)
     assert (tube.spot_mm_per_W, tube.smallest_spot_mm) == (0.001, 0.007)
     assert [(f.material, f.thickness_mm) for f in tube.filters] == [("Al@2.70", 0.5)]
-    assert (panel.exposure_ms, panel.min_exposure_ms, panel.max_exposure_ms) == (100.0, 1.0, 6e4)
+    assert (panel.exposure_ms, panel.min_exposure_ms, panel.max_exposure_ms) == (
+        100.0,
+        1.0,
+        6e4,
+    )
     assert (panel.long_lag_fraction, panel.long_lag_s) == (0.0, 10.0)
     assert panel.pixels.size_mm == pytest.approx((20.0, 16.0))
     oblong = DetectorSpec(**PANEL, row_pitch_mm=0.3)  # type: ignore[arg-type]
@@ -169,7 +179,8 @@ def test_what_a_file_leaves_out() -> None:
         ("micro_ct", "[[components]]\nname = 'pin'\ncenter_mm = [6.1, 8.0, 0.0]",
          "components.pin.center_mm: must be such that the cylinder"),
         ("micro_ct", "[[components]]\nname = 'pin'\nparent = 'turntable'",
-         "components.pin.axis: must be carried by every motor that .geometry. gives the object"),
+         "components.pin.axis: must be carried by every motor that .geometry. gives the "
+         "object"),
         ("micro_ct", "[[components]]\nname = 'mount'\nparent = 'floor'\nanchor = 'object'",
          "components.mount.axis: must be carried by the turntable .R., as mount_x and mount_y"),
         ("micro_ct", "[[components]]\nname = 'pin'\naxis = 'CX'", "has already|every motor"),
@@ -179,7 +190,9 @@ def test_what_a_file_leaves_out() -> None:
          "components.floor.anchor: must be 'object', for a sample_mount"),
     ],
 )  # fmt: skip
-def test_parts_stand_where_the_x_ray_geometry_has_them(base: str, text: str, said: str) -> None:
+def test_parts_stand_where_the_x_ray_geometry_has_them(
+    base: str, text: str, said: str
+) -> None:
     """What is fine says nothing."""
     file = f'base = "{base}"\n{text}\n'
     if said:
@@ -225,7 +238,9 @@ def test_the_middle_of_a_region_is_that_of_its_binned_pixels(
     assert camera.roi_shift_mm(pixels) == pytest.approx((across, down), abs=1e-9)
 
 
-FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
+FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text(
+    "utf-8"
+)
 
 TABLE_2_1 = {
     "ver_tube": (0, 379),
@@ -267,7 +282,12 @@ def test_profiles_are_pinned(
     c_det: float,
 ) -> None:  # fmt: skip
     p = builtin_profile(name)
-    assert (p.det_tan, p.src_ort, p.axs_tan, p.det_roll_deg) == (det_tan, src_ort, axs_tan, roll)
+    assert (p.det_tan, p.src_ort, p.axs_tan, p.det_roll_deg) == (
+        det_tan,
+        src_ort,
+        axs_tan,
+        roll,
+    )
     assert (p.c_obj, p.c_det) == (c_obj, c_det)
     assert name in builtin_profiles("flexray")
 
@@ -328,7 +348,8 @@ VER_OBJ = "moves = { ver_tube = -1.0, ver_det = -1.0 }"
         (
             'of = "ver_tube"',
             'of = "ver_tub"',
-            "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tub' (the `of`) among them",
+            "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tub' (the `of`) "
+            "among them",
         ),
         (
             "factor = -1.0",
@@ -340,12 +361,17 @@ VER_OBJ = "moves = { ver_tube = -1.0, ver_det = -1.0 }"
             "moves = { ver_tube = -1.0, ver_det = 0.0 }",
             "virtual_axes.ver_obj.moves.ver_det: must be a number other than 0, or left out",
         ),
-        (VER_OBJ, "moves = {}", "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tube'"),
+        (
+            VER_OBJ,
+            "moves = {}",
+            "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tube'",
+        ),
         (VER_OBJ, "moves = { ver_det = -1.0 }", "among them (value: {'ver_det': -1.0})"),
         (
             VER_OBJ,
             "moves = { ver_tube = 1.0 }",
-            "virtual_axes.ver_obj.moves.ver_tube: must be 1 / factor, -1, so that the axis gets",
+            "virtual_axes.ver_obj.moves.ver_tube: must be 1 / factor, -1, so that the "
+            "axis gets",
         ),
         (
             VER_OBJ,
@@ -367,16 +393,21 @@ def test_keys_that_do_not_fit_each_other_are_told_at_one_of_them(
     assert old in FLEXRAY
     with pytest.raises(MachineFileError, match=re.escape(line)) as caught:
         parse_machine(FLEXRAY.replace(old, new, 1), "mine.toml")
-    assert all(text.startswith("mine.toml: ") for text in caught.value.message.splitlines())
+    assert all(
+        text.startswith("mine.toml: ") for text in caught.value.message.splitlines()
+    )
     assert "whole file" not in caught.value.message
     assert "'...'" not in caught.value.message
 
 
 def test_a_default_profile_that_does_not_ship_is_told_with_file_and_key() -> None:
     machine = parse_machine(
-        FLEXRAY.replace('default_profile = "cwi-2023-08-21"', 'default_profile = "nix"'), "m.toml"
+        FLEXRAY.replace('default_profile = "cwi-2023-08-21"', 'default_profile = "nix"'),
+        "m.toml",
     )
-    with pytest.raises(MachineFileError, match=r"m\.toml: default_profile: .*'nix'.*thesis"):
+    with pytest.raises(
+        MachineFileError, match=r"m\.toml: default_profile: .*'nix'.*thesis"
+    ):
         default_profile(machine, "m.toml")
     assert default_profile(builtin_machine(), "").name == "cwi-2023-08-21"
 
@@ -440,7 +471,9 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
     profile = builtin_profile(machine.default_profile)
     camera = machine.detector.camera
     near = poses(machine, profile, camera, {"mag_obj": 500.0, "rot_obj": 30.0}).cone_vec()
-    corners = np.array([[x, y, z] for x in (-12, 12) for y in (-8, 8) for z in (-24.9, 24.9)])
+    corners = np.array(
+        [[x, y, z] for x in (-12, 12) for y in (-8, 8) for z in (-24.9, 24.9)]
+    )
     rows = near.project_points(corners, camera.shape)[0, :, 1]
     assert rows.min() > 0
     assert rows.max() < camera.shape[0] - 1
@@ -452,22 +485,52 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
     ("text", "said"),
     [
         ('beam = "parallel"', r"beam: Input should be 'cone'; .* parallel .*limits.md"),
-        ('[detector]\nshape = "curved"', r"detector.shape: Input should be 'flat'; curved .*s.md"),
-        ("[[tube]]\nmax_kV = 90.0", r"tube must be a table, .*one tube and one flat panel.*s.md"),
-        ("[tube2]\nmax_kV = 90.0", r"tube2: there is no such key; .*one tube and .*limits.md"),
-        ('[axes.X]\nunit = "deg"', r"axes.X.unit: there is no such key; linear .*limits.md"),
-        ("[detector]\nbits = 24", "detector.bits: Input should be less than or equal to 16"),
-        ("[geometry]\nsource_angle = { R = 1.0 }", "a known quantity: .* not modelled .*C-arms"),
-        ("[geometry]\nsource_x = { R = 1.0 }", "geometry.source_x: .*linear axes.*C-arms"),
+        (
+            '[detector]\nshape = "curved"',
+            r"detector.shape: Input should be 'flat'; curved .*s.md",
+        ),
+        (
+            "[[tube]]\nmax_kV = 90.0",
+            r"tube must be a table, .*one tube and one flat panel.*s.md",
+        ),
+        (
+            "[tube2]\nmax_kV = 90.0",
+            r"tube2: there is no such key; .*one tube and .*limits.md",
+        ),
+        (
+            '[axes.X]\nunit = "deg"',
+            r"axes.X.unit: there is no such key; linear .*limits.md",
+        ),
+        (
+            "[detector]\nbits = 24",
+            "detector.bits: Input should be less than or equal to 16",
+        ),
+        (
+            "[geometry]\nsource_angle = { R = 1.0 }",
+            "a known quantity: .* not modelled .*C-arms",
+        ),
+        (
+            "[geometry]\nsource_x = { R = 1.0 }",
+            "geometry.source_x: .*linear axes.*C-arms",
+        ),
         ("[geometry]\nangle = { X = 1.0 }", "geometry.angle: .*driven by rotation axes"),
-        ("[geometry]\nangle = {}", "components.turntable.axis: must be a known motor of anchor"),
-        ('without = ["R"]\n[geometry]\nangle = {}', "geometry.angle: must be motors that turn"),
+        (
+            "[geometry]\nangle = {}",
+            "components.turntable.axis: must be a known motor of anchor",
+        ),
+        (
+            'without = ["R"]\n[geometry]\nangle = {}',
+            "geometry.angle: must be motors that turn",
+        ),
         (
             "[axes.tilt]\nkind = 'rotation'\nlower = -5\nupper = 5\nhome = 0\nspeed = 1\n"
             "max_speed = 1\nacceleration = 1\nmax_acceleration = 1",
             r"axes.tilt: must be in .geometry. with what it moves; .*stages that tilt",
         ),
-        ('without = ["nix"]', "without: must be axes and components of xyzr_cabinet: X, Y, Z, R"),
+        (
+            'without = ["nix"]',
+            "without: must be axes and components of xyzr_cabinet: X, Y, Z, R",
+        ),
         ('[detector]\nmode = "fast"', "mode: must be 1x1, 2x2, 4x4, HWaSWb"),
     ],
 )
@@ -504,7 +567,10 @@ def test_a_file_says_only_what_is_different_from_its_base() -> None:
     assert parts["lift"].axis is None
     assert default_profile(mine, "m").name == "zero"
     # A base's zero offsets are those of one machine, and not of another that begins with it.
-    assert default_profile(parse_machine('base = "flexray"\nname = "ours"'), "m").det_tan == 0.0
+    assert (
+        default_profile(parse_machine('base = "flexray"\nname = "ours"'), "m").det_tan
+        == 0.0
+    )
     assert default_profile(parse_machine('base = "flexray"'), "m").det_tan == 24.1215
 
 
@@ -523,7 +589,12 @@ def test_a_part_left_out_takes_its_allowed_contacts_with_it(base: str, gone: str
 
 @pytest.mark.parametrize("word", ["inf", "-inf", "nan"])
 def test_numbers_of_a_machine_are_finite(word: str) -> None:
-    for where in ("[axes.X]\nhome", "[axes.X]\nupper", "[detector]\npitch_mm", "[tube]\nmax_W"):
+    for where in (
+        "[axes.X]\nhome",
+        "[axes.X]\nupper",
+        "[detector]\npitch_mm",
+        "[tube]\nmax_W",
+    ):
         with pytest.raises(MachineFileError, match="finite"):
             parse_machine(f'base = "xyzr_cabinet"\n{where} = {word}\n')
 
@@ -536,7 +607,9 @@ def test_times_that_nobody_measured_are_none() -> None:
     for name in times:
         assert getattr(plain, name) in (0.0, None)
         for fine in (0.0, 0.5):
-            assert getattr(Timing.model_validate({"source": "a", name: fine}), name) == fine
+            assert (
+                getattr(Timing.model_validate({"source": "a", name: fine}), name) == fine
+            )
         with pytest.raises(ValueError, match="greater than or equal to 0"):
             Timing.model_validate({"source": "a", name: -1e-9})
 
@@ -546,7 +619,8 @@ def test_what_a_distance_is_the_sum_of_adds_up(name: str) -> None:
     """The words are read again as a sum: a number, motors, factors before them."""
     if name == "drawn":
         extra = "".join(
-            f"[axes.{m}]\nlower = -7.0\nupper = 50.0\nhome = 3.0\nspeed = 1.0\nmax_speed = 1.0\n"
+            f"[axes.{m}]\nlower = -7.0\nupper = 50.0\nhome = 3.0\nspeed = 1.0\nmax_speed "
+            "= 1.0\n"
             "acceleration = 1.0\nmax_acceleration = 1.0\n" for m in "AB"
         )  # fmt: skip
         machine = parse_machine(
@@ -570,10 +644,14 @@ def test_what_a_distance_is_the_sum_of_adds_up(name: str) -> None:
                 continue
             factor = (-1.0 if sign.strip() == "-" else 1.0) * float(number or 1.0)
             axis = machine.axes[motor] if motor else None
-            ends = (1.0, 1.0, 1.0) if axis is None else (axis.lower, axis.upper, axis.home)
+            ends = (
+                (1.0, 1.0, 1.0) if axis is None else (axis.lower, axis.upper, axis.home)
+            )
             low, high = sorted(factor * end for end in ends[:2])
             least, most, home = least + low, most + high, home + factor * ends[2]
-        assert (place.least, place.most, place.home) == pytest.approx((least, most, home), abs=1e-4)
+        assert (place.least, place.most, place.home) == pytest.approx(
+            (least, most, home), abs=1e-4
+        )
         assert place.least <= place.home <= place.most
         assert not place.total.startswith("+")
     names = {place.name for place in places(machine)}
@@ -589,11 +667,17 @@ def test_a_short_file_from_a_few_answers() -> None:
     )  # fmt: skip
     assert len(text.splitlines()) < 45
     made = parse_machine(text)
-    assert (made.axes["Z"].lower, made.axes["Z"].upper, made.axes["Z"].home) == (60, 500, 400)
+    assert (made.axes["Z"].lower, made.axes["Z"].upper, made.axes["Z"].home) == (
+        60,
+        500,
+        400,
+    )
     assert made.fixed["detector_y"] == 800.0
     assert (made.detector.columns, made.detector.rows) == (1536, 1944)
     assert made.detector.roi == (0, 0, 1535, 1943)
-    assert made.detector.camera.pixels_mm(made.detector.pixels) == pytest.approx((0.1496, 0.1508))
+    assert made.detector.camera.pixels_mm(made.detector.pixels) == pytest.approx(
+        (0.1496, 0.1508)
+    )
     assert made.tube.kV == 100.0
     assert "Y" not in made.axes
     for base in builtin_machines():
@@ -606,7 +690,9 @@ def test_a_short_file_from_a_few_answers() -> None:
         new_machine_text(Answers("lab", "micro_ct", limits={"tilt": (0.0, 1.0)}))
 
 
-def test_an_axis_that_is_left_out_takes_only_the_virtual_axis_that_is_read_from_it() -> None:
+def test_an_axis_that_is_left_out_takes_only_the_virtual_axis_that_is_read_from_it() -> (
+    None
+):
     def virtual_without(*axes: str) -> dict[str, dict[str, float]]:
         names = ", ".join(f'"{name}"' for name in axes)
         machine = parse_machine(f'base = "flexray"\nwithout = [{names}]\n')

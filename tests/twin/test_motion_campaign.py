@@ -1,7 +1,7 @@
 """Any use of the pure scanner, in any order, under the eye of the motion oracle.
 
-Two ways: the seeded campaign of `tests/studies/motion_campaign.py` in its short form, and a rule
-machine of hypothesis, which shortens what it finds by itself.
+Two ways: the seeded campaign of `tests/studies/motion_campaign.py` in its short form, and a
+rule machine of hypothesis, which shortens what it finds by itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ from motion_rules import (
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("machine", MACHINES)
-def test_no_request_brings_anything_into_contact_or_past_a_limit(machine: str, seed: int) -> None:
+def test_no_request_brings_anything_into_contact_or_past_a_limit(
+    machine: str, seed: int
+) -> None:
     tally = batch(machine, seed, 150)
     for number, start, history, what in tally.first.values():
         pytest.fail(f"episode {number}: {what}\n{script_of(start, history)}")
@@ -49,7 +51,10 @@ def test_the_two_contacts_that_were_seen_are_none_any_more() -> None:
     home = {name: axis["home"] for name, axis in model("flexray").data["axes"].items()}
     start = Start("flexray", {**home, "mag_obj": 950.0, "mag_det": 1059.0})
     both = {"targets": {"mag_obj": 450.0, "mag_det": 559.0}}
-    refused = [Request(0.0, "move", both), Request(5.0, "move", {"targets": {"mag_obj": 996.0}})]
+    refused = [
+        Request(0.0, "move", both),
+        Request(5.0, "move", {"targets": {"mag_obj": 996.0}}),
+    ]
     assert replay(start, refused).found == []
     for slow in ("mag_det", "mag_obj"):
         for wait in np.linspace(0.5, 12.0, 24).tolist():
@@ -62,7 +67,8 @@ def test_the_two_contacts_that_were_seen_are_none_any_more() -> None:
 
 
 def test_coupled_motors_keep_in_step_when_a_move_takes_over_from_a_brake() -> None:
-    """Campaign seed 45: the brake's acceleration was read with a millionth of rounding in it."""
+    """Campaign seed 45: the brake's acceleration was read with a millionth of rounding in
+    it."""
     axes = {
         "ver_det": 71.4006526125655, "tra_tube": 37.01838205712659,
         "tra_det": -206.62811684883826, "tra_obj": 183.06059367946534,
@@ -86,7 +92,8 @@ def test_coupled_motors_keep_in_step_when_a_move_takes_over_from_a_brake() -> No
 @pytest.mark.slow
 @pytest.mark.campaign
 def test_what_stands_in_a_part_after_a_restart_comes_out_and_never_goes_deeper() -> None:
-    """Turned boxes and cylinders: their boxes along the axes part while they themselves do not."""
+    """Turned boxes and cylinders: their boxes along the axes part while they themselves do
+    not."""
     rng = np.random.default_rng(7)
     tally: Counter[tuple[str, str]] = Counter()
     inside = 0
@@ -148,11 +155,16 @@ class Use(RuleBasedStateMachine):
         shares = self.model.moves(axis).items()
         return min(float(most[self.model.motors.index(m)]) / abs(f) for m, f in shares)
 
-    @rule(wait=waits, places=st.dictionaries(st.integers(0, 7), parts, min_size=1, max_size=4))
+    @rule(
+        wait=waits,
+        places=st.dictionaries(st.integers(0, 7), parts, min_size=1, max_size=4),
+    )
     def move(self, wait: float, places: dict[int, float]) -> None:
         motors = self.model.motors
         wanted = {motors[i % len(motors)]: part for i, part in places.items()}
-        self.ask(wait, "move", targets={m: self.place(m, part) for m, part in wanted.items()})
+        self.ask(
+            wait, "move", targets={m: self.place(m, part) for m, part in wanted.items()}
+        )
 
     @rule(wait=waits, gap=st.floats(-20.0, 200.0), middle=parts)
     def meet(self, wait: float, gap: float, middle: float) -> None:
@@ -169,7 +181,10 @@ class Use(RuleBasedStateMachine):
         self.ask(wait, "move", targets={self.axis(number): steps}, relative=True)
 
     @rule(
-        wait=waits, number=st.integers(0, 9), speed=st.floats(-1.0, 1.0), lease=st.floats(0.05, 6)
+        wait=waits,
+        number=st.integers(0, 9),
+        speed=st.floats(-1.0, 1.0),
+        lease=st.floats(0.05, 6),
     )
     def jog(self, wait: float, number: int, speed: float, lease: float) -> None:
         axis = self.axis(number)
@@ -196,7 +211,9 @@ class Use(RuleBasedStateMachine):
         values = draw_correction(np.random.default_rng(seed)) if seed % 3 else None
         self.ask(wait, "correction", correction=values, late=late)
 
-    @precondition(lambda self: self.episode.scanner.rest_time(self.episode.now) <= self.episode.now)
+    @precondition(
+        lambda self: self.episode.scanner.rest_time(self.episode.now) <= self.episode.now
+    )
     @rule(legs=st.lists(st.dictionaries(st.integers(0, 7), parts, min_size=1, max_size=3),
                         min_size=1, max_size=4), late=st.booleans())  # fmt: skip
     def programme(self, legs: list[dict[int, float]], late: bool) -> None:
@@ -303,12 +320,18 @@ def test_a_stop_leaves_no_room_unmade() -> None:
         ),
         Request(0.3, "pause", {}),
         Request(0.0, "move", {"targets": {"ver_det": 180.6686, "mag_obj": 278.14}}),
-        Request(11.71, "jog", {"axis": "mag_both", "velocity": -100.0, "lease_s": 0.3757}),
+        Request(
+            11.71, "jog", {"axis": "mag_both", "velocity": -100.0, "lease_s": 0.3757}
+        ),
         Request(
             1.8,
             "move",
             {
-                "targets": {"ver_det": -176.6686, "rot_obj": -72.3765, "mag_det": -207.3972},
+                "targets": {
+                    "ver_det": -176.6686,
+                    "rot_obj": -72.3765,
+                    "mag_det": -207.3972,
+                },
                 "relative": True,
             },
         ),

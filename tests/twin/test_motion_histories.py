@@ -1,4 +1,5 @@
-"""Long histories of small requests: none takes a pair's gap, and none hides that it is too small.
+"""Long histories of small requests: none takes a pair's gap, and none hides that it is too
+small.
 
 The long form is `tests/studies/history_campaign.py`.
 """
@@ -28,11 +29,15 @@ def test_a_thousand_micrometres_towards_the_panel_take_no_more_than_one() -> Non
     """Each of 1 073 moves of 0.95 um once kept its contract; together they took the margin."""
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
-    scanner = ScannerTwin(machine, profile, guard=SceneGuard(build_scene(machine, profile)))
+    scanner = ScannerTwin(
+        machine, profile, guard=SceneGuard(build_scene(machine, profile))
+    )
     flexray, now = model("flexray"), 0.0
     stage, judge = Stage(flexray, Placed()), Judge(machine.safety_margin_mm)
 
-    def move(targets: dict[str, float], *, relative: bool = False) -> type[TwinError] | None:
+    def move(
+        targets: dict[str, float], *, relative: bool = False
+    ) -> type[TwinError] | None:
         nonlocal now
         refused = None
         try:
@@ -59,7 +64,9 @@ def test_a_thousand_micrometres_towards_the_panel_take_no_more_than_one() -> Non
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_drawn_histories_take_no_more_than_a_rung_and_safe_moves_are_allowed(number: int) -> None:
+def test_drawn_histories_take_no_more_than_a_rung_and_safe_moves_are_allowed(
+    number: int,
+) -> None:
     _, histories, verdicts = one_machine(3, number, runs=1, repeats=200, moves=6)
     assert (histories.found, verdicts.refused, verdicts.allowed) == ([], [], [])
     assert histories.long_runs == 1
@@ -72,8 +79,11 @@ def test_drawn_histories_take_no_more_than_a_rung_and_safe_moves_are_allowed(num
     near=st.floats(-2.0, 1.5),
     kept=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=50),
 )
-def test_a_floor_that_is_kept_never_sinks(margin: float, near: float, kept: list[float]) -> None:
-    """However a history goes: the next gap is drawn between the floor and the gap that there is."""
+def test_a_floor_that_is_kept_never_sinks(
+    margin: float, near: float, kept: list[float]
+) -> None:
+    """However a history goes: the next gap is drawn between the floor and the gap that there
+    is."""
     first = gap = margin + near * min(margin, 0.1)
     lowest = floor(gap, margin)
     assert gap - 0.006 <= lowest <= gap or gap > margin

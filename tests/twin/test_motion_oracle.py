@@ -1,6 +1,7 @@
 """The motion oracle itself: what is planted is found, and a near miss is none.
 
-Where parts meet is worked out here by hand from the machine file, and from nothing of the oracle.
+Where parts meet is worked out here by hand from the machine file, and from nothing of the
+oracle.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def still(x: float) -> Motion:
     return lambda t: (x, 0.0)
 
 
-def run(start: float, to: float, speed: float, begin: float = 0.0, a: float = 50.0) -> Motion:
+def run(
+    start: float, to: float, speed: float, begin: float = 0.0, a: float = 50.0
+) -> Motion:
     """The textbook's trapezoid, written here again."""
     way, sign = abs(to - start), math.copysign(1.0, to - start)
     peak = min(speed, math.sqrt(a * way))
@@ -87,7 +90,9 @@ def look(
 
 def met(found: list[Violation], first: str, second: str) -> list[Violation]:
     return [
-        v for v in found if v.kind in ("contact", "margin") and {first, second} <= {*v.what.split()}
+        v
+        for v in found
+        if v.kind in ("contact", "margin") and {first, second} <= {*v.what.split()}
     ]
 
 
@@ -144,7 +149,9 @@ def test_a_planted_contact_is_found_and_a_near_miss_is_not(case: str, kind: str)
             else bounce(nearest, nearest - 1.0, 0.937)
         )
         motors = {"mag_obj": way, "mag_det": still(700.0)}
-        return met(look(motors, 1.9 if kind == "moment" else 9.0, sample, correction), *pair)
+        return met(
+            look(motors, 1.9 if kind == "moment" else 9.0, sample, correction), *pair
+        )
 
     planted = found(touch + DEPTH)
     assert [v.kind for v in planted] == ["contact"]
@@ -156,7 +163,9 @@ def test_a_planted_contact_is_found_and_a_near_miss_is_not(case: str, kind: str)
 
 @pytest.mark.parametrize("speed", [2.0, 45.0])
 @pytest.mark.parametrize("over", [DEPTH, -M.margin - DEPTH])
-def test_the_corner_of_a_turning_bar_is_seen_as_it_passes(speed: float, over: float) -> None:
+def test_the_corner_of_a_turning_bar_is_seen_as_it_passes(
+    speed: float, over: float
+) -> None:
     """It is nearest to the panel for a moment, between two moments at which it is far."""
     half = 0.5 * math.hypot(300.0, 20.0)
     found = look(
@@ -193,9 +202,12 @@ def test_two_that_move_together_are_free_and_one_of_them_alone_is_not() -> None:
         ("tra_obj", lambda t: (10.0 * t, 10.0 if t < 0.7123 else 9.5), "acceleration"),
     ],
 )
-def test_planted_violations_of_limits_are_found(motor: str, way: Motion, kind: str) -> None:
+def test_planted_violations_of_limits_are_found(
+    motor: str, way: Motion, kind: str
+) -> None:
     assert kind in {
-        v.kind for v in look({motor: way}, 1.0 if kind in ("jump", "acceleration") else 5.0)
+        v.kind
+        for v in look({motor: way}, 1.0 if kind in ("jump", "acceleration") else 5.0)
     }
 
 
@@ -215,7 +227,9 @@ def test_less_acceleration_may_be_demanded_of_a_motor() -> None:
     assert look(ways, 6.0, accelerations={"tra_obj": 20.0}) == []
     found = look(ways, 6.0, accelerations={"tra_obj": 19.99})
     assert {v.kind for v in found} == {"acceleration"}
-    assert {v.kind for v in look(ways, 6.0, accelerations={"tra_obj": 0.0})} == {"acceleration"}
+    assert {v.kind for v in look(ways, 6.0, accelerations={"tra_obj": 0.0})} == {
+        "acceleration"
+    }
 
 
 def test_a_command_that_makes_a_motor_jump_is_found() -> None:
@@ -223,7 +237,9 @@ def test_a_command_that_makes_a_motor_jump_is_found() -> None:
     there = {**HOME, "tra_obj": HOME["tra_obj"] + 1e-3}
     rest = dict.fromkeys(HOME, 0.0)
     assert watch.look(lambda t: HOME, lambda t: rest, 0.0, 1.0) == []
-    assert [v.kind for v in watch.look(lambda t: there, lambda t: rest, 1.0, 2.0)] == ["jump"]
+    assert [v.kind for v in watch.look(lambda t: there, lambda t: rest, 1.0, 2.0)] == [
+        "jump"
+    ]
 
 
 def test_what_begins_too_near_may_stay_and_part_but_not_come_nearer() -> None:
@@ -272,5 +288,7 @@ def test_closed_forms_and_fcl_and_the_second_opinion_agree() -> None:
 def test_the_second_opinion_on_cubes_by_hand() -> None:
     cube = Prism.box((2.0, 2.0, 2.0)).corners()
     assert hull_distance(cube, cube + [5.0, 0.0, 0.0]) == pytest.approx(3.0, abs=1e-6)
-    assert hull_distance(cube, cube + [3.0, 3.0, 3.0]) == pytest.approx(math.sqrt(3.0), abs=1e-6)
+    assert hull_distance(cube, cube + [3.0, 3.0, 3.0]) == pytest.approx(
+        math.sqrt(3.0), abs=1e-6
+    )
     assert hull_distance(cube, cube + [1.9, 0.0, 0.3]) == 0.0

@@ -23,7 +23,8 @@ fractions = st.floats(0.0, 1.0)
 
 
 def tolerance(t: Trajectory) -> float:
-    """Rounding allowed in a position: a few ulps of time at the motion's speeds, and of size."""
+    """Rounding allowed in a position: a few ulps of time at the motion's speeds, and of
+    size."""
     fastest = max(
         abs(p.velocity) + abs(p.acceleration) * (stop - p.start)
         for p, stop in zip(t.pieces, ends(t), strict=True)
@@ -38,7 +39,8 @@ def ends(t: Trajectory) -> list[float]:
 
 
 def check_sound(t: Trajectory, acceleration: float) -> None:
-    """Continuous position and velocity over every knot, bounded acceleration, rest at the end."""
+    """Continuous position and velocity over every knot, bounded acceleration, rest at the
+    end."""
     assert all(p.acceleration == 0.0 or math.isclose(abs(p.acceleration), acceleration)
                for p in t.pieces)  # fmt: skip
     starts = [p.start for p in t.pieces]
@@ -47,9 +49,16 @@ def check_sound(t: Trajectory, acceleration: float) -> None:
         dt = stop - p.start
         x = p.position + dt * (p.velocity + 0.5 * p.acceleration * dt)
         v = p.velocity + p.acceleration * dt
-        x1, v1 = (t.target, 0.0) if following is None else (following.position, following.velocity)
+        x1, v1 = (
+            (t.target, 0.0)
+            if following is None
+            else (following.position, following.velocity)
+        )
         assert abs(x - x1) <= tolerance(t)
-        assert abs(v - v1) <= 1e-9 + 1e-12 * abs(v) + 8 * np.spacing(abs(stop)) * acceleration
+        assert (
+            abs(v - v1)
+            <= 1e-9 + 1e-12 * abs(v) + 8 * np.spacing(abs(stop)) * acceleration
+        )
 
 
 @settings(max_examples=400, deadline=None)
@@ -73,7 +82,8 @@ def test_a_move_from_any_state_arrives_exactly(
 def test_a_move_from_rest_is_the_trapezoid_of_the_textbook(
     x: float, target: float, speed: float, acceleration: float, now: float
 ) -> None:
-    """Duration d / v + v / a, or 2 sqrt(d / a) when too short to reach v; never past its ends."""
+    """Duration d / v + v / a, or 2 sqrt(d / a) when too short to reach v; never past its
+    ends."""
     t = motion.move(x, 0.0, target, speed, acceleration, now)
     d = abs(target - x)
     if d >= speed * speed / acceleration:
@@ -100,7 +110,9 @@ def test_time_reversal(
     assert there.duration == pytest.approx(back.duration, rel=1e-12)
     time = fraction * there.duration
     allowed = 10 * tolerance(there)
-    assert there.position(time) == pytest.approx(back.position(back.end - time), abs=allowed)
+    assert there.position(time) == pytest.approx(
+        back.position(back.end - time), abs=allowed
+    )
     assert there.velocity(time) == pytest.approx(
         -back.velocity(back.end - time), abs=1e-6 * (1 + acceleration)
     )
@@ -122,7 +134,9 @@ commands = st.lists(
 @settings(max_examples=300, deadline=None)
 @given(commands, speeds, accelerations)
 def test_any_sequence_of_commands_at_any_times(
-    script: list[tuple[str, float, float, float, float]], speed: float, acceleration: float
+    script: list[tuple[str, float, float, float, float]],
+    speed: float,
+    acceleration: float,
 ) -> None:
     """Position and velocity go on over every retarget; |v| and |a| stay within the limits."""
     t, now, limit = motion.at_rest(0.0), 0.0, speed
@@ -144,7 +158,9 @@ def test_any_sequence_of_commands_at_any_times(
         }[name]()
         check_sound(t, acceleration)
         assert t.position(now) == pytest.approx(x, abs=tolerance(t) + tolerance(before))
-        assert t.velocity(now) == pytest.approx(v, abs=1e-6 + 1e-3 * math.sqrt(acceleration))
+        assert t.velocity(now) == pytest.approx(
+            v, abs=1e-6 + 1e-3 * math.sqrt(acceleration)
+        )
         assert math.isfinite(t.end)
         for time in np.linspace(now, t.end, 11):
             assert abs(t.velocity(time)) <= limit * (1 + 1e-9) + 1e-9
@@ -152,9 +168,21 @@ def test_any_sequence_of_commands_at_any_times(
 
 
 @settings(max_examples=200, deadline=None)
-@given(positions, velocities, positions, speeds, accelerations, st.lists(fractions, max_size=20))
+@given(
+    positions,
+    velocities,
+    positions,
+    speeds,
+    accelerations,
+    st.lists(fractions, max_size=20),
+)
 def test_many_positions_at_once_equal_single_ones(
-    x: float, v: float, target: float, speed: float, acceleration: float, parts: list[float]
+    x: float,
+    v: float,
+    target: float,
+    speed: float,
+    acceleration: float,
+    parts: list[float],
 ) -> None:
     t = motion.move(x, v, target, speed, acceleration, 3.0)
     times = np.array([t.start - 1.0, *t.knots, t.end, t.end + 1.0,
@@ -188,7 +216,9 @@ def test_time_at_is_the_first_passage(
 def test_a_stop_takes_v_squared_over_2_a(x: float, v: float, acceleration: float) -> None:
     t = motion.stop(x, v, acceleration, 1.0)
     check_sound(t, acceleration)
-    assert t.target == pytest.approx(x + v * abs(v) / (2 * acceleration), abs=1e-9, rel=1e-12)
+    assert t.target == pytest.approx(
+        x + v * abs(v) / (2 * acceleration), abs=1e-9, rel=1e-12
+    )
     assert t.duration == pytest.approx(abs(v) / acceleration, abs=1e-12)
 
 
@@ -221,7 +251,9 @@ def test_what_is_left_of_a_motion_and_the_same_later_follow_it(
     late = np.linspace(at, t.end + 1.0, 20)
     assert_allclose(rest.positions(late), t.positions(late), atol=10 * tolerance(t))
     moved = t.shifted(7.0)
-    assert_allclose(moved.positions(early + 7.0), t.positions(early), atol=10 * tolerance(t))
+    assert_allclose(
+        moved.positions(early + 7.0), t.positions(early), atol=10 * tolerance(t)
+    )
 
 
 @pytest.mark.parametrize(
@@ -255,7 +287,13 @@ def test_hand_computed_profile() -> None:
         Piece(12.0, 75.0, 50.0, -50.0),
     )
     assert t.end == 13.0
-    assert [t.position(s) for s in (9.0, 10.5, 11.5, 12.5, 13.0)] == [0, 6.25, 50, 93.75, 100]
+    assert [t.position(s) for s in (9.0, 10.5, 11.5, 12.5, 13.0)] == [
+        0,
+        6.25,
+        50,
+        93.75,
+        100,
+    ]
     assert t.time_at(50.0) == 11.5
     assert t.moving(12.999)
     assert not t.moving(13.0)
@@ -275,7 +313,9 @@ def test_speeds_and_laws_are_those_of_many_moments(seed: int) -> None:
                 lambda x=x, v=v, a=a, now=now: motion.move(
                     x, v, rng.uniform(-80, 80), rng.uniform(4, 40), a, now
                 ),
-                lambda x=x, v=v, a=a, now=now: motion.jog(x, v, rng.uniform(-30, 30), 1.0, a, now),
+                lambda x=x, v=v, a=a, now=now: motion.jog(
+                    x, v, rng.uniform(-30, 30), 1.0, a, now
+                ),
                 lambda x=x, v=v, a=a, now=now: motion.stop(x, v, a, now),
             ][rng.integers(3)]()
         )
@@ -298,8 +338,16 @@ def test_speeds_and_laws_are_those_of_many_moments(seed: int) -> None:
         ends = [p.start for p in t.pieces[1:]] + [t.end]
         long = [abs(p.acceleration) for p, end in zip(t.pieces, ends, strict=True)
                 if end > now and end - max(p.start, now) > 0.03]  # fmt: skip
-        short = [abs(p.acceleration) for p, end in zip(t.pieces, ends, strict=True) if end > now]
-        assert max(long, default=0.0) - 1e-3 <= t.acceleration(now) <= max(short, default=0.0)
+        short = [
+            abs(p.acceleration)
+            for p, end in zip(t.pieces, ends, strict=True)
+            if end > now
+        ]
+        assert (
+            max(long, default=0.0) - 1e-3
+            <= t.acceleration(now)
+            <= max(short, default=0.0)
+        )
         v, a, until = t.law(now)
         assert v == pytest.approx(speed[i], abs=1e-5)
         assert a == pytest.approx(change[i], abs=1e-3)
@@ -318,7 +366,9 @@ def test_the_time_of_a_position_is_the_first_that_many_moments_show() -> None:
     rng = np.random.default_rng(3)
     for _ in range(200):
         x, v = rng.uniform(-20, 20, 2)
-        way = motion.move(x, v, rng.uniform(-40, 40), rng.uniform(2, 30), rng.uniform(3, 40), 5.0)
+        way = motion.move(
+            x, v, rng.uniform(-40, 40), rng.uniform(2, 30), rng.uniform(3, 40), 5.0
+        )
         times = np.linspace(way.start, way.end, 2001)
         at = way.positions(times)
         low, high = at.min(), at.max()

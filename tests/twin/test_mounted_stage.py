@@ -44,8 +44,8 @@ def stage(radius: float, top: float) -> SceneGuard:
 
 @pytest.mark.parametrize("seed", range(60))
 def test_the_reach_of_one_sample_excuses_no_overlap_of_another(seed: int) -> None:
-    """A sample that may come near, within its mount's reach, is replaced by drawn ones: one that
-    overlaps really, and deeper than the first did, is refused."""
+    """A sample that may come near, within its mount's reach, is replaced by drawn ones: one
+    that overlaps really, and deeper than the first did, is refused."""
     rng = random.Random(seed)
     at = {"CX": 0.0, "CY": rng.uniform(-4.0, 4.0)}
     first = rng.uniform(8.0, 20.0), rng.uniform(31.0, 40.0)

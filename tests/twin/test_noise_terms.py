@@ -76,5 +76,7 @@ def test_a_planted_term_lowers_the_contrast_that_expose_forecasts(
 ) -> None:
     ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 8, "material": "aluminium"}
     before = fx.expose(ball).asked.cnr
-    monkeypatch.setattr(panel_noise, "NOISE", (*panel_noise.NOISE, planted(20_000.0, False)))
+    monkeypatch.setattr(
+        panel_noise, "NOISE", (*panel_noise.NOISE, planted(20_000.0, False))
+    )
     assert fx.expose(ball).asked.cnr < 0.5 * before

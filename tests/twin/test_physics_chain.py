@@ -1,4 +1,5 @@
-"""The chain against closed forms, full integrals over the spectrum, and its own output's noise."""
+"""The chain against closed forms, full integrals over the spectrum, and its own output's
+noise."""
 
 from __future__ import annotations
 
@@ -16,7 +17,13 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.physics.blur import blurred, kernel, noise_kernel, spot_blur_px
-from flexdt.twin.physics.chain import Chain, expected_signal, flux_of, radiographs, weights_of
+from flexdt.twin.physics.chain import (
+    Chain,
+    expected_signal,
+    flux_of,
+    radiographs,
+    weights_of,
+)
 from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
@@ -40,12 +47,15 @@ def camera(rows: int, cols: int, mode: str = "HW2SW1High") -> CameraSettings:
 
 
 def thin_and_thick(thickest, count: int = 3000) -> np.ndarray:
-    """Paths alone and together from 1e-5 of the thickest on: far finer than any are chosen from."""
+    """Paths alone and together from 1e-5 of the thickest on: far finer than any are chosen
+    from."""
     m, most = len(thickest), np.array(thickest)
     alone = np.concatenate([np.geomspace(1e-5, 1.0, count), np.linspace(0.0, 1.0, count)])
     rows = [np.outer(alone, most * (np.arange(m) == i)) for i in range(m)]
     random = np.random.default_rng(99)
-    fine = 10.0 ** random.uniform(-5.0, 0.0, (count, m)) * (random.random((count, m)) < 0.7)
+    fine = 10.0 ** random.uniform(-5.0, 0.0, (count, m)) * (
+        random.random((count, m)) < 0.7
+    )
     coarse = random.random((count, m)) ** 2
     return np.concatenate([*rows, fine * most, coarse * most])
 
@@ -58,7 +68,9 @@ def assert_holds(beam, signal, noise, substances, thickest) -> None:
     seen = full > 1e-4 * signal.sum()
     error = np.abs(mean[seen] / full[seen] - 1).max()
     assert error <= 1e-3
-    assert error <= 1.2 * beam.worst + 1e-5  # what it says of itself, from other thicknesses
+    assert (
+        error <= 1.2 * beam.worst + 1e-5
+    )  # what it says of itself, from other thicknesses
     np.testing.assert_allclose(variance[seen], spread[seen], rtol=1e-2)
     assert beam.signal.sum() == pytest.approx(signal.sum(), rel=1e-4)
 
@@ -82,7 +94,9 @@ def test_few_energies_hold_the_full_spectrum(substances, thickest, kV):
 
 
 @pytest.mark.daily(10)
-@pytest.mark.parametrize("metal", [STEEL, COPPER, TITANIUM, CARBIDE], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "metal", [STEEL, COPPER, TITANIUM, CARBIDE], ids=lambda s: s.name
+)
 @pytest.mark.parametrize("kV", [30.0, 60.0, 80.0, 90.0, 160.0])
 @pytest.mark.parametrize("thickest", [0.1, 4.0, 60.0])
 def test_few_energies_hold_for_metals_however_thin(metal, kV, thickest):
@@ -121,7 +135,9 @@ def test_what_cannot_be_held_is_refused():
 
 
 def test_slabs_of_one_energy_follow_beer_lambert():
-    chain = Chain(Detector(), substances=(ABS, STEEL), thickest_mm=(50, 5), mono_keV=50.25)
+    chain = Chain(
+        Detector(), substances=(ABS, STEEL), thickest_mm=(50, 5), mono_keV=50.25
+    )
     abs_mm, steel_mm = [0.0, 1.0, 20.0, 50.0, 0.0, 20.0], [0.0, 0.0, 0.0, 0.0, 1.0, 2.0]
     energy = tube_spectrum(90.0).energy_keV
     at = np.argmin(np.abs(energy - 50.25))
@@ -129,7 +145,10 @@ def test_slabs_of_one_energy_follow_beer_lambert():
     wanted = np.exp(-(np.array([abs_mm, steel_mm]).T @ mu))
     alone = [
         expected_signal(
-            chain, np.full((2, 3, 3), np.array(p, np.float32)[:, None, None]), VIEW, LISTING_1
+            chain,
+            np.full((2, 3, 3), np.array(p, np.float32)[:, None, None]),
+            VIEW,
+            LISTING_1,
         ).mean_e[1, 1]
         for p in zip(abs_mm, steel_mm, strict=True)
     ]
@@ -143,7 +162,9 @@ def test_a_wedge_hardens_the_beam_as_the_integral_says():
     full = np.exp(-np.outer(thickness, ALUMINIUM.attenuation())) @ signal
     got = np.array(
         [
-            expected_signal(chain, np.full((1, 3, 3), t, np.float32), VIEW, LISTING_1).mean_e[1, 1]
+            expected_signal(
+                chain, np.full((1, 3, 3), t, np.float32), VIEW, LISTING_1
+            ).mean_e[1, 1]
             for t in thickness
         ]
     )
@@ -158,17 +179,25 @@ def test_signal_follows_tube_time_and_distance():
     chain = Chain(Detector(), substances=(), thickest_mm=())
     empty = np.zeros((0, 3, 3), np.float32)
     one = expected_signal(chain, empty, VIEW, LISTING_1).mean_e[1, 1]
-    double = expected_signal(chain, empty, VIEW, ExposureSettings(90, 25, 400)).mean_e[1, 1]
+    double = expected_signal(chain, empty, VIEW, ExposureSettings(90, 25, 400)).mean_e[
+        1, 1
+    ]
     assert double == pytest.approx(2 * one, rel=1e-6)
     far = VIEW.copy()
     far[4] += 1059.0
     assert expected_signal(chain, empty, far, LISTING_1).mean_e[1, 1] == pytest.approx(
         one / 4, rel=1e-5
     )
-    wide = expected_signal(chain, np.zeros((0, 3, 4001), np.float32), VIEW, LISTING_1).mean_e[1]
+    wide = expected_signal(
+        chain, np.zeros((0, 3, 4001), np.float32), VIEW, LISTING_1
+    ).mean_e[1]
     aside = 2000 * PIXEL  # inverse square and obliquity: cosine to the third power
-    assert wide[0] / wide[2000] == pytest.approx((1 + (aside / 1059.0) ** 2) ** -1.5, rel=1e-5)
-    off = expected_signal(chain, empty, VIEW, ExposureSettings(90, 50, 100, xrays_on=False))
+    assert wide[0] / wide[2000] == pytest.approx(
+        (1 + (aside / 1059.0) ** 2) ** -1.5, rel=1e-5
+    )
+    off = expected_signal(
+        chain, empty, VIEW, ExposureSettings(90, 50, 100, xrays_on=False)
+    )
     assert not off.mean_e.any()
     soft = expected_signal(chain, empty, VIEW, ExposureSettings(60, 50 * 60 / 90, 100))
     assert soft.mean_e[1, 1] < 0.6 * one  # same charge, lower voltage
@@ -200,7 +229,9 @@ def test_photon_transfer_recovers_gain_and_read_noise(mode):
     assert result.counts_per_quantum == pytest.approx(
         float(noise.sum() / signal.sum()) / per_count, rel=0.02
     )
-    assert result.read_noise_counts == pytest.approx(panel.read_noise(cam) / per_count, rel=0.02)
+    assert result.read_noise_counts == pytest.approx(
+        panel.read_noise(cam) / per_count, rel=0.02
+    )
 
 
 def test_flat_corrected_air_is_one_within_noise():
@@ -215,7 +246,9 @@ def test_flat_corrected_air_is_one_within_noise():
     assert air.std() < 0.002  # gone
     # what is left is two images' noise: the same when the pattern is taken off by subtraction
     other = [flat(chain, many, cam, i).astype(float) for i in (5, 6)]
-    assert air.std() == pytest.approx(np.std(other[0] - other[1]) / (white - dark).mean(), rel=0.03)
+    assert air.std() == pytest.approx(
+        np.std(other[0] - other[1]) / (white - dark).mean(), rel=0.03
+    )
 
 
 def test_counts_saturate_and_never_wrap():
@@ -233,9 +266,13 @@ def test_fixed_pattern_belongs_to_the_panel():
     np.testing.assert_allclose(part.gain[0, 0], whole.gain[8:10, 32:34].mean(), rtol=1e-5)
     assert part.gain.shape == (760, 956)
     assert whole.dead.sum() == pytest.approx(panel.dead_fraction * 1944 * 1536, rel=0.6)
-    assert pattern(Detector(serial=2), 1, (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
+    assert (
+        pattern(Detector(serial=2), 1, (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
+    )
     plain = Detector(dead_fraction=0.01)
-    counts = flat(Chain(plain), LISTING_1, CameraSettings("HW1SW1High", Roi(0, 0, 99, 99)), 1)
+    counts = flat(
+        Chain(plain), LISTING_1, CameraSettings("HW1SW1High", Roi(0, 0, 99, 99)), 1
+    )
     dead = pattern(plain, 1, (0, 0, 99, 99)).dead
     assert dead.any()
     assert (counts[dead] == 0).all()
@@ -259,12 +296,16 @@ def test_few_photons_keep_mean_and_variance():
     per_count = panel.gain(cam)
     assert expected.mean_e.mean() ** 2 / expected.variance_e.mean() < 10  # few indeed
     assert counts.mean() * per_count == pytest.approx(expected.mean_e.mean(), rel=0.01)
-    assert counts.var() * per_count**2 == pytest.approx(expected.variance_e.mean(), rel=0.03)
+    assert counts.var() * per_count**2 == pytest.approx(
+        expected.variance_e.mean(), rel=0.03
+    )
 
 
 def test_earlier_frames_leave_something_behind():
     panel, cam = Detector(gain_sigma=0.0, offset_sigma_counts=0.0), camera(10, 10)
-    bright = expected_signal(Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, LISTING_1)
+    bright = expected_signal(
+        Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, LISTING_1
+    )
     off = ExposureSettings(90.0, 50.0, 100.0, xrays_on=False)
     dark = expected_signal(Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, off)
     alone = read_out(panel, dark, cam, off).astype(float)
@@ -295,11 +336,15 @@ def test_neighbours_share_the_noise_of_light_that_reaches_both(blur_mm: float) -
     panel = Detector(gain_sigma=0.0, offset_sigma_counts=0.0, dead_fraction=0.0, blur_mm=blur_mm,
                   read_noise_e=0.0)  # fmt: skip
     cam = CameraSettings("HW1SW1High", Roi(0, 0, 599, 599))
-    expected = expected_signal(Chain(panel), np.zeros((0, 600, 600), np.float32), VIEW, LISTING_1)
+    expected = expected_signal(
+        Chain(panel), np.zeros((0, 600, 600), np.float32), VIEW, LISTING_1
+    )
     image = read_out(panel, expected, cam, LISTING_1, frame_rng(3, 0)).astype(float)
     image = (image - image.mean())[10:-10, 10:-10] * panel.gain(cam)
     wide = blur_mm / panel.pixels.pitch_mm * np.sqrt(2.0)
-    x = (np.arange(2000) + 0.5) / 1000.0 - 1.0  # from one place in a pixel to one in the other
+    x = (
+        np.arange(2000) + 0.5
+    ) / 1000.0 - 1.0  # from one place in a pixel to one in the other
     shares = [
         np.sum((1 - abs(x)) * np.exp(-((x - n) ** 2) / (2 * wide**2)))
         / (1000 * wide * np.sqrt(2 * np.pi))
@@ -313,8 +358,8 @@ def test_neighbours_share_the_noise_of_light_that_reaches_both(blur_mm: float) -
 
 @pytest.mark.parametrize("sigma", [0.5, 20.0, 80.0, 900.0])
 def test_noise_is_spread_as_wide_as_light_is(sigma: float) -> None:
-    """White noise that a Gaussian spreads keeps 1 / (2 sqrt(pi) sigma) of its variance an axis, the
-    pixels' own width (variance 1/12, twice) included; blurs beyond reason are refused."""
+    """White noise that a Gaussian spreads keeps 1 / (2 sqrt(pi) sigma) of its variance an axis,
+    the pixels' own width (variance 1/12, twice) included; blurs beyond reason are refused."""
     weights = noise_kernel(sigma).astype(np.float64)
     narrow = sigma if sigma > 10.0 else np.sqrt(sigma**2 + 1.0 / 12.0)
     assert (weights**2).sum() == pytest.approx(0.5 / np.sqrt(np.pi) / narrow, rel=0.01)
@@ -328,7 +373,13 @@ def test_hardly_a_photon_is_none_and_not_a_black_pixel() -> None:
     dim = np.geomspace(1e-38, 1e-3, 64, dtype=np.float32).reshape(8, 8)
     panel = Detector(read_noise_e=0.0, dead_fraction=0.0)
     counts = [
-        read_out(panel, Expected(signal, 400.0 * signal), camera(8, 8), LISTING_1, frame_rng(3, 1))
+        read_out(
+            panel,
+            Expected(signal, 400.0 * signal),
+            camera(8, 8),
+            LISTING_1,
+            frame_rng(3, 1),
+        )
         for signal in (dim, 0.0 * dim)
     ]
     assert (counts[0] == counts[1]).mean() > 0.9
@@ -336,7 +387,9 @@ def test_hardly_a_photon_is_none_and_not_a_black_pixel() -> None:
 
 
 def test_small_pixels_have_their_own_area() -> None:
-    view = np.array([0, -600, 0, 0, 459, 0, 1.4e-6, 0, 0, 0, 0, -2.7e-6], dtype=np.float64)
+    view = np.array(
+        [0, -600, 0, 0, 459, 0, 1.4e-6, 0, 0, 0, 0, -2.7e-6], dtype=np.float64
+    )
     assert flux_of(view, (1, 1))[0, 0] == pytest.approx(
         1.4e-8 * 2.7e-6 * (1000 / 1059) ** 2, rel=1e-5, abs=0.0
     )
@@ -385,7 +438,13 @@ def test_signal_to_noise():
 @pytest.mark.parametrize("kind", [Detector, PixelGrid])
 def test_every_default_says_where_it_comes_from(kind):
     _, *body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
-    fields = [(one, after) for one, after in pairwise(body) if isinstance(one, ast.AnnAssign)]
+    fields = [
+        (one, after) for one, after in pairwise(body) if isinstance(one, ast.AnnAssign)
+    ]
     assert [one.target.id for one, _ in fields] == list(kind.__dataclass_fields__)
     for _, said in fields:
-        assert said.value.value.split(":")[0].rstrip(".") in ("Measured", "Literature", "Assumed")
+        assert said.value.value.split(":")[0].rstrip(".") in (
+            "Measured",
+            "Literature",
+            "Assumed",
+        )

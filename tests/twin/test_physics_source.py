@@ -7,7 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula, tables
+from flexdt.twin.attenuation.substances import (
+    Substance,
+    mass_fractions,
+    parse_formula,
+    tables,
+)
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.physics.tube import (
     ALUMINIUM,
@@ -30,7 +35,9 @@ from flexdt.twin.physics.tube import (
 )
 def test_attenuation_of_known_substances(formula, density, values):
     substance = Substance.of("x", formula, density)
-    found = np.interp([30.0, 60.0, 90.0], tables().energy_keV, substance.mass_attenuation())
+    found = np.interp(
+        [30.0, 60.0, 90.0], tables().energy_keV, substance.mass_attenuation()
+    )
     np.testing.assert_allclose(found, values, rtol=4e-3)
     np.testing.assert_allclose(
         substance.attenuation(), substance.mass_attenuation() * density / 10.0
@@ -44,7 +51,9 @@ def test_formulas():
     assert water["H"] == pytest.approx(2 * 1.008 / 18.015, rel=1e-3)
 
 
-@pytest.mark.parametrize("formula", ["", "h2o", "H2O)", "(H2O", "C-1", "H2 O", "2H", "()", "C0"])
+@pytest.mark.parametrize(
+    "formula", ["", "h2o", "H2O)", "(H2O", "C-1", "H2 O", "2H", "()", "C0"]
+)
 def test_formulas_that_cannot_be_read(formula):
     with pytest.raises(LimitError, match="formula"):
         parse_formula(formula)
@@ -81,8 +90,8 @@ def half_value_layer(spectrum: Spectrum) -> float:
 
 
 def test_spectrum_at_90_kv():
-    # spekpy 2.5.4 for 90 kV, 12 degrees, 0.5 mm Al: mean 39.5 keV, 3.37e8 photons/cm2/mAs at 1 m,
-    # first half-value layer 0.98 mm Al
+    # spekpy 2.5.4 for 90 kV, 12 degrees, 0.5 mm Al: mean 39.5 keV, 3.37e8 photons/cm2/mAs at 1
+    # m, first half-value layer 0.98 mm Al
     spectrum = tube_spectrum(90.0)
     assert spectrum.mean_keV == pytest.approx(39.5, abs=0.15)
     assert spectrum.photons == pytest.approx(3.37e8, rel=0.01)
@@ -99,7 +108,9 @@ def test_spectrum_at_90_kv():
         ("Cu", 50.0, 2.613), ("Fe", 60.0, 1.205), ("Pb", 100.0, 5.553), ("Al", 20.0, 3.442),
     ],
 )  # fmt: skip
-def test_one_energy_is_not_that_of_a_bin(formula: str, energy_keV: float, mass: float) -> None:
+def test_one_energy_is_not_that_of_a_bin(
+    formula: str, energy_keV: float, mass: float
+) -> None:
     found = Substance.of(formula, formula, 10.0).attenuation_at(energy_keV)
     assert found == pytest.approx(mass, rel=2e-3)
 
@@ -108,7 +119,9 @@ def test_one_energy_is_on_its_own_side_of_an_edge() -> None:
     xraydb = pytest.importorskip("xraydb")
     random = np.random.default_rng(3)
     for symbol in ("Gd", "W", "I", "Pb", "U", "Mo", "Fe", "C", "Ba"):
-        edges = [e.energy / 1e3 for e in xraydb.xray_edges(symbol).values() if e.energy > 15e3]
+        edges = [
+            e.energy / 1e3 for e in xraydb.xray_edges(symbol).values() if e.energy > 15e3
+        ]
         near = [e + d for e in edges for d in (-0.2, -0.01, 0.01, 0.2)]
         for energy in (*near, *random.uniform(20.0, 235.0, 40)):
             found = Substance.of(symbol, symbol, 10.0).attenuation_at(energy)
@@ -117,7 +130,9 @@ def test_one_energy_is_on_its_own_side_of_an_edge() -> None:
 
 def test_voltages_between_the_tables():
     between, low, high = (tube_spectrum(kV) for kV in (67.5, 67.0, 68.0))
-    np.testing.assert_allclose(between.fluence, (low.fluence + high.fluence) / 2, rtol=1e-9)
+    np.testing.assert_allclose(
+        between.fluence, (low.fluence + high.fluence) / 2, rtol=1e-9
+    )
     with pytest.raises(LimitError, match="is 250;"):
         tube_spectrum(250.0)
     with pytest.raises(LimitError):
@@ -126,13 +141,17 @@ def test_voltages_between_the_tables():
 
 def test_filters_harden():
     soft, hard = (
-        tube_spectrum(90.0, TubeModel(filters=(Filter(ALUMINIUM, t),))) for t in (0.5, 2.0)
+        tube_spectrum(90.0, TubeModel(filters=(Filter(ALUMINIUM, t),)))
+        for t in (0.5, 2.0)
     )
     assert hard.mean_keV > soft.mean_keV + 5
     assert hard.photons < soft.photons
     mono = monochromatic(50.2)
     assert mono.behind(Filter(ALUMINIUM, 3.0)).photons == pytest.approx(
-        math.exp(-3.0 * float(np.interp(50.25, mono.energy_keV, ALUMINIUM.attenuation()))), rel=1e-6
+        math.exp(
+            -3.0 * float(np.interp(50.25, mono.energy_keV, ALUMINIUM.attenuation()))
+        ),
+        rel=1e-6,
     )
 
 

@@ -22,7 +22,10 @@ from flexdt.twin.physics.readout import read_out
 from flexdt.twin.physics.tube import tube_of
 from flexdt.twin.script import check_script
 from flexdt.twin.script.compose import compose_script
-from flexdt.twin.script.planning.open_beam_findings import OPEN_BEAM_CODES, open_beam_problems
+from flexdt.twin.script.planning.open_beam_findings import (
+    OPEN_BEAM_CODES,
+    open_beam_problems,
+)
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.scan_request import ScanRequest
@@ -55,7 +58,9 @@ def flat_image(plan: ScanPlan, physics: str) -> tuple[float, float, float]:
     chain = chain_through([], panel, tube_of(machine.tube))
     made = radiographs(chain, nothing[:0], view, [lit])[0]
     assert made.expected is not None
-    counts = read_out(panel, made.expected, camera, lit).astype(float) - panel.offset_counts
+    counts = (
+        read_out(panel, made.expected, camera, lit).astype(float) - panel.offset_counts
+    )
     return counts.max(), counts.min(), panel.full_scale - panel.offset_counts
 
 
@@ -76,13 +81,18 @@ def drawn_scan(rng: np.random.Generator) -> tuple[Machine, ScanPlan]:
 
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("physics", ["poly", "ideal"])
-def test_an_open_beam_is_called_saturated_or_starved_where_its_image_is(physics: Any) -> None:
+def test_an_open_beam_is_called_saturated_or_starved_where_its_image_is(
+    physics: Any,
+) -> None:
     rng = np.random.default_rng(58)
     seen = dict.fromkeys((*OPEN_BEAM_CODES, "right"), 0)
     for _ in range(40):
         _, plan = drawn_scan(rng)
         brightest, _, full = flat_image(plan, physics)
-        if 0.0 < 1.0 - brightest / full < UNDECIDED or abs(brightest / LEAST_COUNTS - 1.0) < 0.05:
+        if (
+            0.0 < 1.0 - brightest / full < UNDECIDED
+            or abs(brightest / LEAST_COUNTS - 1.0) < 0.05
+        ):
             continue
         codes = {p.code for p in open_beam_problems(plan, physics)}
         want = "right"
@@ -108,7 +118,9 @@ def test_the_proposed_exposure_fills_the_panel() -> None:
         for problem in open_beam_problems(plan):
             words = problem.message.split("; ")[1].removeprefix("not even ")
             time_ms = float(words.split(" ms")[0])
-            power_W = float(words.split(" at ")[1].split(" W")[0]) if " at " in words else None
+            power_W = (
+                float(words.split(" at ")[1].split(" W")[0]) if " at " in words else None
+            )
             group = next(g for g in plan.groups if g.kind == "flat")
             lit = ScanRequest("step", frames=2, exposure_ms=time_ms, kV=group.kV,
                               power_W=group.power_W if power_W is None else power_W)  # fmt: skip
@@ -122,7 +134,9 @@ def test_the_proposed_exposure_fills_the_panel() -> None:
 
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize("physics", ["poly", "ideal"])
-def test_a_shipped_machine_s_own_settings_saturate_nothing(name: str, physics: Any) -> None:
+def test_a_shipped_machine_s_own_settings_saturate_nothing(
+    name: str, physics: Any
+) -> None:
     machine = builtin_machine(name)
     profile = profile_of(machine)
     text = compose_script(ScanRequest("step", frames=2), machine, profile)
@@ -135,7 +149,9 @@ def test_a_shipped_machine_s_own_settings_saturate_nothing(name: str, physics: A
 
 def test_larger_pixels_hold_more_charge() -> None:
     panel = fx.Detector()
-    large = replace(panel, pixels=replace(panel.pixels, pitch_mm=2 * panel.pixels.pitch_mm))
+    large = replace(
+        panel, pixels=replace(panel.pixels, pitch_mm=2 * panel.pixels.pitch_mm)
+    )
     camera = panel.camera((4, 4))
     assert large.gain(camera) == pytest.approx(4 * panel.gain(camera))
 
@@ -143,7 +159,9 @@ def test_larger_pixels_hold_more_charge() -> None:
 def test_a_forecast_is_of_the_machine_s_distances_and_panel() -> None:
     """Air kerma falls with the square of the distance; the micro-CT's source is 150 mm away."""
     kerma = {
-        name: fx.expose("normal-5", machine=name, kV=80.0, power_W=8.0, exposure_ms=100.0, images=1)
+        name: fx.expose(
+            "normal-5", machine=name, kV=80.0, power_W=8.0, exposure_ms=100.0, images=1
+        )
         for name in ("flexray", "micro_ct")
     }
     ratio = kerma["micro_ct"].asked.kerma_mGy / kerma["flexray"].asked.kerma_mGy
@@ -152,7 +170,9 @@ def test_a_forecast_is_of_the_machine_s_distances_and_panel() -> None:
         fx.expose("normal-5", machine="micro_ct", sod=600.0)
 
 
-def test_contrast_on_saturated_pixels_is_not_given(capsys: pytest.CaptureFixture[str]) -> None:
+def test_contrast_on_saturated_pixels_is_not_given(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     words = ["--sample", "normal-5", "--machine", "xyzr_cabinet", "--exposure", "60000"]
     assert run(["expose", *words]) == 0
     told = capsys.readouterr().out
@@ -162,9 +182,20 @@ def test_contrast_on_saturated_pixels_is_not_given(capsys: pytest.CaptureFixture
     assert forecast.best[0].cnr is not None
 
 
-def test_check_and_script_new_say_it(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_and_script_new_say_it(
+    tmp_path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     script = tmp_path / "bright.txt"
-    words = ["--machine", "xyzr_cabinet", "--exposure", "5000", "--frames", "3", "--kind", "step"]
+    words = [
+        "--machine",
+        "xyzr_cabinet",
+        "--exposure",
+        "5000",
+        "--frames",
+        "3",
+        "--kind",
+        "step",
+    ]
     assert run(["script", "new", *words, "--out", str(script)]) == 0
     assert "the open beam saturates the panel" in capsys.readouterr().err
     assert run(["check", str(script), "--machine", "xyzr_cabinet"]) == 0

@@ -51,9 +51,15 @@ def made(plan: ScanPlan, rod: Any) -> CountShares:
     filters = tube_of(plan.machine.tube).filters
     tube = fx.Tube(kV=first.kV, power_W=first.power_W, filters=filters)
     cone = plan.geometry[:1].with_shape(first.camera.shape)
-    counts = fx.simulate(rod, cone, tube=tube, detector=panel, noise=None).counts(0).astype(float)
+    counts = (
+        fx.simulate(rod, cone, tube=tube, detector=panel, noise=None)
+        .counts(0)
+        .astype(float)
+    )
     saturated = float((counts >= panel.full_scale).mean())
-    return CountShares(saturated, float((counts - panel.offset_counts < FEW_COUNTS).mean()))
+    return CountShares(
+        saturated, float((counts - panel.offset_counts < FEW_COUNTS).mean())
+    )
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -72,7 +78,9 @@ def test_shares_of_pixels_are_those_of_images(seed: int) -> None:
         seen = made(plan, rod)
         open_beam = {p.code.split("_")[0] for p in open_beam_problems(plan)}
         for name in {"saturated", "starved"} - open_beam:
-            assert told.get(name, 0.0) == pytest.approx(getattr(seen, name), abs=0.012), material
+            assert told.get(name, 0.0) == pytest.approx(getattr(seen, name), abs=0.012), (
+                material
+            )
         starved += seen.starved > 0.01
     assert starved
 
@@ -113,7 +121,9 @@ def scan_folder(tmp_path: Path) -> Path:
 
     async def body(lab: Lab) -> None:
         client = lab.client()
-        job = await client.call("script.submit", text=script(3), name="scan", speed_up="max")
+        job = await client.call(
+            "script.submit", text=script(3), name="scan", speed_up="max"
+        )
         assert (await lab.ended(client, job["job"]))["state"] == "done"
 
     run(tmp_path, body)

@@ -40,7 +40,9 @@ moves = st.tuples(
 )
 relative = st.tuples(
     st.just("relative"),
-    st.dictionaries(st.sampled_from(AXES), st.floats(-60.0, 60.0), min_size=1, max_size=2),
+    st.dictionaries(
+        st.sampled_from(AXES), st.floats(-60.0, 60.0), min_size=1, max_size=2
+    ),
 )
 jogs = st.tuples(
     st.just("jog"),
@@ -51,7 +53,9 @@ pace = st.tuples(
     st.tuples(st.sampled_from(AXES), st.floats(0.5, 50.0), st.floats(1.0, 90.0)),
 )
 stops = st.tuples(st.sampled_from(["stop", "estop", "reset"]), st.none())
-commands = st.lists(st.tuples(times, st.one_of(moves, relative, jogs, pace, stops)), max_size=14)
+commands = st.lists(
+    st.tuples(times, st.one_of(moves, relative, jogs, pace, stops)), max_size=14
+)
 
 
 def do(s: ScannerTwin, command, now: float) -> None:
@@ -79,7 +83,9 @@ def do(s: ScannerTwin, command, now: float) -> None:
 @given(commands)
 @example([(0.0, ("move", {"ver_tube": 0.0})), (1.0, ("stop", None))])
 @pytest.mark.slow
-def test_any_commands_at_any_times_keep_motion_continuous_and_within_limits(script) -> None:
+def test_any_commands_at_any_times_keep_motion_continuous_and_within_limits(
+    script,
+) -> None:
     s = scanner()
     now = 0.0
     for gap, command in script:
@@ -106,9 +112,9 @@ def test_any_commands_at_any_times_keep_motion_continuous_and_within_limits(scri
         # Pieces join: where one ends, the next begins with the same position and velocity.
         for p, q in zip(t.pieces, t.pieces[1:], strict=False):
             dt = q.start - p.start
-            assert p.position + dt * (p.velocity + p.acceleration * dt / 2) == pytest.approx(
-                q.position, abs=1e-9
-            )
+            assert p.position + dt * (
+                p.velocity + p.acceleration * dt / 2
+            ) == pytest.approx(q.position, abs=1e-9)
             assert p.velocity + p.acceleration * dt == pytest.approx(q.velocity, abs=1e-9)
     end = s.rest_time(now)
     assert not s.moving(end)
@@ -153,7 +159,9 @@ def test_nothing_moves_if_any_target_is_bad() -> None:
     assert not s.moving(0.0)
 
 
-def test_lowering_the_acceleration_in_flight_does_not_carry_a_motor_past_its_limit() -> None:
+def test_lowering_the_acceleration_in_flight_does_not_carry_a_motor_past_its_limit() -> (
+    None
+):
     s = scanner()
     s.set_axis("mag_det", acceleration=125.0)
     s.move({"mag_det": 110.0}, 0.0)
@@ -163,7 +171,9 @@ def test_lowering_the_acceleration_in_flight_does_not_carry_a_motor_past_its_lim
     s.stop(t)
     assert s.positions(s.rest_time(t))["mag_det"] <= 1059.0
     s.move({"mag_det": 1058.0}, t)
-    assert max(s.trajectories(t)["mag_det"].positions(np.linspace(t, t + 5, 2000))) <= 1059.0
+    assert (
+        max(s.trajectories(t)["mag_det"].positions(np.linspace(t, t + 5, 2000))) <= 1059.0
+    )
 
 
 def test_jog_ends_with_its_lease_and_renewal_carries_on() -> None:
@@ -204,9 +214,13 @@ def test_coupled_axis_moves_source_and_detector_in_step() -> None:
     st.sampled_from([-2.0, -0.5, 0.5, 1.0, 2.0]), st.sampled_from([-3.0, -1.0, 0.7]),
     st.floats(-200.0, 200.0), st.floats(100.0, 800.0), st.booleans(),
 )  # fmt: skip
-def test_limits_of_an_axis_without_a_motor_are_its_own(x, z, at_x, at_z, relative) -> None:
+def test_limits_of_an_axis_without_a_motor_are_its_own(
+    x, z, at_x, at_z, relative
+) -> None:
     """What a refusal says is allowed is accepted, and what lies beyond it is refused."""
-    text = 'base = "xyzr_cabinet"\nname = "v"\n[virtual_axes.W]\nconstant = 5.0\nof = "X"\n'
+    text = (
+        'base = "xyzr_cabinet"\nname = "v"\n[virtual_axes.W]\nconstant = 5.0\nof = "X"\n'
+    )
     machine = parse_machine(f"{text}factor = {1.0 / x}\nmoves = {{ X = {x}, Z = {z} }}\n")
     s = ScannerTwin(machine, profile_of(machine))
     s.move({"X": at_x, "Z": at_z}, 0.0)
@@ -243,7 +257,10 @@ def test_coupled_motors_of_different_gears_run_in_step(tube: float, panel: float
         f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / tube}\n'
         f"moves = {{ ver_tube = {tube}, ver_det = {panel} }}\n"
     )
-    drives = {n: replace(d, trajectories=(at_rest(150.0),)) for n, d in home(geared, 0.0).items()}
+    drives = {
+        n: replace(d, trajectories=(at_rest(150.0),))
+        for n, d in home(geared, 0.0).items()
+    }
     drives["ver_tube"] = replace(drives["ver_tube"], speed=7.0, acceleration=5.0)
     ways = plan_move(geared, drives, {"ver_obj": 20.0}, 0.0, relative=True)
     end = max(way.end for way in ways.values())
@@ -264,7 +281,10 @@ def test_coupled_motors_of_different_gears_stop_in_step(
         f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / tube}\n'
         f"moves = {{ ver_tube = {tube}, ver_det = {panel} }}\n"
     )
-    drives = {n: replace(d, trajectories=(at_rest(150.0),)) for n, d in home(geared, 0.0).items()}
+    drives = {
+        n: replace(d, trajectories=(at_rest(150.0),))
+        for n, d in home(geared, 0.0).items()
+    }
     drives["ver_tube"] = replace(drives["ver_tube"], acceleration=5.0)
     ways = plan_move(geared, drives, {"ver_obj": 30.0}, 0.0, relative=True)
     going = {n: drives[n].following(ways[n]) if n in ways else drives[n] for n in drives}
@@ -311,7 +331,9 @@ def test_rotation_is_accumulated_unless_shortest_is_asked() -> None:
     now = s.rest_time(now)
     s.move({"rot_obj": 7200.0}, now)
     now = s.rest_time(now)
-    s.move({"rot_obj": 10.0}, now, shortest=True)  # 7210 is past the travel: one turn back
+    s.move(
+        {"rot_obj": 10.0}, now, shortest=True
+    )  # 7210 is past the travel: one turn back
     assert s.targets(now)["rot_obj"] == 6850.0
 
 
@@ -338,7 +360,10 @@ def test_a_programme_is_followed_at_its_times_and_stop_ends_it() -> None:
 
 def test_a_leg_of_a_programme_on_a_clock_of_its_own_is_shifted_once() -> None:
     """At rest, each of the scanner's motors is read some thirty times a second."""
-    legs = motion.move(0.0, 0.0, 10.0, 5.0, 20.0, 0.0), motion.move(10.0, 0.0, 0.0, 5.0, 20.0, 4.0)
+    legs = (
+        motion.move(0.0, 0.0, 10.0, 5.0, 20.0, 0.0),
+        motion.move(10.0, 0.0, 0.0, 5.0, 20.0, 4.0),
+    )
     drive = Drive(5.0, 20.0, legs, origin=100.0)
     first = drive.at(101.0)
     assert first == legs[0].shifted(100.0)

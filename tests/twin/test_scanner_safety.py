@@ -43,7 +43,9 @@ class Wall:
     def standing(self, positions: Mapping[str, float]) -> Wall:
         return self
 
-    def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Touch | None:
+    def __call__(
+        self, trajectories: Mapping[str, Trajectory], now: float
+    ) -> Touch | None:
         mag_obj_below = self.mag_obj_below
         end = max(now, *(t.end for t in trajectories.values()))
         times = np.linspace(now, end, 4001)
@@ -71,7 +73,9 @@ def scanner(below: float = 500.0) -> ScannerTwin:
 
 def test_one_motor_halts_at_its_last_free_position_and_the_attempt_is_counted() -> None:
     s = scanner()
-    with pytest.raises(CollisionError, match=r"sample and wall .*blocked attempt 1 of 3") as e:
+    with pytest.raises(
+        CollisionError, match=r"sample and wall .*blocked attempt 1 of 3"
+    ) as e:
         s.move({"mag_obj": 300.0}, 0.0)
     assert e.value.data["pair"] == ["sample", "wall"]
     halt = s.targets(0.0)["mag_obj"]
@@ -128,7 +132,9 @@ def test_a_jog_runs_as_far_as_it_is_free_and_then_is_an_error() -> None:
     assert s.safety.blocked_attempts == 1
 
 
-def test_estop_brakes_harder_than_stop_switches_xrays_off_and_refuses_until_reset() -> None:
+def test_estop_brakes_harder_than_stop_switches_xrays_off_and_refuses_until_reset() -> (
+    None
+):
     s = scanner()
     s.set_tube(on=True)
     s.move({"mag_det": 200.0}, 0.0)
@@ -184,8 +190,9 @@ def test_readouts_of_listing_1() -> None:
     assert r.voxel_size_mm == pytest.approx(0.1496 * 674.9192 / 1099.0008)
     assert r.field_of_view_mm[0] == pytest.approx(956 * r.voxel_size_mm)
     assert r.piercing_point_px[0] == pytest.approx(477.5, abs=0.02)
-    # ver_tube - 6.2917 = 33.7083 against ver_det 33.6969: the foot is 0.0114 mm above the centre.
-    # The axis stands at axs_tan = -0.5405: magnified, in pixels of 0.1496 mm, from the centre.
+    # ver_tube - 6.2917 = 33.7083 against ver_det 33.6969: the foot is 0.0114 mm above the
+    # centre. The axis stands at axs_tan = -0.5405: magnified, in pixels of 0.1496 mm, from the
+    # centre.
     assert r.axis_column_px == pytest.approx(
         477.5 + (-0.5405 * r.magnification + 0.0015) / 0.1496, abs=0.02
     )
@@ -206,14 +213,17 @@ def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> N
     s.take_stage(s.stage_change(Sample(), None, None, 0.0).certified(), 0.0)
     assert s.cone_vec(0.0) == nominal
     with pytest.raises(GeometryError):
-        s.stage_change(Sample(), replace(one, parameters=Offsets(dD_z=-3000.0)), None, 0.0)
+        s.stage_change(
+            Sample(), replace(one, parameters=Offsets(dD_z=-3000.0)), None, 0.0
+        )
     with pytest.raises(GeometryError, match="behind the source"):
         s.stage_change(Sample(), replace(one, parameters=Offsets(dO_z=-90.0)), None, 0.0)
     assert s.correction is None
 
 
 def test_a_readout_follows_whatever_it_is_made_of() -> None:
-    """A scanner asked after every change says the same as one that is asked for the first time."""
+    """A scanner asked after every change says the same as one that is asked for the first
+    time."""
     draw = np.random.default_rng(8)
     asked, time = scanner(), 0.0
     seen = set()
@@ -227,13 +237,20 @@ def test_a_readout_follows_whatever_it_is_made_of() -> None:
                 left, top = (int(n) for n in draw.integers(0, 200, 2))
                 asked.set_camera(roi=Roi(left, top, left + 799, top + 599))
             case _:
-                offsets = Offsets(dO_z=draw.uniform(-5.0, 5.0), tau_x=draw.uniform(-1.0, 1.0))
+                offsets = Offsets(
+                    dO_z=draw.uniform(-5.0, 5.0), tau_x=draw.uniform(-1.0, 1.0)
+                )
                 asked.initialise_stage(
-                    Sample(), NamedCorrection("c", "2026-01-01T00:00:00Z", offsets), None, time
+                    Sample(),
+                    NamedCorrection("c", "2026-01-01T00:00:00Z", offsets),
+                    None,
+                    time,
                 )
         rest = asked.rest_time(time) + 1.0
         for now in (time, time + 1.0, rest):
-            fresh = readout(asked.poses(now), asked.camera, M.detector.pixels, asked.parameters)
+            fresh = readout(
+                asked.poses(now), asked.camera, M.detector.pixels, asked.parameters
+            )
             assert asked.state(now).readout == fresh
             seen.add(fresh)
         time = rest
@@ -241,7 +258,8 @@ def test_a_readout_follows_whatever_it_is_made_of() -> None:
 
 
 def test_sample_offset_moves_the_geometry_the_other_way() -> None:
-    """A point of the sample, placed by hand, has the same shadow as in the sample's own frame."""
+    """A point of the sample, placed by hand, has the same shadow as in the sample's own
+    frame."""
     s = scanner()
     cone = s.cone_vec(0.0)
     offset = StagePlacement(x=3.0, y=-2.0, z=7.0, rx=90.0, rz=90.0)

@@ -7,7 +7,11 @@ import math
 import pytest
 
 from flexdt.twin.errors import LimitError, SafetyError
-from flexdt.twin.machine.description import builtin_machine, builtin_profile, builtin_profiles
+from flexdt.twin.machine.description import (
+    builtin_machine,
+    builtin_profile,
+    builtin_profiles,
+)
 from flexdt.twin.scanner.scanner import ScannerTwin
 
 M = builtin_machine()

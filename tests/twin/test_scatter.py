@@ -1,8 +1,9 @@
-"""Scatter images against a direct integral, an analog simulation, and their own standard errors.
+"""Scatter images against a direct integral, an analog simulation, and their own standard
+errors.
 
-The integral and the analog photons are written out here in plain numpy with their own geometry and
-their own cross-sections: Klein and Nishina's formula, and F and S read from the shipped file (the
-file itself is held against xraydb's independent tables).
+The integral and the analog photons are written out here in plain numpy with their own geometry
+and their own cross-sections: Klein and Nishina's formula, and F and S read from the shipped
+file (the file itself is held against xraydb's independent tables).
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ EVEN = np.ones(len(ENERGY))
 def stored() -> dict[str, np.ndarray]:
     file = resources.files("flexdt.twin.attenuation") / "data" / "scattering.npz"
     with file.open("rb") as opened, np.load(opened) as arrays:
-        return {name: np.array(arrays[name]) for name in ("x", "form_factor", "incoherent")}
+        return {
+            name: np.array(arrays[name]) for name in ("x", "form_factor", "incoherent")
+        }
 
 
 FILE = stored()
@@ -83,7 +86,9 @@ def box(atoms: dict[str, int], density: float, size, voxels: int = 12) -> Object
     formula = "".join(f"{s}{n}" for s, n in atoms.items())
     amounts = np.ones((voxels,) * 3 + (1,), np.float32)
     edges = tuple(float(s) / voxels for s in size)
-    return Object(amounts, edges, (0.0, 0.0, 0.0), (Substance.of(formula, formula, density),))  # type: ignore[arg-type]
+    return Object(
+        amounts, edges, (0.0, 0.0, 0.0), (Substance.of(formula, formula, density),)
+    )  # type: ignore[arg-type]
 
 
 def mono(energy: float) -> tuple[Beam, float]:
@@ -99,13 +104,21 @@ def test_the_tables_agree_with_independent_ones() -> None:
     """Integrals with Elam's cross-sections; F with Waasmaier and Kirfel's (1995)."""
     import xraydb
 
-    for formula, worst in (("C5H8O2", 0.005), ("H2O", 0.005), ("Al", 0.005), ("Fe", 0.012)):
+    for formula, worst in (
+        ("C5H8O2", 0.005),
+        ("H2O", 0.005),
+        ("Al", 0.005),
+        ("Fe", 0.012),
+    ):
         one = Substance.of(formula, formula, 1.0)
         found = cross_sections((one,))
         for energy in (30.25, 60.25, 150.25):
             at = int(np.searchsorted(ENERGY, energy))
             for kind, values in (("coh", found.coherent), ("incoh", found.incoherent)):
-                elam = sum(w * xraydb.mu_elam(s, energy * 1e3, kind=kind) for s, w in one.fractions)
+                elam = sum(
+                    w * xraydb.mu_elam(s, energy * 1e3, kind=kind)
+                    for s, w in one.fractions
+                )
                 assert values[0, at] == pytest.approx(float(elam) / 10.0, rel=worst)
     for symbol in ("C", "Al", "Fe", "W"):
         z = xraydb.atomic_number(symbol)
@@ -116,10 +129,12 @@ def test_the_tables_agree_with_independent_ones() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
-    """A box of random size and material, two energies, a panel anywhere, response in proportion to
-    energy: nodes against a midpoint sum over the box."""
+    """A box of random size and material, two energies, a panel anywhere, response in proportion
+    to energy: nodes against a midpoint sum over the box."""
     rng = np.random.default_rng([seed, 19])
-    atoms, density = [(WATER, 1.0), ({"C": 5, "H": 8, "O": 2}, 1.18), ({"Al": 1}, 2.7)][seed % 3]
+    atoms, density = [(WATER, 1.0), ({"C": 5, "H": 8, "O": 2}, 1.18), ({"Al": 1}, 2.7)][
+        seed % 3
+    ]
     size = rng.uniform(8.0, 30.0, 3) * (0.6 if density > 2 else 1.0)
     thing = box(atoms, density, size)
     substance = thing.substances[0]
@@ -132,12 +147,18 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
     picked = np.searchsorted(ENERGY, rng.uniform(25.0, 140.0, 2))
     signal[picked] = rng.uniform(0.3, 1.0, 2)
     image = scatter_image(
-        thing, view, shape, Beam(signal, ENERGY, ENERGY), ScatterSettings(error=0.005, nodes=35)
+        thing,
+        view,
+        shape,
+        Beam(signal, ENERGY, ENERGY),
+        ScatterSettings(error=0.005, nodes=35),
     )
 
     n = 40
     grid = (np.arange(n) + 0.5) / n - 0.5
-    p = np.stack(np.meshgrid(*(grid * s for s in size), indexing="ij"), axis=-1).reshape(-1, 3)
+    p = np.stack(np.meshgrid(*(grid * s for s in size), indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
     volume = float(np.prod(size)) / n**3
     inward = p - source
     distance = np.linalg.norm(inward, axis=1)
@@ -148,7 +169,9 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
     for i, j in ((0, 0), (nv // 2, nu // 2), (nv - 1, nu // 3)):
         row, col = i * (shape[0] - 1) / (nv - 1), j * (shape[1] - 1) / (nu - 1)
         node = (
-            centre + (col - (shape[1] - 1) / 2) * pitch * x - (row - (shape[0] - 1) / 2) * pitch * z
+            centre
+            + (col - (shape[1] - 1) / 2) * pitch * x
+            - (row - (shape[0] - 1) / 2) * pitch * z
         )
         out = node - p
         r = np.linalg.norm(out, axis=1)
@@ -163,7 +186,10 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
             first = np.exp(-attenuation(substance, energy) * into) / distance**2
             arrives = coherent * np.exp(-attenuation(substance, energy) * outward)
             arrives += (
-                softer / energy * incoherent * np.exp(-attenuation(substance, softer) * outward)
+                softer
+                / energy
+                * incoherent
+                * np.exp(-attenuation(substance, softer) * outward)
             )
             slant = np.abs(v @ normal) / r**2
             total += signal[at] * np.sum(first * arrives * slant) * volume
@@ -173,8 +199,9 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
 
 
 def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, rng):  # type: ignore[no-untyped-def]
-    """Photons that scatter once and more than once onto the panel y = panel_y, for one isotropic
-    photon in a steradian; beam along +y that just holds the box. Also absorbed and interacting."""
+    """Photons that scatter once and more than once onto the panel y = panel_y, for one
+    isotropic photon in a steradian; beam along +y that just holds the box. Also absorbed and
+    interacting."""
     substance = box(atoms, density, size).substances[0]
     half = np.asarray(size) / 2
     front = -half[1] - source[1]
@@ -195,16 +222,26 @@ def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, r
     while len(p):
         fly = rng.exponential(size=len(p)) / attenuation(substance, e)
         leaves = fly >= in_box(p, d, half)
-        hit_t = np.where(d[:, 1] > 1e-9, (panel_y - p[:, 1]) / np.maximum(d[:, 1], 1e-9), 0.0)
+        hit_t = np.where(
+            d[:, 1] > 1e-9, (panel_y - p[:, 1]) / np.maximum(d[:, 1], 1e-9), 0.0
+        )
         at = p + d * hit_t[:, None]
-        lands = leaves & (d[:, 1] > 1e-9) & (np.abs(at[:, [0, 2]]) < half_panel).all(axis=1)
+        lands = (
+            leaves & (d[:, 1] > 1e-9) & (np.abs(at[:, [0, 2]]) < half_panel).all(axis=1)
+        )
         once += w[lands & (order == 1)].sum()
         more += w[lands & (order > 1)].sum()
         stay = ~leaves
-        p, d, e, w, order = (p + d * fly[:, None])[stay], d[stay], e[stay], w[stay], order[stay]
+        p, d, e, w, order = (
+            (p + d * fly[:, None])[stay],
+            d[stay],
+            e[stay],
+            w[stay],
+            order[stay],
+        )
         interacting += w[order == 0].sum()
-        # Both processes at once, by rejection from even directions: the sum of their cross-sections
-        # over a bound; what is missing to the whole is absorption.
+        # Both processes at once, by rejection from even directions: the sum of their
+        # cross-sections over a bound; what is missing to the whole is absorption.
         coherent, incoherent = (np.interp(e, energies, c) for c in sums.T)
         u = rng.uniform(size=len(p)) * attenuation(substance, e)
         gone = u >= coherent + incoherent
@@ -218,7 +255,9 @@ def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, r
             )  # density of 1 / (4 sqrt((1 - c) / 2))
             both = scattered(atoms, density, e[open_], trial)
             value = np.where(elastic[open_], both[0], both[1]) * np.sqrt((1 - trial) / 2)
-            taken = rng.uniform(size=len(open_)) * np.where(elastic[open_], *bounds) < value
+            taken = (
+                rng.uniform(size=len(open_)) * np.where(elastic[open_], *bounds) < value
+            )
             c[open_[taken]] = trial[taken]
             open_ = open_[~taken]
         e = np.where(elastic, e, e / (1 + e / MC2 * (1 - c)))
@@ -232,9 +271,14 @@ def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, r
 @pytest.mark.slow
 @pytest.mark.campaign
 def test_forced_detection_counts_what_analog_photons_count() -> None:
-    """Water, 60 keV, a near panel: photons on it after one and after more interactions, absorbed
-    and interacting, within four standard errors and 2 %."""
-    size, source, panel_y, half = (40.0, 40.0, 40.0), np.array([0.0, -200.0, 0.0]), 60.0, 80.0
+    """Water, 60 keV, a near panel: photons on it after one and after more interactions,
+    absorbed and interacting, within four standard errors and 2 %."""
+    size, source, panel_y, half = (
+        (40.0, 40.0, 40.0),
+        np.array([0.0, -200.0, 0.0]),
+        60.0,
+        80.0,
+    )
     beam, energy = mono(60.0)
     thing = box(WATER, 1.0, size)
     once, more, absorbed, interacting = np.mean(
@@ -250,8 +294,8 @@ def test_forced_detection_counts_what_analog_photons_count() -> None:
     both = float((image.full() * open_beam).sum())
     assert single == pytest.approx(once, rel=0.015)
     assert both - single == pytest.approx(more, rel=0.02)
-    # The analog beam just fills the front face; so does the box's shadow, up to the rays that pass
-    # its back edges: compare what becomes of photons that interact.
+    # The analog beam just fills the front face; so does the box's shadow, up to the rays that
+    # pass its back edges: compare what becomes of photons that interact.
     assert image.balance[1] == pytest.approx(absorbed / interacting, rel=0.02)
 
 
@@ -262,11 +306,16 @@ def scene(seed: int, error: float = 0.05) -> ScatterImage:
     amounts[..., 0] = 1.0
     amounts[2:8, 3:6, 2:5] = (0.0, 1.0)
     amounts[..., 0] *= rng.uniform(0.5, 1.0, (10, 10, 10))
-    materials = (Substance.of("pmma", "C5H8O2", 1.19), Substance.of("aluminium", "Al", 2.7))
+    materials = (
+        Substance.of("pmma", "C5H8O2", 1.19),
+        Substance.of("aluminium", "Al", 2.7),
+    )
     thing = Object(amounts, (2.5, 2.5, 2.5), (0.0, 1.0, 0.0), materials)
     view = [0, -300, 0, 5, 200, 0, 0.8, 0, 0, 0, 0, -0.8]
     beam = Beam.of(Chain(Detector()), 90.0)
-    return scatter_image(thing, view, (90, 120), beam, ScatterSettings(error=error, seed=seed))
+    return scatter_image(
+        thing, view, (90, 120), beam, ScatterSettings(error=error, seed=seed)
+    )
 
 
 def test_the_image_does_not_depend_on_the_number_of_threads() -> None:
@@ -304,7 +353,9 @@ def test_standard_errors_hold_and_photons_and_energy_are_kept() -> None:
 
 
 @pytest.mark.slow
-def test_views_between_simulated_ones_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_between_simulated_ones_are_interpolated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(scatter_kernels, "MAX_ORDERS", 1)
     thing = box(WATER, 1.0, (20, 30, 20))
     beam, _ = mono(60.0)
@@ -339,7 +390,9 @@ TURN = ConeVec.circular(sod=300, sdd=400, angles=60, shape=(48, 64), pixel=2.0)
 def in_cylinder(p, d, radius):  # type: ignore[no-untyped-def]
     """Length of the rays p + t d, t >= 0, in an upright cylinder about the origin."""
     a, b = (d[..., :2] ** 2).sum(axis=-1), (p[..., :2] * d[..., :2]).sum(axis=-1)
-    root = np.sqrt(np.maximum(b**2 - a * ((p[..., :2] ** 2).sum(axis=-1) - radius**2), 0.0))
+    root = np.sqrt(
+        np.maximum(b**2 - a * ((p[..., :2] ** 2).sum(axis=-1) - radius**2), 0.0)
+    )
     ends = (np.array([[-HALF], [HALF]]) - p[..., 2].ravel()) / d[..., 2].ravel()
     low, high = (f(ends, axis=0).reshape(a.shape) for f in (np.min, np.max))
     near, far = np.maximum((-b - root) / a, low), np.minimum((-b + root) / a, high)
@@ -347,7 +400,8 @@ def in_cylinder(p, d, radius):  # type: ignore[no-untyped-def]
 
 
 def radiograph(row, atoms, density, inside, points, each, counts=(7, 9)):  # type: ignore[no-untyped-def]
-    """Transmission and single scatter in a view, by chords and by a sum over points of an object.
+    """Transmission and single scatter in a view, by chords and by a sum over points of an
+    object.
 
     Args:
         row: the cone_vec row.
@@ -393,8 +447,12 @@ def radiograph(row, atoms, density, inside, points, each, counts=(7, 9)):  # typ
         arrives += gained * incoherent * np.exp(-attenuation(substance, softer) * outward)
         away = node - source
         open_beam = np.abs(away @ normal) / np.linalg.norm(away) ** 3
-        nodes[i, j] = np.sum(first * arrives * np.abs(w @ normal) / reach**2 * each) / open_beam
-    return straight, RectBivariateSpline(at_v, at_u, nodes)(np.arange(rows), np.arange(cols))
+        nodes[i, j] = (
+            np.sum(first * arrives * np.abs(w @ normal) / reach**2 * each) / open_beam
+        )
+    return straight, RectBivariateSpline(at_v, at_u, nodes)(
+        np.arange(rows), np.arange(cols)
+    )
 
 
 def cylinder_scan(
@@ -404,7 +462,11 @@ def cylinder_scan(
     nr, na, nz = 8, 24, 12
     r, angle, z = (
         (np.arange(n) + 0.5) / n * size + low
-        for n, size, low in ((nr, radius, 0.0), (na, 2 * np.pi, 0.0), (nz, 2 * HALF, -HALF))
+        for n, size, low in (
+            (nr, radius, 0.0),
+            (na, 2 * np.pi, 0.0),
+            (nz, 2 * HALF, -HALF),
+        )
     )
     r, angle, z = (one.ravel() for one in np.meshgrid(r, angle, z, indexing="ij"))
     points = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
@@ -415,7 +477,8 @@ def cylinder_scan(
 
 
 def cupping(line_integrals: np.ndarray, size: float) -> tuple[float, float]:
-    """Mean attenuation by FDK near the axis and near the cylinder's rim, in its middle layers."""
+    """Mean attenuation by FDK near the axis and near the cylinder's rim, in its middle
+    layers."""
     found = fdk(line_integrals, TURN, Grid((3, 60, 60), size / 25)).data.mean(axis=0)
     at = (np.arange(60) - 29.5) * size / 25
     radius = np.hypot(at[:, None], at)
@@ -440,10 +503,14 @@ def test_subtracted_scatter_leaves_no_cupping(
     clean = np.tile(-np.log(straight), views)
     measured = np.tile(-np.log(straight + scatter), views)
     formula = "".join(f"{s}{n}" for s, n in atoms.items())
-    chain = Chain(Detector(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV)
+    chain = Chain(
+        Detector(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV
+    )
     settings = ScatterSettings(nodes=100, step_deg=90.0)
     corrected = without_scatter(measured, TURN, chain, 90.0, settings)
-    truth, cupped, flat = (np.array(cupping(one, radius)) for one in (clean, measured, corrected))
+    truth, cupped, flat = (
+        np.array(cupping(one, radius)) for one in (clean, measured, corrected)
+    )
     assert (cupped / truth)[0] < 0.98 * (cupped / truth)[1]
     np.testing.assert_allclose(flat / truth, 1.0, rtol=0.008)
     assert (flat / truth)[0] == pytest.approx((flat / truth)[1], rel=0.005)
@@ -453,7 +520,11 @@ def test_subtracted_scatter_leaves_no_cupping(
     # A wrong material is told from how much the object attenuates.
     wrong = Substance.of("Fe", "Fe", 7.874)
     doubts = scatterer_of(
-        measured.astype(np.float32), TURN, replace(chain, substances=(wrong,)), 90.0, settings
+        measured.astype(np.float32),
+        TURN,
+        replace(chain, substances=(wrong,)),
+        90.0,
+        settings,
     ).doubts
     assert any("either it is not Fe" in doubt for doubt in doubts)
 
@@ -461,13 +532,18 @@ def test_subtracted_scatter_leaves_no_cupping(
 def test_a_scatter_correction_needs_materials_that_differ() -> None:
     air = np.zeros((len(TURN), 48, 64), np.float32)
     water = Substance.of("water", "H2O", 1.0)
-    for substances, why in (((), "no material"), ((water, replace(water, name="w")), "alike")):
+    for substances, why in (
+        ((), "no material"),
+        ((water, replace(water, name="w")), "alike"),
+    ):
         with pytest.raises(LimitError, match=why):
             without_scatter(air, TURN, Chain(Detector(), substances=substances), 90.0)
 
 
 @given(st.floats(-10.0, 2.0**100, width=32), st.floats(0.0, 1e3, width=32))
-def test_any_scatter_is_subtracted_from_any_line_integral(integral: float, scatter: float) -> None:
+def test_any_scatter_is_subtracted_from_any_line_integral(
+    integral: float, scatter: float
+) -> None:
     """Black pixels, too, whose transmission has no inverse in float32."""
     image = np.full((2, 3), integral, np.float32)
     left = subtracted(image, np.full((2, 3), scatter, np.float32))

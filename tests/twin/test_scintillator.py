@@ -23,11 +23,17 @@ def followed(
     def at(values: np.ndarray, e: np.ndarray | float) -> np.ndarray:
         return np.interp(e, energy, values)
 
-    total, compton, coherent = sections.total[0], sections.incoherent[0], sections.coherent[0]
+    total, compton, coherent = (
+        sections.total[0],
+        sections.incoherent[0],
+        sections.coherent[0],
+    )
     photo = total - compton - coherent
     stopping = float(at(photo + compton, keV))
     stopped = -np.expm1(-stopping * screen.thickness_mm)
-    depth = -np.log1p(-rng.random(number) * stopped) / stopping  # all interact, of `stopped`
+    depth = (
+        -np.log1p(-rng.random(number) * stopped) / stopping
+    )  # all interact, of `stopped`
     electron = rng.random(len(depth)) * at(photo + compton, keV) < at(photo, keV)
     kept = np.where(electron, keV, 0.0)
 
@@ -55,15 +61,21 @@ def followed(
     while len(k) < len(depth):  # Klein and Nishina by rejection
         cosine = rng.uniform(-1, 1, number)
         one = 1.0 / (1.0 + keV / 511.0 * (1.0 - cosine))
-        k = np.append(k, one[rng.random(number) * 2 < one**2 * (one + 1 / one - 1 + cosine**2)])
+        k = np.append(
+            k, one[rng.random(number) * 2 < one**2 * (one + 1 / one - 1 + cosine**2)]
+        )
     rest = keV * k[: len(depth)]
     kept += np.where(~electron, keV - np.where(leaves(rest, photo), rest, 0.0), 0.0)
     return np.array([np.mean(kept / keV), np.mean((kept / keV) ** 2)]) * float(stopped)
 
 
 @pytest.mark.parametrize("keV", [25.25, 34.25, 40.25, 60.25, 110.25, 180.25])
-@pytest.mark.parametrize("screen", [Filter(CSI, 0.2), Filter(GOS, 0.5)], ids=["CsI", "GOS"])
-def test_the_energy_kept_is_that_of_photons_followed_one_by_one(screen: Filter, keV: float) -> None:
+@pytest.mark.parametrize(
+    "screen", [Filter(CSI, 0.2), Filter(GOS, 0.5)], ids=["CsI", "GOS"]
+)
+def test_the_energy_kept_is_that_of_photons_followed_one_by_one(
+    screen: Filter, keV: float
+) -> None:
     rng = np.random.default_rng(3)
     ours = [np.interp(keV, tables().energy_keV, one) for one in deposited(screen)]
     assert ours == pytest.approx(followed(screen, keV, rng), rel=0.012)

@@ -32,15 +32,21 @@ MACHINE = builtin_machine()
 PROFILE = builtin_profile(MACHINE.default_profile)
 
 
-def planned(wish: ScanRequest, machine: Machine = MACHINE, profile: Profile = PROFILE) -> ScanPlan:
-    return plan_script(parse_script(compose_script(wish, machine, profile)), machine, profile)
+def planned(
+    wish: ScanRequest, machine: Machine = MACHINE, profile: Profile = PROFILE
+) -> ScanPlan:
+    return plan_script(
+        parse_script(compose_script(wish, machine, profile)), machine, profile
+    )
 
 
 def geometry(plan: ScanPlan) -> tuple[ConeVec, CameraSettings]:
     """Nominal cone_vec of every projection."""
     images = [e for e in plan.exposures if e.kind == "projection"]
     camera = images[0].camera
-    positions = {a: np.array([e.positions[a] for e in images]) for a in images[0].positions}
+    positions = {
+        a: np.array([e.positions[a] for e in images]) for a in images[0].positions
+    }
     return poses(MACHINE, PROFILE, camera, positions).cone_vec(), camera
 
 
@@ -100,7 +106,9 @@ def test_figures_of_a_request_have_bounds(field: str, least: float, most: float)
             asked = [ScanPosition(600.0)] * int(value)  # type: ignore[assignment]
         elif field in ("placements", "lateral"):
             name, asked = "placements", (ScanPosition(600.0, value),)  # type: ignore[assignment]
-        whole = dict.fromkeys((name,), asked) | ({} if field == "sdd_mm" else {"sdd_mm": 1000.0})
+        whole = dict.fromkeys((name,), asked) | (
+            {} if field == "sdd_mm" else {"sdd_mm": 1000.0}
+        )
         found: object = None
         try:
             compose_script(ScanRequest(**whole), MACHINE, PROFILE)  # type: ignore[arg-type]
@@ -111,13 +119,24 @@ def test_figures_of_a_request_have_bounds(field: str, least: float, most: float)
 
 def test_moves_begin_together_and_are_waited_for_one_by_one() -> None:
     rows = [
-        line.split("\t") for line in compose_script(ScanRequest(), MACHINE, PROFILE).splitlines()
+        line.split("\t")
+        for line in compose_script(ScanRequest(), MACHINE, PROFILE).splitlines()
     ]
     moves = [(row[0], row[2], row[4]) for row in rows if row[1] == "move absolute"]
-    names = {"mag_obj", "mag_det", "tra_obj", "tra_det", "tra_tube", "ver_tube", "ver_det"}
+    names = {
+        "mag_obj",
+        "mag_det",
+        "tra_obj",
+        "tra_det",
+        "tra_tube",
+        "ver_tube",
+        "ver_det",
+    }
     begun = [move[:2] for move in moves[:7]]
     assert {name for name, _ in begun} == names
-    assert moves[:14] == [(*move, "no wait") for move in begun] + [(*move, "ACK") for move in begun]
+    assert moves[:14] == [(*move, "no wait") for move in begun] + [
+        (*move, "ACK") for move in begun
+    ]
     # Then the sample alone goes into the beam, and the turntable turns.
     assert [(name, wait) for name, _, wait in moves[14:]] == [
         ("tra_obj", "ACK"), ("rot_obj", "ACK"), ("rot_obj", "POS"),
@@ -141,11 +160,15 @@ def test_the_sample_leaves_the_beam_by_the_freer_side(
         f"{quantity} = {{ {motor} = {factor} }}\n"
         + CABINET_AXIS.format(name=motor, lower=room[0], upper=room[1], home=0.0)
     )
-    request = ScanRequest(frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000, height_mm=0.0)
+    request = ScanRequest(
+        frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000, height_mm=0.0
+    )
     rows = [line.split("\t") for line in compose_script(
         request, machine, profile_of(machine)).splitlines()]  # fmt: skip
     first, *_, last = [
-        float(row[2]) for row in rows if row[:2] == [motor, "move absolute"] and row[4] == "ACK"
+        float(row[2])
+        for row in rows
+        if row[:2] == [motor, "move absolute"] and row[4] == "ACK"
     ]
     away = (2000 * 0.2 * 300 / 1000 / 2 + 60) / abs(factor)
     freer = room[0] if -room[0] > room[1] else room[1]
@@ -156,7 +179,12 @@ def test_the_sample_leaves_the_beam_by_the_freer_side(
 @pytest.mark.parametrize("beside", [0.099, 0.101])
 @pytest.mark.parametrize(
     ("quantity", "mm"),
-    [("source_x", 400.0), ("detector_x", 400.0), ("source_z", 400.0), ("object_x", 120.0)],
+    [
+        ("source_x", 400.0),
+        ("detector_x", 400.0),
+        ("source_z", 400.0),
+        ("object_x", 120.0),
+    ],
 )
 def test_what_no_motor_moves_may_stand_a_tenth_of_the_view_beside(
     quantity: str, mm: float, beside: float
@@ -168,7 +196,9 @@ def test_what_no_motor_moves_may_stand_a_tenth_of_the_view_beside(
         f'base = "xyzr_cabinet"\nname = "mine"\n{gone}[fixed]\n'
         f"{quantity} = {mm * beside}{heights}\n"
     )
-    request = ScanRequest(frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000, height_mm=0.0)
+    request = ScanRequest(
+        frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000, height_mm=0.0
+    )
     if beside < 0.1:
         assert compose_script(request, machine, profile_of(machine))
     else:
@@ -204,7 +234,9 @@ def test_everything_comes_out_centred(
     middle = [[(cols - 1) / 2, (rows - 1) / 2]] * 5
     np.testing.assert_allclose(centre[:, 0], middle, atol=1e-3)
     np.testing.assert_allclose(cone_vec.source_detector_distance, sdd, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(cone_vec.source[:, :2], axis=1), sod, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(cone_vec.source[:, :2], axis=1), sod, atol=1e-5
+    )
 
 
 @settings(max_examples=30, deadline=None)
@@ -212,15 +244,23 @@ def test_everything_comes_out_centred(
     st.integers(0, 750).map(lambda k: 2 * k), st.integers(150, 249).map(lambda k: 2 * k + 1),
     st.integers(0, 850).map(lambda k: 2 * k), st.integers(50, 149).map(lambda k: 2 * k + 1),
 )  # fmt: skip
-def test_the_sample_goes_to_a_region_of_a_panel_that_stands_still(left, wide, top, high) -> None:
+def test_the_sample_goes_to_a_region_of_a_panel_that_stands_still(
+    left, wide, top, high
+) -> None:
     cabinet = builtin_machine("xyzr_cabinet")
     wish = ScanRequest(frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000,
                        roi=Roi(left, top, left + wide, top + high))  # fmt: skip
     rows = [line.split("\t") for line in compose_script(
         wish, cabinet, profile_of(cabinet)).splitlines()]  # fmt: skip
-    at = {row[0]: float(row[2]) for row in rows if row[1] == "move absolute" and row[0] in "XYZ"}
+    at = {
+        row[0]: float(row[2])
+        for row in rows
+        if row[1] == "move absolute" and row[0] in "XYZ"
+    }
     # By hand: the middle of 2000 pixels of 0.2 mm is 999.5, a magnification of 1000 / 300.
-    assert 999.5 + at["X"] * (1000 / 300) / 0.2 == pytest.approx(left + wide / 2, abs=1e-3)
+    assert 999.5 + at["X"] * (1000 / 300) / 0.2 == pytest.approx(
+        left + wide / 2, abs=1e-3
+    )
     assert 999.5 - at["Y"] * (1000 / 300) / 0.2 == pytest.approx(top + high / 2, abs=1e-3)
     assert at["Z"] == 300.0
 
@@ -241,7 +281,9 @@ def test_step_images_do_not_repeat_the_first_angle() -> None:
 
 
 def test_helix_rises_evenly_and_symmetrically() -> None:
-    plan = planned(ScanRequest(kind="helical", frames=241, turns=4.0, rise_mm=16.0, height_mm=25.0))
+    plan = planned(
+        ScanRequest(kind="helical", frames=241, turns=4.0, rise_mm=16.0, height_mm=25.0)
+    )
     images = [e for e in plan.exposures if e.kind == "projection"]
     angle = np.array([e.positions["rot_obj"] for e in images])
     for axis, offset in (("ver_tube", PROFILE.src_ort), ("ver_det", 0.0)):
@@ -290,7 +332,10 @@ def test_the_sample_is_out_of_the_beam_for_the_flat() -> None:
         (ScanRequest(sdd_mm=2000), "mag_det target"),
         (ScanRequest(frames=5, exposure_ms=10), "turns at most 90 deg/s"),
         (ScanRequest(kind="helical", rise_mm=200), "ver_tube target"),
-        (ScanRequest(kind="helical", rise_mm=3000, turns=1), "raise frames, exposure or averages"),
+        (
+            ScanRequest(kind="helical", rise_mm=3000, turns=1),
+            "raise frames, exposure or averages",
+        ),
         (ScanRequest(kind="helical", turns=30, frames=20_000), "rot_obj target"),
         (ScanRequest(exposure_ms=float("nan")), "exposure_ms"),
     ],
@@ -305,13 +350,24 @@ def shared_machine(rng: np.random.Generator) -> Machine:
     base = 'base = "xyzr_cabinet"\nname = "shared"\nwithout = ["X", "Y", "Z", "floor", "source", '
     text = base + '"z_carriage", "x_carriage", "lift", "turntable", "mount", "panel"]\n'
     text += "allowed_contacts = []\n[geometry]\n"
-    quantities = ("object_y", "detector_y", "object_x", "source_z", "detector_x", "detector_z")
+    quantities = (
+        "object_y",
+        "detector_y",
+        "object_x",
+        "source_z",
+        "detector_x",
+        "detector_z",
+    )
     signs = {q: float(rng.choice([-2.0, -1.0, 0.5, 1.0])) for q in quantities}
     for q in quantities:
         own = {f"own_{q}": signs[q]}
         others = [other for other in quantities if other != q and rng.random() < 0.25]
-        shared = {f"own_{other}": float(rng.choice([-0.5, 0.25, 0.5])) for other in others}
-        text += f"{q} = {{ {', '.join(f'{m} = {f}' for m, f in (shared | own).items())} }}\n"
+        shared = {
+            f"own_{other}": float(rng.choice([-0.5, 0.25, 0.5])) for other in others
+        }
+        text += (
+            f"{q} = {{ {', '.join(f'{m} = {f}' for m, f in (shared | own).items())} }}\n"
+        )
     text += "[fixed]\nobject_y = 300.0\ndetector_y = 900.0\n"
     for q in quantities:
         text += (
@@ -373,12 +429,16 @@ def test_the_beam_is_at_the_height_of_the_sample() -> None:
     machine = builtin_machine("unitom_xl")
     profile = builtin_profile(machine.default_profile)
     plan = plan_script(
-        parse_script(compose_script(ScanRequest(frames=5, exposure_ms=2000), machine, profile)),
+        parse_script(
+            compose_script(ScanRequest(frames=5, exposure_ms=2000), machine, profile)
+        ),
         machine,
         profile,
     )
     last = next(e for e in plan.exposures if e.kind == "projection")
-    assert last.positions["ver_tube"] + profile.src_ort == pytest.approx(169.604412, abs=1e-5)
+    assert last.positions["ver_tube"] + profile.src_ort == pytest.approx(
+        169.604412, abs=1e-5
+    )
 
 
 def test_one_motor_for_two_distances_is_said() -> None:
@@ -388,7 +448,9 @@ def test_one_motor_for_two_distances_is_said() -> None:
         "[geometry]\ndetector_y = { Z = 1.0 }\n[fixed]\ndetector_y = 500.0\n"
     )
     machine = parse_machine(text)
-    with pytest.raises(LimitError, match=r"no motor of its own for .*: 700 mm .* it is 600 mm"):
+    with pytest.raises(
+        LimitError, match=r"no motor of its own for .*: 700 mm .* it is 600 mm"
+    ):
         compose_script(
             ScanRequest(sod_mm=100.0, sdd_mm=700.0, frames=3, exposure_ms=20_000),
             machine,
@@ -429,14 +491,18 @@ BARE = (
          "source_x = { S = 1.0 }", "tiled", "of its own for the source sideways"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_centred_is_said(more: str, text: str, kind: Kind, says: str) -> None:
+def test_what_cannot_be_centred_is_said(
+    more: str, text: str, kind: Kind, says: str
+) -> None:
     head = BARE.replace("{more}", more)
     if text.startswith("sample_height_mm"):
         head, text = head + text + "\n", ""
     machine = parse_machine(head + text)
     with pytest.raises(LimitError, match=says) as caught:
         compose_script(
-            ScanRequest(kind=kind, frames=61, exposure_ms=1000), machine, profile_of(machine)
+            ScanRequest(kind=kind, frames=61, exposure_ms=1000),
+            machine,
+            profile_of(machine),
         )
     if says == "turns the sample by":
         assert caught.value.data["allowed"] == [1.0, -1.0]
@@ -450,15 +516,23 @@ def test_a_second_place_is_chosen_where_there_is_room(upper: float, second: bool
         f"[axes.X]\nupper = 0.0\nhome = 0.0\n[axes.Z]\nupper = {upper}\nhome = 600.0\n"
     )
     text = compose_script(
-        ScanRequest("calibration", frames=41, exposure_ms=500), machine, profile_of(machine)
+        ScanRequest("calibration", frames=41, exposure_ms=500),
+        machine,
+        profile_of(machine),
     )
     rows = [line.split("\t") for line in text.splitlines()]
-    at = [float(row[2]) for row in rows if row[:2] == ["Z", "move absolute"] and row[4] == "ACK"]
+    at = [
+        float(row[2])
+        for row in rows
+        if row[:2] == ["Z", "move absolute"] and row[4] == "ACK"
+    ]
     assert at == [600.0, 600.0, *([800.0] if second else [])]
 
 
 def test_a_second_motor_of_a_distance_is_sent_home() -> None:
-    text = f"[axes.ZF]\n{AXIS}home = 5.0\n[geometry]\nobject_y = {{ Z = 1.0, ZF = 1.0 }}\n"
+    text = (
+        f"[axes.ZF]\n{AXIS}home = 5.0\n[geometry]\nobject_y = {{ Z = 1.0, ZF = 1.0 }}\n"
+    )
     machine = parse_machine(BARE.replace("{more}", "") + text)
     request = ScanRequest(frames=61, exposure_ms=1000, sod_mm=300.0)
     rows = [
@@ -491,8 +565,14 @@ def drawn_machine(rng: np.random.Generator) -> Machine:
         if rng.random() < 0.6:
             continue
         if a.kind == "rotation":
-            pace, acceleration = float(rng.choice([5, 20, 45])), float(rng.choice([5, 20]))
-            ends = -float(rng.choice([0, 10, 400])), float(rng.choice([200, 360, 400, 7200]))
+            pace, acceleration = (
+                float(rng.choice([5, 20, 45])),
+                float(rng.choice([5, 20])),
+            )
+            ends = (
+                -float(rng.choice([0, 10, 400])),
+                float(rng.choice([200, 360, 400, 7200])),
+            )
             text += f"[axes.{axis}]\nspeed = {pace}\nmax_speed = {pace}\n"
             text += f"acceleration = {acceleration}\n"
         else:

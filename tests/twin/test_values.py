@@ -1,4 +1,5 @@
-"""Plans and geometries are values: equal by content, printed in one line, through JSON and back."""
+"""Plans and geometries are values: equal by content, printed in one line, through JSON and
+back."""
 
 from __future__ import annotations
 
@@ -82,7 +83,10 @@ def test_a_plan_goes_to_json_and_back(plan: ScanPlan) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.floats(0.0, 400.0), st.integers(1, 5), st.integers(1, 5), st.binary(min_size=1, max_size=20)
+    st.floats(0.0, 400.0),
+    st.integers(1, 5),
+    st.integers(1, 5),
+    st.binary(min_size=1, max_size=20),
 )
 def test_any_plan_goes_to_json_and_back(
     target: float, frames: int, averages: int, info: bytes
@@ -149,12 +153,18 @@ def test_a_geometry_s_document_is_checked() -> None:
 
 
 def record(plan: ScanPlan) -> ScanRecord:
-    return ScanRecord.from_plan(plan, name="bird", started=datetime(2026, 5, 4, 3, 2, tzinfo=UTC))
+    return ScanRecord.from_plan(
+        plan, name="bird", started=datetime(2026, 5, 4, 3, 2, tzinfo=UTC)
+    )
 
 
-def test_records_are_values_and_their_documents_go_to_json_and_back(plan: ScanPlan) -> None:
+def test_records_are_values_and_their_documents_go_to_json_and_back(
+    plan: ScanPlan,
+) -> None:
     assert record(plan) == record(plan_script(SCRIPT))
-    assert record(plan) != record(plan_script(SCRIPT.replace(b"exposure 100", b"exposure 50")))
+    assert record(plan) != record(
+        plan_script(SCRIPT.replace(b"exposure 100", b"exposure 50"))
+    )
     document = DatasetDocument.of(record(plan))
     assert parse_document(document.to_json()) == document
 
@@ -174,7 +184,9 @@ def test_values_print_in_one_short_line(plan: ScanPlan) -> None:
         repr(many): "<Poses: 360 views, 0 to 359 deg>",
         repr(plan): f"<ScanPlan on flexray: {len(plan.steps)} steps, 1 projections, "
         f"{plan.duration_s:.1f} s, {len(plan.errors)} errors, {len(plan.warnings)} warnings>",
-        repr(made): "<ScanRecord 'bird' on flexray: 2 images, 2026-05-04 03:02, incomplete>",
+        repr(
+            made
+        ): "<ScanRecord 'bird' on flexray: 2 images, 2026-05-04 03:02, incomplete>",
         repr(made.blocks[0]): "<FrameBlock: 1 dark images, di000000.tif to di000000.tif>",
     }
     for found, expected in printed.items():

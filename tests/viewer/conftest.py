@@ -22,8 +22,8 @@ FLAGS = [
     "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--disable-gpu-compositing",
 ]  # fmt: skip
-"""WebGL by SwiftShader; what lies around the scenes is put together without it, at an eighth of the
-processor time."""
+"""WebGL by SwiftShader; what lies around the scenes is put together without it, at an eighth of
+the processor time."""
 BUSY = ("running", "paused", "queued")
 SPEED_UP = 8
 """Of the twin's clock, unless a test sets another for itself."""
@@ -82,7 +82,12 @@ class Lab:
         self.twin = Process(
             "flexdt.server.twin.main", "--port", "0", *self.twin_words, log=self.log
         )
-        self.viewer_words = ("--twin", f"127.0.0.1:{self.twin.port}", "--data", str(self.data))
+        self.viewer_words = (
+            "--twin",
+            f"127.0.0.1:{self.twin.port}",
+            "--data",
+            str(self.data),
+        )
         self.viewer = Process(
             "flexdt.clients.viewer.main", "--port", "0", *self.viewer_words, log=self.log
         )
@@ -153,11 +158,14 @@ def need_browser() -> Any:
     return sync_playwright
 
 
-# Of a module, not the session: playwright keeps an event loop running, which others must not meet.
+# Of a module, not the session: playwright keeps an event loop running, which others must not
+# meet.
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     with need_browser()() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, headless=True, args=FLAGS
+        )
         yield browser
         browser.close()
 
@@ -179,7 +187,9 @@ def no_errors_on_the_console(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[..., Any]]:
+def open_page(
+    chromium: Any, lab: Lab, console: list[str]
+) -> Iterator[Callable[..., Any]]:
     """Opens the viewer's page; whatever it says on the console as an error fails the test."""
     made: list[Any] = []
 
@@ -201,7 +211,9 @@ def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[
         given = {"view": view, "theme": "light", "patience": PATIENCE_S, **query}
         words = "&".join(f"{k}={v}" for k, v in given.items())
         page.goto(f"{lab.url}?{words}")
-        page.wait_for_function("window.flexdt?.store.state && window.flexdt.store.session")
+        page.wait_for_function(
+            "window.flexdt?.store.state && window.flexdt.store.session"
+        )
         made.append(page)
         return page
 
@@ -214,7 +226,9 @@ def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[
 
 def _matters(message: Any) -> bool:
     gone = ("ERR_CONNECTION_REFUSED", "WebSocket connection to", "WebSocket is closed")
-    return message.type == "error" and not any(h in message.text for h in (*HARMLESS, *gone))
+    return message.type == "error" and not any(
+        h in message.text for h in (*HARMLESS, *gone)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -232,13 +246,16 @@ def wait() -> Callable[..., Any]:
 
 @pytest.fixture(autouse=True)
 def at_peace(request: pytest.FixtureRequest) -> None:
-    """Whatever the test before left behind, the servers run, no scan does, nothing moves, no key is
-    held, no note is left and no correction in force when a test begins; and the page knows it. A
-    module begins with the usual camera."""
+    """Whatever the test before left behind, the servers run, no scan does, nothing moves, no
+    key is held, no note is left and no correction in force when a test begins; and the page
+    knows it. A module begins with the usual camera."""
     if "lab" not in request.fixturenames:
         return
     lab: Lab = request.getfixturevalue("lab")
-    for process, again in ((lab.twin, lab.restart_twin), (lab.viewer, lab.restart_viewer)):
+    for process, again in (
+        (lab.twin, lab.restart_twin),
+        (lab.viewer, lab.restart_viewer),
+    ):
         if process.process.poll() is not None:
             again()
     names = [name for name in ("page", "scene") if name in request.fixturenames]
@@ -249,7 +266,9 @@ def at_peace(request: pytest.FixtureRequest) -> None:
         for job in client.jobs().jobs:
             if job.state in BUSY:
                 client.abort_job(job.job)
-        until(lambda: all(job.state not in BUSY for job in client.jobs().jobs), "scans end")
+        until(
+            lambda: all(job.state not in BUSY for job in client.jobs().jobs), "scans end"
+        )
         state = client.state()
         usual = state.clock.speed_up == SPEED_UP and state.correction is None
         usual = usual and lab.module == request.module.__name__

@@ -32,12 +32,15 @@ def until(condition: Callable[[], Any], what: str = "", seconds: float = 120.0) 
         value = condition()
         if value:
             return value
-        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what or condition}"
+        assert time.monotonic() < deadline, (
+            f"not within {seconds:g} s: {what or condition}"
+        )
         time.sleep(0.03)
 
 
 def seen(page: Any, twin: TwinClient) -> None:
-    """Waits until the page shows a state from now on, or one that says what the twin says now."""
+    """Waits until the page shows a state from now on, or one that says what the twin says
+    now."""
 
     def facts(state: State) -> object:
         return state.model_dump(exclude={"time", "clock"}), state.clock.speed_up
@@ -80,7 +83,9 @@ def picture(target: Any) -> Picture:
 def point_at(page: Any, across: float, down: float, aside: float = 0.0) -> None:
     """Puts the pointer on the radiograph as it lies now, at shares of its width and height and
     `aside` CSS pixels from there."""
-    page.locator("#film-canvas").scroll_into_view_if_needed()  # buttons below it may have been used
+    page.locator(
+        "#film-canvas"
+    ).scroll_into_view_if_needed()  # buttons below it may have been used
     box = page.locator("#film-canvas").bounding_box()
     page.mouse.move(
         box["x"] + box["width"] * across + aside, box["y"] + box["height"] * down + aside
@@ -98,8 +103,8 @@ def film(page: Any) -> Picture:
 
 
 def arrived(target: Any) -> None:
-    """Waits until a view has drawn what its viewer has told it so far: viser answers for a picture
-    of its own only after that."""
+    """Waits until a view has drawn what its viewer has told it so far: viser answers for a
+    picture of its own only after that."""
     page, view = target.page, target.evaluate("e => e.closest('.view').dataset.view")
     ask = (
         "view => flexdt.call('viewer.screenshot', { view, width: 64, height: 48 })"
@@ -132,7 +137,8 @@ def still(target: Any) -> Picture:
 
 
 def settled(target: Any, reached: Callable[[Picture], Any]) -> Picture:
-    """A picture at rest of which `reached` holds: what was asked may take a while to be drawn."""
+    """A picture at rest of which `reached` holds: what was asked may take a while to be
+    drawn."""
     for _ in range(40):
         now = still(target)
         if reached(now):
@@ -141,7 +147,8 @@ def settled(target: Any, reached: Callable[[Picture], Any]) -> Picture:
 
 
 def drawn(view: Picture) -> bool:
-    """Something with edges stands between the labels above and below: an empty scene has none."""
+    """Something with edges stands between the labels above and below: an empty scene has
+    none."""
     rows = view.shape[0]
     middle = view[rows // 8 : 6 * rows // 8].mean(axis=2)
     return bool((np.abs(np.diff(middle, axis=1)) > 30.0).sum() > 100)

@@ -1,5 +1,5 @@
-"""What the page says, read off its DOM, held against what the twin answers; nothing of the page's
-own code decides here.
+"""What the page says, read off its DOM, held against what the twin answers; nothing of the
+page's own code decides here.
 
 `contradictions` returns in words every statement that the wire denies.
 """
@@ -86,7 +86,9 @@ class Checked:
 
 def begun_with(state: State) -> object:
     """What a script would begin with."""
-    motors = {name: round(a.position, 2) for name, a in state.axes.items() if not a.virtual}
+    motors = {
+        name: round(a.position, 2) for name, a in state.axes.items() if not a.virtual
+    }
     correction = None if state.correction is None else state.correction.name
     camera = state.camera.model_dump()
     return (
@@ -117,7 +119,11 @@ def contradictions(page: Any, wire: Wire, projector: bool, checked: Checked) -> 
     ]
     if said["picture"] is not None and wire.image is not None:
         found += of_picture(said, wire)
-    if shown["report"] and checked.asked and re.search("eady to run|Not ready", texts["report"]):
+    if (
+        shown["report"]
+        and checked.asked
+        and re.search("eady to run|Not ready", texts["report"])
+    ):
         idle = wire.job is None or wire.job.state not in UNENDED
         differs = idle and checked.facts != begun_with(wire.state)
         if differs != shown["stale"]:
@@ -128,9 +134,15 @@ def contradictions(page: Any, wire: Wire, projector: bool, checked: Checked) -> 
 def of_connection(texts: dict[str, str], projector: bool) -> list[str]:
     """Of the pill, while the twin answers."""
     wanted = "connected" if projector else "no images"
-    found = [] if texts["connection"] == wanted else [f"pill: {texts['connection']}, not {wanted}"]
+    found = (
+        []
+        if texts["connection"] == wanted
+        else [f"pill: {texts['connection']}, not {wanted}"]
+    )
     if ("No new images" in texts["warnings"]) == projector:
-        found.append(f"warnings: {texts['warnings']}, and a projector answers: {projector}")
+        found.append(
+            f"warnings: {texts['warnings']}, and a projector answers: {projector}"
+        )
     return found
 
 
@@ -144,11 +156,20 @@ def of_machine(said: dict[str, Any], state: State) -> list[str]:
 
     name = state.sample.name or "empty"
     claim(
-        said["sample"] in (None, name, state.sample.name), f"sample: {said['sample']}, not {name}"
+        said["sample"] in (None, name, state.sample.name),
+        f"sample: {said['sample']}, not {name}",
     )
-    claim(("ON" in texts["beam"] or "warm" in texts["beam"]) == state.tube.on, texts["beam"])
+    claim(
+        ("ON" in texts["beam"] or "warm" in texts["beam"]) == state.tube.on, texts["beam"]
+    )
     holder = state.controller
-    words = "nobody" if holder is None else "you control" if holder == said["session"] else holder
+    words = (
+        "nobody"
+        if holder is None
+        else "you control"
+        if holder == said["session"]
+        else holder
+    )
     claim(words in texts["holder"], f"holder: {texts['holder']}, not {words}")
     if said["shown"]["record"]:
         wanted = f"Geometry of {said['record']}"
@@ -158,7 +179,8 @@ def of_machine(said: dict[str, Any], state: State) -> list[str]:
         claim(texts["geometry-title"] == "Geometry now", texts["geometry-title"])
         for row, mm in (("SOD", g.SOD_mm), ("SDD", g.SDD_mm)):
             claim(
-                abs(float(said["rows"][row].split()[0]) - mm) < 0.011, f"{row}: {said['rows'][row]}"
+                abs(float(said["rows"][row].split()[0]) - mm) < 0.011,
+                f"{row}: {said['rows'][row]}",
             )
         off = said["rows"]["beam"] == "off"
         claim(off != state.tube.on, f"beam: {said['rows']['beam']}")
@@ -166,17 +188,25 @@ def of_machine(said: dict[str, Any], state: State) -> list[str]:
     if mm is not None and pair:
         near = re.search(r"([\d.]+) mm", texts["near"])
         close = near is not None and abs(float(near[1]) - mm) < 0.11
-        claim(close and all(part in texts["near"] for part in pair), f"near: {texts['near']}")
+        claim(
+            close and all(part in texts["near"] for part in pair),
+            f"near: {texts['near']}",
+        )
     if said["shown"]["welcome-title"] and state.sample.name:
         claim(state.sample.name in texts["welcome-title"], texts["welcome-title"])
     return found
 
 
 def of_scan(said: dict[str, Any], wire: Wire) -> list[str]:
-    """Of the line of the scan: its state, who ended it, what stands where, what may be pressed."""
+    """Of the line of the scan: its state, who ended it, what stands where, what may be
+    pressed."""
     texts, shown, job, found = said["texts"], said["shown"], wire.job, []
     if job is None or (not shown["scan-bar"] and job.state not in UNENDED):
-        return ["a scan is shown, and there is none"] if job is None and shown["scan-bar"] else []
+        return (
+            ["a scan is shown, and there is none"]
+            if job is None and shown["scan-bar"]
+            else []
+        )
     if not shown["scan-bar"]:
         return [f"{job.job} is {job.state}, and no scan is shown"]
     if texts["job-name"] != (job.name or job.job):
@@ -191,10 +221,14 @@ def of_scan(said: dict[str, Any], wire: Wire) -> list[str]:
         off = "X-rays are off" in texts["job-what"]
         if off == wire.state.tube.on:
             found.append(f"scan: {texts['job-what']}, and X-rays: {wire.state.tube.on}")
-        for motor, value in re.findall(r"(?!began)\b(\w+) at (-?[\d.]+)", texts["job-what"]):
+        for motor, value in re.findall(
+            r"(?!began)\b(\w+) at (-?[\d.]+)", texts["job-what"]
+        ):
             if abs(wire.state.axes[motor].position - float(value)) > 0.02:
                 found.append(f"scan: {motor} at {value}")
-    if shown["job-abort"] != (job.state in UNENDED) or shown["job-resume"] != (job.state != "done"):
+    if shown["job-abort"] != (job.state in UNENDED) or shown["job-resume"] != (
+        job.state != "done"
+    ):
         found.append(f"buttons of a scan that is {job.state}: {shown}")
     return found
 
@@ -219,13 +253,17 @@ def of_picture(said: dict[str, Any], wire: Wire) -> list[str]:
         return ["the radiograph is not of now, and is not called old"]
     lit = wire.state.tube.on and wire.state.tube.ready
     if same and not shown["film-old"] and shown["film-beam"] == lit:
-        return [f"beam over the radiograph: {said['texts']['film-beam']}, and it is lit: {lit}"]
+        return [
+            f"beam over the radiograph: {said['texts']['film-beam']}, and it is lit: {lit}"
+        ]
     return []
 
 
 def pictured_of(state: State) -> tuple[object, object]:
     """What an image of this state shows: the sample, and everything else that changes it."""
-    motors = {name: round(a.position, 2) for name, a in state.axes.items() if not a.virtual}
+    motors = {
+        name: round(a.position, 2) for name, a in state.axes.items() if not a.virtual
+    }
     correction = None if state.correction is None else state.correction.name
     sample = state.sample
     return (sample.name, sample.revision), (motors, correction, state.camera.mode)
@@ -242,5 +280,7 @@ def of_old_picture(page: Any, before: tuple[object, object], state: State) -> li
         return []  # an empty stage is computed without a projector
     tag = said["texts"]["film-old"] if said["shown"]["film-old"] else ""
     if not tag or (before[0] != now[0]) != ("sample" in tag):
-        return [f"the radiograph is of {before[0]}, now is {now[0]}, and it is called {tag!r}"]
+        return [
+            f"the radiograph is of {before[0]}, now is {now[0]}, and it is called {tag!r}"
+        ]
     return []

@@ -37,7 +37,9 @@ def four(open_page: Callable[..., Any]) -> Iterator[Any]:
 def sample_px(view: Picture) -> int:
     """Pixels as red as LEGO: more than amber light makes of grey."""
     red, green, blue = np.moveaxis(view[..., :3], 2, 0)
-    return int(((red - np.maximum(green, blue) > 40.0) & (np.abs(green - blue) < 40.0)).sum())
+    return int(
+        ((red - np.maximum(green, blue) > 40.0) & (np.abs(green - blue) < 40.0)).sum()
+    )
 
 
 def counted(four: Any, distance_mm: float, on: bool) -> dict[str, int]:
@@ -62,7 +64,10 @@ def test_x_rays_never_hide_the_sample(
 ) -> None:
     """The sample's pixels stay its own in all four views, at any distance."""
     four.evaluate("d => flexdt.call('axes.move', {targets: {mag_obj: d}})", distance_mm)
-    wait(lambda: not any(axis.moving for axis in twin.state().axes.values()), "the stage rests")
+    wait(
+        lambda: not any(axis.moving for axis in twin.state().axes.values()),
+        "the stage rests",
+    )
     seen: dict[bool, dict[str, int]] = {}
     for on in (False, True):
         four.evaluate("on => flexdt.call('tube.set', {on})", on)

@@ -1,4 +1,5 @@
-"""The cabinet stands around all that the machine's parts reach, however large the machine is."""
+"""The cabinet stands around all that the machine's parts reach, however large the machine
+is."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ def scaled(name: str, factor: float) -> Machine:
         name: axis
         if axis.kind == "rotation"
         else axis.model_copy(
-            update={end: getattr(axis, end) * factor for end in ("lower", "upper", "home")}
+            update={
+                end: getattr(axis, end) * factor for end in ("lower", "upper", "home")
+            }
         )
         for name, axis in shipped.axes.items()
     }
@@ -76,7 +79,9 @@ def require_around(machine: Machine, rng: np.random.Generator) -> None:
     assert 0.0 < gaps.min() <= gaps.max() <= 351 * room.scale
     assert room.floor_mm == pytest.approx(low[2])
     whole = np.concatenate([p.mesh.vertices for p in pieces])
-    assert (whole.max(axis=0) - whole.min(axis=0)).max() < 4 * (room.high - room.low).max()
+    assert (whole.max(axis=0) - whole.min(axis=0)).max() < 4 * (
+        room.high - room.low
+    ).max()
 
 
 @pytest.mark.parametrize("name", builtin_machines())

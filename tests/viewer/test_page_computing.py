@@ -54,7 +54,9 @@ def test_ticks_are_round_inside_the_range_and_equally_far_apart() -> None:
     cases = []
     for _ in range(200):
         low = float(rng.normal() * 10.0 ** rng.integers(-4, 5))
-        cases.append([low, low + float(10.0 ** rng.uniform(-4, 5)), int(rng.integers(1, 9))])
+        cases.append(
+            [low, low + float(10.0 ** rng.uniform(-4, 5)), int(rng.integers(1, 9))]
+        )
     found = computed("plot_axes.js", "m.ticks(...c)", cases)
     for (low, high, wished), ticks in zip(cases, found, strict=True):
         span = high - low
@@ -65,4 +67,7 @@ def test_ticks_are_round_inside_the_range_and_equally_far_apart() -> None:
             assert np.ptp(steps) <= 1e-6 * span
             digit = steps[0] / 10.0 ** np.floor(np.log10(steps[0]) + 1e-6)
             assert min(abs(digit - one) for one in (1.0, 2.0, 5.0, 10.0)) < 1e-3
-    assert computed("plot_axes.js", "m.ticks(...c)", [[1.0, 1.0, 5], [2.0, 1.0, 5]]) == [[], []]
+    assert computed("plot_axes.js", "m.ticks(...c)", [[1.0, 1.0, 5], [2.0, 1.0, 5]]) == [
+        [],
+        [],
+    ]

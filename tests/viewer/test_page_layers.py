@@ -112,10 +112,14 @@ def test_the_first_picture_shows_what_its_page_shows(empty_lab: Any) -> None:
 def test_the_first_picture_has_the_background_of_the_scenes() -> None:
     """Its upper colour is one of the gradient's inner part, its lower one that of the rim."""
     css = page_html.page_file("scene.css").decode()
-    gradients = re.findall(r"radial-gradient\(.*?, (#\w{6}) 0%, (#\w{6}) 55%, (#\w{6}) 100%\)", css)
+    gradients = re.findall(
+        r"radial-gradient\(.*?, (#\w{6}) 0%, (#\w{6}) 55%, (#\w{6}) 100%\)", css
+    )
     assert len(gradients) == 2
     for dark, stops in zip((False, True), gradients, strict=True):
-        inner, middle, rim = (np.array([int(s[k : k + 2], 16) for k in (1, 3, 5)]) for s in stops)
+        inner, middle, rim = (
+            np.array([int(s[k : k + 2], 16) for k in (1, 3, 5)]) for s in stops
+        )
         above, below = np.array(GROUND[dark])
         assert (below == rim).all()
         assert ((above - inner) * (above - middle) <= 0).all()

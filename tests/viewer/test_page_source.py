@@ -1,4 +1,5 @@
-"""The page's TypeScript: types of the wire that are current, and built files that are what it says.
+"""The page's TypeScript: types of the wire that are current, and built files that are what it
+says.
 
 `make web` (this module run by itself) writes the types and the built files anew and lints.
 """
@@ -27,7 +28,9 @@ from flexdt.protocol.methods import openrpc_document
 ROOT = Path(__file__).parents[2]
 WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / "data"
 SOURCE = "".join(
-    path.read_text("utf-8") for path in sorted(WEB.glob("*.ts")) if path.name != "wire.d.ts"
+    path.read_text("utf-8")
+    for path in sorted(WEB.glob("*.ts"))
+    if path.name != "wire.d.ts"
 )
 WORDS = set(re.findall(r"\w+", SOURCE))
 COLUMNS = 120
@@ -43,7 +46,9 @@ HEAD = """\
 def types() -> str:
     """TypeScript of the methods that the page calls and of the types that it names."""
     own = {
-        name: Method(name, asked, METHODS[name].result if name in METHODS else Nothing, name)
+        name: Method(
+            name, asked, METHODS[name].result if name in METHODS else Nothing, name
+        )
         for name, (asked, _) in PAGE_METHODS.items()
     }
     table = {name: m for name, m in {**METHODS, **own}.items() if called(name)}
@@ -51,14 +56,18 @@ def types() -> str:
     answers = [m for m in table.values() if m.name in METHODS]
     asked = within([m.params.__name__ for m in table.values()], schemas)
     schemas = {name: of_page(schema, name in asked) for name, schema in schemas.items()}
-    imported = ",".join(re.findall(r"^import type \{(.*?)\}", SOURCE, re.MULTILINE | re.DOTALL))
+    imported = ",".join(
+        re.findall(r"^import type \{(.*?)\}", SOURCE, re.MULTILINE | re.DOTALL)
+    )
     named = [name for name in map(str.strip, imported.split(",")) if name in schemas]
     own_types = [each.__name__ for m in table.values() for each in (m.params, m.result)]
     used = within([*named, *own_types], schemas) - {Nothing.__name__}
     lines = [HEAD]
     for name in sorted(used):
         lines.append(f"export type {name} = {typed(schemas[name], name in asked)};\n")
-    lines.append("\n// Method -> its parameters, and its answer where the wire names one.\n")
+    lines.append(
+        "\n// Method -> its parameters, and its answer where the wire names one.\n"
+    )
     lines.append("export interface Methods {\n")
     for m in table.values():
         answer = m.result.__name__ if m in answers else "object"
@@ -68,8 +77,14 @@ def types() -> str:
 
 def of_page(schema: Mapping[str, Any], asked: bool) -> Mapping[str, Any]:
     """A type with the fields that the page names or, in a request, has to send."""
-    fields, needed = schema.get("properties", {}), schema.get("required", []) if asked else ()
-    return {**schema, "properties": {k: v for k, v in fields.items() if k in WORDS or k in needed}}
+    fields, needed = (
+        schema.get("properties", {}),
+        schema.get("required", []) if asked else (),
+    )
+    return {
+        **schema,
+        "properties": {k: v for k, v in fields.items() if k in WORDS or k in needed},
+    }
 
 
 def called(name: str) -> bool:
@@ -85,7 +100,8 @@ def within(names: list[str], schemas: Mapping[str, Any]) -> set[str]:
         if name not in found:
             found.add(name)
             names += [
-                part.split('"')[0] for part in json.dumps(schemas[name]).split("schemas/")[1:]
+                part.split('"')[0]
+                for part in json.dumps(schemas[name]).split("schemas/")[1:]
             ]
     return found
 
@@ -95,7 +111,9 @@ def typed(schema: Mapping[str, Any], asked: bool) -> str:
     if "$ref" in schema:
         return str(schema["$ref"]).rsplit("/", 1)[1]
     if "enum" in schema or "const" in schema:
-        return " | ".join(json.dumps(v) for v in schema.get("enum", [schema.get("const")]))
+        return " | ".join(
+            json.dumps(v) for v in schema.get("enum", [schema.get("const")])
+        )
     if (some := schema.get("anyOf") or schema.get("oneOf")) is not None:
         return " | ".join(dict.fromkeys(typed(each, asked) for each in some))
     kind = schema.get("type")
@@ -109,14 +127,19 @@ def typed(schema: Mapping[str, Any], asked: bool) -> str:
             f"{name}{'' if name in needed else '?'}: {typed(field, asked)}"
             for name, field in schema["properties"].items()
         ]
-        # As many as a line has room for, as in the page's own modules; a line ends behind a field.
+        # As many as a line has room for, as in the page's own modules; a line ends behind a
+        # field.
         held = "; ".join(field.replace(" ", HELD) for field in fields)
-        lines = textwrap.wrap(held, COLUMNS - 2, break_long_words=False, break_on_hyphens=False)
+        lines = textwrap.wrap(
+            held, COLUMNS - 2, break_long_words=False, break_on_hyphens=False
+        )
         if len(held) < SHORT:
             return f"{{ {lines[0].replace(HELD, ' ')} }}"
         return "{\n" + "".join(f"  {line.replace(HELD, ' ')}\n" for line in lines) + "}"
     if kind == "object":
-        more = schema.get("patternProperties", {"": schema.get("additionalProperties", {})})
+        more = schema.get(
+            "patternProperties", {"": schema.get("additionalProperties", {})}
+        )
         values = [
             typed({} if v is True else v, asked) if v is not False else "never"
             for v in more.values()
@@ -164,7 +187,9 @@ def tools() -> None:
 
 
 def test_the_types_of_the_wire_are_current() -> None:
-    assert (WEB / "wire.d.ts").read_text("utf-8") == types(), "run `make web`, or this file"
+    assert (WEB / "wire.d.ts").read_text("utf-8") == types(), (
+        "run `make web`, or this file"
+    )
 
 
 def test_every_module_has_a_source() -> None:
@@ -189,7 +214,11 @@ def test_eslint_finds_nothing() -> None:
 
 
 def test_styles_have_no_long_lines() -> None:
-    lines = [line for path in BUILT.glob("*.css") for line in path.read_text("utf-8").split("\n")]
+    lines = [
+        line
+        for path in BUILT.glob("*.css")
+        for line in path.read_text("utf-8").split("\n")
+    ]
     assert [line for line in lines if len(line) > COLUMNS] == []
 
 

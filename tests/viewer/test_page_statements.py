@@ -53,7 +53,9 @@ class History:
         return self.page.evaluate(ask, [method, params])
 
     def other(self) -> TwinClient:
-        return TwinClient(port=self.lab.twin.port, name="Bert", wait_s=60.0, timeout_s=120.0)
+        return TwinClient(
+            port=self.lab.twin.port, name="Bert", wait_s=60.0, timeout_s=120.0
+        )
 
     def act(self) -> None:
         """One thing that somebody does, or that happens."""
@@ -87,11 +89,17 @@ class History:
 
     def switch(self) -> None:
         on, kV = self.rng.random() < 0.5, self.rng.choice((60.0, 80.0, 90.0))
-        self.either("tube.set", {"on": on, "kV": kV}, lambda bert: bert.set_tube(on=on, kV=kV))
+        self.either(
+            "tube.set", {"on": on, "kV": kV}, lambda bert: bert.set_tube(on=on, kV=kV)
+        )
 
     def set_camera(self) -> None:
         ms = self.rng.choice((50.0, 100.0, 150.0))
-        self.either("camera.set", {"exposure_ms": ms}, lambda bert: bert.set_camera(exposure_ms=ms))
+        self.either(
+            "camera.set",
+            {"exposure_ms": ms},
+            lambda bert: bert.set_camera(exposure_ms=ms),
+        )
 
     def move(self) -> None:
         to = {
@@ -115,7 +123,11 @@ class History:
         self.either("script.submit", {"text": text, "speed_up": speed}, submit)
         if self.rng.random() < 0.5:
             with self.other() as bert:
-                until(lambda: bert.jobs().jobs[-1].state not in UNENDED, "the scan ends", 300)
+                until(
+                    lambda: bert.jobs().jobs[-1].state not in UNENDED,
+                    "the scan ends",
+                    300,
+                )
 
     def end_scan(self) -> None:
         self.either("job.abort", {}, lambda bert: bert.abort_job())
@@ -147,7 +159,9 @@ class History:
         self.projector = False
         self.without_images()
         words = ("--port", str(port), "--threads", "1")
-        self.lab.projector = Process("flexdt.server.projector.main", *words, log=self.lab.log)
+        self.lab.projector = Process(
+            "flexdt.server.projector.main", *words, log=self.lab.log
+        )
         self.projector = True
 
     def hang_projector(self, *acts: Callable[[], Any]) -> None:
@@ -249,5 +263,7 @@ def test_an_abort_of_somebody_else_and_a_hung_projector(
     history.call("session.control", action="force")
     history.call("sample.set", name="lego")
     history.agree()
-    history.hang_projector(lambda: history.call("sample.set", name="square"), history.move)
+    history.hang_projector(
+        lambda: history.call("sample.set", name="square"), history.move
+    )
     history.agree()

@@ -14,7 +14,8 @@ from tests.viewer.test_page_source import BUILT, WEB, node
 COLUMNS = 100
 LONG_STILL = {"calibrate", "film", "keys", "measure", "path", "raycast", "scene", "shared",
               "slices", "timeline", "viewer.d", "views", "volume", "welcome"}  # fmt: skip
-"""Modules with longer lines: those that draw, and tables of types. Take out what becomes short."""
+"""Modules with longer lines: those that draw, and tables of types. Take out what becomes
+short."""
 
 
 def test_what_the_page_computes() -> None:
@@ -26,7 +27,11 @@ def test_what_the_page_computes() -> None:
     # Without the caller's own settings of node: they may name files that are not there.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NODE_")}
     done = subprocess.run(
-        [program, "--test", *files], capture_output=True, text=True, check=False, env=environment
+        [program, "--test", *files],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     passed = re.search(r"pass (\d+)", done.stdout)

@@ -41,11 +41,15 @@ def test_five_steps_lead_from_a_wrong_geometry_to_a_sharp_volume(
             page.select_option("#scan-it-sample", "gear")
         page.locator(f"#story-{button}.primary:enabled").click(timeout=PATIENCE_MS)
         if button == "bend":
-            page.wait_for_function("flexdt.store.state.correction?.parameters.dO_x === 0.6")
+            page.wait_for_function(
+                "flexdt.store.state.correction?.parameters.dO_x === 0.6"
+            )
             assert twin.state().sample.name == "lego"
     page.locator("#story-says", has_text="Sharp again").wait_for(timeout=PATIENCE_MS)
     print(f"\n{time.monotonic() - begun:.0f} s; load average {os.getloadavg()[0]:.1f}")
-    before, after = map(float, re.findall(r"([0-9.]+) /mm", page.inner_text("#story-says")))
+    before, after = map(
+        float, re.findall(r"([0-9.]+) /mm", page.inner_text("#story-says"))
+    )
     assert after < 0.8 * before
     correction = twin.state().correction
     assert correction is not None

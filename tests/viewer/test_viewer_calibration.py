@@ -47,7 +47,8 @@ def on_top(page: Any, selector: str) -> bool:
     """Whether an element is what one sees at its middle."""
     return bool(page.locator(selector).evaluate(
         "(e) => { e.style.pointerEvents = 'auto'; const b = e.getBoundingClientRect();"
-        " const hit = document.elementFromPoint((b.left + b.right) / 2, (b.top + b.bottom) / 2);"
+        " const hit = document.elementFromPoint((b.left + b.right) / 2, (b.top + "
+        "b.bottom) / 2);"
         " e.style.pointerEvents = ''; return e.contains(hit); }"
     ))  # fmt: skip
 
@@ -68,12 +69,16 @@ def scanned(page: Any, twin: TwinClient, wait: Wait, frames: int) -> str:
     return job
 
 
-def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_from_scan_to_correction_and_back(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     # A wrong correction in force is to the fit what a misalignment is: it has to find it out.
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     camera = "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
     page.evaluate(camera)
-    page.evaluate("p => flexdt.call('calibration.apply', {parameters: p, name: 'wrong'})", WRONG)
+    page.evaluate(
+        "p => flexdt.call('calibration.apply', {parameters: p, name: 'wrong'})", WRONG
+    )
     job = twin.job_status(scanned(page, twin, wait, 13))
     name, folder = str(job.name), str(job.dataset)
 
@@ -85,7 +90,9 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     page.locator("#fit-report .verdict.ok").wait_for(timeout=600_000)
     report = page.inner_text("#fit-report")
     assert "13 frames" in report
-    verdict = re.match(r"Safe to reconstruct: the rotation axis is known to ([0-9.e-]+) px", report)
+    verdict = re.match(
+        r"Safe to reconstruct: the rotation axis is known to ([0-9.e-]+) px", report
+    )
     assert verdict, report
     assert "Write the scan that tells more" in report
     assert "flexdt " not in report, "commands are for shells, folded away"
@@ -110,7 +117,9 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     page.check("#compare-before")
     page.check("#compare-after")
     page.select_option("#compare-times", "10")
-    assert coloured(film(page), AMBER) > coloured(both, AMBER)  # longer lines to the circles
+    assert coloured(film(page), AMBER) > coloured(
+        both, AMBER
+    )  # longer lines to the circles
     # What is wrong with the machine is seen over it.
     page.evaluate("flexdt.call('safety.estop')")
     page.locator("#warnings .bad", has_text="Emergency stop").wait_for()
@@ -120,31 +129,48 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     for way in ("measured", "before", "after"):
         page.uncheck(f"#compare-{way}")
 
-    # The virtual image is that of the wrong correction, which the recorded one was not taken with.
+    # The virtual image is that of the wrong correction, which the recorded one was not taken
+    # with.
     page.select_option("#compare-mode", "difference")
     page.wait_for_function("flexdt.store.image?.virtual")
     apart = residue(page)
     page.click("#fit-apply")
-    wait(lambda: twin.state().correction is not None and twin.state().correction.name != "wrong")
+    wait(
+        lambda: (
+            twin.state().correction is not None
+            and twin.state().correction.name != "wrong"
+        )
+    )
     applied = twin.state().correction
     assert applied is not None
-    wait(lambda: residue(page) < 0.2 * apart, "the virtual image goes with the correction")
+    wait(
+        lambda: residue(page) < 0.2 * apart, "the virtual image goes with the correction"
+    )
     page.select_option("#compare-mode", "recorded")
     page.keyboard.press("Escape")
     page.locator("#record").wait_for(state="hidden")
     for parameter in WRONG:
-        assert abs(applied.parameters[parameter]) < 4 * sigmas[parameter], applied.parameters
+        assert abs(applied.parameters[parameter]) < 4 * sigmas[parameter], (
+            applied.parameters
+        )
     # dO_z is told no better than the panel's height is known; what the images see of it is.
     dataset = load_dataset(folder)
     place = np.array(list(itertools.product((-15.0, 15.0), (-15.0, 15.0), (-25.0, 25.0))))
     seen = [
-        dataset.poses.cone_vec(Offsets.from_edge(each)).project_points(place, dataset.shape)
+        dataset.poses.cone_vec(Offsets.from_edge(each)).project_points(
+            place, dataset.shape
+        )
         for each in (applied.parameters, {})
     ]
     assert np.abs(seen[0] - seen[1]).max() < 0.1
     page.locator("#in-force", has_text=applied.name).wait_for()
     page.click("#revert")
-    wait(lambda: twin.state().correction is not None and twin.state().correction.name == "wrong")
+    wait(
+        lambda: (
+            twin.state().correction is not None
+            and twin.state().correction.name == "wrong"
+        )
+    )
     page.locator("#in-force", has_text="wrong").wait_for()
     page.click("#revert")
     wait(lambda: twin.state().correction is None)
@@ -157,7 +183,9 @@ def test_what_cannot_be_fitted_is_told(page: Any, twin: TwinClient, wait: Wait) 
     page.fill("#fit-phantom", "no-such-phantom")
     page.locator("#datasets input").first.check()
     page.click("#fit")
-    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=600_000)
+    page.locator(".note.error", has_text="no-such-phantom").first.wait_for(
+        timeout=600_000
+    )
     assert page.locator("#fit:not([disabled])").count() == 1
 
 
@@ -183,7 +211,9 @@ def test_beads_marked_by_clicking_are_what_is_fitted(page: Any, twin: TwinClient
     wish = ScanRequest("step", frames=13, mode="HW4SW1High")
     twin.control("force")
     twin.set_sample("lego")
-    twin.submit_script(compose_script(wish, machine, profile_of(machine)), "marked", "max")
+    twin.submit_script(
+        compose_script(wish, machine, profile_of(machine)), "marked", "max"
+    )
     assert twin.wait_job().state == "done"
     folder = str(twin.job_status().dataset)
     twin.control("release")

@@ -43,13 +43,16 @@ def settled(twin: TwinClient, axis: str, value: float) -> Callable[[], bool]:
 
 
 def stands(page: Any, twin: TwinClient, axis: str) -> Callable[[], bool]:
-    """Whether an axis stands still for a while: on a busy machine a lease may run out before."""
+    """Whether an axis stands still for a while: on a busy machine a lease may run out
+    before."""
 
     def check() -> bool:
         before = twin.state().axes[axis]
         page.wait_for_timeout(400)
         after = twin.state().axes[axis]
-        return not before.moving and not after.moving and before.position == after.position
+        return (
+            not before.moving and not after.moving and before.position == after.position
+        )
 
     return check
 
@@ -66,8 +69,8 @@ def quickly(page: Any) -> Iterator[None]:
 
 @contextmanager
 def gently(page: Any, twin: TwinClient, wait: Wait, axis: str) -> Iterator[None]:
-    """An axis to jog, by a clock so slow that a busy machine's pauses send it into nothing; it goes
-    back to where it was."""
+    """An axis to jog, by a clock so slow that a busy machine's pauses send it into nothing; it
+    goes back to where it was."""
     before = twin.state().axes[axis].position
     page.evaluate("flexdt.call('clock.set', {speed_up: 1})")
     seen(page, twin)  # the lease that the page asks for depends on it
@@ -110,7 +113,12 @@ def test_slider_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str
 
 
 @pytest.mark.parametrize("axis", list(TARGETS))
-def test_jog_buttons_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
+def test_jog_buttons_of_every_axis(
+    page: Any, twin: TwinClient, wait: Wait, axis: str
+) -> None:
+    def travel() -> float:
+        return twin.state().axes[axis].position - before
+
     with gently(page, twin, wait, axis):
         for direction in (1, -1):
             before = twin.state().axes[axis].position
@@ -119,8 +127,7 @@ def test_jog_buttons_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis
             button.hover()
             page.mouse.down()
             try:
-                moved = lambda: (twin.state().axes[axis].position - before) * direction > 0.05  # noqa: B023, E731
-                wait(moved, f"{axis} {direction}")
+                wait(lambda: travel() * direction > 0.05, f"{axis} {direction}")  # noqa: B023
             finally:
                 page.mouse.up()
             wait(stands(page, twin, axis), "letting go stops")
@@ -144,14 +151,21 @@ def test_keys_jog_while_held(page: Any, twin: TwinClient, wait: Wait, key: str) 
         before = twin.state().axes[axis].position
         page.keyboard.down(key)
         try:
-            wait(lambda: (twin.state().axes[axis].position - before) * direction > 0.05, key)
+            wait(
+                lambda: (twin.state().axes[axis].position - before) * direction > 0.05,
+                key,
+            )
         finally:
             page.keyboard.up(key)
         wait(stands(page, twin, axis), "letting go stops")
 
 
-@pytest.mark.parametrize(("name", "share"), [("slow", 0.04), ("medium", 0.2), ("fast", 1.0)])
-def test_jog_speed(page: Any, twin: TwinClient, wait: Wait, name: str, share: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "share"), [("slow", 0.04), ("medium", 0.2), ("fast", 1.0)]
+)
+def test_jog_speed(
+    page: Any, twin: TwinClient, wait: Wait, name: str, share: float
+) -> None:
     page.select_option("#jog-speed", label=name)
     top = twin.state().axes["rot_obj"].speed
     button = page.locator('[data-jog="rot_obj:1"]')
@@ -159,7 +173,10 @@ def test_jog_speed(page: Any, twin: TwinClient, wait: Wait, name: str, share: fl
     button.hover()
     page.mouse.down()
     try:
-        wait(lambda: twin.state().axes["rot_obj"].velocity == pytest.approx(share * top), name)
+        wait(
+            lambda: twin.state().axes["rot_obj"].velocity == pytest.approx(share * top),
+            name,
+        )
     finally:
         page.mouse.up()
     wait(lambda: not twin.state().axes["rot_obj"].moving)
@@ -172,7 +189,13 @@ def test_a_way_around_obstacles_where_it_is_asked_for(
     sample = "flexdt.call('sample.set', {name: 'lego', offset: {y: -80}})"
     before = {n: a.position for n, a in twin.state().axes.items() if n != "ver_obj"}
     page.evaluate(sample)
-    start = {"mag_obj": 70.0, "tra_obj": -60.0, "rot_obj": 0.0, "ver_tube": 40.0, "tra_tube": 0.0}
+    start = {
+        "mag_obj": 70.0,
+        "tra_obj": -60.0,
+        "rot_obj": 0.0,
+        "ver_tube": 40.0,
+        "tra_tube": 0.0,
+    }
     for axis, value in start.items():
         if axis != "mag_obj":
             page.evaluate("t => flexdt.call('axes.move', {targets: t})", {axis: value})
@@ -184,7 +207,9 @@ def test_a_way_around_obstacles_where_it_is_asked_for(
     field.press("Enter")
     page.locator(".note.error").filter(has_text="tra_obj goes to").first.wait_for()
     wait(lambda: not twin.state().axes["tra_obj"].moving)
-    assert twin.state().axes["tra_obj"].position < 20.0, "as far as is free, and no farther"
+    assert twin.state().axes["tra_obj"].position < 20.0, (
+        "as far as is free, and no farther"
+    )
     page.check("#around")
     field.fill("60")
     field.press("Enter")
@@ -192,11 +217,15 @@ def test_a_way_around_obstacles_where_it_is_asked_for(
     wait(settled(twin, "tra_obj", 60.0), "around")
     page.uncheck("#around")
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
-    page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true, wait: true})", before)
+    page.evaluate(
+        "t => flexdt.call('axes.move', {targets: t, plan: true, wait: true})", before
+    )
     wait(settled(twin, "mag_obj", before["mag_obj"]))
 
 
-def test_single_keys_move_nothing_unless_they_are_asked_to(page: Any, twin: TwinClient) -> None:
+def test_single_keys_move_nothing_unless_they_are_asked_to(
+    page: Any, twin: TwinClient
+) -> None:
     page.uncheck("#key-jog")
     page.evaluate("() => document.activeElement.blur()")
     before = {n: a.position for n, a in twin.state().axes.items()}
@@ -231,7 +260,9 @@ def test_stop_button_and_space(page: Any, twin: TwinClient, wait: Wait) -> None:
         start = twin.state().axes["mag_obj"].position
         # So slow that a busy machine stops it on the way.
         page.evaluate("flexdt.call('clock.set', {speed_up: 0.05})")
-        page.evaluate("v => flexdt.call('axes.move', {targets: {mag_obj: v}})", start - 200.0)
+        page.evaluate(
+            "v => flexdt.call('axes.move', {targets: {mag_obj: v}})", start - 200.0
+        )
         wait(lambda: twin.state().axes["mag_obj"].moving)
         page.evaluate("() => document.activeElement.blur()")
         act()
@@ -242,7 +273,9 @@ def test_stop_button_and_space(page: Any, twin: TwinClient, wait: Wait) -> None:
         wait(settled(twin, "mag_obj", start))
 
 
-def test_refusals_are_notes_and_nothing_moves(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_refusals_are_notes_and_nothing_moves(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     before = twin.state().axes["mag_obj"].position
     field = page.locator("[data-axis=mag_obj] .num")
     field.fill("5000")
@@ -252,7 +285,9 @@ def test_refusals_are_notes_and_nothing_moves(page: Any, twin: TwinClient, wait:
     assert twin.state().axes["mag_obj"].target == before
 
 
-def test_collision_is_refused_with_its_pair(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_collision_is_refused_with_its_pair(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     answer = page.evaluate(
         "flexdt.call('axes.move', {targets: {mag_det: 200}})"
         ".then(() => null, ({ code, data }) => ({ code, data }))"
@@ -326,7 +361,9 @@ def test_sample_chooser(page: Any, twin: TwinClient, wait: Wait) -> None:
     wait(lambda: twin.state().sample.name == "lego")
 
 
-@pytest.mark.parametrize(("form", "name"), [("stl", "rod"), ("glb", "试样"), ("off", "..rod")])
+@pytest.mark.parametrize(
+    ("form", "name"), [("stl", "rod"), ("glb", "试样"), ("off", "..rod")]
+)
 @pytest.mark.campaign(1)
 def test_upload_of_a_mesh(
     page: Any, twin: TwinClient, wait: Wait, tmp_path: Path, form: str, name: str
@@ -354,13 +391,17 @@ def test_upload_of_a_mesh(
     assert twin.state().sample.material == "aluminium"
     middle = np.asarray(twin.projection().image)
     assert middle.max() > 0.1
-    page.locator(".note.good", has_text=shown).wait_for()  # the page has done all that it does
+    page.locator(
+        ".note.good", has_text=shown
+    ).wait_for()  # the page has done all that it does
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     page.select_option("#sample", "lego")
     assert page.is_hidden("#sample-delete"), "what ships stays"
     page.select_option("#sample", shown)
     page.click("#sample-delete")
-    wait(lambda: shown not in {sample.name for sample in twin.samples().samples}, "deleted")
+    wait(
+        lambda: shown not in {sample.name for sample in twin.samples().samples}, "deleted"
+    )
     page.locator("#sample-delete").wait_for(state="hidden")
 
 
@@ -430,7 +471,9 @@ def test_people_have_names(
     wait(lambda: "Emmy" in (other.evaluate(connected) or ""), "the other name")
     other.click("#take")
     told = "Emmy #"
-    page.locator(".note").filter(has_text=told).filter(has_text="took control from Ada").wait_for()
+    page.locator(".note").filter(has_text=told).filter(
+        has_text="took control from Ada"
+    ).wait_for()
     page.locator("#holder", has_text="held by Emmy").wait_for()
     page.reload()
     page.wait_for_function("window.flexdt?.store.session")

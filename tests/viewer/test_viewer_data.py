@@ -1,4 +1,5 @@
-"""Past scans on the page: found, opened, gone through with machine and radiograph, brought back."""
+"""Past scans on the page: found, opened, gone through with machine and radiograph, brought
+back."""
 
 from __future__ import annotations
 
@@ -57,7 +58,9 @@ def find(page: Any, words: str) -> None:
 
 
 def shows(page: Any, index: int) -> None:
-    page.wait_for_function(f"document.querySelector('#record').dataset.index === '{index}'")
+    page.wait_for_function(
+        f"document.querySelector('#record').dataset.index === '{index}'"
+    )
     page.wait_for_function(
         f"flexdt.store.image?.recorded?.index === {index} && !flexdt.store.hidden"
     )
@@ -90,7 +93,9 @@ def test_data_sets_are_found_by_words(page: Any, scans: Any) -> None:
 
 def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None:
     """Pixels and poses are those of the files, read here by tifffile and json."""
-    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))["frames"]
+    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))[
+        "frames"
+    ]
     find(page, "whole")
     page.locator("#data-count", has_text="1 of 1").wait_for()
     page.locator(".data-set[data-name='whole scan']").click()
@@ -124,9 +129,13 @@ def test_the_geometry_that_is_read_is_that_of_the_image_shown(
     page: Any, scans: Any, twin: TwinClient, wait: Wait
 ) -> None:
     """Not of the machine, which has moved since; what is not known is said to be so."""
-    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))["frames"]
+    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))[
+        "frames"
+    ]
     page.evaluate("flexdt.call('session.control', {action: 'force'})")
-    to = "mm => flexdt.call('axes.move', {targets: {mag_det: mm}, plan: true, wait: true})"
+    to = (
+        "mm => flexdt.call('axes.move', {targets: {mag_det: mm}, plan: true, wait: true})"
+    )
     page.evaluate(to, 940)
     try:
         seen(page, twin)
@@ -179,14 +188,21 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     shows(page, 2)
     page.click("#record-volume")
     # Its process is behind all others (nice), so that a busy machine makes it wait.
-    page.locator("#volume-title", has_text="Volume of turned once").wait_for(timeout=400_000)
-    page.locator("#volume-note", has_text="flexdt reconstruct --binning").wait_for(timeout=400_000)
+    page.locator("#volume-title", has_text="Volume of turned once").wait_for(
+        timeout=400_000
+    )
+    page.locator("#volume-note", has_text="flexdt reconstruct --binning").wait_for(
+        timeout=400_000
+    )
     page.wait_for_function("flexdt.volume().three.block && flexdt.volume().solid")
     nx, ny, nz = page.evaluate("flexdt.volume().told.size")
     cross = "flexdt.volume().three.cross"
     assert page.evaluate(cross) == [nx // 2, ny // 2, nz // 2]
     page.locator("#slice-top").scroll_into_view_if_needed()
-    wait(lambda: page.locator("#slice-top").get_attribute("data-index") == str(nz // 2), "a slice")
+    wait(
+        lambda: page.locator("#slice-top").get_attribute("data-index") == str(nz // 2),
+        "a slice",
+    )
     before = page.evaluate("document.querySelector('#slice-top').toDataURL()")
     sent = page.evaluate("flexdt.call('state.get').then(() => 0)")
     page.locator("#slice-top").focus()
@@ -194,8 +210,16 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     page.keyboard.press("ArrowUp")
     page.locator("#slice-top").hover()
     page.mouse.wheel(0, 100)
-    wait(lambda: page.evaluate(cross) == [nx // 2, ny // 2, nz // 2 + 10 + sent], "keys and wheel")
-    wait(lambda: page.evaluate("document.querySelector('#slice-top').toDataURL()") != before, "it")
+    wait(
+        lambda: page.evaluate(cross) == [nx // 2, ny // 2, nz // 2 + 10 + sent],
+        "keys and wheel",
+    )
+    wait(
+        lambda: (
+            page.evaluate("document.querySelector('#slice-top').toDataURL()") != before
+        ),
+        "it",
+    )
     box = page.locator("#slice-front").bounding_box()
     page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.5)
     page.mouse.down()
@@ -203,7 +227,9 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     page.mouse.up()
     x, y, z = page.evaluate(cross)
     assert (abs(x - nx / 4) < 2, y, abs(z - nz / 4) < 2) == (True, ny // 2, True)
-    read = re.compile(r"mm\s+(-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)")
+    read = re.compile(
+        r"mm\s+(-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)"
+    )
     page.locator("#volume-at", has_text=read).wait_for()
     exact = page.evaluate(
         "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
@@ -236,7 +262,9 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     shutil.rmtree(scans / "turned once")
 
 
-def test_an_image_that_cannot_be_read_leaves_none_in_its_place(page: Any, scans: Any) -> None:
+def test_an_image_that_cannot_be_read_leaves_none_in_its_place(
+    page: Any, scans: Any
+) -> None:
     page.evaluate("flexdt.data.open('cut scan')")
     shows(page, 2)
     for index, why in ((6, "not a readable TIFF image"), (10, "is not there")):
@@ -275,7 +303,9 @@ def test_a_recorded_image_beside_the_virtual_one(
 ) -> None:
     """The scanner's own texts alone tell the pose. What the panel shows left and right of the
     curtain, and as difference, is what the two images say there."""
-    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))["frames"]
+    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))[
+        "frames"
+    ]
     page.select_option("#kind", "counts")
     page.evaluate("flexdt.data.open('own texts')")
     shows(page, 2)
@@ -289,9 +319,15 @@ def test_a_recorded_image_beside_the_virtual_one(
         shot = frames[index]
         camera = {k: shot[k] for k in ("mode", "roi", "exposure_ms", "averages")}
         tube = {"kV": 90.0, "power_W": 20.0, "on": True}
-        there = twin.projection("counts", positions=shot["positions"], tube=tube, camera=camera)
-        assert np.array_equal(part(page, "pixels"), tifffile.imread(scans / "bare" / shot["file"]))
-        assert np.abs(part(page, "virtual") - there.image).max() <= 2  # the texts round the angle
+        there = twin.projection(
+            "counts", positions=shot["positions"], tube=tube, camera=camera
+        )
+        assert np.array_equal(
+            part(page, "pixels"), tifffile.imread(scans / "bare" / shot["file"])
+        )
+        assert (
+            np.abs(part(page, "virtual") - there.image).max() <= 2
+        )  # the texts round the angle
     recorded, virtual = part(page, "pixels"), part(page, "virtual")
     noise = (recorded - virtual)[8:-8, 8:-8]
     assert abs(noise.mean()) < 0.01 * recorded.mean()  # the same exposure
@@ -304,7 +340,9 @@ def test_a_recorded_image_beside_the_virtual_one(
     page.wait_for_function("flexdt.value(0, 0) === flexdt.store.image.pixels[0]")
     cols = recorded.shape[1]
     seen = np.array(
-        page.evaluate("([r, n]) => [...Array(n).keys()].map((c) => flexdt.value(c, r))", [20, cols])
+        page.evaluate(
+            "([r, n]) => [...Array(n).keys()].map((c) => flexdt.value(c, r))", [20, cols]
+        )
     )
     cut = round(cols / 4)
     assert np.array_equal(seen[:cut], recorded[20, :cut])
@@ -320,7 +358,9 @@ def test_a_recorded_image_beside_the_virtual_one(
     compares(page, "difference")
     page.wait_for_function("flexdt.value(3, 3) < flexdt.store.image.pixels[0] / 2")
     seen = np.array(
-        page.evaluate("([r, n]) => [...Array(n).keys()].map((c) => flexdt.value(c, r))", [20, cols])
+        page.evaluate(
+            "([r, n]) => [...Array(n).keys()].map((c) => flexdt.value(c, r))", [20, cols]
+        )
     )
     assert seen == pytest.approx((recorded - virtual)[20], abs=1.0)
     page.check("#show-beads")
@@ -364,7 +404,9 @@ def test_a_reload_brings_everything_back(
     page.close()
 
 
-def test_an_address_that_names_nothing_says_so(open_page: Callable[..., Any], scans: Any) -> None:
+def test_an_address_that_names_nothing_says_so(
+    open_page: Callable[..., Any], scans: Any
+) -> None:
     page = open_page(data="no%20such%20scan", frame="x")
     page.locator(".note.error", has_text="no such scan cannot be opened").wait_for()
     assert page.evaluate("flexdt.store.recorded") is None
@@ -380,14 +422,19 @@ def test_its_script_and_its_replay(page: Any, scans: Any, tmp_path: Any) -> None
     promise.value.save_as(tmp_path / "replay.html")
     assert (tmp_path / "replay.html").stat().st_size > 100_000
     page.click("#record-script")
-    until(lambda: "take and save image sequence" in page.input_value("#script"), "the script")
+    until(
+        lambda: "take and save image sequence" in page.input_value("#script"),
+        "the script",
+    )
     page.click("#plan")  # a plan of its own closes the data set
     page.locator("#timeline-card").wait_for()
     assert page.evaluate("flexdt.store.recorded") is None
     page.click("#unscrub")
 
 
-def test_what_stands_elsewhere_is_kept_when_asked_for(page: Any, twin: TwinClient) -> None:
+def test_what_stands_elsewhere_is_kept_when_asked_for(
+    page: Any, twin: TwinClient
+) -> None:
     twin.move({"tra_tube": 15.5, "ver_det": 33.25}, wait=True)
     twin.control("release")
     seen(page, twin)
@@ -403,7 +450,9 @@ def test_what_stands_elsewhere_is_kept_when_asked_for(page: Any, twin: TwinClien
     page.click("#plan")
     page.locator("#timeline-card").wait_for()
     for time_s in (1e9, 60.0):
-        at = page.evaluate("t => flexdt.call('viewer.scrub', {time_s: t})", time_s)["positions"]
+        at = page.evaluate("t => flexdt.call('viewer.scrub', {time_s: t})", time_s)[
+            "positions"
+        ]
         assert at["tra_tube"] == pytest.approx(15.5)
         assert at["ver_det"] == pytest.approx(33.25)
     page.click("#unscrub")

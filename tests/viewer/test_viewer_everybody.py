@@ -20,8 +20,8 @@ SIZES = [(390, 844), (768, 1024), (1024, 768), (1280, 800), (1600, 900)]
 
 
 def findings(page: Any) -> list[str]:
-    """What axe-core finds in our part of the page, which is dimmed while no server answers, as on
-    a busy machine: then once more."""
+    """What axe-core finds in our part of the page, which is dimmed while no server answers, as
+    on a busy machine: then once more."""
     if not page.evaluate("'axe' in window"):
         page.evaluate(AXE.read_text())
     old, found = True, []
@@ -51,7 +51,9 @@ def too_small(page: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_axe_finds_nothing_and_targets_are_large(open_page: Callable[..., Any], theme: str) -> None:
+def test_axe_finds_nothing_and_targets_are_large(
+    open_page: Callable[..., Any], theme: str
+) -> None:
     page = open_page(theme=theme)
     for tab in TABS:
         page.click(f"#tabs [data-tab={tab}]")
@@ -92,7 +94,9 @@ def test_axe_finds_nothing_after_a_run_and_with_a_data_set_open(
     assert findings(page) == []
     assert page.inner_text("#saturated") == "saturated: not judged in a recorded image"
     lanes = page.locator("#record .lanes")
-    assert lanes.evaluate("e => e.scrollHeight <= e.clientHeight + 1"), "no lane is cut off"
+    assert lanes.evaluate("e => e.scrollHeight <= e.clientHeight + 1"), (
+        "no lane is cut off"
+    )
     page.click("#record-close")
     page.evaluate("flexdt.call('session.control', {action: 'release'})")
     page.close()
@@ -105,8 +109,15 @@ def test_every_size_has_all_parts_and_the_stop(
     page = open_page(size=size)
     assert findings(page) == []
     assert too_small(page) == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "nothing sideways"
-    for part in ("#film-canvas", "[data-axis=rot_obj] .num", "#tab-of-share", "#readouts"):
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0], (
+        "nothing sideways"
+    )
+    for part in (
+        "#film-canvas",
+        "[data-axis=rot_obj] .num",
+        "#tab-of-share",
+        "#readouts",
+    ):
         page.locator(part).scroll_into_view_if_needed()
         box = page.locator("#estop").bounding_box()
         middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
@@ -167,13 +178,19 @@ def test_a_plan_is_gone_through_by_keyboard(page: Any, wait: Wait) -> None:
     step = page.locator("#report .steps [role=button]").nth(2)
     step.focus()
     page.keyboard.press("Enter")
-    wait(lambda: page.evaluate("document.activeElement.id") == "script", "the step's line")
-    page.evaluate("document.querySelector('#unscrub').click()")  # hidden beside the script's line
+    wait(
+        lambda: page.evaluate("document.activeElement.id") == "script", "the step's line"
+    )
+    page.evaluate(
+        "document.querySelector('#unscrub').click()"
+    )  # hidden beside the script's line
     page.click("#tabs [data-tab=move]")
 
 
 @pytest.mark.campaign
-def test_four_views_fetch_the_program_once(open_page: Callable[..., Any], wait: Wait) -> None:
+def test_four_views_fetch_the_program_once(
+    open_page: Callable[..., Any], wait: Wait
+) -> None:
     page = open_page("four")
     page.locator(".view iframe").nth(3).wait_for()
     sizes = (
@@ -181,7 +198,10 @@ def test_four_views_fetch_the_program_once(open_page: Callable[..., Any], wait: 
         ".getEntriesByType('resource').find((e) => /viser-/.test(e.name))?.transferSize)"
     )
     fetched = lambda: page.evaluate(sizes)  # noqa: E731
-    wait(lambda: len(fetched()) == 4 and None not in fetched(), "four views have their program")
+    wait(
+        lambda: len(fetched()) == 4 and None not in fetched(),
+        "four views have their program",
+    )
     assert sum(size > 100_000 for size in fetched()) <= 1, fetched()
     page.close()
 
@@ -205,11 +225,13 @@ def test_slices_grow_while_a_scan_runs(page: Any, twin: TwinClient, wait: Wait) 
     whole = "flexdt.volume().told.done === 1 && flexdt.volume().three.block"
     shape = page.wait_for_function(f"{whole} && {whole}.shape").json_value()
     assert all(80 < n < 150 for n in shape)
-    # What is shown in the end is the finished volume, also where it was told while one was fetched.
+    # What is shown in the end is the finished volume, also where it was told while one was
+    # fetched.
     apart = (
         "async ([z, y, x]) => { const b = flexdt.volume().three.block;"
         " const at = [x >> 1, y >> 1, z >> 1];"
-        " const code = b.codes[(at[2] * y + at[1]) * x + at[0]], step = (b.high - b.low) / 65534;"
+        " const code = b.codes[(at[2] * y + at[1]) * x + at[0]], step = (b.high - b.low) "
+        "/ 65534;"
         " const exact = await flexdt.call('viewer.voxel', { ...flexdt.volume().of, at });"
         " return Math.abs(b.low + (code - 1) * step - exact.volume) / step; }"
     )
@@ -231,6 +253,7 @@ def test_slices_grow_while_a_scan_runs(page: Any, twin: TwinClient, wait: Wait) 
 def test_what_is_no_data_set_is_not_followed(page: Any) -> None:
     for name in ("../outside", "not-there", ".hidden"):
         said = page.evaluate(
-            "name => flexdt.call('viewer.live', {name}).then(() => null, (e) => e.message)", name
+            "name => flexdt.call('viewer.live', {name}).then(() => null, (e) => e.message)",
+            name,
         )
         assert said, name

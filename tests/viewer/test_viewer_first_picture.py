@@ -1,4 +1,5 @@
-"""What a page shows first: cameras that hold what matters, a picture that the viewer computes."""
+"""What a page shows first: cameras that hold what matters, a picture that the viewer
+computes."""
 
 from __future__ import annotations
 
@@ -19,14 +20,27 @@ from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.meshes.cabinet import cabinet, room_of
 from flexdt.clients.viewer.scenes.sample_looks import MeshCache
 from flexdt.clients.viewer.scenes.still import Shape, drawn
-from flexdt.clients.viewer.scenes.views import ROOM, WIDE, Standpoint, fitted, presets, rim
+from flexdt.clients.viewer.scenes.views import (
+    ROOM,
+    WIDE,
+    Standpoint,
+    fitted,
+    presets,
+    rim,
+)
 from flexdt.clients.viewer.scenes.world import World, placed
 from flexdt.protocol.state_model import SampleState
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from tests.viewer.looking import changed, picture, until
 
-HOME = {"ver_tube": 26.29, "mag_obj": 600.0, "mag_det": 1059.0, "ver_det": 20.0, "tra_det": 25.32}
+HOME = {
+    "ver_tube": 26.29,
+    "mag_obj": 600.0,
+    "mag_det": 1059.0,
+    "ver_det": 20.0,
+    "tra_det": 25.32,
+}
 Points = npt.NDArray[np.float64]
 
 
@@ -54,9 +68,12 @@ def seen_at(points: Points, camera: Standpoint, aspect: float) -> Points:
 
 @pytest.mark.parametrize("aspect", [0.45, 0.72, 1.0, WIDE, 2.2])
 @pytest.mark.parametrize(
-    "targets", [{}, {"mag_obj": 200.0}, {"mag_det": 700.0, "mag_obj": 300.0, "ver_tube": 200.0}]
+    "targets",
+    [{}, {"mag_obj": 200.0}, {"mag_det": 700.0, "mag_obj": 300.0, "ver_tube": 200.0}],
 )
-def test_views_hold_source_sample_and_image(targets: dict[str, float], aspect: float) -> None:
+def test_views_hold_source_sample_and_image(
+    targets: dict[str, float], aspect: float
+) -> None:
     world = world_at(**targets)
     views = presets(world, 45.0)
     middle, up = world.sample.shift, np.array([0.0, 0.0, 45.0])
@@ -68,7 +85,9 @@ def test_views_hold_source_sample_and_image(targets: dict[str, float], aspect: f
         assert seen.max() <= ROOM + 1e-9
         assert seen.max() > 0.75
         # The image on the panel is seen from its front, or its edge.
-        assert (np.asarray(camera.position) - 0.001 * world.detector) @ world.normal < 0.05
+        assert (
+            np.asarray(camera.position) - 0.001 * world.detector
+        ) @ world.normal < 0.05
 
 
 @pytest.mark.parametrize("name", ["lego", "wide", "small", "chiral"])
@@ -113,10 +132,14 @@ def test_a_solid_covers_the_hull_of_its_corners_and_hides_what_lies_behind() -> 
     red, blue = np.array([250, 0, 0]), np.array([0, 0, 250])
     behind = Shape(ball.triangles, blue, lit=False)
     size = (300, 200)
-    now = drawn([behind, Shape(box.triangles, red, lit=False)], EYE, size, False).astype(int)
+    now = drawn([behind, Shape(box.triangles, red, lit=False)], EYE, size, False).astype(
+        int
+    )
     is_red = (now[..., 0] > 200) & (now[..., 2] < 60)
     corners = seen_at(np.asarray(box.vertices), EYE, 1.5) * [150.0, 100.0]
-    assert is_red.sum() == pytest.approx(ConvexHull(corners).volume, rel=0.02)  # area, in 2-D
+    assert is_red.sum() == pytest.approx(
+        ConvexHull(corners).volume, rel=0.02
+    )  # area, in 2-D
     assert not ((now[..., 2] > 200) & (now[..., 0] < 60)).any()
     glass = Shape(box.triangles, red, 0.4, lit=False)
     through = drawn([behind, glass], EYE, size, False).astype(int)
@@ -135,7 +158,9 @@ def test_large_triangles_that_reach_behind_the_eye_do_not_break_a_picture() -> N
 
 def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> None:
     pieces, lamp = cabinet(room_of(builtin_machine()))
-    triangles = np.concatenate([p.mesh.triangles for p in pieces if p.mesh.extents.max() < 2400.0])
+    triangles = np.concatenate(
+        [p.mesh.triangles for p in pieces if p.mesh.extents.max() < 2400.0]
+    )
     whole = np.concatenate([p.mesh.triangles for p in pieces]).reshape(-1, 3)
     low, high = whole.min(axis=0), whole.max(axis=0)
     assert ((lamp > low) & (lamp < high)).all()
@@ -154,7 +179,9 @@ def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> 
         sides = [(np.cross(q - p, at - p) * normal).sum(axis=1) >= 0
                  for p, q in ((a, b), (b, c), (c, a))]  # fmt: skip
         front = normal @ ahead < 0.0
-        assert not (np.logical_and.reduce(sides) & front & (along > 0.0) & (along < 0.99)).any()
+        assert not (
+            np.logical_and.reduce(sides) & front & (along > 0.0) & (along < 0.99)
+        ).any()
 
 
 @pytest.mark.browser

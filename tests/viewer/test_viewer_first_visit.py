@@ -1,10 +1,12 @@
 """What a first visitor wants to do, each from a page just opened, by what is written on it.
 
-Clicks are counted as a hand makes them: a press is one, held or dragged too, a choice from a list
-two (open it, take one), a field to type into one, a file to pick one. Keys are not counted.
+Clicks are counted as a hand makes them: a press is one, held or dragged too, a choice from a
+list two (open it, take one), a field to type into one, a file to pick one. Keys are not
+counted.
 
-The clicks of the table in docs/page-tour.md are those counted here, on a small desktop screen, a
-tablet and a phone; `pytest -s tests/viewer/test_viewer_first_visit.py` prints the seconds, too.
+The clicks of the table in docs/page-tour.md are those counted here, on a small desktop screen,
+a tablet and a phone; `pytest -s tests/viewer/test_viewer_first_visit.py` prints the seconds,
+too.
 """
 
 from __future__ import annotations
@@ -77,7 +79,10 @@ class Visitor:
         return str(found.inner_text())
 
     def sees_no_more(self, words: str) -> None:
-        until(lambda: not self.page.get_by_text(words).locator("visible=true").count(), words)
+        until(
+            lambda: not self.page.get_by_text(words).locator("visible=true").count(),
+            words,
+        )
 
     def readout(self, name: str) -> str:
         term = self.page.get_by_role("term").filter(has_text=re.compile(f"^{name}$"))
@@ -104,7 +109,10 @@ def turn_the_sample(v: Visitor) -> None:
     v.clicks += 1
     v.page.get_by_role("button", name="jog rot_obj up").hover()
     v.page.mouse.down()
-    until(lambda: float(turned.input_value()) > before + 2, "a turn while the button is held")
+    until(
+        lambda: float(turned.input_value()) > before + 2,
+        "a turn while the button is held",
+    )
     v.page.mouse.up()
 
 
@@ -221,14 +229,18 @@ def calibrate(v: Visitor) -> None:
 def share_the_scene(v: Visitor) -> None:
     """an HTML file that needs no server"""
     v.tab("Share")
-    card = v.page.locator(".card").filter(has=v.page.get_by_role("heading", name="The scene as"))
+    card = v.page.locator(".card").filter(
+        has=v.page.get_by_role("heading", name="The scene as")
+    )
     with v.page.expect_download(timeout=120_000) as told:
         v.click(card.get_by_role("button", name="One HTML file"))
     assert told.value.suggested_filename.endswith(".html")
     alone = v.page.context.browser.new_page()
     told.value.save_as(file := v.folder / "scene.html")
     alone.goto(file.as_uri())
-    until(lambda: drawn(picture(alone.locator("canvas").first)), "the machine in the file")
+    until(
+        lambda: drawn(picture(alone.locator("canvas").first)), "the machine in the file"
+    )
     alone.close()
 
 
@@ -286,7 +298,11 @@ def quiet(lab: Any, past: None) -> None:
 @pytest.mark.parametrize(("task", "size"), [(t, s) for t in TASKS for s in SIZES])
 @pytest.mark.campaign(15)
 def test_a_task_of_a_first_visit(
-    task: str, size: tuple[int, int], quiet: None, open_page: Callable[..., Any], tmp_path: Path
+    task: str,
+    size: tuple[int, int],
+    quiet: None,
+    open_page: Callable[..., Any],
+    tmp_path: Path,
 ) -> None:
     do = TASKS[task]
     view = "iso" if do is look_along_the_beam else "none"

@@ -106,7 +106,9 @@ def test_a_picture_that_takes_too_long_is_answered_with_none(
         try:
             status, headers, body = await fetch(front.port, "/still.jpg?view=iso")
             assert (status, body) == (204, b"")
-            assert headers["Connection"] == "close"  # no further request goes into nothing
+            assert (
+                headers["Connection"] == "close"
+            )  # no further request goes into nothing
         finally:
             await front.close()
 
@@ -114,8 +116,11 @@ def test_a_picture_that_takes_too_long_is_answered_with_none(
 
 
 def test_what_has_not_changed_is_not_sent_again() -> None:
-    """viser's program, nearly all of each view, is one file under a name made of its content."""
-    program = '<script data-p="ab!c" data-ss="7">run(document.currentScript.dataset.p)</script>'
+    """viser's program, nearly all of each view, is one file under a name made of its
+    content."""
+    program = (
+        '<script data-p="ab!c" data-ss="7">run(document.currentScript.dataset.p)</script>'
+    )
     html = f"<html><head>{program}</head><body>viser</body></html>".encode()
 
     async def work(port: int) -> None:
@@ -123,14 +128,20 @@ def test_what_has_not_changed_is_not_sent_again() -> None:
         other = (await fetch(port, f"/scene/{'b' * 12}/beam"))[2].decode()
         assert "run(" not in one
         (path,) = set(re.findall(r'src="(/viser-[0-9a-f]+\.js)"', one + other))
-        for asked, patience in ((path, "immutable"), ("/main.js", "no-cache"), ("/", "no-cache")):
+        for asked, patience in (
+            (path, "immutable"),
+            ("/main.js", "no-cache"),
+            ("/", "no-cache"),
+        ):
             status, headers, body = await fetch(port, asked)
             assert status == 200
             assert patience in headers["Cache-Control"]
             tag = {"If-None-Match": headers["ETag"]}
             assert (await fetch(port, asked, **tag))[::2] == (304, b"")
             assert (await fetch(port, asked, **{"If-None-Match": '"another"'}))[2] == body
-            _, headers, packed = await fetch(port, asked, **{"Accept-Encoding": "br, gzip"})
+            _, headers, packed = await fetch(
+                port, asked, **{"Accept-Encoding": "br, gzip"}
+            )
             assert headers["Content-Encoding"] == "gzip"
             assert gzip.decompress(packed) == body
         script = (await fetch(port, path))[2].decode()
@@ -149,7 +160,15 @@ def test_what_has_not_changed_is_not_sent_again() -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["/nothing.js", "/../link.py", "/..%2flink.py", "/data", "/__init__.py", "/scene/x/iso"]
+    "path",
+    [
+        "/nothing.js",
+        "/../link.py",
+        "/..%2flink.py",
+        "/data",
+        "/__init__.py",
+        "/scene/x/iso",
+    ],
 )
 def test_nothing_else_is_served(path: str) -> None:
     assert with_front(lambda front: fetch(front.port, path))[0] == 404
@@ -183,7 +202,9 @@ def test_a_token_is_asked_for_once() -> None:
         status, _, again = await fetch(front.port, "/?token=wrong-but-long-enough")
         assert status == 401
         assert b"This is not it" in again
-        assert (await fetch(front.port, "/main.js"))[1]["Content-Type"].startswith("text/plain")
+        assert (await fetch(front.port, "/main.js"))[1]["Content-Type"].startswith(
+            "text/plain"
+        )
         url = f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}"
         with pytest.raises(InvalidStatus):
             async with connect(url, proxy=None):
@@ -195,17 +216,23 @@ def test_a_token_is_asked_for_once() -> None:
         assert "Secure" not in headers["Set-Cookie"], "a browser would not send it back"
         cookie = headers["Set-Cookie"].split(";")[0]
         assert (await fetch(front.port, "/", Cookie=cookie))[0] == 200
-        async with connect(url, additional_headers={"Cookie": cookie}, proxy=None) as page:
+        async with connect(
+            url, additional_headers={"Cookie": cookie}, proxy=None
+        ) as page:
             await page.send("x")
             assert await page.recv()
 
     with_front(work, TOKEN)
 
 
-def test_guesses_wait_for_each_other_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_guesses_wait_for_each_other_and_are_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Wrong tokens are answered one after another; a right one is not kept waiting by them."""
     told: list[object] = []
-    monkeypatch.setattr(module, "log", lambda *event, **facts: told.append((event[0], facts)))
+    monkeypatch.setattr(
+        module, "log", lambda *event, **facts: told.append((event[0], facts))
+    )
 
     async def guess(front: Front) -> list[asyncio.Task[Any]]:
         wrong = [fetch(front.port, f"/?token=wrong-{i}") for i in range(3)]
@@ -218,7 +245,9 @@ def test_guesses_wait_for_each_other_and_are_told(monkeypatch: pytest.MonkeyPatc
         begun = time.monotonic()
         assert [(await g)[0] for g in await guess(front)] == [401, 401, 401]
         assert time.monotonic() - begun >= 3 * module.GUESS_S
-        assert told == [("wrong token", {"client": "127.0.0.1", "count": i}) for i in (1, 2, 3)]
+        assert told == [
+            ("wrong token", {"client": "127.0.0.1", "count": i}) for i in (1, 2, 3)
+        ]
         told.clear()
         monkeypatch.setattr(module, "GUESS_S", 600.0)
         guesses = await guess(front)
@@ -276,7 +305,9 @@ def test_views_beyond_the_limit_are_refused() -> None:
 
         async with serve(viser, "127.0.0.1", 0, compression=None) as behind:
             there = f"ws://127.0.0.1:{behind.sockets[0].getsockname()[1]}"
-            front = Front(echo, lambda *_: connect(there, proxy=None), HTML, {}, max_scenes=1)
+            front = Front(
+                echo, lambda *_: connect(there, proxy=None), HTML, {}, max_scenes=1
+            )
             await front.start("127.0.0.1", 0)
             url = f"ws://127.0.0.1:{front.port}/scene/{'c' * 12}/iso"
             async with connect(url, proxy=None):
@@ -303,11 +334,19 @@ def test_silent_connections_give_way_to_newcomers_and_pages_stay(
     async def run() -> None:
         front = Front(echo, nowhere, HTML, {}, TOKEN, max_scenes=1, max_pages=1)
         await front.start("127.0.0.1", 0)
-        cookie = (await fetch(front.port, f"/?token={TOKEN}"))[1]["Set-Cookie"].split(";")[0]
+        cookie = (await fetch(front.port, f"/?token={TOKEN}"))[1]["Set-Cookie"].split(
+            ";"
+        )[0]
         url = f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}"
         held = []
-        async with connect(url, proxy=None, additional_headers={"Cookie": cookie}) as page:
-            for said in [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"] * 30:
+        async with connect(
+            url, proxy=None, additional_headers={"Cookie": cookie}
+        ) as page:
+            for said in [
+                b"",
+                b"GET / HTTP/1.1\r\n",
+                b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
+            ] * 30:
                 _, writer = await asyncio.open_connection("127.0.0.1", front.port)
                 writer.write(said)
                 held.append(writer)
@@ -325,7 +364,9 @@ def test_silent_connections_give_way_to_newcomers_and_pages_stay(
     assert caplog.messages == []
 
 
-def test_answers_that_are_not_read_give_way_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_that_are_not_read_give_way_to_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A peer that sends whole requests and takes no answer displaces its own alone."""
     monkeypatch.setattr(browser_connections, "ANSWERED", 3)
     monkeypatch.setattr(module, "STILL_S", 0.5)
@@ -374,7 +415,9 @@ def test_messages_that_never_end_are_cut_and_others_are_heard(
                 *(endless(front.port, i) for i in range(4)), return_exceptions=True
             )
         assert all(isinstance(error, ConnectionClosed) for error in ended)
-        async with connect(f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}", proxy=None) as page:
+        async with connect(
+            f"ws://127.0.0.1:{front.port}/ws/{'b' * 12}", proxy=None
+        ) as page:
             for _ in range(200):
                 await page.send("y" * 100_000)
                 assert len(await page.recv()) > 100_000
@@ -470,10 +513,19 @@ def test_two_pages_at_the_socket(lab: Any) -> None:
                     one, lambda m, id=id: isinstance(m, dict) and m.get("id") == id
                 )
                 assert answer["error"]["code"] == -32601
-            for wrong in ("", "[]", "{", '{"id": 9}', '{"id": 9, "method": "x", "params": 3}'):
+            for wrong in (
+                "",
+                "[]",
+                "{",
+                '{"id": 9}',
+                '{"id": 9, "method": "x", "params": 3}',
+            ):
                 await one.send(wrong)
                 (answer,) = await listen(
-                    one, lambda m: isinstance(m, dict) and m["type"] == "answer" and "error" in m
+                    one,
+                    lambda m: (
+                        isinstance(m, dict) and m["type"] == "answer" and "error" in m
+                    ),
                 )
                 assert answer["error"]["code"] == -32600
 

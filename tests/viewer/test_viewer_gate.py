@@ -1,7 +1,7 @@
 """viser behind the front: who reaches it, and what a page may tell it.
 
-What this module says of a new version of viser: `flexdt.clients.viewer.viser_gate` has to be looked
-at.
+What this module says of a new version of viser: `flexdt.clients.viewer.viser_gate` has to be
+looked at.
 """
 
 from __future__ import annotations
@@ -126,7 +126,9 @@ TYPES = sorted(_messages.Message._subclass_from_type_string())
 def test_whatever_gets_through_is_on_the_list_and_viser_can_read_it(
     kind: str, base: dict[str, Any], data: st.DataObject
 ) -> None:
-    changed = data.draw(st.dictionaries(st.sampled_from([*base, "x"]), ANYTHING, max_size=2))
+    changed = data.draw(
+        st.dictionaries(st.sampled_from([*base, "x"]), ANYTHING, max_size=2)
+    )
     raw = msgpack.packb({**base, **changed, "type": kind}, unicode_errors="surrogatepass")
     try:
         heard = _messages.Message.deserialize(admitted(raw))
@@ -195,7 +197,9 @@ def test_a_long_way_to_temporary_files_is_not_too_long(
     assert not scenes.path.parent.exists()
 
 
-def test_a_viser_that_listens_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viser_that_listens_elsewhere_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     serve = library.serve
     monkeypatch.setattr(viser, "ViserServer", lambda **_: SimpleNamespace())
     with pytest.raises(GateError, match="starts its server in another way"):
@@ -203,7 +207,9 @@ def test_a_viser_that_listens_elsewhere_is_refused(monkeypatch: pytest.MonkeyPat
     assert library.serve is serve
 
 
-def with_scenes(work: Callable[[Scenes, Front], Awaitable[None]], token: str | None = None) -> None:
+def with_scenes(
+    work: Callable[[Scenes, Front], Awaitable[None]], token: str | None = None
+) -> None:
     async def page(id: str, connection: object) -> None:
         return None
 
@@ -289,8 +295,12 @@ def test_a_page_opens_no_tunnel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither through the front, nor to viser itself; each kind is one line of the log."""
     told: list[object] = []
     opened: list[object] = []
-    monkeypatch.setattr(page_messages, "log", lambda *event, **facts: told.append(facts["message"]))
-    monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_: opened.append(1))
+    monkeypatch.setattr(
+        page_messages, "log", lambda *event, **facts: told.append(facts["message"])
+    )
+    monkeypatch.setattr(
+        viser.ViserServer, "request_share_url", lambda *_: opened.append(1)
+    )
     share = msgpack.packb({"type": "ShareUrlRequest"})
 
     async def work(scenes: Scenes, front: Front) -> None:
@@ -319,7 +329,9 @@ def test_a_page_opens_no_tunnel(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_folders_of_killed_viewers_are_removed_and_those_of_others_stay() -> None:
-    with tempfile.TemporaryDirectory(prefix="gate-") as name:  # short: it is a socket's path
+    with tempfile.TemporaryDirectory(
+        prefix="gate-"
+    ) as name:  # short: it is a socket's path
         folder = Path(name)
         with contextlib.ExitStack() as stack:
             for each in ("dead", "alive", "young"):

@@ -49,7 +49,8 @@ def asked(page: Any) -> Iterator[Callable[[], list[str]]]:
         "(() => { const send = WebSocket.prototype.send; window.asked = [];"
         " WebSocket.prototype.send = function (t) { const { method } = JSON.parse(t);"
         " if (method) window.asked.push(method);"
-        " send.call(this, t); }; window.unspy = () => { WebSocket.prototype.send = send; }; })()"
+        " send.call(this, t); }; window.unspy = () => { WebSocket.prototype.send = send; "
+        "}; })()"
     )
     yield lambda: list(page.evaluate("window.asked"))
     page.evaluate("window.unspy()")
@@ -93,7 +94,9 @@ def test_space_stops_wherever_the_focus_is(
         before = asked()
         page.keyboard.press("Space")
         wait(lambda: not twin.state().axes["mag_obj"].moving, "stopped")
-        page.evaluate("new Promise((done) => setTimeout(done))")  # all that the key has set off
+        page.evaluate(
+            "new Promise((done) => setTimeout(done))"
+        )  # all that the key has set off
         assert asked()[len(before) :] == ["axes.stop"], "and nothing is pressed"
         assert page.evaluate("document.documentElement.dataset.theme") == "light"
 
@@ -110,7 +113,9 @@ def test_emergency_stop_by_key_while_typing(
     page.evaluate("flexdt.call('safety.reset')")
 
 
-def test_space_ticks_a_box_and_stops_nothing(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_space_ticks_a_box_and_stops_nothing(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     with motion(page, twin, wait):
         page.focus("#around")
         for on in (True, False):
@@ -133,11 +138,15 @@ def test_enter_held_on_a_jog_button(page: Any, twin: TwinClient, wait: Wait) -> 
         page.keyboard.down("Enter")
         wait(lambda: twin.state().axes["tra_obj"].moving)
         page.focus("#theme")
-        wait(lambda: not twin.state().axes["tra_obj"].moving, "and so does going elsewhere")
+        wait(
+            lambda: not twin.state().axes["tra_obj"].moving, "and so does going elsewhere"
+        )
     finally:
         page.keyboard.up("Enter")
         page.evaluate("flexdt.call('clock.set', {speed_up: 8})")
-        page.evaluate("x => flexdt.call('axes.move', {targets: {tra_obj: x}, wait: true})", before)
+        page.evaluate(
+            "x => flexdt.call('axes.move', {targets: {tra_obj: x}, wait: true})", before
+        )
 
 
 def test_a_hurried_emergency_stop_does_not_reset_itself(
@@ -312,7 +321,8 @@ def test_clock_and_rates_at_rest(page: Any, twin: TwinClient, wait: Wait) -> Non
     first = shown()
     wait(lambda: shown() > first + 16.0, "the clock goes on at 8 times the pace")
     assert shown() <= twin.state().clock.time_s + 0.1
-    # Achieved, over the last seconds; a pause between two looks at the clock is in it for a while.
+    # Achieved, over the last seconds; a pause between two looks at the clock is in it for a
+    # while.
     wait(lambda: page.inner_text("#clock").endswith(("8.00×", "8×")), "its pace")
     wait(lambda: page.inner_text("#film-rate") == "", "no images, no rate")
     page.evaluate("flexdt.call('clock.set', {speed_up: 'max'})")
@@ -320,7 +330,9 @@ def test_clock_and_rates_at_rest(page: Any, twin: TwinClient, wait: Wait) -> Non
     page.evaluate("flexdt.call('clock.set', {speed_up: 8})")
 
 
-def test_the_value_under_a_resting_pointer(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_the_value_under_a_resting_pointer(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     before = twin.state().sample.name
     page.evaluate("flexdt.call('sample.set', {name: 'normal'})")
     wait(lambda: twin.state().sample.name == "normal")
@@ -387,9 +399,13 @@ def test_zoom_to_pixels_and_a_window_in_order(page: Any, wait: Wait) -> None:
     page.mouse.move(1, 1)
 
 
-def test_the_picture_has_every_pixel_and_nothing_over_it(page: Any, twin: TwinClient) -> None:
+def test_the_picture_has_every_pixel_and_nothing_over_it(
+    page: Any, twin: TwinClient
+) -> None:
     shape = list(np.asarray(twin.projection().image).shape)
-    page.wait_for_function("s => flexdt.store.image?.shape.join() === s.join()", arg=shape)
+    page.wait_for_function(
+        "s => flexdt.store.image?.shape.join() === s.join()", arg=shape
+    )
     assert page.is_checked("#show-beads")
     content = base64.b64decode(page.evaluate("flexdt.picture()").split(",")[1])
     saved = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), dtype=int)
@@ -415,7 +431,10 @@ def test_every_control_has_a_name_and_tabs_go_by_arrow(page: Any) -> None:
         page.keyboard.press(key)
         assert page.locator(f"#tab-{shown}").is_visible()
         assert page.evaluate("document.activeElement.dataset.tab") == shown
-        assert page.get_attribute("#tabs [aria-selected=true]", "aria-controls") == f"tab-{shown}"
+        assert (
+            page.get_attribute("#tabs [aria-selected=true]", "aria-controls")
+            == f"tab-{shown}"
+        )
     assert page.locator("#tabs [tabindex='0']").count() == 1
 
 
@@ -458,13 +477,17 @@ def test_a_page_without_its_viewer_says_so(
 
 def test_no_quantity_has_two_fields(page: Any) -> None:
     fields = page.evaluate(
-        "[...document.querySelectorAll(':is(#tab-scan, #tab-setup) :is(input, select, textarea)')]"
-        ".map((e) => [e.id, e.dataset.quantity ?? (e.dataset.layer && `layer.${e.dataset.layer}`)])"
+        "[...document.querySelectorAll(':is(#tab-scan, #tab-setup) :is(input, select, "
+        "textarea)')]"
+        ".map((e) => [e.id, e.dataset.quantity ?? (e.dataset.layer && "
+        "`layer.${e.dataset.layer}`)])"
     )
     assert [id for id, quantity in fields if not quantity] == []
     quantities = [quantity for _, quantity in fields]
     assert sorted({q for q in quantities if quantities.count(q) > 1}) == []
-    assert {"scan.frames", "scan.exposure_ms", "scan.kV", "scan.voxel_um"} <= set(quantities)
+    assert {"scan.frames", "scan.exposure_ms", "scan.kV", "scan.voxel_um"} <= set(
+        quantities
+    )
 
 
 SENT = """
@@ -477,7 +500,9 @@ WebSocket.prototype.send = function (data) {
 """
 
 
-def test_designer_and_script_wish_the_same_scan(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_designer_and_script_wish_the_same_scan(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     """Whatever the camera is set to: one quantity in two fields was two scans."""
     page.evaluate(f"(() => {{ {SENT} }})()")
     page.click("#tabs [data-tab=scan]")
@@ -486,7 +511,9 @@ def test_designer_and_script_wish_the_same_scan(page: Any, twin: TwinClient, wai
     page.click("#designer summary")
     newest = "name => window.sent.filter((r) => r.method === name).at(-1)?.params"
     for ms, frames, typed in ((150, 91, None), (400, 45, None), (400, 60, 80)):
-        page.evaluate("ms => flexdt.call('camera.set', {exposure_ms: ms}).then(() => null)", ms)
+        page.evaluate(
+            "ms => flexdt.call('camera.set', {exposure_ms: ms}).then(() => null)", ms
+        )
         seen(page, twin)
         if typed is not None:
             page.fill("#wish-exposure", str(typed))

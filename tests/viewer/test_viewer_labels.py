@@ -68,7 +68,10 @@ def test_a_leader_ends_at_its_box() -> None:
 
 
 def test_three_names_take_a_few_milliseconds() -> None:
-    anchors, sizes = np.array([[80.0, 400], [250, 300], [420, 200]]), np.tile([90.0, 22.0], (3, 1))
+    anchors, sizes = (
+        np.array([[80.0, 400], [250, 300], [420, 200]]),
+        np.tile([90.0, 22.0], (3, 1)),
+    )
     begun = time.process_time()
     for _ in range(5):
         laid_out(anchors, sizes, AREA)

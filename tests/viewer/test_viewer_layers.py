@@ -64,7 +64,9 @@ def test_a_frame_shows_what_its_page_wants_whatever_is_built_anew(seed: int) -> 
                 frame.build(plain, [n for n in names if rng.integers(2)])
             case 2:
                 frame.behind = not frame.behind
-        clients.show("page", {n: dict(some) for n, some in wanted.items()}, plain, frame.said)
+        clients.show(
+            "page", {n: dict(some) for n, some in wanted.items()}, plain, frame.said
+        )
         if not frame.behind:
             assert frame.nodes == wanted
 
@@ -97,7 +99,8 @@ def test_what_is_shown_is_each_persons_own(open_page: Callable[..., Any]) -> Non
     assert mine.evaluate(length) != other.evaluate(length)
     mine.reload()
     mine.wait_for_function("window.flexdt?.store.layers.machine === false")
-    # Names and the image come when they come, so the other page is what this one is compared with.
+    # Names and the image come when they come, so the other page is what this one is compared
+    # with.
     settled(of(mine), lambda now: apart(now, still(of(other))) > MANY_PX)
     mine.click("#layer-machine")
     settled(of(mine), lambda now: apart(now, still(of(other))) < MANY_PX / 20)
@@ -111,9 +114,13 @@ def darker(now: Picture, before: Picture) -> int:
 
 
 @pytest.mark.browser
-def test_where_a_graphics_processor_draws_parts_cast_shadows(open_page: Callable[..., Any]) -> None:
+def test_where_a_graphics_processor_draws_parts_cast_shadows(
+    open_page: Callable[..., Any],
+) -> None:
     """And the rest is lit from all around. Here, without one, the address asks for it."""
-    plain, fine = (open_page("iso", (900, 600), light=light) for light in ("plain", "fine"))
+    plain, fine = (
+        open_page("iso", (900, 600), light=light) for light in ("plain", "fine")
+    )
     before = settled(of(plain), drawn)
     settled(of(fine), lambda now: darker(now, before) > MANY_PX < darker(before, now))
     for page in (plain, fine):

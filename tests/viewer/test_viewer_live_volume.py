@@ -36,7 +36,12 @@ from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord, parse_document
+from flexdt.twin.dataset.flexdt_json import (
+    NoiseRecord,
+    SampleRecord,
+    ScanRecord,
+    parse_document,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume
@@ -99,7 +104,9 @@ def scan_of(tmp_path: Path, at: Place, radius: float) -> tuple[Path, list[Path]]
         beam = {"dark": 0.0, "flat": 1.0}.get(frame.kind)
         if beam is None:
             beam = np.exp(-MU * through(radius, row[:3] - at, places - at))
-        counts = np.rint(np.broadcast_to(100.0 + 12_000.0 * beam, (rows, cols))).astype(np.uint16)
+        counts = np.rint(np.broadcast_to(100.0 + 12_000.0 * beam, (rows, cols))).astype(
+            np.uint16
+        )
         file = (home if frame.kind != "projection" else tmp_path) / frame.file
         tifffile.imwrite(file, counts)
         if frame.kind == "projection":
@@ -137,8 +144,8 @@ def test_it_grows_with_every_image_to_the_true_values(
             assert work.is_alive()
             assert time.monotonic() < deadline
             time.sleep(0.01)
-        # Each view has its part of the whole; in the middle of a ball all give the same. The first
-        # and the last are of one direction, and share its part.
+        # Each view has its part of the whole; in the middle of a ball all give the same. The
+        # first and the last are of one direction, and share its part.
         share = 0.0 if come == 1 else (come - 0.5) / (VIEWS - 1) if come < VIEWS else 1.0
         value = next(value for views, value in told if views == come)
         assert value == pytest.approx(MU * share, rel=0.05, abs=0.01 * MU)
@@ -203,16 +210,23 @@ def test_the_net_of_drawn_balls_is_closed_and_outward(seed: int) -> None:
     rng = np.random.default_rng(seed)
     at = np.stack(np.mgrid[:40, :44, :48], axis=-1).astype(float)
     centers, radii = rng.uniform(13.0, 26.0, (2, 3)), rng.uniform(4.0, 9.0, 2)
-    depth = [r - np.linalg.norm(at - c, axis=-1) for c, r in zip(centers, radii, strict=True)]
+    depth = [
+        r - np.linalg.norm(at - c, axis=-1) for c, r in zip(centers, radii, strict=True)
+    ]
     vertices, faces = net(np.max(depth, axis=0), 0.0)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()
     assert mesh.volume > 0.0
-    away = [np.linalg.norm(vertices - c, axis=1) - r for c, r in zip(centers, radii, strict=True)]
+    away = [
+        np.linalg.norm(vertices - c, axis=1) - r
+        for c, r in zip(centers, radii, strict=True)
+    ]
     gaps = np.abs(away).min(axis=0)
     assert gaps.max() < 1.0, "within a cell, in the crease between balls that touch, too"
     if np.linalg.norm(centers[0] - centers[1]) > radii.sum() + 2.0:
-        assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * (radii**3).sum(), rel=0.04)
+        assert mesh.volume == pytest.approx(
+            4.0 / 3.0 * np.pi * (radii**3).sum(), rel=0.04
+        )
 
 
 def test_otsus_threshold_parts_what_no_other_threshold_parts_better() -> None:
@@ -220,7 +234,9 @@ def test_otsus_threshold_parts_what_no_other_threshold_parts_better() -> None:
     rng = np.random.default_rng(3)
     for _ in range(5):
         share, apart = rng.uniform(0.02, 0.5), rng.uniform(1.5, 6.0)
-        values = np.where(rng.random(20_000) < share, apart, 0.0) + rng.normal(0, 0.4, 20_000)
+        values = np.where(rng.random(20_000) < share, apart, 0.0) + rng.normal(
+            0, 0.4, 20_000
+        )
 
         def within(level: float, values: Any = values) -> float:
             parts = values[values > level], values[values <= level]
@@ -231,7 +247,9 @@ def test_otsus_threshold_parts_what_no_other_threshold_parts_better() -> None:
 
 
 @pytest.mark.slow
-def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Path]]) -> None:
+def test_nobody_waits_for_a_scan_that_nobody_looks_at(
+    scan: tuple[Path, list[Path]],
+) -> None:
     with pytest.raises(SystemExit):
         grow(held(lambda document: None), scan[0], SIDE, alive=lambda: False)
 
@@ -239,8 +257,8 @@ def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Pat
 def test_the_volume_of_a_past_scan_is_that_of_the_command(
     scan: tuple[Path, list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every voxel within 1e-6 of the greatest that `flexdt reconstruct` writes, and the codes that
-    a page gets within half a step; what it may be off by, in the same words."""
+    """Every voxel within 1e-6 of the greatest that `flexdt reconstruct` writes, and the codes
+    that a page gets within half a step; what it may be off by, in the same words."""
     home, files = scan
     for file in files:
         file.rename(home / file.name)
@@ -252,7 +270,14 @@ def test_the_volume_of_a_past_scan_is_that_of_the_command(
     last = told[-1]
     assert (last["done"], last["views"], last["of"]) == (1.0, VIEWS, VIEWS)
     out = tmp_path / "volume.tif"
-    words = ["reconstruct", str(home), "--out", str(out), "--binning", str(last["binning"])]
+    words = [
+        "reconstruct",
+        str(home),
+        "--out",
+        str(out),
+        "--binning",
+        str(last["binning"]),
+    ]
     with pytest.raises(SystemExit, match="0"):
         main(words)
     accuracy = last["doubts"][-1].removeprefix("values may be off; ")
@@ -263,7 +288,9 @@ def test_the_volume_of_a_past_scan_is_that_of_the_command(
     ours = np.array(
         [
             [x, y, z, exact(made.volumes["volume"], (x, y, z))]
-            for x, y, z in np.random.default_rng(4).integers(0, last["size"], (500, 3)).tolist()
+            for x, y, z in np.random.default_rng(4)
+            .integers(0, last["size"], (500, 3))
+            .tolist()
         ]
     )
     x, y, z = ours[:, :3].astype(int).T
@@ -271,12 +298,17 @@ def test_the_volume_of_a_past_scan_is_that_of_the_command(
     np.testing.assert_allclose(ours[:, 3], whole[z, y, x], atol=1e-6 * most, rtol=0)
     head, codes = block(made.volumes["volume"])
     step = (head["high"] - head["low"]) / TOP
-    values = head["low"] + (np.frombuffer(codes, "<u2").reshape(head["shape"]) - 1.0) * step
+    values = (
+        head["low"] + (np.frombuffer(codes, "<u2").reshape(head["shape"]) - 1.0) * step
+    )
     assert np.abs(values - whole).max() < 0.51 * step + 1e-6 * most
 
 
-def test_a_folder_of_the_real_scanner_has_its_volume(scan: tuple[Path, list[Path]]) -> None:
-    """Without flexdt.json, from the scanner's two texts: the same to what they are rounded to."""
+def test_a_folder_of_the_real_scanner_has_its_volume(
+    scan: tuple[Path, list[Path]],
+) -> None:
+    """Without flexdt.json, from the scanner's two texts: the same to what they are rounded
+    to."""
     home, files = scan
     for file in files:
         file.rename(home / file.name)
@@ -311,7 +343,8 @@ def test_a_block_says_where_no_data_are_and_has_room_for_most_voxels() -> None:
 
 
 def test_figures_of_a_body_whose_size_is_known() -> None:
-    """A hollow box of 0.02 /mm, seen with noise, 5 % less attenuation and a shift of a voxel."""
+    """A hollow box of 0.02 /mm, seen with noise, 5 % less attenuation and a shift of a
+    voxel."""
     truth = np.zeros((40, 50, 60), np.float32)
     truth[10:30, 10:40, 10:50] = 0.02
     truth[10:30, 20:30, 20:40] = 0.0
@@ -344,7 +377,9 @@ def test_the_truth_stands_where_the_sample_stood(
     truth = truth_of(load_dataset(home), like)
     phantom = load_phantom("normal")
     mu = main_level(truth)
-    assert mu == pytest.approx(max(solid.mu_per_mm for solid in phantom.scene.solids[:1]), rel=1e-4)
+    assert mu == pytest.approx(
+        max(solid.mu_per_mm for solid in phantom.scene.solids[:1]), rel=1e-4
+    )
     assert truth.min() == 0.0
     sizes = phantom.size_mm if turn == 0.0 else np.array(phantom.size_mm)[[1, 0, 2]]
     for axis, (size, place) in enumerate(zip(sizes, (2.0, -1.0, 3.0 - 1.0), strict=True)):
@@ -355,7 +390,9 @@ def test_the_truth_stands_where_the_sample_stood(
         assert middle_mm == pytest.approx(place, abs=0.41)
 
 
-def test_a_scan_of_what_nobody_knows_is_not_compared(scan: tuple[Path, list[Path]]) -> None:
+def test_a_scan_of_what_nobody_knows_is_not_compared(
+    scan: tuple[Path, list[Path]],
+) -> None:
     home, files = scan
     made = held(lambda document: None, past=True)
     with pytest.raises(TwinError, match="only the finished volume"):
@@ -368,7 +405,9 @@ def test_a_scan_of_what_nobody_knows_is_not_compared(scan: tuple[Path, list[Path
 
 
 @pytest.mark.slow
-def test_answers_come_from_the_process_until_it_is_stopped(scan: tuple[Path, list[Path]]) -> None:
+def test_answers_come_from_the_process_until_it_is_stopped(
+    scan: tuple[Path, list[Path]],
+) -> None:
     home, files = scan
     for file in files:
         file.rename(home / file.name)

@@ -1,4 +1,5 @@
-"""What the page measures in a radiograph, beside NumPy on the twin's own image; how large it is."""
+"""What the page measures in a radiograph, beside NumPy on the twin's own image; how large it
+is."""
 
 from __future__ import annotations
 
@@ -24,10 +25,20 @@ BOXES = [
 def at_rest(page: Any, twin: TwinClient) -> Iterator[None]:
     """The page shows the image as it is on the wire, every pixel of it, whole and unmarked."""
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
-    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    page.evaluate(
+        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+    )
     if abs(twin.state().axes["mag_det"].position - 1000) > 1e-6:
-        middle = {"mag_obj": 600, "mag_det": 1000, "ver_tube": 26.29, "ver_det": 20, "tra_obj": 0}
-        page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true, wait: true})", middle)
+        middle = {
+            "mag_obj": 600,
+            "mag_det": 1000,
+            "ver_tube": 26.29,
+            "ver_det": 20,
+            "tra_obj": 0,
+        }
+        page.evaluate(
+            "t => flexdt.call('axes.move', {targets: t, plan: true, wait: true})", middle
+        )
     seen(page, twin)
     shape = list(np.asarray(twin.projection().image).shape)
     page.wait_for_function(
@@ -55,7 +66,9 @@ def alike(told: list[float], wanted: list[float], apart: float) -> bool:
 
 
 def numbers(text: str) -> list[float]:
-    return [float(w) for w in text.replace("·", " ").split() if w.lstrip("-")[:1].isdigit()]
+    return [
+        float(w) for w in text.replace("·", " ").split() if w.lstrip("-")[:1].isdigit()
+    ]
 
 
 @pytest.mark.parametrize("box", BOXES)
@@ -68,18 +81,27 @@ def test_statistics_of_a_box(
     mark(page, "region", box)
     spread = [part.std(ddof=1)] if part.size > 1 else []
     wanted = [part.mean(), *spread, part.min(), part.max(), part.size]
-    wait(lambda: alike(numbers(page.inner_text("#measured")), wanted, 2e-4), f"{wanted} of {box}")
+    wait(
+        lambda: alike(numbers(page.inner_text("#measured")), wanted, 2e-4),
+        f"{wanted} of {box}",
+    )
 
 
 @pytest.mark.parametrize("along", ["row", "column"])
-def test_profile_along_a_line(page: Any, twin: TwinClient, wait: Wait, along: str) -> None:
+def test_profile_along_a_line(
+    page: Any, twin: TwinClient, wait: Wait, along: str
+) -> None:
     image = np.asarray(twin.projection().image, dtype=float)
     first, last = sorted(DRAWN.sample(range(700), 2))
     at = DRAWN.randrange(300, 500)
     # Longer lines than the plot has samples may leave pixels out.
     last = min(last, first + 400)
     line = image[at, first : last + 1] if along == "row" else image[first : last + 1, at]
-    mark(page, "profile", (first, at, last, at) if along == "row" else (at, first, at, last))
+    mark(
+        page,
+        "profile",
+        (first, at, last, at) if along == "row" else (at, first, at, last),
+    )
     wanted = [line.min(), line.max(), last - first]
     told = lambda: numbers(page.inner_text("#measured"))  # noqa: E731
     wait(lambda: alike(told(), wanted, 2e-3), f"{wanted}")
@@ -127,7 +149,9 @@ def test_the_windows_end_is_pulled_on_the_histogram(page: Any, wait: Wait) -> No
     wait(lambda: abs(float(page.input_value("#high")) - 1000 * high) < 3, "auto again")
 
 
-def test_the_transmission_of_dark_pixels_and_all(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_the_transmission_of_dark_pixels_and_all(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     through = np.exp(-np.asarray(twin.projection().image, dtype=float))
     wanted = [100 * np.percentile(through, 1), 1.0, 100 * through.mean()]
     told = lambda: numbers(page.inner_text("#transmission"))  # noqa: E731
@@ -137,12 +161,17 @@ def test_the_transmission_of_dark_pixels_and_all(page: Any, twin: TwinClient, wa
 def test_an_image_without_beam_says_so(page: Any, twin: TwinClient, wait: Wait) -> None:
     assert page.inner_text("#film-beam") == "X-rays off: drawn as though on"
     page.evaluate("flexdt.call('tube.set', {on: true})")
-    wait(lambda: twin.state().tube.ready and not page.is_visible("#film-beam"), "no word of it")
+    wait(
+        lambda: twin.state().tube.ready and not page.is_visible("#film-beam"),
+        "no word of it",
+    )
     page.evaluate("flexdt.call('tube.set', {on: false})")
     wait(lambda: page.is_visible("#film-beam"))
 
 
-def test_the_difference_from_a_frame_that_was_kept(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_the_difference_from_a_frame_that_was_kept(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     before = np.asarray(twin.projection().image, dtype=float)
     page.click("#keep-reference")
     page.check("#difference")
@@ -206,11 +235,15 @@ def test_setup_names_the_physics_and_draws_the_spectrum(page: Any, wait: Wait) -
     assert page.inner_text("#filters") == "0.50 mm Al"
     for kV in (40, 90):
         told = page.evaluate("kV => flexdt.call('viewer.spectrum', {kV})", kV)
-        highest = max(e for e, n in zip(told["energy_keV"], told["photons"], strict=True) if n > 0)
+        highest = max(
+            e for e, n in zip(told["energy_keV"], told["photons"], strict=True) if n > 0
+        )
         assert kV - 2 < highest <= kV + 1, "no photon has more than the electrons"
         assert 0.3 * kV < told["mean_keV"] < 0.7 * kV
     page.click("#predict")
     wait(lambda: "contrast to noise of" in page.inner_text("#predicted"), "a prediction")
-    refused = page.evaluate("flexdt.call('viewer.spectrum', {kV: 900}).catch((e) => e.message)")
+    refused = page.evaluate(
+        "flexdt.call('viewer.spectrum', {kV: 900}).catch((e) => e.message)"
+    )
     assert "the voltage of a spectrum is 900;" in refused
     page.click("#tabs [data-tab=move]")

@@ -1,8 +1,8 @@
 """A minute of motion leaves no memory behind, in the viewer's process and in the page.
 
-The long form is `python examples/viewer_study.py --minutes 30`. What is compared are the medians of
-two halves after a warm-up, the page's heap after a collection, so that a pause or a cache that
-fills once decides nothing.
+The long form is `python examples/viewer_study.py --minutes 30`. What is compared are the
+medians of two halves after a warm-up, the page's heap after a collection, so that a pause or a
+cache that fills once decides nothing.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 WARM_UP_S, MEASURED_S, EVERY_S = 15.0, 45.0, 1.5
 PAGE_MB, VIEWER_MB = 2.0, 10.0
-"""Growth allowed between the halves, whose middles lie 22 s apart. Images that are kept would be
-some MB a second in either place, states that are kept more than 2 MB between the page's halves."""
+"""Growth allowed between the halves, whose middles lie 22 s apart. Images that are kept would
+be some MB a second in either place, states that are kept more than 2 MB between the page's
+halves."""
 
 
 def resident_mb(pid: int) -> float:
@@ -40,7 +41,9 @@ def growth(values: list[float]) -> float:
 
 
 @pytest.mark.campaign
-def test_memory_is_flat_over_a_minute_of_motion(open_page: Callable[..., Any], lab: Any) -> None:
+def test_memory_is_flat_over_a_minute_of_motion(
+    open_page: Callable[..., Any], lab: Any
+) -> None:
     page = open_page("side", (900, 600))
     session = page.context.new_cdp_session(page)
     page.evaluate("flexdt.call('session.control', {action: 'force'})")

@@ -36,8 +36,8 @@ async def settled() -> None:
 
 
 def test_few_states_and_parts_of_images_are_on_their_way() -> None:
-    """A browser that acknowledges now and then gets the newest state each time, and whole images,
-    of which none is cut off by a newer one; answers wait for neither."""
+    """A browser that acknowledges now and then gets the newest state each time, and whole
+    images, of which none is cut off by a newer one; answers wait for neither."""
 
     async def run() -> None:
         browser = Browser()
@@ -74,9 +74,13 @@ def test_few_states_and_parts_of_images_are_on_their_way() -> None:
             for slot in ("image", "state", "volume") if number % 3 else ("image",):
                 if unacknowledged[slot]:
                     unacknowledged[slot] -= 1
-                    browser.says.put_nowait(json.dumps({"took": slot}, separators=(",", ":")))
+                    browser.says.put_nowait(
+                        json.dumps({"took": slot}, separators=(",", ":"))
+                    )
             if number % 7 == 0:
-                await asyncio.sleep(0.03)  # a slow acknowledgement makes parts small again
+                await asyncio.sleep(
+                    0.03
+                )  # a slow acknowledgement makes parts small again
         assert all(shown - told <= 1 for told, shown in got), "the newest state is sent"
         assert len(got) > 200
         assert len(images) > 5

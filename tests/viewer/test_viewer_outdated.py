@@ -32,7 +32,9 @@ def emitted(page: Any, *events: tuple[Any, ...], then: str) -> Any:
     )
 
 
-def test_a_checked_script_is_to_be_checked_again(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_a_checked_script_is_to_be_checked_again(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 0}, wait: true})")
     seen(page, twin)
     page.click("#tabs [data-tab=scan]")
@@ -83,7 +85,13 @@ def test_an_open_data_set_is_complete_when_its_scan_is(
 
 
 def test_a_scan_that_waits_takes_no_other_ones_place(page: Any) -> None:
-    job = {"time": 1e9, "frames_done": 3, "frames_total": 9, "elapsed_s": 1.0, "speed_up": 1}
+    job = {
+        "time": 1e9,
+        "frames_done": 3,
+        "frames_total": 9,
+        "elapsed_s": 1.0,
+        "speed_up": 1,
+    }
     first = {**job, "job": "job-a", "state": "running", "dataset": "/data/a"}
     later = {**job, "job": "job-b", "state": "queued", "dataset": "/data/b"}
     name = "document.querySelector('#job-name').textContent"
@@ -100,7 +108,14 @@ def test_slices_of_another_page_and_answers_that_come_late(page: Any) -> None:
     const note = document.querySelector('#volume-note');
     const choose = (v) => { size.value = v; size.dispatchEvent(new Event('change')); };
     """
-    told = {"name": "none", "past": False, "views": 5, "of": 9, "voxel_mm": 0.1, "size": [9, 9, 9]}
+    told = {
+        "name": "none",
+        "past": False,
+        "views": 5,
+        "of": 9,
+        "voxel_mm": 0.1,
+        "size": [9, 9, 9],
+    }
     own, other = (("volume", {**told, "side": side}) for side in (128, 256))
     emitted(page, ("job", job), then=f"{choose} choose('128'); 0")
     assert "another page" not in emitted(page, own, then=f"{choose} note.textContent")
@@ -124,12 +139,17 @@ def test_no_difference_is_said(page: Any, wait: Wait) -> None:
     page.select_option("#kind", "counts")
     page.locator("#film-note", has_text="of another kind or size").wait_for()
     page.select_option("#kind", "line_integral")
-    wait(lambda: "no difference" not in page.inner_text("#film-note"), "the difference again")
+    wait(
+        lambda: "no difference" not in page.inner_text("#film-note"),
+        "the difference again",
+    )
     page.uncheck("#difference")
 
 
 def test_a_confirmed_stop_is_not_called_unconfirmed(page: Any, wait: Wait) -> None:
-    emitted(page, ("note", "error", "E-stop not confirmed", "no answer for 5 s"), then="0")
+    emitted(
+        page, ("note", "error", "E-stop not confirmed", "no answer for 5 s"), then="0"
+    )
     assert page.locator("#notes .note", has_text="E-stop not confirmed").count() == 1
     page.evaluate("flexdt.call('safety.estop').then(() => null)")
     page.locator("#reset").wait_for()

@@ -19,14 +19,15 @@ PITCH_MM = 0.1496
 
 
 def go(page: Any, twin: TwinClient, wait: Wait, **targets: float) -> None:
-    """Move the motors, around obstacles if need be, and wait until they stand there and the page
-    knows it."""
+    """Move the motors, around obstacles if need be, and wait until they stand there and the
+    page knows it."""
     page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", targets)
 
     def there() -> bool:
         axes = twin.state().axes
         return all(
-            not axes[n].moving and abs(axes[n].position - v) < 1e-6 for n, v in targets.items()
+            not axes[n].moving and abs(axes[n].position - v) < 1e-6
+            for n, v in targets.items()
         )
 
     wait(there, str(targets))
@@ -36,7 +37,9 @@ def go(page: Any, twin: TwinClient, wait: Wait, **targets: float) -> None:
 @pytest.fixture(autouse=True)
 def in_the_middle(page: Any, twin: TwinClient, wait: Wait) -> Iterator[None]:
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
-    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    page.evaluate(
+        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+    )
     go(page, twin, wait, **MIDDLE)
     yield
     page.evaluate("flexdt.call('safety.reset')")
@@ -128,7 +131,9 @@ def test_where_the_machine_was_found_is_no_warning(
     fresh.close()
 
 
-def test_near_contact_then_blocked_then_reset(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_near_contact_then_blocked_then_reset(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     """Runs towards the sample until the twin halts; the third attempt blocks the machine."""
     into = "flexdt.call('axes.move', {targets: {mag_det: 300}}).then(() => null, (e) => e.code)"
     assert page.evaluate(into) == -32002

@@ -66,14 +66,18 @@ async def answer(page: ClientConnection, id: object) -> Any:
     return await hear(page, told)
 
 
-def on_page(port: int, work: Callable[[ClientConnection], Awaitable[Any]], id: str = "a") -> Any:
+def on_page(
+    port: int, work: Callable[[ClientConnection], Awaitable[Any]], id: str = "a"
+) -> Any:
     async def run() -> Any:
         url = f"ws://127.0.0.1:{port}/ws/{id * 12}"
         async with connect(url, max_size=None, proxy=None) as page:
             # States come over the viewer's connection to the twin, answers over the page's own.
             missing = {"state", "session"}
             while missing:
-                told = await hear(page, lambda m: isinstance(m, dict) and m["type"] in missing)
+                told = await hear(
+                    page, lambda m: isinstance(m, dict) and m["type"] in missing
+                )
                 if told.get("connected", True):
                     missing.discard(told["type"])
             return await work(page)
@@ -148,7 +152,9 @@ def test_wrong_parameters_are_told_and_the_radiograph_goes_on(lab: Any) -> None:
         await hear(page, lambda m: isinstance(m, bytes))
         await ask(page, "viewer.window", {}, "auto")
         await ask(page, "clock.set", {"speed_up": 8}, "clock")
-        turned = await ask(page, "axes.move", {"targets": {"rot_obj": 3.0}, "relative": True}, "go")
+        turned = await ask(
+            page, "axes.move", {"targets": {"rot_obj": 3.0}, "relative": True}, "go"
+        )
         assert "error" not in turned
         await hear(page, lambda m: isinstance(m, bytes))
 
@@ -175,7 +181,10 @@ def test_what_the_wire_has_no_bytes_for_is_refused_with_its_field(lab: Any) -> N
             got = await ask(page, method, params, i)
             error = got.get("error", {})
             assert error.get("code") == -32602, (method, params, got)
-            assert any(field in p["path"] for p in error["data"]["problems"]), (field, error)
+            assert any(field in p["path"] for p in error["data"]["problems"]), (
+                field,
+                error,
+            )
         assert "result" in await ask(page, "state.get", {}, "still there")
 
     on_page(lab.viewer.port, work)
@@ -191,9 +200,13 @@ def test_requests_that_are_none_are_told_and_the_page_goes_on(lab: Any) -> None:
             "[" + "1," * 600_000 + "1]",
         ):  # fmt: skip
             await page.send(text)
-            got = await hear(page, lambda m: isinstance(m, dict) and m["type"] == "answer")
+            got = await hear(
+                page, lambda m: isinstance(m, dict) and m["type"] == "answer"
+            )
             assert got["error"]["code"] == -32600, (text[:60], got)
-            assert got["id"] == (1 if text.startswith('{"id": 1, "m') else None), text[:60]
+            assert got["id"] == (1 if text.startswith('{"id": 1, "m') else None), text[
+                :60
+            ]
         got = await ask(page, "\ud800" * 10**6, {}, 1)
         assert got["error"]["code"] == -32601
         assert len(json.dumps(got)) < 2000
@@ -217,7 +230,10 @@ def test_a_page_with_too_many_requests_under_way_is_told_and_still_stops(
 
         page = Page("b" * 12, cast(Any, SimpleNamespace()), NOWHERE, {"x": slow})
         page.say = lambda kind, **content: sent.append(content)  # type: ignore[method-assign,assignment]
-        waiting = [asyncio.create_task(page._handle('{"id": 1, "method": "x"}')) for _ in range(64)]
+        waiting = [
+            asyncio.create_task(page._handle('{"id": 1, "method": "x"}'))
+            for _ in range(64)
+        ]
         await asyncio.sleep(0)
         await page._handle('{"id": 2, "method": "x"}')
         await page._handle('{"id": 3, "method": "safety.estop"}')
@@ -237,7 +253,10 @@ def test_a_page_with_too_many_requests_under_way_is_told_and_still_stops(
 
 def test_a_request_nested_too_deep_is_answered(lab: Any) -> None:
     async def work(page: ClientConnection) -> None:
-        for text in ("[" * 100_000, '{"id": 1, "method": "x", "params": ' + '{"a":' * 100_000):
+        for text in (
+            "[" * 100_000,
+            '{"id": 1, "method": "x", "params": ' + '{"a":' * 100_000,
+        ):
             await page.send(text)
             got = await answer(page, None)
             assert got["error"]["code"] == -32600
@@ -403,7 +422,9 @@ def test_a_page_that_takes_nothing_is_closed() -> None:
     asyncio.run(run())
 
 
-def test_an_internal_error_is_in_the_log_under_its_id(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_internal_error_is_in_the_log_under_its_id(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     from flexdt.runtime.log import LOGGER, set_up
 
     async def broken(page: Page, params: object) -> object:
@@ -484,7 +505,9 @@ def test_pages_beyond_the_limit_are_told_why_and_figures_count_them(
             assert closed.value.rcvd is not None
             assert closed.value.rcvd.code == 1013
             assert "1 pages at most" in closed.value.rcvd.reason
-            text = await asyncio.to_thread(lambda: urlopen(f"{pages}/metrics").read().decode())
+            text = await asyncio.to_thread(
+                lambda: urlopen(f"{pages}/metrics").read().decode()
+            )
             assert "\nflexdt_pages 1" in text
             assert "\nflexdt_twin_connected 1" in text
 
@@ -519,7 +542,9 @@ def test_an_event_that_nobody_understands_does_not_end_the_link() -> None:
     async def run() -> None:
         server = await asyncio.start_server(twin, "127.0.0.1", 0)
         address = TwinAddress("127.0.0.1", server.sockets[0].getsockname()[1])
-        link = KeptConnection(address, "a test", understand, subscription={"topics": ["state"]})
+        link = KeptConnection(
+            address, "a test", understand, subscription={"topics": ["state"]}
+        )
         keeping = asyncio.create_task(link.run())
         async with asyncio.timeout(PATIENCE_S):
             # Its events may come in the same packet as the answer to the subscription.

@@ -1,4 +1,5 @@
-"""Scripts on the page: written, checked, scrubbed, run, paused, stepped, aborted; and the rest."""
+"""Scripts on the page: written, checked, scrubbed, run, paused, stepped, aborted; and the
+rest."""
 
 from __future__ import annotations
 
@@ -43,7 +44,9 @@ def on_scan_tab(page: Any) -> None:
 def write(page: Any, kind: str = "step", frames: int = 6) -> str:
     page.select_option("#wish-kind", kind)
     page.fill("#wish-frames", str(frames))
-    page.fill("#script", "")  # with which the report of the one before goes, and one on its way
+    page.fill(
+        "#script", ""
+    )  # with which the report of the one before goes, and one on its way
     page.click("#compose")
     page.locator("#report .verdict").wait_for()
     return str(page.input_value("#script"))
@@ -76,9 +79,13 @@ def test_a_file_is_opened_checked_and_each_step_leads_to_its_line(
     page: Any, twin: TwinClient, tmp_path: Path
 ) -> None:
     path = tmp_path / "from a file.txt"
-    path.write_text("rot_obj\tmove absolute\t5.0\t\tACK\t\t\nrot_obj\tset speed\t9\t\tACK\t\t\n")
+    path.write_text(
+        "rot_obj\tmove absolute\t5.0\t\tACK\t\t\nrot_obj\tset speed\t9\t\tACK\t\t\n"
+    )
     page.set_input_files("#script-file", path)
-    page.wait_for_function("document.querySelector('#script').value.startsWith('rot_obj')")
+    page.wait_for_function(
+        "document.querySelector('#script').value.startsWith('rot_obj')"
+    )
     page.click("#check")
     page.locator("#report .verdict.ok").wait_for()
     page.locator("#report .steps div", has_text="speed").last.click()
@@ -155,7 +162,9 @@ def test_the_script_box_can_be_left_with_the_keyboard(page: Any) -> None:
     assert page.input_value("#script") == "a\t"
 
 
-def test_running_makes_a_data_set(page: Any, twin: TwinClient, lab: Any, wait: Wait) -> None:
+def test_running_makes_a_data_set(
+    page: Any, twin: TwinClient, lab: Any, wait: Wait
+) -> None:
     write(page, frames=5)
     page.select_option("#speed-up", "max")
     job = begun(page, twin)
@@ -185,7 +194,9 @@ def test_a_data_set_is_named_after_the_file_its_script_is_from(
     path = tmp_path / "listing.txt"
     path.write_text(turn)
     page.set_input_files("#script-file", path)
-    page.wait_for_function("document.querySelector('#script').value.startsWith('rot_obj')")
+    page.wait_for_function(
+        "document.querySelector('#script').value.startsWith('rot_obj')"
+    )
     page.select_option("#speed-up", "max")
     job = begun(page, twin)
     wait(lambda: twin.job_status(job).state == "done")
@@ -222,7 +233,9 @@ def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> Non
     page.locator("#job-bar.failed").wait_for()
 
 
-def test_a_stop_during_a_scan_is_one_warning(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_a_stop_during_a_scan_is_one_warning(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     # It turns for a minute before its first frame.
     text = write(page, "fly", 200)
     page.fill("#script", f"rot_obj\tmove absolute\t3000.0\t\tACK\t\t\n{text}")
@@ -237,8 +250,11 @@ def test_a_stop_during_a_scan_is_one_warning(page: Any, twin: TwinClient, wait: 
     wait(lambda: twin.job_status().state in ("aborted", "incomplete"))
 
 
-def test_an_end_that_was_not_heard_of_is_asked_for(page: Any, twin: TwinClient, wait: Wait) -> None:
-    """A page whose connection was away when the scan ended must not show it as running for ever."""
+def test_an_end_that_was_not_heard_of_is_asked_for(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
+    """A page whose connection was away when the scan ended must not show it as running for
+    ever."""
     write(page, "fly", LONG)
     page.select_option("#speed-up", "1")
     begun(page, twin)
@@ -256,7 +272,9 @@ def test_an_end_that_was_not_heard_of_is_asked_for(page: Any, twin: TwinClient, 
         page.evaluate("window.heard()")
 
 
-def test_who_is_refused_is_told_of_the_button(page: Any, open_page: Callable[..., Any]) -> None:
+def test_who_is_refused_is_told_of_the_button(
+    page: Any, open_page: Callable[..., Any]
+) -> None:
     page.evaluate("flexdt.call('session.control', {action: 'force'})")
     other = open_page()
     told = other.evaluate(
@@ -278,7 +296,10 @@ def test_scrubbing_goes_through_the_plan(page: Any, twin: TwinClient, wait: Wait
     place = {"x": box["width"] - 2, "y": box["height"] / 2}
     page.locator("#timeline").click(position=place)
     said = lambda: page.inner_text("#scrub-at")  # noqa: E731
-    wait(lambda: "line" in said() and not said().startswith("0.0 s"), "the moment clicked at")
+    wait(
+        lambda: "line" in said() and not said().startswith("0.0 s"),
+        "the moment clicked at",
+    )
     end = page.evaluate("flexdt.call('viewer.scrub', {time_s: 1e9})")["positions"]
     begin = page.evaluate("flexdt.call('viewer.scrub', {time_s: 0})")["positions"]
     assert end["rot_obj"] - begin["rot_obj"] > 360.0
@@ -287,7 +308,9 @@ def test_scrubbing_goes_through_the_plan(page: Any, twin: TwinClient, wait: Wait
 
 def test_the_timeline_comes_into_view_below_a_long_report(page: Any) -> None:
     write(page, "fly", 45)
-    page.locator("#tab-scan").evaluate("e => { e.scrollTop = 0; e.parentElement.scrollTop = 0; }")
+    page.locator("#tab-scan").evaluate(
+        "e => { e.scrollTop = 0; e.parentElement.scrollTop = 0; }"
+    )
     page.locator("#report").evaluate("e => { e.style.minHeight = '1500px'; }")
     page.click("#plan")
     in_view = (
@@ -319,9 +342,15 @@ def test_replay_and_scene_files_open_without_a_server(
             told = re.search(r"<title>(.*?)</title>", path.read_text("utf-8"))
             assert told is not None
             assert re.fullmatch(r"[\w-]+ · [\d-]{10} \d\d:\d\d · flexdt \w+", told[1])
-        if path.suffix == ".viser":  # it opens where the machine is seen, not from viser's default
+        if (
+            path.suffix == ".viser"
+        ):  # it opens where the machine is seen, not from viser's default
             messages = contents(path)
-            first = [m["position"] for _, m in messages if m["type"] == "SetCameraPositionMessage"]
+            first = [
+                m["position"]
+                for _, m in messages
+                if m["type"] == "SetCameraPositionMessage"
+            ]
             assert first
             assert first[0] == pytest.approx(FREE.position)
     for kind in ("scene", "replay"):
@@ -334,11 +363,17 @@ def test_replay_and_scene_files_open_without_a_server(
             canvas.wait_for()
             wait(lambda on=canvas: drawn(picture(on)), f"the machine in the {kind}")
             if kind == "scene":
-                assert alone.locator("img[alt=radiograph]").evaluate("e => e.naturalWidth") >= 200
+                assert (
+                    alone.locator("img[alt=radiograph]").evaluate("e => e.naturalWidth")
+                    >= 200
+                )
                 assert "source to detector: " in alone.locator("aside").inner_text()
             if kind == "replay":
                 first = picture(canvas)
-                wait(lambda on=canvas, was=first: changed(picture(on), was) > 200, "it plays")
+                wait(
+                    lambda on=canvas, was=first: changed(picture(on), was) > 200,
+                    "it plays",
+                )
         finally:
             alone.close()
 
@@ -401,7 +436,9 @@ def test_what_is_no_report_is_not_applied(
     assert twin.state().correction is None
     given = content.get("parameters", content) if isinstance(content, dict) else content
     if not isinstance(content, dict) or "identifiable" not in content:
-        ask = "p => flexdt.call('calibration.apply', {parameters: p}).catch((e) => e.code)"
+        ask = (
+            "p => flexdt.call('calibration.apply', {parameters: p}).catch((e) => e.code)"
+        )
         assert page.evaluate(ask, given) == -32602
     assert twin.state().correction is None
 
@@ -425,15 +462,20 @@ def test_corrections_are_shown_with_units_and_digits_that_say_something(
     wait(lambda: page.locator("#revert").is_disabled())
 
 
-def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_radiograph_shows_the_twins_values(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     wanted = np.asarray(twin.projection().image)
     shape = list(wanted.shape)
-    page.wait_for_function("s => flexdt.store.image?.shape.join() === s.join()", arg=shape)
+    page.wait_for_function(
+        "s => flexdt.store.image?.shape.join() === s.join()", arg=shape
+    )
     for across, down in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.2)):
 
         def shown(across: float = across, down: float = down) -> bool:
-            # Whatever coarse or earlier image is still on its way, at rest the page shows this one.
+            # Whatever coarse or earlier image is still on its way, at rest the page shows this
+            # one.
             point_at(page, across, down)
             text = page.inner_text("#pixel")
             if not text.startswith("("):
@@ -444,7 +486,10 @@ def test_radiograph_shows_the_twins_values(page: Any, twin: TwinClient, wait: Wa
         wait(shown, "the value under the pointer")
     page.locator("#film-canvas").hover()
     page.mouse.wheel(0, -600)
-    wait(lambda: "4." in page.inner_text("#film-note").split("·")[-1], "four times as large")
+    wait(
+        lambda: "4." in page.inner_text("#film-note").split("·")[-1],
+        "four times as large",
+    )
     page.click("#film-reset")
     page.select_option("#kind", "counts")
     page.wait_for_function("flexdt.store.image.kind === 'counts'")
@@ -461,20 +506,29 @@ def test_window_level_and_inversion(page: Any, wait: Wait) -> None:
     page.uncheck("#show-beads")
     plain = film(page)
     page.check("#invert")
-    wait(lambda: film(page)[..., 1].mean() > 255.0 - plain[..., 1].mean() - 12.0, "inverted")
+    wait(
+        lambda: film(page)[..., 1].mean() > 255.0 - plain[..., 1].mean() - 12.0,
+        "inverted",
+    )
     page.uncheck("#invert")
     drag = ("(e, v) => { e.value = v; e.dispatchEvent(new Event('input'));"
             " e.dispatchEvent(new Event('change')); }")  # fmt: skip
     page.locator("#low").evaluate(drag, 0)
     page.locator("#high").evaluate(drag, 60)
-    wait(lambda: film(page)[..., 1].mean() > plain[..., 1].mean() + 5.0, "a narrow window")
+    wait(
+        lambda: film(page)[..., 1].mean() > plain[..., 1].mean() + 5.0, "a narrow window"
+    )
     assert not page.locator("#auto-window").is_checked()
     page.check("#auto-window")
-    wait(lambda: abs(film(page)[..., 1].mean() - plain[..., 1].mean()) < 1.0, "auto again")
+    wait(
+        lambda: abs(film(page)[..., 1].mean() - plain[..., 1].mean()) < 1.0, "auto again"
+    )
     page.check("#show-beads")
 
 
-def test_starved_and_saturated_pixels_are_marked(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_starved_and_saturated_pixels_are_marked(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     # Square to the beam, so that there is open beam beside the block.
     page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 0}})")
     wait(lambda: abs(twin.state().axes["rot_obj"].position) < 1e-6)
@@ -502,7 +556,9 @@ def test_starved_and_saturated_pixels_are_marked(page: Any, twin: TwinClient, wa
     page.wait_for_function("flexdt.store.image?.kind === 'line_integral'")
 
 
-def test_the_radiograph_is_saved_as_a_picture(page: Any, twin: TwinClient, tmp_path: Path) -> None:
+def test_the_radiograph_is_saved_as_a_picture(
+    page: Any, twin: TwinClient, tmp_path: Path
+) -> None:
     page.click("#tabs [data-tab=share]")
     with page.expect_download() as promise:
         page.click("#shot-film")
@@ -516,10 +572,15 @@ def test_the_radiograph_is_saved_as_a_picture(page: Any, twin: TwinClient, tmp_p
     bar = np.flatnonzero(saved[rows + 29] > 150.0)
     bar = bar[: np.argmax(np.diff(bar, append=10**6) > 1) + 1]
     length_mm = len(bar) * voxel_mm
-    assert min(abs(length_mm / (m * 10.0**e) - 1.0) for m in (1, 2, 5) for e in range(-2, 3)) < 0.03
+    assert (
+        min(abs(length_mm / (m * 10.0**e) - 1.0) for m in (1, 2, 5) for e in range(-2, 3))
+        < 0.03
+    )
 
 
-def test_predicted_beads_lie_on_the_shadows(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_predicted_beads_lie_on_the_shadows(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527]})")
     page.wait_for_function("flexdt.store.image?.shape[0] === 760")
     beads = page.evaluate("flexdt.store.image.beads")
@@ -529,7 +590,9 @@ def test_predicted_beads_lie_on_the_shadows(page: Any, twin: TwinClient, wait: W
         c, r = round(column), round(row)
         if 8 < r < 751:
             inside = image[r - 2 : r + 3, c - 2 : c + 3].mean()
-            around = image[r - 30 : r + 31, c - 30 : c + 31].mean() if 30 < r < 729 else 0.0
+            around = (
+                image[r - 30 : r + 31, c - 30 : c + 31].mean() if 30 < r < 729 else 0.0
+            )
             assert inside > around + 0.3
     page.evaluate("roi => flexdt.call('camera.set', {roi})", ROI)
 
@@ -556,7 +619,9 @@ def test_servers_killed_and_restarted_while_the_page_is_open(
     lab.restart_twin()
     page.locator("#veil").wait_for(state="hidden")
     page.locator("#connection", has_text="connected").wait_for()
-    page.wait_for_function("flexdt.store.session")  # the page's own connection to the twin
+    page.wait_for_function(
+        "flexdt.store.session"
+    )  # the page's own connection to the twin
     with lab.client() as client:
         page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 2}})")
         wait(lambda: abs(client.state().axes["tra_tube"].position - 2.0) < 1e-6)
@@ -573,7 +638,9 @@ def test_servers_killed_and_restarted_while_the_page_is_open(
         page.evaluate("flexdt.call('axes.move', {targets: {tra_tube: 1}})")
         wait(lambda: abs(client.state().axes["tra_tube"].position - 1.0) < 1e-6)
     # The new viewer knows nothing of the plan: the page makes it anew.
-    ask = "flexdt.call('viewer.scrub', {time_s: 1e9}).then((a) => a.positions, () => null)"
+    ask = (
+        "flexdt.call('viewer.scrub', {time_s: 1e9}).then((a) => a.positions, () => null)"
+    )
     end = wait(lambda: page.evaluate(ask), "the plan is back")
     assert end["rot_obj"] > 360.0
     assert page.locator("#timeline-card").is_visible()
@@ -597,10 +664,14 @@ def written(page: Any, device: str, command: str) -> list[float]:
     return [float(row[2]) for row in rows if row[:2] == [device, command]]
 
 
-def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_a_bar_of_the_designer_rewrites_the_script(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     """What it says is counted here: bytes by images, time by exposures, kerma by both."""
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
-    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    page.evaluate(
+        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+    )
     seen(page, twin)
     page.click("#tabs [data-tab=scan]")
     page.select_option("#wish-kind", "fly")
@@ -614,7 +685,8 @@ def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, 
         size = f"{(frames + 2) * 956 * 760 * 2 / 1e6:.1f} MB"  # a dark and a flat beside them
         page.locator("#design-time", has_text=size).wait_for()
         told.append(
-            float(re.findall(r"([0-9.]+) mGy", page.inner_text("#design-time"))[0]) / frames
+            float(re.findall(r"([0-9.]+) mGy", page.inner_text("#design-time"))[0])
+            / frames
         )
     assert told[0] == pytest.approx(told[1], rel=0.02)
     kV = pull(page, "kV", 0.6)
@@ -631,7 +703,10 @@ def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, 
     page.locator("#design-quality .verdict.ok").wait_for()
     wish, ms = (float(v) for v in re.findall(r"[0-9.]+", words))
     assert float(page.inner_text("#design-quality .verdict")) >= 0.98 * wish
-    wait(lambda: abs(written(page, "camera", "set exposure")[0] - ms) <= 0.02 * ms, "the exposure")
+    wait(
+        lambda: abs(written(page, "camera", "set exposure")[0] - ms) <= 0.02 * ms,
+        "the exposure",
+    )
     # Somebody's own script stays.
     page.fill("#script", "camera\tset exposure\t123\t\tACK\t\t\n")
     pull(page, "kV", 0.5)
@@ -654,9 +729,12 @@ def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, 
 def test_the_designer_says_what_the_report_says_in_every_mode(
     page: Any, twin: TwinClient, wait: Wait, kind: str
 ) -> None:
-    """Its scales follow the mode that is set: a script was impossible after a change of mode."""
+    """Its scales follow the mode that is set: a script was impossible after a change of
+    mode."""
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
-    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    page.evaluate(
+        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+    )
     seen(page, twin)
     page.click("#tabs [data-tab=scan]")
     page.select_option("#wish-kind", kind)
@@ -668,10 +746,18 @@ def test_the_designer_says_what_the_report_says_in_every_mode(
     for mode in ("HW4SW1High", "HW2SW1High"):
         page.evaluate("mode => flexdt.call('camera.set', {mode})", mode)
         seen(page, twin)
-        wait(lambda mode=mode: f"set mode\t{mode}" in page.input_value("#script"), "the script")
+        wait(
+            lambda mode=mode: f"set mode\t{mode}" in page.input_value("#script"),
+            "the script",
+        )
         state = twin.state()
-        g, voxel = state.geometry, float(page.inner_text("#design-voxel_um-is").split()[0])
-        assert voxel == pytest.approx(1000 * state.camera.pixel_mm * g.SOD_mm / g.SDD_mm, abs=0.06)
+        g, voxel = (
+            state.geometry,
+            float(page.inner_text("#design-voxel_um-is").split()[0]),
+        )
+        assert voxel == pytest.approx(
+            1000 * state.camera.pixel_mm * g.SOD_mm / g.SDD_mm, abs=0.06
+        )
         report = twin.check_script(page.input_value("#script"))
         size = f"{report.bytes / 1e6:.1f} MB"
         page.locator("#design-time", has_text=size).wait_for()

@@ -1,4 +1,5 @@
-"""The scenes themselves: four views, presets, the beam's eye against the projection, dragging."""
+"""The scenes themselves: four views, presets, the beam's eye against the projection,
+dragging."""
 
 from __future__ import annotations
 
@@ -57,10 +58,13 @@ def layers(page: Any, **values: object) -> None:
 
 
 def outline_error(scene: Any, lab: Any, wait: Wait) -> float:
-    """How far [px of the screen] the drawn sample's outline lies from its shadow's, at worst."""
+    """How far [px of the screen] the drawn sample's outline lies from its shadow's, at
+    worst."""
     hidden = dict.fromkeys(HIDDEN, False)
     layers(scene, **hidden, opacity=1.0)
-    scene.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    scene.evaluate(
+        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+    )
     with lab.client() as client:
         wait(lambda: not any(a.moving for a in client.state().axes.values()))
         shadow_image = np.asarray(client.projection().image)
@@ -82,19 +86,34 @@ def outline_error(scene: Any, lab: Any, wait: Wait) -> float:
     assert 0.02 < shadow.mean() < 0.9
     assert cols > 400
     # A pixel that differs may lie within two pixels of the shadow's outline, on either side.
-    depth = np.where(shadow, distance_transform_edt(shadow), distance_transform_edt(~shadow))
+    depth = np.where(
+        shadow, distance_transform_edt(shadow), distance_transform_edt(~shadow)
+    )
     inner = slice(3, -3)  # the crop's own one-pixel frame is no part of the picture
     return float((depth * (drawn ^ shadow))[inner, inner].max(initial=0.0))
 
 
-def test_beams_eye_is_the_shadow_within_two_pixels(scene: Any, lab: Any, wait: Wait) -> None:
-    """The drawn sample's outline, seen from the focal spot, is the outline of its X-ray shadow."""
+def test_beams_eye_is_the_shadow_within_two_pixels(
+    scene: Any, lab: Any, wait: Wait
+) -> None:
+    """The drawn sample's outline, seen from the focal spot, is the outline of its X-ray
+    shadow."""
     move = "t => flexdt.call('axes.move', {targets: t})"
-    targets = {"mag_obj": 700.0, "tra_obj": 4.0, "rot_obj": 33.0, "ver_tube": 50.0, "tra_det": 60.0}
-    scene.evaluate("flexdt.call('sample.set', {name: 'normal', offset: {x: 3, z: 2, ry: 15}})")
+    targets = {
+        "mag_obj": 700.0,
+        "tra_obj": 4.0,
+        "rot_obj": 33.0,
+        "ver_tube": 50.0,
+        "tra_det": 60.0,
+    }
+    scene.evaluate(
+        "flexdt.call('sample.set', {name: 'normal', offset: {x: 3, z: 2, ry: 15}})"
+    )
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
     scene.evaluate(move, targets)
-    wait(lambda: outline_error(scene, lab, wait) <= 2.0, "it is drawn where it stands", 240)
+    wait(
+        lambda: outline_error(scene, lab, wait) <= 2.0, "it is drawn where it stands", 240
+    )
 
 
 def test_what_another_client_uploads_is_drawn_in_its_shape(
@@ -129,7 +148,9 @@ def test_a_fixed_view_goes_back_to_its_preset(scene: Any, twin: TwinClient) -> N
     settled(box, lambda back: np.abs(back - before).mean() < 1.0)
 
 
-def test_keys_work_while_a_scene_has_the_focus(scene: Any, twin: TwinClient, wait: Wait) -> None:
+def test_keys_work_while_a_scene_has_the_focus(
+    scene: Any, twin: TwinClient, wait: Wait
+) -> None:
     scene.check("#key-jog")
     box = show(scene, "side")
     frame = box.bounding_box()
@@ -147,14 +168,20 @@ def held(box: Any) -> bool:
     """Whether the pointer lies on a handle: it is yellow then, and nothing else is."""
     frames(box, 3)
     red, green, blue = np.moveaxis(picture(box), 2, 0)
-    yellow = (np.minimum(red, green) - blue > 70.0) & (np.abs(red - green) < 20.0) & (red > 180.0)
+    yellow = (
+        (np.minimum(red, green) - blue > 70.0)
+        & (np.abs(red - green) < 20.0)
+        & (red > 180.0)
+    )
     return int(yellow.sum()) > 20
 
 
 def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> Any:
     """Show a view at its preset with handles, the stages apart."""
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
-    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450, tra_obj: 0}})")
+    scene.evaluate(
+        "flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450, tra_obj: 0}})"
+    )
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     box = show(scene, view)
     scene.click("#tabs [data-tab=move]")
@@ -194,7 +221,10 @@ def test_dragging_a_handle_moves_its_stage(
     scene.mouse.move(*there, steps=6)
     frames(box, 3)
     scene.mouse.up()
-    wait(lambda: abs(twin.state().axes[axis].target - before) > 1.0, f"{axis} is sent somewhere")
+    wait(
+        lambda: abs(twin.state().axes[axis].target - before) > 1.0,
+        f"{axis} is sent somewhere",
+    )
     scene.uncheck("#handles")
     wait(lambda: (twin.state().axes[axis].position - before) * sign > 1.0, axis)
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
@@ -228,11 +258,13 @@ def test_dragging_the_ring_turns_the_sample_with_the_pointer(
     frames(box, 3)
     scene.mouse.up()
     # The stage follows the drag at its end, however late.
-    wait(lambda: abs(twin.state().axes["rot_obj"].target - before) > 43.0, "the drag's end")
+    wait(
+        lambda: abs(twin.state().axes["rot_obj"].target - before) > 43.0, "the drag's end"
+    )
     scene.uncheck("#handles")
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
-    # Growing angles turn the object clockwise, seen from above. The ring may be taken hold of 6 px
-    # beside it, and 57 px are its radius here: 6 degrees.
+    # Growing angles turn the object clockwise, seen from above. The ring may be taken hold of 6
+    # px beside it, and 57 px are its radius here: 6 degrees.
     assert twin.state().axes["rot_obj"].position - before == pytest.approx(50.0, abs=7.0)
     scene.evaluate("t => flexdt.call('axes.move', {targets: t})", {"rot_obj": before})
     wait(lambda: abs(twin.state().axes["rot_obj"].position - before) < 1e-6)
@@ -274,7 +306,9 @@ def _on_screen(
     scale = 0.5 * frame["height"] / math.tan(camera.fov / 2.0) / (along @ ahead)
     return (
         float(frame["x"] + frame["width"] / 2 + scale * (along @ right)),
-        float(frame["y"] + frame["height"] / 2 - scale * (along @ np.cross(right, ahead))),
+        float(
+            frame["y"] + frame["height"] / 2 - scale * (along @ np.cross(right, ahead))
+        ),
     )
 
 
@@ -368,8 +402,8 @@ PINK = (255.0, 60.0, 160.0)
 
 @pytest.fixture
 def block(scene: Any, twin: TwinClient, wait: Wait) -> Iterator[Any]:
-    """A block on the stage, turned, the stages in the middle, and nothing else drawn; afterwards
-    everything is where it was."""
+    """A block on the stage, turned, the stages in the middle, and nothing else drawn;
+    afterwards everything is where it was."""
     stood = {n: a.position for n, a in twin.state().axes.items() if n in MIDDLE}
     scene.evaluate("flexdt.call('session.control', {action: 'release'})")
     mesh = trimesh.creation.box(BLOCK_MM)
@@ -396,8 +430,11 @@ def go(scene: Any, twin: TwinClient, wait: Wait, targets: dict[str, float]) -> N
     wait(there, f"at {targets}")
 
 
-def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]) -> float:
-    """How far [px] a layer's picture lies off the outline of a convex body's points [m], at worst.
+def off_outline(
+    box: Any, layer: str, view: str, points: npt.NDArray[np.float64]
+) -> float:
+    """How far [px] a layer's picture lies off the outline of a convex body's points [m], at
+    worst.
 
     The points are projected here, with the pinhole of the view's camera alone.
     """
@@ -406,9 +443,13 @@ def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]
     corners = np.array([_on_screen(frame, camera, p) for p in points])
     wanted = inside_hull(corners, int(frame["height"]), int(frame["width"]))
     assert 200 < wanted.sum() < 0.2 * wanted.size
-    depth = np.where(wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted))
+    depth = np.where(
+        wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted)
+    )
     found = math.inf
-    for _ in range(12):  # the image on the panel, a shape or the view's own width may come late
+    for _ in range(
+        12
+    ):  # the image on the panel, a shape or the view's own width may come late
         box.locator(".home").click()
         layers(box.page, **{layer: True})
         shown = still(box)
@@ -421,11 +462,15 @@ def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]
     return found
 
 
-def inside_hull(corners: npt.NDArray[np.float64], rows: int, cols: int) -> npt.NDArray[np.bool_]:
+def inside_hull(
+    corners: npt.NDArray[np.float64], rows: int, cols: int
+) -> npt.NDArray[np.bool_]:
     """Pixels whose centres lie in the convex hull of points (x, y)."""
     hull = ConvexHull(corners)
     y, x = np.mgrid[0:rows, 0:cols] + 0.5
-    sides = hull.equations[:, :2] @ np.stack([x.ravel(), y.ravel()]) + hull.equations[:, 2:]
+    sides = (
+        hull.equations[:, :2] @ np.stack([x.ravel(), y.ravel()]) + hull.equations[:, 2:]
+    )
     return np.asarray((sides <= 0.0).all(axis=0).reshape(rows, cols))
 
 
@@ -437,13 +482,19 @@ def test_a_view_shows_sample_and_image_where_the_geometry_puts_them(
     box = show_bare(block, view, "sample")
     turn = -math.radians(25.0)  # growing angles turn clockwise, seen from above
     c, n = math.cos(turn), math.sin(turn)
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    signs = np.array(
+        [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float
+    )
     points = signs * np.array(BLOCK_MM) / 2000.0
     points = points @ np.array([[c, -n, 0.0], [n, c, 0.0], [0.0, 0.0, 1.0]]).T
-    assert off_outline(box, "sample", view, points + _handles(block, twin)["object"]) <= 2.0
+    assert (
+        off_outline(box, "sample", view, points + _handles(block, twin)["object"]) <= 2.0
+    )
     if view == "side":  # which sees the panel from its edge
         return
-    block.evaluate("flexdt.call('viewer.window', {low: 100, high: 200})")  # black all over
+    block.evaluate(
+        "flexdt.call('viewer.window', {low: 100, high: 200})"
+    )  # black all over
     try:
         state = twin.state()
         (rows, cols), pitch = state.camera.shape, state.camera.pixel_mm * 0.001
@@ -470,7 +521,8 @@ def show_bare(page: Any, view: str, layer: str) -> Any:
 def test_a_clicked_pixels_ray_is_drawn_and_says_what_it_goes_through(
     block: Any, twin: TwinClient, wait: Wait
 ) -> None:
-    """Where the ray cuts the block's faces, and where it lies on the screen, is computed here."""
+    """Where the ray cuts the block's faces, and where it lies on the screen, is computed
+    here."""
     box = show_bare(block, "iso", "machine")
     layers(block, machine=False, sample=False)
     settled(box, lambda now: pink(now).sum() == 0)
@@ -482,9 +534,12 @@ def test_a_clicked_pixels_ray_is_drawn_and_says_what_it_goes_through(
     block.select_option("#tool", "ray")
     rng = np.random.default_rng(8)
     for k in range(3):
-        # In the object's frame the block stands as it was uploaded; the panel sees its upper part.
+        # In the object's frame the block stands as it was uploaded; the panel sees its upper
+        # part.
         aim = rng.uniform([-0.4, -0.4, 0.3], [0.4, 0.4, 0.48]) * BLOCK_MM
-        across, down, _ = np.linalg.solve(np.stack([u, v, source - aim], axis=1), source - middle)
+        across, down, _ = np.linalg.solve(
+            np.stack([u, v, source - aim], axis=1), source - middle
+        )
         column, row = round(across + (cols - 1) / 2), round(down + (rows - 1) / 2)
         if k == 0:
             block.fill("#measure-at", f"{column} {row}")
@@ -492,15 +547,21 @@ def test_a_clicked_pixels_ray_is_drawn_and_says_what_it_goes_through(
         else:
             click_pixel(block, column, row, (rows, cols))
         end = middle + (column - (cols - 1) / 2) * u + (row - (rows - 1) / 2) * v
-        faces = np.sort((np.array([-1, 1])[:, None] * BLOCK_MM / 2 - source) / (end - source), 0)
+        faces = np.sort(
+            (np.array([-1, 1])[:, None] * BLOCK_MM / 2 - source) / (end - source), 0
+        )
         length = float(np.linalg.norm(end - source))
         inside = max(0.0, faces[1].min() - faces[0].max()) * length
         assert inside > 5.0
         words = rf"abs {NUMBER} mm · {NUMBER} mm from the focal spot"
 
-        def said(wanted: tuple[float, float] = (inside, length), words: str = words) -> bool:
+        def said(
+            wanted: tuple[float, float] = (inside, length), words: str = words
+        ) -> bool:
             found = re.fullmatch(words, block.inner_text("#measured"))
-            return found is not None and np.allclose([*map(float, found.groups())], wanted, 0, 0.06)
+            return found is not None and np.allclose(
+                [*map(float, found.groups())], wanted, 0, 0.06
+            )
 
         wait(said, f"{inside} mm of abs at {column} {row}")
     frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
@@ -565,7 +626,9 @@ def test_names_axes_scale_and_a_look_at_the_sample(scene: Any) -> None:
     layers(scene, opacity=0.6)
 
 
-def test_parts_about_to_touch_are_highlighted(scene: Any, twin: TwinClient, wait: Wait) -> None:
+def test_parts_about_to_touch_are_highlighted(
+    scene: Any, twin: TwinClient, wait: Wait
+) -> None:
     """Their collision bodies turn red, and lose it when they are apart again."""
     box = show(scene, "side")
     red = lambda now: int((now[..., 0] - now[..., 1:].max(axis=2) > 40.0).sum())  # noqa: E731

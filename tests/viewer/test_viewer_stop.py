@@ -31,7 +31,9 @@ WATCH = """
 
 
 def blocked(page: Any, twin: TwinClient, wait: Wait) -> None:
-    page.evaluate("flexdt.call('axes.move', {targets: {mag_det: 1000}, plan: true, wait: true})")
+    page.evaluate(
+        "flexdt.call('axes.move', {targets: {mag_det: 1000}, plan: true, wait: true})"
+    )
     page.evaluate("flexdt.call('tube.set', {on: true})")
     for _ in range(3):
         page.evaluate(INTO)
@@ -50,13 +52,21 @@ def the_button(page: Any) -> tuple[Any, str, str]:
     middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
     hit = "([x, y]) => document.elementFromPoint(x, y)?.id"
     assert page.evaluate(hit, middle) == "estop"
-    return box, button.inner_text(), button.evaluate("e => getComputedStyle(e).backgroundColor")
+    return (
+        box,
+        button.inner_text(),
+        button.evaluate("e => getComputedStyle(e).backgroundColor"),
+    )
 
 
 @pytest.mark.parametrize("size", [(1366, 768), (1000, 700), (800, 600), (360, 640)])
 @pytest.mark.campaign(1)
 def test_the_emergency_stop_never_changes(
-    open_page: Callable[..., Any], lab: Any, twin: TwinClient, wait: Wait, size: tuple[int, int]
+    open_page: Callable[..., Any],
+    lab: Any,
+    twin: TwinClient,
+    wait: Wait,
+    size: tuple[int, int],
 ) -> None:
     page = open_page(size=size)
     always = the_button(page)

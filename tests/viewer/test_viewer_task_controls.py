@@ -43,11 +43,14 @@ def test_a_scan_is_set_by_what_it_is_planned_by(
     until(lambda: rests(twin), "the motors rest")
     assert told(twin.state().geometry) == pytest.approx(value, rel=2e-6)
     until(
-        lambda: float(field.input_value()) == pytest.approx(value, abs=0.005), "the field follows"
+        lambda: float(field.input_value()) == pytest.approx(value, abs=0.005),
+        "the field follows",
     )
 
 
-def test_the_height_moves_source_and_detector_together(page: Any, twin: TwinClient) -> None:
+def test_the_height_moves_source_and_detector_together(
+    page: Any, twin: TwinClient
+) -> None:
     page.click("#tabs [data-tab=move]")
     before = twin.state().axes
     field = page.get_by_label("Sample above beam", exact=True)
@@ -55,7 +58,10 @@ def test_the_height_moves_source_and_detector_together(page: Any, twin: TwinClie
     field.fill(f"{wanted:.2f}")
     field.press("Enter")
     up = lambda axis: twin.state().axes[axis].position - before[axis].position  # noqa: E731
-    until(lambda: up("ver_tube") == pytest.approx(4.0, abs=0.006) and rests(twin), "the source")
+    until(
+        lambda: up("ver_tube") == pytest.approx(4.0, abs=0.006) and rests(twin),
+        "the source",
+    )
     assert up("ver_det") == pytest.approx(up("ver_tube"), abs=1e-6)
     seen = "flexdt.store.framing.sample_height_mm"
     until(lambda: page.evaluate(seen) == pytest.approx(wanted, abs=1e-6), "the height")
@@ -105,7 +111,9 @@ def test_gamma_brightens_what_is_thin_and_keeps_black_and_white(page: Any) -> No
             "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value
         )
         url = page.evaluate("flexdt.picture()")  # pixel by pixel, nothing drawn over it
-        return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))))[..., 0]
+        return np.asarray(
+            Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2])))
+        )[..., 0]
 
     page.wait_for_function("flexdt.store.image && flexdt.store.image.code === 'deflate'")
     plain, bright = set_to(1.0), set_to(2.0)
@@ -128,7 +136,9 @@ def test_a_small_screen_shows_the_button_and_its_sample_beside_each_other(
 ) -> None:
     page = open_page(size=size, fresh=True)
     page.locator("#scan-it").scroll_into_view_if_needed()
-    boxes = [page.locator(name).bounding_box() for name in ("#scan-it", "#scan-it-sample")]
+    boxes = [
+        page.locator(name).bounding_box() for name in ("#scan-it", "#scan-it-sample")
+    ]
     for k, a in enumerate(boxes):
         assert a["x"] >= 0.0
         assert a["x"] + a["width"] <= size[0]
@@ -147,7 +157,9 @@ def test_one_click_ends_with_a_volume_beside_its_truth(
     twin.set_sample("small-3")
     twin.control("release")
     page = open_page(fresh=True)
-    page.wait_for_function("document.querySelector('#scan-it-sample').value === 'small-3'")
+    page.wait_for_function(
+        "document.querySelector('#scan-it-sample').value === 'small-3'"
+    )
     assert page.locator("button.primary:visible", has_text="Scan").count() == 1
     page.click("#scan-it")
     page.locator("#volume-beside").wait_for(timeout=600_000)

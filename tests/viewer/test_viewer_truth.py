@@ -1,4 +1,5 @@
-"""What the page says of its own age: servers that hang, images of another pose, what is refused."""
+"""What the page says of its own age: servers that hang, images of another pose, what is
+refused."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ def hung(process: Any) -> Iterator[float]:
 
 
 def watch(page: Any, selector: str, words: str) -> None:
-    """The page notes itself when an element says `words`: asking it takes a busy machine long."""
+    """The page notes itself when an element says `words`: asking it takes a busy machine
+    long."""
     page.evaluate(
         "([selector, words]) => { window.watcher?.disconnect(); window.shownAt = null;"
         " const node = document.querySelector(selector);"
@@ -62,7 +64,9 @@ def tell(shown: list[float]) -> None:
 
 
 def veil(page: Any) -> str:
-    return str(page.evaluate("document.querySelector('#veil:not([hidden])')?.innerText ?? ''"))
+    return str(
+        page.evaluate("document.querySelector('#veil:not([hidden])')?.innerText ?? ''")
+    )
 
 
 def age(page: Any) -> float:
@@ -120,7 +124,9 @@ def test_a_page_that_stood_still_itself_blames_nobody(page: Any, wait: Wait) -> 
     assert said == []
 
 
-def test_an_emergency_stop_that_nobody_confirms_is_said(page: Any, lab: Any, wait: Wait) -> None:
+def test_an_emergency_stop_that_nobody_confirms_is_said(
+    page: Any, lab: Any, wait: Wait
+) -> None:
     shown = []
     while not shown or (min(shown) >= TOLD_S and len(shown) < TRIES):
         watch(page, "#veil", "E-stop not confirmed")
@@ -150,12 +156,18 @@ def test_requests_to_a_hung_twin_end(open_page: Callable[..., Any], lab: Any) ->
 def test_a_radiograph_of_another_pose_is_said_to_be_old(
     page: Any, lab: Any, twin: TwinClient, wait: Wait
 ) -> None:
-    wait(lambda: page.evaluate("flexdt.store.image !== null && flexdt.store.imageAge === 0"))
+    wait(
+        lambda: page.evaluate(
+            "flexdt.store.image !== null && flexdt.store.imageAge === 0"
+        )
+    )
     shown = []
     while not shown or (min(shown) >= SHOWN_S and len(shown) < TRIES):
         watch(page, "#film-old", "of another pose")
         with hung(lab.projector) as begun:
-            page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 40}, relative: true})")
+            page.evaluate(
+                "flexdt.call('axes.move', {targets: {rot_obj: 40}, relative: true})"
+            )
             shown.append(noted(page, wait) - begun)
             assert page.is_visible("#film-old")
             wait(lambda: not veil(page), "states are as new as ever")
@@ -174,20 +186,27 @@ def test_saturation_is_said(page: Any, twin: TwinClient, wait: Wait) -> None:
     finally:
         tube, camera = before.tube, before.camera
         page.evaluate(
-            "([kV, power_W]) => flexdt.call('tube.set', {kV, power_W})", [tube.kV, tube.power_W]
+            "([kV, power_W]) => flexdt.call('tube.set', {kV, power_W})",
+            [tube.kV, tube.power_W],
         )
-        page.evaluate("t => flexdt.call('camera.set', {exposure_ms: t})", camera.exposure_ms)
+        page.evaluate(
+            "t => flexdt.call('camera.set', {exposure_ms: t})", camera.exposure_ms
+        )
         page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 1}, relative: true})")
     wait(lambda: "saturated" not in page.inner_text("#warnings"), "the warning goes")
 
 
-def test_the_histogram_counts_what_the_image_holds(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_the_histogram_counts_what_the_image_holds(
+    page: Any, twin: TwinClient, wait: Wait
+) -> None:
     # Rows and columns of the film are those of the wire; the page looks at every seventh pixel.
     values = np.asarray(twin.projection().image, dtype=np.float64).ravel()[::7]
 
     def counts_it() -> bool:
         # Whatever coarse or earlier image is still on its way, at rest the page has this one.
-        ask = "import('/film.js').then((m) => [...m.histogram(flexdt.store.image, [0, 1])])"
+        ask = (
+            "import('/film.js').then((m) => [...m.histogram(flexdt.store.image, [0, 1])])"
+        )
         bins = np.array(page.evaluate(ask))
         right, _ = np.histogram(np.clip(values, 0.0, 1.0 - 1e-9), bins.size, (0.0, 1.0))
         # A value on the edge of a bin may fall on either side of it.
@@ -198,7 +217,8 @@ def test_the_histogram_counts_what_the_image_holds(page: Any, twin: TwinClient, 
     wait(counts_it, "the image's histogram")
     drawn = page.evaluate(
         "(() => { const c = document.querySelector('#histogram'), d = c.getContext('2d')"
-        ".getImageData(0, 0, c.width, c.height).data; return d.filter((v, k) => k % 4 == 3 && v)"
+        ".getImageData(0, 0, c.width, c.height).data; return d.filter((v, k) => k % 4 == "
+        "3 && v)"
         ".length; })()"
     )
     assert drawn > 100
@@ -225,7 +245,9 @@ image => {
 @pytest.mark.parametrize("bits", [14, 16])
 @pytest.mark.parametrize("code", ["deflate", "jpeg"])
 @pytest.mark.parametrize("kind", ["counts", "line_integral"])
-def test_flags_are_drawn_by_the_cameras_limits(page: Any, bits: int, code: str, kind: str) -> None:
+def test_flags_are_drawn_by_the_cameras_limits(
+    page: Any, bits: int, code: str, kind: str
+) -> None:
     """As the page gets images at rest and in motion, of cameras of any depth."""
     rng, full = np.random.default_rng([bits, len(code), len(kind)]), 2.0**bits - 1.0
     for most in (0.7, 0.99, 1.0, 1.0):
@@ -267,13 +289,18 @@ def test_a_move_that_halts_early_is_not_called_standing(
     """The motion that the note speaks of is the one that takes place."""
     home = {"mag_obj": 600.0, "mag_det": 1000.0}
     page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", home)
-    rest: Callable[[], bool] = lambda: not any(a.moving for a in twin.state().axes.values())  # noqa: E731
+
+    def rest() -> bool:
+        return not any(a.moving for a in twin.state().axes.values())
+
     wait(lambda: rest() and abs(twin.state().axes["mag_det"].position - 1000.0) < 1e-6)
     page.evaluate(
         "for (const s of document.querySelectorAll('[data-axis=mag_det] input[type=range]'))"
         "{ s.value = s.min; s.dispatchEvent(new Event('change')); }"
     )
-    words = wait(lambda: page.evaluate("document.querySelector('#notes .error b')?.textContent"))
+    words = wait(
+        lambda: page.evaluate("document.querySelector('#notes .error b')?.textContent")
+    )
     wait(rest)
     reached = twin.state().axes["mag_det"].position
     page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", home)

@@ -1,6 +1,7 @@
 """From a page just opened to a volume beside its truth, and what can be done with it there.
 
-`pytest -s -m slow tests/viewer/test_viewer_volume.py` prints clicks, seconds and frames a second.
+`pytest -s -m slow tests/viewer/test_viewer_volume.py` prints clicks, seconds and frames a
+second.
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ def test_from_nothing_to_a_volume_beside_its_truth(
     for axis, size in (("x_mm", x), ("y_mm", y)):
         assert nominal[axis] == pytest.approx([size, size], abs=0.25)
     assert wrong["rms"] > 1.1 * nominal["rms"]
-    names = page.locator("#volume-shown option").evaluate_all("all => all.map((o) => o.value)")
+    names = page.locator("#volume-shown option").evaluate_all(
+        "all => all.map((o) => o.value)"
+    )
     # The correction is wrong, which the volume says, and nothing bounds its error.
     assert names == ["volume", "sigma", "other", "truth", "difference"]
     assert "the axis, is moved" in page.evaluate("flexdt.volume().told.doubts")[0]
@@ -103,11 +106,14 @@ def scrolls_and_turns(page: Any) -> None:
     ms = page.evaluate(
         "() => new Promise((done) => { const s = flexdt.volume().solid, all = [];"
         " const next = () => { s.yaw += 0.1; s.draw(); requestAnimationFrame(() =>"
-        " requestAnimationFrame(() => { all.push(s.ms); all.length < 30 ? next() : done(all); }));"
+        " requestAnimationFrame(() => { all.push(s.ms); all.length < 30 ? next() : "
+        "done(all); }));"
         " }; next(); })"
     )
     wide = page.evaluate("document.querySelector('#volume-ray').width")
-    print(f"{np.median(ms):.0f} ms, {min(ms):.0f} at best, a picture of {wide} x {wide} pixels")
+    print(
+        f"{np.median(ms):.0f} ms, {min(ms):.0f} at best, a picture of {wide} x {wide} pixels"
+    )
     turned = picture(page.locator("#volume-ray"))
     assert np.abs(turned - before).max(axis=2).mean() > 2, "it is another picture"
     page.select_option("#volume-cut", "1")
@@ -129,7 +135,9 @@ def is_shared(page: Any, folder: Path) -> None:
     said: list[str] = []
     alone = page.context.browser.new_page(viewport={"width": 1280, "height": 900})
     alone.on("pageerror", lambda error: said.append(str(error)))
-    alone.on("request", lambda r: said.append(r.url) if r.url.startswith("http") else None)
+    alone.on(
+        "request", lambda r: said.append(r.url) if r.url.startswith("http") else None
+    )
     alone.goto(file.as_uri())
     alone.wait_for_function("document.querySelector('#ray').width > 1")
     assert re.fullmatch(r"lego · \d{4}-\d\d-\d\d \d\d:\d\d · flexdt", alone.title())

@@ -66,7 +66,8 @@ CORRECTION = Offsets.from_edge(
 
 @pytest.mark.parametrize("correction", [Offsets(), CORRECTION])
 def test_world_and_rows_project_alike(correction: Offsets) -> None:
-    """Points of the object drawn in the world appear where the rows say, seen from the source."""
+    """Points of the object drawn in the world appear where the rows say, seen from the
+    source."""
     world = placed(MACHINE, PROFILE, CAMERA, AT, correction)
     cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(correction)
     points = np.random.default_rng(1).uniform(-20.0, 20.0, (30, 3))
@@ -79,11 +80,15 @@ def test_world_and_rows_project_alike(correction: Offsets) -> None:
     column = hits @ world.u / (world.u @ world.u) + (cols - 1) / 2
     row = hits @ world.v / (world.v @ world.v) + (rows - 1) / 2
     np.testing.assert_allclose(np.stack([column, row], axis=1), wanted, atol=1e-8)
-    np.testing.assert_allclose(world.piercing_px, cone.piercing_points(CAMERA.shape)[0], atol=1e-8)
+    np.testing.assert_allclose(
+        world.piercing_px, cone.piercing_points(CAMERA.shape)[0], atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("name", builtin_machines())
-def test_without_a_correction_tube_and_panel_stand_where_their_motors_are(name: str) -> None:
+def test_without_a_correction_tube_and_panel_stand_where_their_motors_are(
+    name: str,
+) -> None:
     """Also where stages on the turntable hold the sample beside the axis."""
     machine = builtin_machine(name)
     at = {n: 0.9 * axis.home + 0.1 * axis.upper for n, axis in machine.axes.items()}
@@ -122,7 +127,8 @@ def test_quaternion() -> None:
 
 @pytest.mark.parametrize("tra_det", [-30.0, 24.1, 60.0, 95.0])
 def test_beams_eye_frames_exactly_the_image(tra_det: float) -> None:
-    """A symmetric camera and the page's crop together show the image's corners at the corners."""
+    """A symmetric camera and the page's crop together show the image's corners at the
+    corners."""
     world = placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": tra_det, "tra_tube": 0.0})
     camera, frame = beam_view(world)
     assert frame["exact"]
@@ -143,7 +149,9 @@ def test_beams_eye_frames_exactly_the_image(tra_det: float) -> None:
 
 
 def test_far_off_axis_the_beams_eye_says_that_it_is_not_exact() -> None:
-    assert not beam_view(placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": 404.0}))[1]["exact"]
+    assert not beam_view(placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": 404.0}))[1][
+        "exact"
+    ]
 
 
 @pytest.mark.parametrize("name", builtin_machines())
@@ -177,7 +185,9 @@ def test_an_unknown_upload_is_a_box_of_its_size() -> None:
 def test_an_upload_looks_as_the_twin_says_once_its_shape_has_come() -> None:
     mesh = trimesh.creation.annulus(3.0, 5.0, 8.0)
     mesh.apply_translation([0.5, 0.0, 0.0])
-    sample = SampleState(name="ring", revision="1", material="pmma", size_mm=(10.0, 10.0, 8.0))
+    sample = SampleState(
+        name="ring", revision="1", material="pmma", size_mm=(10.0, 10.0, 8.0)
+    )
     wardrobe = MeshCache()
     assert not wardrobe.look(sample).exact
     assert wardrobe.lacks(sample)
@@ -225,7 +235,9 @@ def test_a_shape_comes_in_parts_or_not_at_all() -> None:
 def test_packed_pixels_come_out_within_half_a_step() -> None:
     pixels = np.random.default_rng(2).uniform(-0.1, 2.5, (31, 41)).astype(np.float32)
     image = ShownImage(pixels, "line_integral", (0.0,) * 12, 1.5, 7)
-    head, values = _unpack(packed(image, coarse=False, beads=[(1.5, 2.5)], facts={"x": 1}))
+    head, values = _unpack(
+        packed(image, coarse=False, beads=[(1.5, 2.5)], facts={"x": 1})
+    )
     assert np.abs(values - pixels).max() <= 0.51 * head["scale"]
     assert (head["seq"], head["beads"], head["x"]) == (7, [[1.5, 2.5]], 1)
     head, values = _unpack(packed(image, coarse=True, beads=[], facts={}))
@@ -237,7 +249,9 @@ def test_packed_pixels_come_out_within_half_a_step() -> None:
 
 def test_a_coarse_image_is_near_and_small() -> None:
     y, x = np.mgrid[:760, :956] / 956.0
-    pixels = np.exp(-((x - 0.5) ** 2 + (y - 0.4) ** 2) * 9.0) + 0.3 * (np.hypot(x - 0.6, y) < 0.2)
+    pixels = np.exp(-((x - 0.5) ** 2 + (y - 0.4) ** 2) * 9.0) + 0.3 * (
+        np.hypot(x - 0.6, y) < 0.2
+    )
     image = ShownImage(pixels.astype(np.float32), "line_integral", (0.0,) * 12, 1.5, 7)
     content = packed(image, coarse=True, beads=[], facts={})
     _, values = _unpack(content)
@@ -284,7 +298,9 @@ def _unpack(content: bytes) -> tuple[dict[str, Any], np.ndarray]:
         raw = np.asarray(Image.open(io.BytesIO(body)), dtype=np.float64) * 257.0
         assert list(raw.shape) == head["shape"]
     else:
-        low, high = np.frombuffer(zlib.decompress(body), np.uint8).reshape(2, *head["shape"])
+        low, high = np.frombuffer(zlib.decompress(body), np.uint8).reshape(
+            2, *head["shape"]
+        )
         raw = np.cumsum(low + 256 * high.astype(np.int64), axis=1) % 65536
     return head, head["low"] + head["scale"] * raw
 
@@ -292,7 +308,9 @@ def _unpack(content: bytes) -> tuple[dict[str, Any], np.ndarray]:
 def test_the_margin_is_the_body_and_what_is_within_the_clearance_of_it() -> None:
     """Box: faces moved out by the margin, corners round. Cylinder: the same about its axis."""
     low, high = np.array([-5.0, -3.0, 1.0]), np.array([7.0, 4.0, 2.0])
-    corners = np.array([[x, y, z] for x in (-5, 7) for y in (-3, 4) for z in (1, 2)], dtype=float)
+    corners = np.array(
+        [[x, y, z] for x in (-5, 7) for y in (-3, 4) for z in (1, 2)], dtype=float
+    )
     shell = grown(bare(hull(corners)), 2.5)
     np.testing.assert_allclose(shell.bounds, [low - 2.5, high + 2.5], atol=1e-9)
     points = np.asarray(shell.vertices)
@@ -319,13 +337,21 @@ def test_the_scene_draws_the_machines_own_margin() -> None:
             for name, shell in scene._margins.items():
                 bare = np.asarray(scene._hulls[name].vertices) * 1000.0
                 grown = np.asarray(shell.vertices) * 1000.0
-                np.testing.assert_allclose(grown.min(axis=0), bare.min(axis=0) - margin, atol=1e-3)
-                np.testing.assert_allclose(grown.max(axis=0), bare.max(axis=0) + margin, atol=1e-3)
-        assert not any(h.visible for h in (*scene._margins.values(), *scene._hulls.values()))
+                np.testing.assert_allclose(
+                    grown.min(axis=0), bare.min(axis=0) - margin, atol=1e-3
+                )
+                np.testing.assert_allclose(
+                    grown.max(axis=0), bare.max(axis=0) + margin, atol=1e-3
+                )
+        assert not any(
+            h.visible for h in (*scene._margins.values(), *scene._hulls.values())
+        )
 
         def seen(kind: str, shown: Shown, near: tuple[str, ...] = ()) -> set[str]:
             nodes = scene.nodes(shown, near)
-            return {n.split("/")[2] for n in nodes if n.endswith(kind) and nodes[n]["visible"]}
+            return {
+                n.split("/")[2] for n in nodes if n.endswith(kind) and nodes[n]["visible"]
+            }
 
         margins = Shown().changed(margin=True)
         assert seen("/margin", margins) == set(scene._margins)
@@ -363,9 +389,14 @@ def test_a_handle_is_at_its_stage_when_the_drag_is_over() -> None:
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0)
     try:
-        gizmos = Gizmos(server, MACHINE, lambda client, targets: aims.append(dict(targets)))
+        gizmos = Gizmos(
+            server, MACHINE, lambda client, targets: aims.append(dict(targets))
+        )
         world = placed(MACHINE, PROFILE, CAMERA, AT)
-        axes = {n: SimpleNamespace(position=AT.get(n, a.home)) for n, a in MACHINE.axes.items()}
+        axes = {
+            n: SimpleNamespace(position=AT.get(n, a.home))
+            for n, a in MACHINE.axes.items()
+        }
         state = cast(State, SimpleNamespace(axes=axes))
         gizmos.update(state, world)
         handle = next(h for h in gizmos._handles if h.stage == "detector")
@@ -376,7 +407,12 @@ def test_a_handle_is_at_its_stage_when_the_drag_is_over() -> None:
             for follow in handle.control._impl_aux.update_cb:
                 await follow(SimpleNamespace(phase=phase, client_id=1))
 
-        for phase, shift in (("start", 0.0), ("update", -0.01), ("end", -0.02), ("update", -0.02)):
+        for phase, shift in (
+            ("start", 0.0),
+            ("update", -0.01),
+            ("end", -0.02),
+            ("update", -0.02),
+        ):
             asyncio.run(say(phase, shift))
         assert [a["mag_det"] for a in aims] == pytest.approx([1010.0, 1000.0])
         np.testing.assert_allclose(handle.control.position, here)
@@ -413,12 +449,16 @@ def _state() -> Any:
     from flexdt.server.twin.state_views import camera_view
 
     return State.model_construct(
-        axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)
+        axes={},
+        camera=camera_view(CAMERA, MACHINE),
+        correction=None,
+        sample=SampleState(name=None),
     )
 
 
 def test_the_beam_in_the_air_has_the_transmission_of_the_pixels_behind_it() -> None:
-    """Where a place's ray ends on the panel is found here, from the rows of the geometry alone."""
+    """Where a place's ray ends on the panel is found here, from the rows of the geometry
+    alone."""
     rng = np.random.default_rng(4)
     for _ in range(4):
         at = {**AT, "ver_tube": rng.uniform(20, 80), "tra_det": rng.uniform(0, 60)}
@@ -429,20 +469,26 @@ def test_the_beam_in_the_air_has_the_transmission_of_the_pixels_behind_it() -> N
         for k, plane in enumerate(fans(world, lines, 25.0)):
             upright, behind, seen = k < 2, k % 2 == 1, 0
             size, other = (rows, cols) if upright else (cols, rows)
-            for r, c in zip(rng.integers(0, 160, 200), rng.integers(20, 192, 200), strict=True):
+            for r, c in zip(
+                rng.integers(0, 160, 200), rng.integers(20, 192, 200), strict=True
+            ):
                 place = plane.center + plane.axes[:, :2] @ (
                     np.array(plane.size) * [(c + 0.5) / 192 - 0.5, (r + 0.5) / 160 - 0.5]
                 )
                 depth = (place - world.sample.shift) @ plane.axes[:, 0]
                 assert depth > 25.0 if behind else depth < -25.0
-                a, b, _ = np.linalg.solve(np.stack([u, v, source - place], axis=1), source - middle)
+                a, b, _ = np.linalg.solve(
+                    np.stack([u, v, source - place], axis=1), source - middle
+                )
                 along, across = (b + rows / 2, a + cols / 2)[:: 1 if upright else -1]
                 assert across == pytest.approx(other / 2, abs=1e-6)
                 if abs(along % 1.0 - 0.5) > 0.49:
                     continue  # between two pixels
                 light = float(0.0 < along < size)
                 if light and behind:
-                    pixel = (int(along), cols // 2) if upright else (rows // 2, int(along))
+                    pixel = (
+                        (int(along), cols // 2) if upright else (rows // 2, int(along))
+                    )
                     light = math.exp(-lines[pixel])
                 assert plane.rgba[r, c, 3] == pytest.approx(MOST * light, abs=1.0)
                 seen += light > 0.0
@@ -457,7 +503,9 @@ def test_the_beam_is_never_a_wall() -> None:
     most = 0.0
     for _ in range(3000):
         part = rng.uniform(0.02, 0.98)
-        target = world.source + part * (rng.dirichlet(np.ones(4)) @ world.corners - world.source)
+        target = world.source + part * (
+            rng.dirichlet(np.ones(4)) @ world.corners - world.source
+        )
         way = rng.normal(size=3)
         eye, kept = target - way * rng.uniform(5.0, 800.0) / np.linalg.norm(way), 1.0
         for sheet in sheets:
@@ -480,14 +528,20 @@ def test_what_is_drawn_of_axis_and_beam_follows_stage_and_tube() -> None:
             world = placed(MACHINE, PROFILE, CAMERA, {**AT, "mag_obj": sod})
             lines = np.full(world.shape, 0.5)
             scene.show_image(np.zeros((8, 8, 3), np.uint8), lines, world)
-            scene._show_beam(cast(State, SimpleNamespace(tube=SimpleNamespace(on=on))), world)
-            np.testing.assert_allclose(scene._axis.position, world.axis / 1000.0, atol=1e-9)
+            scene._show_beam(
+                cast(State, SimpleNamespace(tube=SimpleNamespace(on=on))), world
+            )
+            np.testing.assert_allclose(
+                scene._axis.position, world.axis / 1000.0, atol=1e-9
+            )
             shade = server.scene.get_handle_by_name("/beam/shade1")
             assert shade is not None
             assert shade.visible == on
             if on:  # the light begins behind the sample
                 begins = shade.position[1] - shade.render_width / 2
-                assert begins == pytest.approx((world.sample.shift[1] + 1.0) / 1000.0, abs=0.002)
+                assert begins == pytest.approx(
+                    (world.sample.shift[1] + 1.0) / 1000.0, abs=0.002
+                )
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()

@@ -78,7 +78,9 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     energy = tables().energy_keV
     stored = _scattering()
     # Of an atom by atomic number from 1, (92, q), at (q,) values of x whose root grows evenly.
-    x, form_factor, function = (stored[name] for name in ("x", "form_factor", "incoherent"))
+    x, form_factor, function = (
+        stored[name] for name in ("x", "form_factor", "incoherent")
+    )
     form, shell = np.zeros((2, len(substances), len(x)))
     for m, one in enumerate(substances):
         for row, part in one.parts:
@@ -87,7 +89,9 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
             form[m] += atoms * RADIUS2_BARN * form_factor[row] ** 2
             shell[m] += atoms * RADIUS2_BARN * function[row]
     rings = np.diff(x**2) * (form[:, 1:] + form[:, :-1]) / 2.0
-    cumulated = np.concatenate([np.zeros((len(form), 1)), np.cumsum(rings, axis=1)], axis=1)
+    cumulated = np.concatenate(
+        [np.zeros((len(form), 1)), np.cumsum(rings, axis=1)], axis=1
+    )
     # Integrals over the sphere, in w = sin(theta / 2)^(1/2): the forward peak is broad there.
     points, weights = np.polynomial.legendre.leggauss(160)
     w = (points + 1.0) / 2.0
@@ -101,9 +105,18 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     thomson = 0.5 * (1.0 + cosine**2) * ring
     klein_nishina = 0.5 * k**2 * (k + 1.0 / k - 1.0 + cosine**2) * ring
     coherent = [(np.interp(column, index, row) * thomson).sum(axis=1) for row in form]
-    incoherent = [(np.interp(column, index, row) * klein_nishina).sum(axis=1) for row in shell]
+    incoherent = [
+        (np.interp(column, index, row) * klein_nishina).sum(axis=1) for row in shell
+    ]
     total = [one.attenuation() for one in substances]
-    arrays = np.array(total), np.array(coherent), np.array(incoherent), form, shell, cumulated
+    arrays = (
+        np.array(total),
+        np.array(coherent),
+        np.array(incoherent),
+        form,
+        shell,
+        cumulated,
+    )
     for array in arrays:  # shared by all callers
         array.flags.writeable = False
     return CrossSections(energy, *arrays[:3], root_step, *arrays[3:])

@@ -84,7 +84,9 @@ def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         (name -> array, provenance).
     """
     with (
-        (resources.files("flexdt.twin.attenuation") / "data" / file).open("rb") as content,
+        (resources.files("flexdt.twin.attenuation") / "data" / file).open(
+            "rb"
+        ) as content,
         np.load(content, allow_pickle=False) as stored,
     ):
         arrays = {
@@ -115,7 +117,9 @@ class Substance:
     def __post_init__(self) -> None:
         if not 0.0 < (density := self.density_g_cm3) <= MAX_DENSITY_G_CM3:
             message = f"{self.name}: density {density:g} g/cm3"
-            raise LimitError.instead(message, density, f"above 0 and at most {MAX_DENSITY_G_CM3:g}")
+            raise LimitError.instead(
+                message, density, f"above 0 and at most {MAX_DENSITY_G_CM3:g}"
+            )
         for symbol, part in self.fractions:
             _row(symbol)
             if not part > 0.0:
@@ -123,7 +127,9 @@ class Substance:
                 raise LimitError.instead(message, part, "above 0")
         total = sum(part for _, part in self.fractions)
         if not math.isclose(total, 1.0, abs_tol=2e-3):
-            raise LimitError.instead(f"{self.name}: mass fractions add up to {total:g}", total, 1.0)
+            raise LimitError.instead(
+                f"{self.name}: mass fractions add up to {total:g}", total, 1.0
+            )
 
     @property
     def parts(self) -> list[tuple[int, float]]:
@@ -139,7 +145,9 @@ class Substance:
             UnknownNameError: an element the table does not have.
             LimitError: a formula that cannot be read, or an impossible density.
         """
-        return cls(name, tuple(mass_fractions(parse_formula(formula)).items()), density_g_cm3)
+        return cls(
+            name, tuple(mass_fractions(parse_formula(formula)).items()), density_g_cm3
+        )
 
     @classmethod
     def parse(cls, text: str) -> Substance:
@@ -197,7 +205,9 @@ def _mass_at(row: int, energy_keV: float) -> float:
     bins = tables().energy_keV
     edges = tables().edges_keV[row]
     total = tables().total[row]
-    alike = np.searchsorted(edges, bins, "right") == np.searchsorted(edges, energy_keV, "right")
+    alike = np.searchsorted(edges, bins, "right") == np.searchsorted(
+        edges, energy_keV, "right"
+    )
     away = np.abs(bins - energy_keV)
     near, far = np.argsort(np.where(alike, away, np.inf) if alike.any() else away)[:2]
     slope = ABSORPTION_EXPONENT  # if there is only one bin between two edges
@@ -242,7 +252,10 @@ def parse_formula(formula: str) -> dict[str, float]:
 
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
     """Compute the mass fractions of a compound from its numbers of atoms."""
-    masses = {symbol: n * float(tables().molar_mass[_row(symbol)]) for symbol, n in atoms.items()}
+    masses = {
+        symbol: n * float(tables().molar_mass[_row(symbol)])
+        for symbol, n in atoms.items()
+    }
     total = sum(masses.values())
     return {symbol: mass / total for symbol, mass in masses.items()}
 
@@ -262,6 +275,8 @@ def _row(symbol: str) -> int:
 
 def _unreadable(formula: str, at: int) -> LimitError:
     """Make the error for a formula that cannot be parsed at character `at`."""
-    allowed = "element symbols with counts and parentheses, such as C15H17N or Ca5(PO4)3OH"
+    allowed = (
+        "element symbols with counts and parentheses, such as C15H17N or Ca5(PO4)3OH"
+    )
     message = f"formula {formula!r} cannot be read at character {at + 1}"
     return LimitError.instead(message, formula, allowed, at=at)

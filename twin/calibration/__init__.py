@@ -1,6 +1,11 @@
 """Geometric calibration from a bead phantom: detect, identify, fit, certify, predict."""
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
+from flexdt.twin.calibration.bead_model import (
+    BeadModel,
+    BeadPhantom,
+    bead_model,
+    spot_radii,
+)
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
 from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
 from flexdt.twin.calibration.fit.fit import (
@@ -14,7 +19,11 @@ from flexdt.twin.calibration.fit.fit import (
     image_slopes,
     require_identifiable,
 )
-from flexdt.twin.calibration.fit.identifiability import Prediction, identifiability, visible_beads
+from flexdt.twin.calibration.fit.identifiability import (
+    Prediction,
+    identifiability,
+    visible_beads,
+)
 from flexdt.twin.calibration.fit.problem import (
     EIGHT,
     SIX,
@@ -24,7 +33,12 @@ from flexdt.twin.calibration.fit.problem import (
     edge_factor,
 )
 from flexdt.twin.calibration.fit.weak_directions import Direction, tolerance_of
-from flexdt.twin.calibration.identify import Identification, Search, identify_beads, overlapping
+from flexdt.twin.calibration.identify import (
+    Identification,
+    Search,
+    identify_beads,
+    overlapping,
+)
 
 __all__ = [
     "EIGHT",

@@ -39,8 +39,8 @@ class BeadModel:
     Attributes:
         beads: centres in the object's frame, (k, 3) [mm].
         bead_radius_mm: (k,) [mm].
-        tolerance_mm: standard deviation of each coordinate of each bead about `beads` [mm]; 0 if
-            the phantom is exact.
+        tolerance_mm: standard deviation of each coordinate of each bead about `beads` [mm]; 0
+            if the phantom is exact.
         name: for reports.
         contrast: (k,) line integral through each bead's middle above its surroundings;
             None: all are of one material.
@@ -114,11 +114,15 @@ def with_contrast(model: BeadModel, scene: Scene | None) -> BeadModel:
         model: the beads.
         scene: the phantom's solids; None if it has none.
     """
-    balls = [solid for solid in (scene or Scene(())).solids if isinstance(solid.shape, Sphere)]
+    balls = [
+        solid for solid in (scene or Scene(())).solids if isinstance(solid.shape, Sphere)
+    ]
     if model.contrast is not None or not balls:
         return model
     nearest = [_ball_of(balls, centre) for centre in model.beads]
-    gaps = np.linalg.norm(np.array([_centre(ball) for ball in nearest]) - model.beads, axis=1)
+    gaps = np.linalg.norm(
+        np.array([_centre(ball) for ball in nearest]) - model.beads, axis=1
+    )
     if not (gaps < 0.5 * model.bead_radius_mm).all():
         return model
     attenuation = np.array([ball.mu_per_mm for ball in nearest])

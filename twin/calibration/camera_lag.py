@@ -47,7 +47,10 @@ class Lag:
 
 
 def lag_of(
-    images: Float32Array, frames: Frames, plan: Windows, usable: npt.NDArray[np.bool_] | None = None
+    images: Float32Array,
+    frames: Frames,
+    plan: Windows,
+    usable: npt.NDArray[np.bool_] | None = None,
 ) -> Lag:
     """Estimate the lag of a scan, from places far from all beads of the frame itself.
 
@@ -65,15 +68,22 @@ def lag_of(
         there = _rolled(plan, step)
         shadow = np.roll(light, step, axis=0)
         shadow[0 if step == 1 else -1] = np.nan  # the first has none before it
-        shown, near = np.exp(-frames.windows(there)[some]), _near(there.corner[some], plan, some)
+        shown, near = (
+            np.exp(-frames.windows(there)[some]),
+            _near(there.corner[some], plan, some),
+        )
         if usable is not None:
             shown[~usable[some]] = np.nan
         sums.append(_products(shown, np.where(near, np.nan, shadow[some])))
     (with_before, before), (with_after, after) = sums
     if min(np.count_nonzero(before), np.count_nonzero(after)) < FEWEST_BEADS:
         return Lag()
-    one, other = (float(p.sum() / q.sum()) for p, q in ((with_before, before), (with_after, after)))
-    apart = (with_before - one * before) / before.sum() - (with_after - other * after) / after.sum()
+    one, other = (
+        float(p.sum() / q.sum()) for p, q in ((with_before, before), (with_after, after))
+    )
+    apart = (with_before - one * before) / before.sum() - (
+        with_after - other * after
+    ) / after.sum()
     part = max(one - other, 0.0)
     return Lag(part / (1.0 + part), math.sqrt(float((apart**2).sum())))
 
@@ -104,7 +114,9 @@ def _rolled(plan: Windows, step: int) -> Windows:
     return replace(plan, **{n: np.roll(getattr(plan, n), step, axis=0) for n in names})
 
 
-def _near(corner: npt.NDArray[np.int64], plan: Windows, some: slice) -> npt.NDArray[np.bool_]:
+def _near(
+    corner: npt.NDArray[np.int64], plan: Windows, some: slice
+) -> npt.NDArray[np.bool_]:
     """Mark pixels of windows (n, k, side, side) that are near a bead of that frame."""
     reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
     out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
@@ -130,8 +142,12 @@ def _bent(light: npt.NDArray[Any], use: npt.NDArray[np.bool_]) -> FloatArray:
     x = np.linspace(-1.0, 1.0, light.shape[-1])
     right, down = np.broadcast_arrays(x[None, :], x[:, None])
     terms = np.stack([right**0, right, down, right**2, right * down, down**2])
-    normal = np.einsum("nkrc,arc,brc->nkab", use, terms, terms) + 1e-9 * np.eye(len(terms))
+    normal = np.einsum("nkrc,arc,brc->nkab", use, terms, terms) + 1e-9 * np.eye(
+        len(terms)
+    )
     values = np.where(use, light, 0.0)
     push = np.einsum("nkrc,arc->nka", values, terms)
-    smooth = np.einsum("nka,arc->nkrc", np.linalg.solve(normal, push[..., None])[..., 0], terms)
+    smooth = np.einsum(
+        "nka,arc->nkrc", np.linalg.solve(normal, push[..., None])[..., 0], terms
+    )
     return np.where(use, values - smooth, 0.0)

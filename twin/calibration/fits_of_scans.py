@@ -83,7 +83,9 @@ def fit_scans(
     Returns:
         The fit; with motion, its sigmas contain the motion's uncertainty.
     """
-    tolerance = request.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
+    tolerance = (
+        request.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
+    )
     seen = state.measured or state.identifications
     weighed = positions_weighed(state)
     frames = [len(scan.poses) for scan in state.scans]
@@ -149,9 +151,14 @@ def refit_scans(
     freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))
     turning = fit.problem.curvature is not None if arc is None else arc
     return fit_scans(
-        state, freed, begin, bead_tolerance_mm, panel or fit.problem.panel,
-        fit.strain_prior if strain is None else strain, turning,
-    )  # fmt: skip
+        state,
+        freed,
+        begin,
+        bead_tolerance_mm,
+        panel or fit.problem.panel,
+        fit.strain_prior if strain is None else strain,
+        turning,
+    )
 
 
 def positions_weighed(state: Calibration) -> bool:

@@ -124,7 +124,10 @@ def check_fixed(
     verdict = judge_priors(loose_fit, exact)
     errors = {f.code for f in explained if f.forbids}
     if verdict.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
-        return fit, [*_left_by_priors(state, usual, loose_fit, explained), verdict.finding]
+        return fit, [
+            *_left_by_priors(state, usual, loose_fit, explained),
+            verdict.finding,
+        ]
     found = []
     if verdict.factor > 1.0:
         found.append(narrow_priors(verdict))
@@ -209,11 +212,15 @@ def _left_by_priors(
     """Return the findings that remain with wider priors, where priors are off."""
     priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
-    moved = [f for f in explained if f.code == "bead_tolerance" and loose_fit.bead_prior_mm]
+    moved = [
+        f for f in explained if f.code == "bead_tolerance" and loose_fit.bead_prior_mm
+    ]
     return [*(f for f in left if f.code != "misfit"), *moved]
 
 
-def _doubted(fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]) -> FitResult:
+def _doubted(
+    fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]
+) -> FitResult:
     """Widen the intervals by the change that fixed parameters would make, where the data
     doubt them.
     """
@@ -223,7 +230,9 @@ def _doubted(fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]) ->
     return replace(fit, certificate=widened(fit.certificate, doubt))
 
 
-def _fit_with_fixed(state: Calibration, request: CalibrationRequest, fit: FitResult) -> FitResult:
+def _fit_with_fixed(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> FitResult:
     """Fit from the geometry of another fit, with the fixed parameters of `request` at
     their values.
     """

@@ -1,7 +1,7 @@
 """Where calibration gets its images from: a small protocol, images held in memory, and a scan.
 
-A source detects beads in its frames and cuts windows out of them. How it reads and normalises the
-images, and on how many threads, is left to the source.
+A source detects beads in its frames and cuts windows out of them. How it reads and normalises
+the images, and on how many threads, is left to the source.
 """
 
 from __future__ import annotations
@@ -152,7 +152,9 @@ class SpotFrames:
         """Cut the windows of every frame; nan without images."""
         if self.images is not None:
             return self.images.windows(plan)
-        return np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan, dtype=np.float32)
+        return np.full(
+            (*plan.corner.shape[:2], plan.side, plan.side), np.nan, dtype=np.float32
+        )
 
 
 @dataclass(frozen=True, eq=False)

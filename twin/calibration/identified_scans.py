@@ -60,9 +60,13 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
                 break
             looks[i] = _without(looks[i], numbers.again.tolist())
             detections = _spots(scan, looks[i])
-            seek = partial(attempt, detections, state.model, scan.poses, start=request.start)
+            seek = partial(
+                attempt, detections, state.model, scan.poses, start=request.start
+            )
             found = seek()
-        told = explain_identification(found, detections, state.model, scan.poses, scan.name)
+        told = explain_identification(
+            found, detections, state.model, scan.poses, scan.name
+        )
         if request.per_frame and told is not None and told.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
             found = seek(search=Search(gate_px=WIDE_GATE_PX)) or found
@@ -78,10 +82,14 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
 def _spots(scan: Scan, looks: Sequence[FrameSpots]) -> list[Detections]:
     """Return the spots of each frame; empty for frames that repeat another."""
     unseen = nothing(scan.frames.shape)
-    return [unseen if look.state is FrameState.REPEATED else look.detections for look in looks]
+    return [
+        unseen if look.state is FrameState.REPEATED else look.detections for look in looks
+    ]
 
 
-def _without(looks: Sequence[FrameSpots], frames: Sequence[int]) -> tuple[FrameSpots, ...]:
+def _without(
+    looks: Sequence[FrameSpots], frames: Sequence[int]
+) -> tuple[FrameSpots, ...]:
     """Mark some frames as unused."""
     again = frozenset(frames)
     return tuple(
@@ -120,7 +128,9 @@ def _numbers(
         if base is None or not base.typical_px < NEAR_PX:
             continue
         spread = max(base.typical_px, LEAST_TYPICAL_PX)
-        numbers = frame_numbers(detections, model.beads, scan.poses, base.parameters, spread)
+        numbers = frame_numbers(
+            detections, model.beads, scan.poses, base.parameters, spread
+        )
         if numbers is not None:
             return numbers
     return None

@@ -1,10 +1,10 @@
-"""Identification: which spot belongs to which bead, given the phantom's model and a rough geometry
-without a start angle.
+"""Identification: which spot belongs to which bead, given the phantom's model and a rough
+geometry without a start angle.
 
 Many start angles are tried on some of the frames: predict, vote for the shift that brings
-predictions and spots together, assign within each frame (`linear_sum_assignment`), fit, and repeat
-with a narrower gate. The best hypothesis is finished on all frames. If others explain the spots
-equally well with another angle, the result is reported as ambiguous.
+predictions and spots together, assign within each frame (`linear_sum_assignment`), fit, and
+repeat with a narrower gate. The best hypothesis is finished on all frames. If others explain
+the spots equally well with another angle, the result is reported as ambiguous.
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
+from flexdt.twin.calibration.bead_model import (
+    BeadModel,
+    BeadPhantom,
+    bead_model,
+    spot_radii,
+)
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.calibration.fit.identifiability import visible_beads
@@ -30,7 +35,8 @@ from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
 LOOSE_PX = 0.6
-"""Root mean square distance of spots from their beads above which panel and axis are loosened."""
+"""Root mean square distance of spots from their beads above which panel and axis are
+loosened."""
 LOOSE_FACTOR = 15.0
 """Factor on the priors of panel and axis then."""
 WIDE_PX, NARROW_PX = (120.0, 60.0, 40.0), (25.0, 15.0, 10.0)
@@ -153,8 +159,8 @@ def identify(
     Args:
         detections: of each of the n frames.
         phantom: the beads.
-        geometry: rough geometry of each frame; positions may be off by centimetres and the start
-            angle may be anything, but the angles between frames must be right.
+        geometry: rough geometry of each frame; positions may be off by centimetres and the
+            start angle may be anything, but the angles between frames must be right.
         start: offsets to begin with.
         search: settings; None is the default.
         loose: standard deviations [mm, deg, 1] of other offsets that may be off.
@@ -178,9 +184,12 @@ def identify(
     chosen = _spread(np.flatnonzero(counts > 0), how.frames)
     some = scene.take(chosen)
     problem = build_problem(
-        np.full((len(chosen), len(model), 2), np.nan), model, poses[chosen], free=SIX,
+        np.full((len(chosen), len(model), 2), np.nan),
+        model,
+        poses[chosen],
+        free=SIX,
         shape=shapes[chosen],
-    )  # fmt: skip
+    )
     base = np.array([getattr(start, n) for n in SIX])
     turn = np.eye(len(SIX))[SIX.index("alpha")] * 2.0 * math.pi / how.starts
     hypotheses = [_Hypothesis(base + i * turn, math.inf, 0) for i in range(how.starts)]
@@ -195,13 +204,17 @@ def identify(
         _finish(whole, scene, h, how) for h in _different(hypotheses)[:MAX_FINALISTS]
     )
     if finals and (loose or finals[0].loss > LOOSE_PX**2):
-        # A rolled panel or a leaning axis looks like another phantom: only loose priors tell. Where
-        # the six explain the spots, this is not needed.
+        # A rolled panel or a leaning axis looks like another phantom: only loose priors tell.
+        # Where the six explain the spots, this is not needed.
         whole = build_problem(
-            np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes,
+            np.full((len(poses), len(model), 2), np.nan),
+            model,
+            poses,
+            free=SIX,
+            shape=shapes,
             start=start,
             priors={n: LOOSE_FACTOR * w for n, w in ASSUMED.items()} | dict(loose or {}),
-        )  # fmt: skip
+        )
         finals = _best_first(_finish(whole, scene, h, how, wide_px=60.0) for h in finals)
     return _report(whole, scene, finals, shapes, start, how)
 
@@ -228,7 +241,9 @@ def identified(
     """
     shadows = _Shadows.of(detections)
     origin = (np.array([d.shape[::-1] for d in detections], dtype=np.float64) - 1) / 2
-    return Identification(*shadows.picked(index, origin), index, start, math.nan, 1.0, 1.0, ())
+    return Identification(
+        *shadows.picked(index, origin), index, start, math.nan, 1.0, 1.0, ()
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +363,9 @@ def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
     grid = np.zeros(keys.max(axis=0) - low + 3)
     np.add.at(grid, tuple((keys - low + 1).T), 1.0)
     # Votes of a cell and its neighbours: the peak may straddle cells.
-    summed = sum(np.roll(grid, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
+    summed = sum(
+        np.roll(grid, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)
+    )
     peak = np.array(np.unravel_index(int(np.argmax(summed)), grid.shape)) + low - 1
     near = (np.abs(keys - peak) <= 1).all(axis=1)
     shift = flat[near].mean(axis=0)
@@ -424,7 +441,8 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
     index = assign(predicted, shadows.points, shadows.counts, cap)
     frames, beads = np.nonzero(index >= 0)
     d2 = np.sum(
-        (predicted[frames, beads] - shadows.points[frames, index[frames, beads]]) ** 2, axis=1
+        (predicted[frames, beads] - shadows.points[frames, index[frames, beads]]) ** 2,
+        axis=1,
     )
     possible = np.minimum(shadows.counts, predicted.shape[1]).sum()
     missing = int(possible) - len(d2)
@@ -446,7 +464,9 @@ def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
     """Keep hypotheses that ended at different angles, best first."""
     out: list[_Hypothesis] = []
     for h in hypotheses:
-        if math.isfinite(h.loss) and all(_turn_between(h.x, o.x) > math.radians(3.0) for o in out):
+        if math.isfinite(h.loss) and all(
+            _turn_between(h.x, o.x) > math.radians(3.0) for o in out
+        ):
             out.append(h)
     return out
 
@@ -457,7 +477,11 @@ def _turn_between(a: FloatArray, b: FloatArray) -> float:
 
 
 def _finish(
-    problem: FitProblem, shadows: _Shadows, h: _Hypothesis, how: Search, wide_px: float = 20.0
+    problem: FitProblem,
+    shadows: _Shadows,
+    h: _Hypothesis,
+    how: Search,
+    wide_px: float = 20.0,
 ) -> _Hypothesis:
     """Assign and fit on all frames; the gate narrows from `wide_px`.
 
@@ -504,7 +528,9 @@ def _report(
     index[touching] = -1
     seen = index >= 0
     tracks, covariances, bias = shadows.picked(index, problem.origin)
-    residual = np.linalg.norm(tracks - problem.origin[:, None, :] - predicted, axis=2)[seen]
+    residual = np.linalg.norm(tracks - problem.origin[:, None, :] - predicted, axis=2)[
+        seen
+    ]
     spread = float(np.median(residual)) / RAYLEIGH_MEDIAN if seen.any() else math.inf
     total = max(int(shadows.counts.sum()), 1)
     rivals = []
@@ -512,7 +538,9 @@ def _report(
         if _turn_between(h.x, best.x) < math.radians(3.0):
             continue
         # Difference of squared residuals in units of the best one's variance.
-        excess = (h.loss - best.loss) * max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
+        excess = (h.loss - best.loss) * max(
+            int(np.minimum(shadows.counts, len(model)).sum()), 1
+        )
         if excess < MAX_RIVAL_EXCESS * max(spread, 0.02) ** 2:
             rivals.append(_at(problem, h.x, start))
     view = visible_beads(model, poses, shapes, geometry) & ~touching

@@ -81,7 +81,8 @@ def settle_motion(
         out.append(
             warning(
                 "motion_unsettled",
-                f"the motion differs by up to {worst:.1f} sigma from what the last fit would make "
+                f"the motion differs by up to {worst:.1f} sigma from what the last fit "
+                "would make "
                 "of it; its sigmas contain that",
             )
         )

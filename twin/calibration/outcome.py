@@ -61,7 +61,9 @@ class Calibration:
         panel = None if self.fit is None else self.fit.panel
         if not (seen := [lag.part for lag in self.lags if lag.seen]):
             return panel
-        return replace(panel or Panel.flat(self.scans[0].frames.shape), lag=float(np.mean(seen)))
+        return replace(
+            panel or Panel.flat(self.scans[0].frames.shape), lag=float(np.mean(seen))
+        )
 
     @property
     def errors(self) -> tuple[Finding, ...]:

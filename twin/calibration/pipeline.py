@@ -1,5 +1,5 @@
-"""From images to a geometry with its uncertainty report: detect, identify, fit, measure again, fit,
-diagnose.
+"""From images to a geometry with its uncertainty report: detect, identify, fit, measure again,
+fit, diagnose.
 
 Several scans may be given; they are identified one by one and fitted together. The result
 lists the faults of the data, and offers numbers only where they can be trusted.
@@ -41,7 +41,14 @@ from flexdt.twin.calibration.scans_to_calibrate import require_different, requir
 from flexdt.twin.calibration.second_measurement import measure_again
 from flexdt.twin.projection.analytic_solids import Scene
 
-__all__ = ["Calibration", "CalibrationRequest", "FrameState", "Scan", "calibrate", "detector_for"]
+__all__ = [
+    "Calibration",
+    "CalibrationRequest",
+    "FrameState",
+    "Scan",
+    "calibrate",
+    "detector_for",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +91,8 @@ def calibrate(
         scans: one or more scans of the same phantom.
         phantom: its beads.
         request: the parameters to estimate; None is the thesis's six parameters.
-        scene: the phantom's solids, so that its body can be subtracted; None is the phantom's own
-            if it has one.
+        scene: the phantom's solids, so that its body can be subtracted; None is the phantom's
+            own if it has one.
         detector: settings of the detection; None: from the phantom's beads and the
             geometry.
 
@@ -115,7 +122,9 @@ def calibrate(
     return _diagnosed(fitted, asked)
 
 
-def _detected(scans: Sequence[Scan], model: BeadModel, detector: SpotFinder | None) -> Calibration:
+def _detected(
+    scans: Sequence[Scan], model: BeadModel, detector: SpotFinder | None
+) -> Calibration:
     """Detect spots in all frames, and judge the frames.
 
     Args:
@@ -131,7 +140,8 @@ def _detected(scans: Sequence[Scan], model: BeadModel, detector: SpotFinder | No
     """
     sought = [detector or detector_for(model, scan.poses) for scan in scans]
     looks = tuple(
-        without_repeats(scan.frames.look(how)) for scan, how in zip(scans, sought, strict=True)
+        without_repeats(scan.frames.look(how))
+        for scan, how in zip(scans, sought, strict=True)
     )
     require_different(scans, looks)
     findings = [
@@ -191,12 +201,16 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
     return replace(state, fit=fit).with_findings(*explained)
 
 
-def _judged_places(state: Calibration, fit: FitResult, explained: Sequence[Finding]) -> Calibration:
+def _judged_places(
+    state: Calibration, fit: FitResult, explained: Sequence[Finding]
+) -> Calibration:
     """Judge the places of the spots, unless the residuals explain them."""
     if not any(f.forbids and f.code != "misfit" for f in explained):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.
         state = state.with_findings(*listed(judge_places(fit, state.looks)))
-    if any(f.code == "bead_displaced" for f in explained):  # the other spots are that bead's
+    if any(
+        f.code == "bead_displaced" for f in explained
+    ):  # the other spots are that bead's
         findings = tuple(f for f in state.findings if f.code != "extra_spots")
         state = replace(state, findings=findings)
     return state

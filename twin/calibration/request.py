@@ -69,10 +69,14 @@ class CalibrationRequest:
     per_frame: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "per_frame", tuple(dict.fromkeys(require_movable(self.per_frame))))
+        object.__setattr__(
+            self, "per_frame", tuple(dict.fromkeys(require_movable(self.per_frame)))
+        )
         require_names((*self.free, *self.per_scan))
         if not self.free:
-            raise TwinError("no parameter is free: there is nothing to estimate", {"asked": []})
+            raise TwinError(
+                "no parameter is free: there is nothing to estimate", {"asked": []}
+            )
         for name in self.per_scan:
             if name not in self.free:
                 raise TwinError(
@@ -84,7 +88,9 @@ class CalibrationRequest:
             require_tolerance(self.bead_tolerance_mm)
         for name, width in require_widths(self.priors).items():
             if width == 0 and name in self.free:
-                raise TwinError(f"{name} is free, and its prior is 0: exactly known; choose one")
+                raise TwinError(
+                    f"{name} is free, and its prior is 0: exactly known; choose one"
+                )
         if not self.bound > 0:
             raise TwinError(f"bound {self.bound:g}; allowed: a sigma above 0 [mm, deg]")
 
@@ -108,5 +114,9 @@ def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:
 
 def with_free(request: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:
     """Free more parameters, without their priors."""
-    priors = {n: w for n, w in request.priors.items() if n in request.free or n not in names}
-    return replace(request, free=tuple(dict.fromkeys((*request.free, *names))), priors=priors)
+    priors = {
+        n: w for n, w in request.priors.items() if n in request.free or n not in names
+    }
+    return replace(
+        request, free=tuple(dict.fromkeys((*request.free, *names))), priors=priors
+    )

@@ -24,7 +24,8 @@ def require_scans(scans: Sequence[Scan]) -> None:
     for scan in scans:
         if len(scan.poses) != len(scan.frames) or len(scan.frames) == 0:
             raise TwinError(
-                f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; allowed: as "
+                f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; "
+                "allowed: as "
                 "many of both, at least one"
             )
         require_seen_from_source(scan)
@@ -51,7 +52,9 @@ def require_seen_from_source(scan: Scan) -> None:
             )
 
 
-def require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]) -> None:
+def require_different(
+    scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]
+) -> None:
     """Check that no image is given twice, which would count as twice the evidence.
 
     No two images have the same noise, so no image has all its spots at another's places,
@@ -62,7 +65,9 @@ def require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots
     """
     known: dict[bytes, int] = {}
     for j, some in enumerate(looks):
-        shadows = [look.detections.centers.tobytes() for look in some if len(look.detections)]
+        shadows = [
+            look.detections.centers.tobytes() for look in some if len(look.detections)
+        ]
         for i, again in Counter(known[s] for s in shadows if s in known).items():
             raise TwinError(
                 f"scans {i + 1} and {j + 1} ({scans[i].name}, {scans[j].name}) hold the same "

@@ -36,8 +36,8 @@ def measure_again(
     """Measure in windows and fit again; once more if the first fit was far off.
 
     With few frames the first fit is rough, so that a draft comes before the measurement. A
-    measurement that loses the spots of a scan is not fitted: state and fit stay as they were before
-    it, with a finding.
+    measurement that loses the spots of a scan is not fitted: state and fit stay as they were
+    before it, with a finding.
 
     Args:
         state: the scans, identified.
@@ -88,12 +88,16 @@ def _measured(
         contrast = seen_contrasts(model, spots, state.identifications[g].index)
         images = scan.frames.windows(plan)
         usable = np.array([look.state is FrameState.USABLE for look in state.looks[g]])
-        lag = state.lags[g] if state.measured else lag_of(images, scan.frames, plan, usable)
+        lag = (
+            state.lags[g] if state.measured else lag_of(images, scan.frames, plan, usable)
+        )
         if lag.seen:
             images = without_lag(scan.frames, plan, lag)
         images[~usable] = np.nan
         images = mended(images, plan)
-        measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
+        measured.append(
+            measure_beads(images, plan, cone, model, contrast, solids, draft=draft)
+        )
         lags.append(lag)
         plans.append(plan)
     return replace(state, measured=tuple(measured), lags=tuple(lags)), plans
@@ -111,8 +115,10 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
         out.append(
             error(
                 "spots_unconfirmed",
-                f"{scan.name}: {confirmed} of {int(before.sum())} spots are, where the first fit "
-                "expects them, shadows of balls of the phantom's size; are the images saturated or "
+                f"{scan.name}: {confirmed} of {int(before.sum())} spots are, where the "
+                "first fit "
+                "expects them, shadows of balls of the phantom's size; are the images "
+                "saturated or "
                 "clipped, and are phantom, geometry and pixel size right?",
             )
         )

@@ -76,7 +76,8 @@ def link(
         if len(places) < 3:
             raise TwinError(
                 f"{len(places)} markers are found that move as the angles say, among "
-                f"{counts.mean():.1f} spots in each of {n} frames; allowed: three or more. Look at "
+                f"{counts.mean():.1f} spots in each of {n} frames; allowed: three or "
+                "more. Look at "
                 "the angles and at the axis's place",
                 {"asked": len(places), "allowed": ">= 3"},
             )
@@ -88,9 +89,17 @@ def link(
         if gate != GATES_PX[-1] and enough.sum() >= 3:
             tracks = _picked(points, index)
             fit = estimate_geometry(
-                tracks, places, poses, ("dO_x", "det_roll"), shape=shape, start=at, free_beads=True,
-                bead_tolerance_mm=ANYWHERE_MM, priors={"det_roll": 1.0}, bound=np.inf,
-            )  # fmt: skip
+                tracks,
+                places,
+                poses,
+                ("dO_x", "det_roll"),
+                shape=shape,
+                start=at,
+                free_beads=True,
+                bead_tolerance_mm=ANYWHERE_MM,
+                priors={"det_roll": 1.0},
+                bound=np.inf,
+            )
             places, at = fit.beads, fit.parameters
     order = np.argsort(-places[:, 2])
     return index[:, order], places[order], at
@@ -109,7 +118,9 @@ def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> Fl
     """
     source, ray = _rays(tracks, cone, shape)
     seen: npt.NDArray[np.bool_] = np.asarray(np.isfinite(tracks).all(axis=2))
-    across = np.where(seen[..., None, None], np.eye(3) - ray[..., None] * ray[..., None, :], 0.0)
+    across = np.where(
+        seen[..., None, None], np.eye(3) - ray[..., None] * ray[..., None, :], 0.0
+    )
     normal = across.sum(axis=0)
     weak = np.asarray(np.linalg.cond(normal) > 1e8)
     if weak.any():
@@ -122,7 +133,9 @@ def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> Fl
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
-def centred(points: FloatArray, poses: Poses, shape: tuple[int, int], start: Offsets) -> Offsets:
+def centred(
+    points: FloatArray, poses: Poses, shape: tuple[int, int], start: Offsets
+) -> Offsets:
     """Move the axis in `start` to the mean column of the spots: over a full turn they agree.
 
     Args:
@@ -133,7 +146,9 @@ def centred(points: FloatArray, poses: Poses, shape: tuple[int, int], start: Off
     """
     flat = points[np.isfinite(points).all(axis=2)]
     scale = float(np.median(np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd))
-    axis = float(poses.cone_vec(start).project_points(np.zeros((1, 3)), shape)[:, 0, 0].mean())
+    axis = float(
+        poses.cone_vec(start).project_points(np.zeros((1, 3)), shape)[:, 0, 0].mean()
+    )
     return replace(start, dO_x=start.dO_x + scale * (float(flat[:, 0].mean()) - axis))
 
 
@@ -151,7 +166,9 @@ def _rays(
     return cone.source, at / np.linalg.norm(at, axis=2, keepdims=True)
 
 
-def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, int]) -> FloatArray:
+def _found(
+    points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, int]
+) -> FloatArray:
     """Find positions of markers, those with most spots first, (k, 3).
 
     Args:
@@ -171,7 +188,9 @@ def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, i
     bases = usable[np.linspace(0, len(usable) - 1, BASE_FRAMES).astype(int)]
     for i in np.unique(bases).tolist():
         for step in (len(usable) // 4, len(usable) // 3):
-            j = int(usable[(int(np.searchsorted(usable, i)) + max(step, 1)) % len(usable)])
+            j = int(
+                usable[(int(np.searchsorted(usable, i)) + max(step, 1)) % len(usable)]
+            )
             a, b = ray[i, : counts[i], None], ray[j, None, : counts[j]]
             between = source[j] - source[i]
             dot = (a * b).sum(axis=2)
@@ -183,7 +202,9 @@ def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, i
             near = np.linalg.norm(p - q, axis=2) < gap
             candidates.append(((p + q) / 2)[near])
     places = np.concatenate(candidates)
-    some = usable[np.linspace(0, len(usable) - 1, min(len(usable), MAX_SCORED_FRAMES)).astype(int)]
+    some = usable[
+        np.linspace(0, len(usable) - 1, min(len(usable), MAX_SCORED_FRAMES)).astype(int)
+    ]
     spots = points[some].copy()
     with np.errstate(invalid="ignore"):
         predicted = cone[some].project_points(places, shape)
@@ -192,7 +213,10 @@ def _found(points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, i
     while len(places):
         nearest = distance.min(axis=2)
         close = nearest < GATES_PX[0]
-        score = close.sum(axis=0) - (np.where(close, nearest, 0.0).sum(axis=0) / GATES_PX[0]) / 2
+        score = (
+            close.sum(axis=0)
+            - (np.where(close, nearest, 0.0).sum(axis=0) / GATES_PX[0]) / 2
+        )
         k = int(np.argmax(score))
         if close[:, k].sum() < max(3, MIN_SEEN_SHARE * len(some)):
             break

@@ -58,7 +58,9 @@ class SceneParts:
         axes = dict(self.machine.axes)
         for name in self.mounts:
             here = positions.get(name, axes[name].home)
-            axes[name] = axes[name].model_copy(update={"lower": here, "upper": here, "home": here})
+            axes[name] = axes[name].model_copy(
+                update={"lower": here, "upper": here, "home": here}
+            )
         standing = self.machine.model_copy(update={"axes": axes})
         return build_scene(
             standing, self.profile, self.sample, self.parameters, margin_mm=self.margin_mm
@@ -89,7 +91,9 @@ class CollisionScene:
     home: FloatArray
     limits: Limits
     parts: SceneParts | None = None
-    _separations: dict[tuple[int, int], Separate] = field(default_factory=dict, repr=False)
+    _separations: dict[tuple[int, int], Separate] = field(
+        default_factory=dict, repr=False
+    )
     """Filled on first use. Threads that share a scene may compute one twice.
 
     That costs only the work: the results are equal, keep no state, and are stored
@@ -123,7 +127,9 @@ class CollisionScene:
         within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
         return self.near if within else self.all
 
-    def path(self, trajectories: Mapping[str, Trajectory], start: float, end: float) -> Path:
+    def path(
+        self, trajectories: Mapping[str, Trajectory], start: float, end: float
+    ) -> Path:
         """Make the path of all motors from `start` to `end` [s]; motors left out
         are at home."""
         tables = {
@@ -137,7 +143,10 @@ class CollisionScene:
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
         """Convert positions to (axes,) [mm, deg]; motors left out are at home."""
         return np.array(
-            [positions.get(n, h) for n, h in zip(self.axes, self.home.tolist(), strict=True)]
+            [
+                positions.get(n, h)
+                for n, h in zip(self.axes, self.home.tolist(), strict=True)
+            ]
         )
 
 
@@ -162,11 +171,17 @@ class PairStack:
     moves: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> PairStack:
+    def of(
+        cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]
+    ) -> PairStack:
         """Stack pairs of `bodies`, which `axes` motors move."""
         chosen = [(bodies[i], bodies[j]) for i, j in pairs]
-        slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(len(pairs), axes, 3)
-        turns = [(a.turns != 0.0) & a.spins | (b.turns != 0.0) & b.spins for a, b in chosen]
+        slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(
+            len(pairs), axes, 3
+        )
+        turns = [
+            (a.turns != 0.0) & a.spins | (b.turns != 0.0) & b.spins for a, b in chosen
+        ]
         return cls(
             tuple(pairs),
             np.ascontiguousarray(np.moveaxis(slides, 1, 0)).reshape(axes, 3 * len(pairs)),
@@ -227,12 +242,17 @@ def build_scene(
         bodies,
         {frozenset(pair) for pair in machine.allowed_contacts},
         reach=np.array(
-            [(a.lower - REACH_SLACK_MM, a.upper + REACH_SLACK_MM) for a in machine.axes.values()]
+            [
+                (a.lower - REACH_SLACK_MM, a.upper + REACH_SLACK_MM)
+                for a in machine.axes.values()
+            ]
         ),
         home=np.array([a.home for a in machine.axes.values()]),
         limits=Limits(margin, TOLERANCE_MM, ACCURACY),
     )
-    return replace(scene, parts=SceneParts(machine, profile, tuple(sample), parameters, margin_mm))
+    return replace(
+        scene, parts=SceneParts(machine, profile, tuple(sample), parameters, margin_mm)
+    )
 
 
 def scene_of(
@@ -262,12 +282,15 @@ def scene_of(
         if bodies[i].group != bodies[j].group
         and frozenset((bodies[i].name, bodies[j].name)) not in may_touch
     ]
-    scene = CollisionScene(tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits)
+    scene = CollisionScene(
+        tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits
+    )
     if not pairs:
         return scene
     least = scene.all.clearances(reach[:, 0], reach[:, 1])
     built_in = [
-        _one_stage(bodies[i], bodies[j]) or _levels_apart(bodies[i], bodies[j]) for i, j in pairs
+        _one_stage(bodies[i], bodies[j]) or _levels_apart(bodies[i], bodies[j])
+        for i, j in pairs
     ]
     far = (np.array(built_in) & (least > limits.margin + limits.tolerance)).tolist()
     return replace(

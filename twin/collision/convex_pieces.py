@@ -133,7 +133,10 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
     two = count == 2
     # The corner that is alone on its side comes first.
     alone = np.concatenate(
-        [_led_by(triangles[one], height[one], 1.0), _led_by(triangles[two], height[two], -1.0)]
+        [
+            _led_by(triangles[one], height[one], 1.0),
+            _led_by(triangles[two], height[two], -1.0),
+        ]
     )
     lead = alone[:, 0]
     left = alone[:, 1]

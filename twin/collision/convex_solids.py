@@ -19,14 +19,26 @@ from flexdt.twin.machine.description import Vector3
 
 IntArray = npt.NDArray[np.int32]
 
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+_CORNERS = np.array(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float
+)
 _BOX_FACES = np.array(
     [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
     ],
     dtype=np.int32,
-)  # fmt: skip
+)
 """Outward triangles of a box over `_CORNERS`."""
 
 
@@ -62,14 +74,22 @@ class Polytope(ConvexSolid):
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-            raise ValueError(f"vertices have shape {vertices.shape}; allowed: (k, 3), finite")
+        if (
+            vertices.ndim != 2
+            or vertices.shape[1] != 3
+            or not np.isfinite(vertices).all()
+        ):
+            raise ValueError(
+                f"vertices have shape {vertices.shape}; allowed: (k, 3), finite"
+            )
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
 
     def farthest(self, directions: FloatArray) -> FloatArray:
         """See `ConvexSolid`."""
-        corner: FloatArray = self.vertices[np.argmax(directions @ self.vertices.T, axis=-1)]
+        corner: FloatArray = self.vertices[
+            np.argmax(directions @ self.vertices.T, axis=-1)
+        ]
         return corner
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -122,8 +142,14 @@ class UprightCylinder(ConvexSolid):
     def prism(self, sides: int = 48) -> Polytope:
         """Make a prism around the cylinder; 48 sides add 0.2 % of the radius at the edges."""
         angle = 2.0 * math.pi * np.arange(sides) / sides
-        rim = self.radius / math.cos(math.pi / sides) * np.stack([np.cos(angle), np.sin(angle)])
-        ends = [np.vstack([rim, np.full(sides, s * self.height / 2)]).T for s in (-1.0, 1.0)]
+        rim = (
+            self.radius
+            / math.cos(math.pi / sides)
+            * np.stack([np.cos(angle), np.sin(angle)])
+        )
+        ends = [
+            np.vstack([rim, np.full(sides, s * self.height / 2)]).T for s in (-1.0, 1.0)
+        ]
         return hull(np.concatenate(ends) + self.center)
 
     @staticmethod

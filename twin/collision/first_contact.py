@@ -67,7 +67,9 @@ class PathSearch:
 
     scene: CollisionScene
     path: Path
-    _motions: dict[int, RelativeMotion] = field(default_factory=dict, init=False, repr=False)
+    _motions: dict[int, RelativeMotion] = field(
+        default_factory=dict, init=False, repr=False
+    )
     """Filled on first use; a search belongs to the thread that made it."""
 
     @cached_property
@@ -112,7 +114,9 @@ class PathSearch:
         looks = 0
         first: tuple[float, int, PairResult] | None = None
         for k, bound in enumerate(self.bounds):
-            if bound > limits.margin + limits.tolerance and (only_contacts or bound >= best):
+            if bound > limits.margin + limits.tolerance and (
+                only_contacts or bound >= best
+            ):
                 break
             motion = self.motion(k)
             until = math.inf if first is None else first[0]
@@ -209,7 +213,9 @@ def clearance_trace(
     q = path.vectors(np.asarray(times, dtype=np.float64))
     stack = scene.candidates(q.min(axis=0), q.max(axis=0))
     bounds = stack.clearances(q, q)
-    nearest = [_nearest(scene, at, stack.pairs, near) for at, near in zip(q, bounds, strict=True)]
+    nearest = [
+        _nearest(scene, at, stack.pairs, near) for at, near in zip(q, bounds, strict=True)
+    ]
     return tuple((float(t), n.mm, n.pair) for t, n in zip(times, nearest, strict=True))
 
 

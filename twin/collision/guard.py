@@ -26,7 +26,9 @@ class SceneGuard:
 
     scene: CollisionScene
 
-    def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
+    def __call__(
+        self, trajectories: Mapping[str, Trajectory], now: float
+    ) -> Contact | None:
         """Find the first contact from `now` on; when nothing moves, the nearest
         pair that touches.
 
@@ -35,7 +37,10 @@ class SceneGuard:
             now: since when [s].
         """
         scene = self.scene
-        ends = [t.end if math.isfinite(t.end) else now + HORIZON_S for t in trajectories.values()]
+        ends = [
+            t.end if math.isfinite(t.end) else now + HORIZON_S
+            for t in trajectories.values()
+        ]
         path = scene.path(trajectories, now, max([now, *ends]))
         if path.moving.any():
             contact = first_contact(scene, path)

@@ -27,7 +27,9 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
     """
 
     def wrong(what: str, **data: object) -> MachineFileError:
-        return MachineFileError(f"{file}: axes: {what}", {"file": file, "path": "axes", **data})
+        return MachineFileError(
+            f"{file}: axes: {what}", {"file": file, "path": "axes", **data}
+        )
 
     stage = place(machine, "object_y")
     panel = place(machine, "detector_y")
@@ -48,9 +50,12 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
     if found:
         what = f"at home {_pairs(found)}; the safety margin is {machine.safety_margin_mm:g} mm"
         more = (
-            "another home, other sizes or places; or say in allowed_contacts that they are mounted"
+            "another home, other sizes or places; or say in allowed_contacts that they "
+            "are mounted"
         )
-        raise wrong(f"{what} ({more} on each other)", pairs=[list(pair) for pair, _ in found])
+        raise wrong(
+            f"{what} ({more} on each other)", pairs=[list(pair) for pair, _ in found]
+        )
 
 
 def _pairs(found: Iterable[tuple[tuple[str, str], float]]) -> str:

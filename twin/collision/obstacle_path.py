@@ -92,14 +92,18 @@ class _Planner:
         a = self.machine.axes[axis]
         return self.paces.get(axis, (a.speed, a.acceleration))
 
-    def contact(self, moved: Mapping[str, float], step: Mapping[str, float]) -> Contact | None:
+    def contact(
+        self, moved: Mapping[str, float], step: Mapping[str, float]
+    ) -> Contact | None:
         """Sweep one move from the start with `moved` changed; return its first contact."""
         trajectories = {}
         for axis in self.scene.axes:
             here = moved.get(axis, self.at(axis))
             trajectories[axis] = motion.at_rest(here)
             if axis in step:
-                trajectories[axis] = motion.move(here, 0.0, step[axis], *self.pace(axis), 0.0)
+                trajectories[axis] = motion.move(
+                    here, 0.0, step[axis], *self.pace(axis), 0.0
+                )
         self.sweeps += 1
         end = max(t.end for t in trajectories.values())
         contact = first_contact(self.scene, self.scene.path(trajectories, 0.0, end))
@@ -134,7 +138,9 @@ class _Planner:
             if body.name in self.blockers
         ]
         movable = [
-            axis for i, axis in enumerate(self.scene.axes) if any(chain[i] for chain in chains)
+            axis
+            for i, axis in enumerate(self.scene.axes)
+            if any(chain[i] for chain in chains)
         ]
         out = {}
         for axis in dict.fromkeys([*goal, *movable]):
@@ -169,7 +175,8 @@ class _Planner:
         def left(station: Station) -> float:
             """Estimate the remaining time from below [s]."""
             return sum(
-                self.duration(axis, x, y) for axis, x, y in zip(axes, station, end, strict=True)
+                self.duration(axis, x, y)
+                for axis, x, y in zip(axes, station, end, strict=True)
             )
 
         order = itertools.count()
@@ -194,7 +201,9 @@ class _Planner:
                         best[following] = total
                         step = (*way, (axis, value))
                         estimate = total + left(following)
-                        heapq.heappush(queue, (estimate, next(order), total, following, step))
+                        heapq.heappush(
+                            queue, (estimate, next(order), total, following, step)
+                        )
         return None
 
     def shortened(
@@ -215,7 +224,11 @@ class _Planner:
             long = 1.0
             for _ in range(HALVINGS):
                 share = 0.5 * (short + long)
-                trial = [*way[:i], (axis, before + share * (value - before)), *way[i + 1 :]]
+                trial = [
+                    *way[:i],
+                    (axis, before + share * (value - before)),
+                    *way[i + 1 :],
+                ]
                 if self._all_free(trial):
                     way = trial
                     long = share

@@ -74,11 +74,16 @@ def _planes(solid: Polytope) -> FloatArray:
     normals = normals[areas > 0.0] / areas[areas > 0.0, None]
     heights = np.einsum("ij,ij->i", normals, a[areas > 0.0])
     _, first, same = np.unique(
-        np.column_stack([normals, heights]).round(6), axis=0, return_index=True, return_inverse=True
+        np.column_stack([normals, heights]).round(6),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
     )
     large = np.argsort(np.bincount(same.ravel(), areas[areas > 0.0]))[-MAX_PLANES:]
     normals = normals[first[large]]
-    reach = (normals @ solid.vertices.T).max(axis=1)  # a face's own height, but for rounding
+    reach = (normals @ solid.vertices.T).max(
+        axis=1
+    )  # a face's own height, but for rounding
     return np.column_stack([normals, -reach])
 
 

@@ -69,7 +69,8 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     points = clearance_trace(scene, path, _trace_times(path, TRACE_POINTS))
     return Clearance(
         tuple(
-            Collision(_line(plan, scene, c), c.time, c.pair, dict(c.last_free)) for c in contacts
+            Collision(_line(plan, scene, c), c.time, c.pair, dict(c.last_free))
+            for c in contacts
         ),
         float(least) if np.isfinite(least) else None,
         pair,
@@ -77,7 +78,9 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     )
 
 
-def _least(search: PathSearch, contacts: Sequence[Contact]) -> tuple[float, tuple[str, str] | None]:
+def _least(
+    search: PathSearch, contacts: Sequence[Contact]
+) -> tuple[float, tuple[str, str] | None]:
     """Find the least clearance [mm] and its pair; with contacts, those of the worst."""
     if contacts:
         worst = min(contacts, key=lambda c: c.clearance_mm)

@@ -69,14 +69,20 @@ class Path:
 
     def vectors(self, times: FloatArray) -> FloatArray:
         """Compute positions at `times` (n,) within the path, (n, axes)."""
-        i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1)
-        dt = np.clip(times - self.times[i], 0.0, self.times[i + 1] - self.times[i])[:, None]
+        i = np.clip(
+            np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1
+        )
+        dt = np.clip(times - self.times[i], 0.0, self.times[i + 1] - self.times[i])[
+            :, None
+        ]
         at = self.q[i] + dt * (self.v[i] + 0.5 * dt * self.a[i])
         return np.where((times >= self.times[-1])[:, None], self.q[-1], at)
 
     def positions(self, time: float) -> dict[str, float]:
         """Compute motor -> position at `time` within the path [mm, deg]."""
-        return dict(zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True))
+        return dict(
+            zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True)
+        )
 
     def after(self, time: float) -> Path:
         """Return the rest of the path from `time` on, which is before its end."""
@@ -92,11 +98,15 @@ class Path:
     @property
     def moving(self) -> npt.NDArray[np.bool_]:
         """(axes,) whether each motor ever moves."""
-        moving: npt.NDArray[np.bool_] = np.abs(self.v).sum(axis=0) + np.abs(self.a).sum(axis=0) > 0
+        moving: npt.NDArray[np.bool_] = (
+            np.abs(self.v).sum(axis=0) + np.abs(self.a).sum(axis=0) > 0
+        )
         return moving
 
 
-def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float) -> Path:
+def path_of(
+    axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float
+) -> Path:
     """Make the path of `axes` from `start` to `end` [s].
 
     Args:
@@ -139,7 +149,12 @@ def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, e
                 f"{name} jumps from {arrives[where]:g} to {x0[where + 1]:g} at "
                 f"{times[where + 1]:g} s; a path must be continuous"
             )
-        q[:-1, column], q[-1, column], v[:, column], a[:, column] = x0, arrives[-1], v0, a0
+        q[:-1, column], q[-1, column], v[:, column], a[:, column] = (
+            x0,
+            arrives[-1],
+            v0,
+            a0,
+        )
     return Path(tuple(axes), times, q, v, a)
 
 
@@ -153,7 +168,9 @@ def _stands(table: AxisPath) -> bool:
     return not (table.v.any() or table.a.any() or (table.x != table.x[0]).any())
 
 
-def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _state(
+    table: AxisPath, times: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute position, velocity, acceleration in force from each of `times` (in order) on."""
     i = table.times.searchsorted(times, side="right") - 1
     before, i = i < 0, np.maximum(i, 0)  # it is at rest there
@@ -205,7 +222,9 @@ class _Bound:
 
     def less(self, other: _Bound, factor: float) -> _Bound:
         """Subtract `factor` times another bound."""
-        return _Bound(self.rate - factor * other.rate, self.growth - factor * other.growth)
+        return _Bound(
+            self.rate - factor * other.rate, self.growth - factor * other.growth
+        )
 
     def first_fall(
         self, at: Moment, lengths: FloatArray, value: float, level: float
@@ -294,7 +313,8 @@ class _Turn:
         both = (rate * after < 0.0) & (np.minimum(np.abs(rate), np.abs(after)) > rounding)
         fastest = np.maximum(np.abs(rate), np.abs(after))
         nearing = _Bound(
-            np.where(both, fastest, signs * rate)[kept], np.where(both, 0.0, signs * growth)[kept]
+            np.where(both, fastest, signs * rate)[kept],
+            np.where(both, 0.0, signs * growth)[kept],
         )
         senses = set(signs[kept].tolist()) - {0.0}
         sense = senses.pop() if len(senses) == 1 and not both[kept].any() else 0.0
@@ -328,7 +348,9 @@ class _Turn:
         """
         along = float(normal @ self.body.spin_axis)
         crude = self.body.reach * math.sqrt(max(0.0, 1.0 - along * along))
-        turn = self.body.turn_until(self.side * normal @ orientation, allowance, self.sense)
+        turn = self.body.turn_until(
+            self.side * normal @ orientation, allowance, self.sense
+        )
         if turn * crude <= allowance:
             return crude, math.inf
         return allowance / turn, turn
@@ -351,7 +373,10 @@ class RelativeMotion:
         changes = [velocity, acceleration]
         for body in (a, b):
             if body.spins:
-                changes += [(path.v @ body.turns)[:, None], (path.a @ body.turns)[:, None]]
+                changes += [
+                    (path.v @ body.turns)[:, None],
+                    (path.a @ body.turns)[:, None],
+                ]
         moving = np.concatenate(changes, axis=1).any(axis=1)
         kept: Kept = np.flatnonzero(moving) if moving.any() else slice(0, 1)
         self.times: FloatArray = path.times[:-1][kept]
@@ -362,7 +387,9 @@ class RelativeMotion:
         self._turn_a = _Turn.of(a, -1.0, path, kept) if a.spins else None
         self._turn_b = _Turn.of(b, 1.0, path, kept) if b.spins else None
         self._turning = [
-            (i, t) for i, t in enumerate((self._turn_a, self._turn_b)) if t is not None and t.turns
+            (i, t)
+            for i, t in enumerate((self._turn_a, self._turn_b))
+            if t is not None and t.turns
         ]
         self._leave_out_repeated_turns()
 
@@ -391,7 +418,9 @@ class RelativeMotion:
         """Compute the certified gap of the two bodies at a moment."""
         i = at.segment
         dt = at.dt
-        offset = self._origin[i] + dt * (self._velocity[i] + 0.5 * dt * self._acceleration[i])
+        offset = self._origin[i] + dt * (
+            self._velocity[i] + 0.5 * dt * self._acceleration[i]
+        )
         turn_a = None if self._turn_a is None else self._turn_a.orientation(at)
         turn_b = None if self._turn_b is None else self._turn_b.orientation(at)
         gap, normal = separate(offset, turn_a, turn_b)
@@ -418,7 +447,9 @@ class RelativeMotion:
                 horizons.append(turn.left.first_fall(look.at, self.lengths, horizon, 0.0))
         found = [bound.first_fall(look.at, self.lengths, look.gap, level), *horizons]
         return min(
-            (f for f in found if f is not None), key=lambda f: (f.segment, f.dt), default=None
+            (f for f in found if f is not None),
+            key=lambda f: (f.segment, f.dt),
+            default=None,
         )
 
     def after_travel(self, at: Moment, distance: float) -> Moment | None:

@@ -161,7 +161,9 @@ class _Overlap:
         outward = np.unique(ConvexHull(between).equations[:, :3].round(9), axis=0)
         outward /= np.linalg.norm(outward, axis=1)[:, None]
         overlap = cls((a, b), (turn_a, turn_b), -outward)
-        return replace(overlap, directions=np.vstack([overlap.directions, overlap._refined(q)]))
+        return replace(
+            overlap, directions=np.vstack([overlap.directions, overlap._refined(q)])
+        )
 
     @cached_property
     def _reach(self) -> tuple[FloatArray, FloatArray]:
@@ -191,8 +193,14 @@ class _Overlap:
             turn_a: orientation of a (3, 3); None for a body that never turns.
             turn_b: orientation of b, likewise.
         """
-        turned = (np.eye(3) if turn_a is None else turn_a, np.eye(3) if turn_b is None else turn_b)
-        off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
+        turned = (
+            np.eye(3) if turn_a is None else turn_a,
+            np.eye(3) if turn_b is None else turn_b,
+        )
+        off = (
+            np.abs(now - then).max()
+            for now, then in zip(turned, self.turned, strict=True)
+        )
         turns = max(off) > ORIENTATION_ROUNDING
         widest = -math.inf
         across = self.directions[0]
@@ -223,7 +231,11 @@ class _Overlap:
 
         def gaps(directions: FloatArray) -> FloatArray:
             reach = self._reach_of(0, directions, self.turned)
-            return directions @ (at_a - at_b) - reach - self._reach_of(1, directions, self.turned)
+            return (
+                directions @ (at_a - at_b)
+                - reach
+                - self._reach_of(1, directions, self.turned)
+            )
 
         best = self.directions[int(np.argmax(gaps(self.directions)))]
         step = 0.1

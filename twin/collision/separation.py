@@ -105,14 +105,18 @@ def _improved(
     normal = found[1]
     corners = []
     for _ in range(MAX_SEARCH_STEPS):
-        corners.append(offset + ra @ a.farthest(-normal @ ra) - rb @ b.farthest(normal @ rb))
+        corners.append(
+            offset + ra @ a.farthest(-normal @ ra) - rb @ b.farthest(normal @ rb)
+        )
         found = max(found, (float(normal @ corners[-1]), normal), key=lambda f: f[0])
         # The hull's point nearest to the origin: least squares with weights that add up to one.
         points = np.array(corners).T
         system = np.vstack([points, np.full(len(corners), 100.0)])
         try:
             weights, _ = nnls(system, [0.0, 0.0, 0.0, 100.0])
-        except RuntimeError:  # not within its rounds: the last result is a certificate, too
+        except (
+            RuntimeError
+        ):  # not within its rounds: the last result is a certificate, too
             break
         nearest = points @ weights / weights.sum()
         length = math.sqrt(nearest @ nearest)

@@ -22,7 +22,13 @@ from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
+from flexdt.twin.collision.convex_solids import (
+    ConvexSolid,
+    Polytope,
+    UprightCylinder,
+    box,
+    hull,
+)
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     COORDINATES,
@@ -124,7 +130,9 @@ class Body:
     def _levers(self) -> FloatArray:
         """Points, their velocities about the axis, and their distances from it, stacked
         (3 k, 3)."""
-        points = self.solid.vertices if isinstance(self.solid, Polytope) else np.empty((0, 3))
+        points = (
+            self.solid.vertices if isinstance(self.solid, Polytope) else np.empty((0, 3))
+        )
         inner = points - np.outer(points @ self.spin_axis, self.spin_axis)
         return np.concatenate([points, np.cross(self.spin_axis, points), inner])
 
@@ -143,7 +151,9 @@ class Body:
         return turned
 
 
-def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMINAL) -> list[Body]:
+def stage_bodies(
+    machine: Machine, profile: Profile, parameters: Offsets = NOMINAL
+) -> list[Body]:
     """Place the components of a machine as bodies.
 
     Args:
@@ -162,7 +172,10 @@ def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMIN
 
 
 def sample_bodies(
-    machine: Machine, profile: Profile, sample: Sequence[ConvexSolid], parameters: Offsets = NOMINAL
+    machine: Machine,
+    profile: Profile,
+    sample: Sequence[ConvexSolid],
+    parameters: Offsets = NOMINAL,
 ) -> list[Body]:
     """Place the sample's pieces as bodies on the component whose role is `sample_holder`.
 
@@ -218,7 +231,8 @@ def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatAr
     tau = from_unity([p.tau_x, 0.0, p.tau_z])
     shifts = {
         "world": np.zeros(3),
-        "source": np.array([0.0, 0.0, profile.src_ort]) + from_unity([p.dS_x, p.dS_y, 0.0]),
+        "source": np.array([0.0, 0.0, profile.src_ort])
+        + from_unity([p.dS_x, p.dS_y, 0.0]),
         "object": np.array([profile.axs_tan, profile.c_obj, 0.0])
         + from_unity([p.dO_x, p.dO_y, p.dO_z])
         + tau,
@@ -258,7 +272,9 @@ def _wherever(
             ends[:, i] = machine.fixed.get(f"mount_{coordinate}", 0.0)
         for motor in moved:
             axis = machine.axes[motor]
-            ends[:, i] += sorted((factors[motor] * axis.lower, factors[motor] * axis.upper))
+            ends[:, i] += sorted(
+                (factors[motor] * axis.lower, factors[motor] * axis.upper)
+            )
     if not ends.any():
         return solid
     points = (solid.prism() if isinstance(solid, UprightCylinder) else solid).vertices
@@ -315,14 +331,20 @@ def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | P
 
 def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
     """Compute the panel's orientation (3, 3) from the directions of its columns and rows."""
-    u, v = turn_detector(COLUMN_DIRECTION, ROW_DIRECTION, 0, 0, math.radians(profile.det_roll_deg))
+    u, v = turn_detector(
+        COLUMN_DIRECTION, ROW_DIRECTION, 0, 0, math.radians(profile.det_roll_deg)
+    )
     u, v = turn_detector(u, v, p.det_yaw, p.det_pitch, p.det_roll)
-    upright = np.stack([COLUMN_DIRECTION, ROW_DIRECTION, np.cross(COLUMN_DIRECTION, ROW_DIRECTION)])
+    upright = np.stack(
+        [COLUMN_DIRECTION, ROW_DIRECTION, np.cross(COLUMN_DIRECTION, ROW_DIRECTION)]
+    )
     turned: FloatArray = np.stack([u, v, np.cross(u, v)], axis=1) @ upright
     return turned
 
 
-def _placed(piece: ConvexSolid, place: FloatArray, tau: FloatArray) -> UprightCylinder | Polytope:
+def _placed(
+    piece: ConvexSolid, place: FloatArray, tau: FloatArray
+) -> UprightCylinder | Polytope:
     """Move a piece by p -> place (p - tau)."""
     if not isinstance(piece, (UprightCylinder, Polytope)):
         raise TypeError(f"cannot place a {type(piece).__name__}")

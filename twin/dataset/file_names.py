@@ -23,7 +23,9 @@ UNFINISHED: Final = "unfinished.json"
 """Name of the marker file in a folder that is being saved, or whose saving was
 interrupted."""
 _FORBIDDEN: Final = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]')
-_DEVICE: Final = re.compile(r"(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?:\..*)?", re.IGNORECASE)
+_DEVICE: Final = re.compile(
+    r"(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?:\..*)?", re.IGNORECASE
+)
 
 
 def plain_name(name: str, what: str = "file") -> str:

@@ -4,10 +4,10 @@
 nominal (motors and profile); the applied correction is kept with it, and the hidden
 misalignment is nowhere in it. Dates are arguments.
 
-`flexdt.json` says what the scanner's own texts cannot express, as one versioned document: machine
-and profile in full, nominal cone_vec, motor positions and time of every frame, the correction in
-force, the noise's seed and completeness. Reading checks the version, types, names and lengths, and
-an error names the place.
+`flexdt.json` says what the scanner's own texts cannot express, as one versioned document:
+machine and profile in full, nominal cone_vec, motor positions and time of every frame, the
+correction in force, the noise's seed and completeness. Reading checks the version, types, names
+and lengths, and an error names the place.
 """
 
 from __future__ import annotations
@@ -207,7 +207,9 @@ class ScanRecord(ArrayValue):
             speeds=dict(shown.speeds),
             accelerations=dict(shown.accelerations),
             blocks=blocks,
-            smooth=any(g.moving for g in plan.groups if g.kind == "projection" and g.files),
+            smooth=any(
+                g.moving for g in plan.groups if g.kind == "projection" and g.files
+            ),
             started=started,
             duration_s=plan.duration_s,
             sample=sample,
@@ -245,7 +247,9 @@ class ScanRecord(ArrayValue):
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
         """Compute the nominal geometry of all images, or of some blocks."""
         chosen = self.blocks if blocks is None else tuple(blocks)
-        return ConeVec.concatenate([self.poses_of(b).cone_vec() for b in chosen if len(b)])
+        return ConeVec.concatenate(
+            [self.poses_of(b).cone_vec() for b in chosen if len(b)]
+        )
 
     def angles_deg(self) -> FloatArray:
         """Stage angle of every projection [deg], accumulated."""
@@ -272,7 +276,8 @@ class ScanRecord(ArrayValue):
         angles = self.angles_deg()
         rule = np.linspace(angles[0], angles[-1], len(angles))
         if np.abs(angles - rule).max() < POSITION_TOLERANCE and all(
-            np.abs(v - self.positions[n]).max() < POSITION_TOLERANCE for n, v in still.items()
+            np.abs(v - self.positions[n]).max() < POSITION_TOLERANCE
+            for n, v in still.items()
         ):
             return 1
         steps = np.zeros(len(angles) - 1, dtype=bool)
@@ -345,7 +350,9 @@ class FrameEntry(_Model):
                 time_s=time,
                 **block.camera.of_image,
                 xrays_on=block.xrays_on,
-                positions={name: float(values[i]) for name, values in block.positions.items()},
+                positions={
+                    name: float(values[i]) for name, values in block.positions.items()
+                },
                 cone_vec=row,
             )
 
@@ -384,7 +391,9 @@ class CorrectionEntry(_Model):
         c = correction
         if c is None:
             return None
-        return cls(name=c.name, date=c.date, note=c.note, parameters=c.parameters.to_edge())
+        return cls(
+            name=c.name, date=c.date, note=c.note, parameters=c.parameters.to_edge()
+        )
 
 
 class PredictedEntry(_Model):
@@ -482,7 +491,10 @@ class DatasetDocument(_Model):
             settings_positions=dict(record.positions),
             predicted=[PredictedEntry.of(one) for one in record.predicted],
             frames=[
-                entry for b in record.blocks if len(b) for entry in FrameEntry.all_of(record, b)
+                entry
+                for b in record.blocks
+                if len(b)
+                for entry in FrameEntry.all_of(record, b)
             ],
         )
 
@@ -490,7 +502,9 @@ class DatasetDocument(_Model):
         """Write the document as text, one line a frame, for people and diffs."""
         head = self.model_dump(mode="json", by_alias=True, exclude={"frames"})
         text = json.dumps(head, indent=1, ensure_ascii=False)
-        lines = [json.dumps(f.model_dump(mode="json"), ensure_ascii=False) for f in self.frames]
+        lines = [
+            json.dumps(f.model_dump(mode="json"), ensure_ascii=False) for f in self.frames
+        ]
         frames = ",\n  ".join(lines)
         return f'{text[:-2]},\n "frames": [\n  {frames}\n ]\n}}\n'
 
@@ -502,7 +516,9 @@ class DatasetDocument(_Model):
     def positions(self, kind: FrameKind = "projection") -> dict[str, FloatArray]:
         """Read motor positions of the frames of one kind: motor -> (n,) [mm, deg]."""
         chosen = [f.positions for f in self.frames if f.kind == kind]
-        return {n: np.array([p[n] for p in chosen]) for n in (chosen[0] if chosen else {})}
+        return {
+            n: np.array([p[n] for p in chosen]) for n in (chosen[0] if chosen else {})
+        }
 
     def files(self, kind: FrameKind) -> tuple[str, ...]:
         """List file names of one kind, in the order taken."""
@@ -525,9 +541,13 @@ class DatasetDocument(_Model):
         named = detector.get("modes") if isinstance(detector, dict) else None
         modes = tuple(named.items()) if isinstance(named, dict) else ()
         roi = Roi(*entry.roi)
-        return CameraSettings(entry.mode, roi, entry.exposure_ms, entry.averages, modes=modes)
+        return CameraSettings(
+            entry.mode, roi, entry.exposure_ms, entry.averages, modes=modes
+        )
 
-    def poses(self, machine: Machine, profile: Profile, kind: FrameKind = "projection") -> Poses:
+    def poses(
+        self, machine: Machine, profile: Profile, kind: FrameKind = "projection"
+    ) -> Poses:
         """Compute nominal poses of the frames of one kind from their motor positions.
 
         Raises:
@@ -550,7 +570,9 @@ class DatasetDocument(_Model):
         """Return the applied correction in internal units, or None."""
         c = self.correction
         return (
-            None if c is None else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
+            None
+            if c is None
+            else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
         )
 
     def machine_of(self, file: str = DOCUMENT) -> Machine:
@@ -575,10 +597,13 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
     try:
         content = parse_json(text)
     except ValueError as error:
-        raise DatasetFormatError(f"{file} is not valid JSON: {error}", {"path": file}) from None
+        raise DatasetFormatError(
+            f"{file} is not valid JSON: {error}", {"path": file}
+        ) from None
     if isinstance(content, dict) and content.get("schema") != SCHEMA:
         raise DatasetFormatError(
-            f"{file}: schema is {str(content.get('schema'))[:40]!r}; this version reads {SCHEMA}",
+            f"{file}: schema is {str(content.get('schema'))[:40]!r}; this version reads "
+            f"{SCHEMA}",
             {"path": file, "asked": repr(content.get("schema"))[:40], "allowed": SCHEMA},
         )
     return _validated(DatasetDocument, content, file)
@@ -601,5 +626,9 @@ def _validated(model: type[_M], content: object, file: str) -> _M:
             }
             for e in error.errors(include_url=False)[:10]
         ]
-        lines = [f"{file}: {p['path']}: {p['message']} (value: {p['value']})" for p in problems]
-        raise DatasetFormatError("\n".join(lines), {"path": file, "problems": problems}) from None
+        lines = [
+            f"{file}: {p['path']}: {p['message']} (value: {p['value']})" for p in problems
+        ]
+        raise DatasetFormatError(
+            "\n".join(lines), {"path": file, "problems": problems}
+        ) from None

@@ -1,9 +1,9 @@
 """Counts to line integrals: -log((p - d) / (f - d)), finite for every pixel.
 
-A pixel that the beam does not reach in the flat (f - d below one count) is dead: it is interpolated
-between the nearest live ones of its row. A pixel without signal in the projection counts as half a
-count, the largest attenuation the data support. Nothing is smoothed, bright pixels are not clipped,
-and beam hardening is not corrected.
+A pixel that the beam does not reach in the flat (f - d below one count) is dead: it is
+interpolated between the nearest live ones of its row. A pixel without signal in the projection
+counts as half a count, the largest attenuation the data support. Nothing is smoothed, bright
+pixels are not clipped, and beam hardening is not corrected.
 """
 
 from __future__ import annotations
@@ -103,7 +103,9 @@ def of_intensities(
     """
     opened = np.maximum(flat - dark, LEAST_LIGHT * np.max(flat))
     light = (np.asarray(images, dtype=np.float32) - dark) / opened
-    return np.asarray(-np.log(np.maximum(light, np.finfo(np.float32).tiny)), dtype=np.float32)
+    return np.asarray(
+        -np.log(np.maximum(light, np.finfo(np.float32).tiny)), dtype=np.float32
+    )
 
 
 def _neighbours(
@@ -124,7 +126,9 @@ def _neighbours(
     cols = dead.shape[1]
     column = np.broadcast_to(np.arange(cols), dead.shape)
     before = np.maximum.accumulate(np.where(dead, -1, column), axis=1)[dead]
-    after = np.minimum.accumulate(np.where(dead, cols, column)[:, ::-1], axis=1)[:, ::-1][dead]
+    after = np.minimum.accumulate(np.where(dead, cols, column)[:, ::-1], axis=1)[:, ::-1][
+        dead
+    ]
     row, here = np.nonzero(dead)
     _, (near_row, near_column) = distance_transform_edt(dead, return_indices=True)
     nearest = (near_row * cols + near_column)[dead]
@@ -135,7 +139,9 @@ def _neighbours(
     return first.astype(np.intp), second.astype(np.intp), weight.astype(np.float32)
 
 
-def binned_mean(images: npt.NDArray[Any], factor: int | tuple[int, int]) -> npt.NDArray[Any]:
+def binned_mean(
+    images: npt.NDArray[Any], factor: int | tuple[int, int]
+) -> npt.NDArray[Any]:
     """Average over blocks of pixels; surplus rows and columns are cut off.
 
     Args:

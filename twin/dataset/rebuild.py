@@ -1,8 +1,8 @@
 """Poses from the settings texts alone, for data sets without flexdt.json: above all real scans.
 
 The machine is found by its name or its motors, the profile by reproducing the printed SOD, SDD,
-COR, VC and HC. Where no profile does, the printed figures are the geometry and only heights come
-from the motors. Every such decision is recorded as a note; missing figures are errors.
+COR, VC and HC. Where no profile does, the printed figures are the geometry and only heights
+come from the motors. Every such decision is recorded as a note; missing figures are errors.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ class Rebuilt:
 
 
 def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
-    """Stage angle of images 0 to count - 1 by the smooth-scan rule: i * (last - start) / (N - 1).
+    """Stage angle of images 0 to count - 1 by the smooth-scan rule: i * (last - start) / (N -
+    1).
 
     Args:
         settings: gives N ("# projections"), start and last angle; rot_obj there is the run-up
@@ -107,7 +108,11 @@ def rebuild(
         positions, assumed = _positions(settings, machine, np.degrees(angles))
         notes = [*assumed, *notes]
         camera = _camera(settings, shape, file, machine.detector.camera.modes)
-        found = None if camera is None else _profile(machine, profiles, camera, positions, figures)
+        found = (
+            None
+            if camera is None
+            else _profile(machine, profiles, camera, positions, figures)
+        )
         if found is not None and camera is not None:
             profile, why = found
             notes.append(f"profile {profile.name}{why}")
@@ -116,7 +121,11 @@ def rebuild(
         nothing = Profile(name=ZERO, machine=machine.name, source="no offsets")
         offsets = _default(machine, profiles) or nothing
         heights = motor_poses(machine, offsets, machine.detector.camera, positions)
-        why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
+        why = (
+            "no ROI and mode"
+            if camera is None
+            else "no profile reproduces the printed figures"
+        )
         height = f"heights come from the motors and {offsets.name}"
         place = {
             "source_x": float(heights.source[0, 0]),
@@ -157,7 +166,8 @@ def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]
     if sdd is not None and cor is not None and hc is not None:
         cor = hc + (cor - hc) * (sdd + far) / sdd
     note = (
-        f"mag_det_phys is {real.value:g} mm, mag_det {read.value:g} mm: the detector is taken to "
+        f"mag_det_phys is {real.value:g} mm, mag_det {read.value:g} mm: the detector is "
+        "taken to "
         f"be {far:+g} mm from where SDD has it"
     )
     motors = {**settings.motors, "mag_det": real}
@@ -182,7 +192,11 @@ def _profile(
         return profiles[0], ": as asked"
     if printed is None:
         chosen = _default(machine, profiles)
-        return None if chosen is None else (chosen, ": the default, no figures to check it by")
+        return (
+            None
+            if chosen is None
+            else (chosen, ": the default, no figures to check it by")
+        )
     first = {n: v[:1] for n, v in positions.items()}
     own = () if machine.default_profile else (profile_of(machine),)
     for profile in (*profiles, *own):
@@ -201,7 +215,11 @@ def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machin
     """
     said = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
     for machine in machines:
-        names = {_word(machine.scanner_name), _word(machine.scanner_type), _word(machine.name)}
+        names = {
+            _word(machine.scanner_name),
+            _word(machine.scanner_type),
+            _word(machine.name),
+        }
         if said & names or any(s.startswith(n) for s in said for n in names if n):
             return machine
     if said:
@@ -229,15 +247,22 @@ def _positions(
         if name in turning:
             out[name] = angles / turning[name]
         elif name in settings.motors:
-            out[name] = np.full(len(angles), axis.settings_sign * settings.motors[name].value)
+            out[name] = np.full(
+                len(angles), axis.settings_sign * settings.motors[name].value
+            )
         else:
             out[name] = np.full(len(angles), axis.home)
-            notes.append(f"the texts do not say where {name} stood; {axis.home:g} is assumed")
+            notes.append(
+                f"the texts do not say where {name} stood; {axis.home:g} is assumed"
+            )
     return out, notes
 
 
 def _camera(
-    settings: ScanSettings, shape: tuple[int, int], file: str, modes: tuple[tuple[str, int], ...]
+    settings: ScanSettings,
+    shape: tuple[int, int],
+    file: str,
+    modes: tuple[tuple[str, int], ...],
 ) -> CameraSettings | None:
     """Compute camera settings for images of `shape`; None if the texts do not state them."""
     if settings.roi is None or settings.mode is None:
@@ -268,6 +293,10 @@ def _default(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
     if not machine.default_profile:
         return profile_of(machine)
     return next(
-        (p for p in profiles if (p.machine, p.name) == (machine.name, machine.default_profile)),
+        (
+            p
+            for p in profiles
+            if (p.machine, p.name) == (machine.name, machine.default_profile)
+        ),
         None,
     )

@@ -1,8 +1,8 @@
 """`scan settings.txt` as a frozen value: the scanner's description of one scan, in its
 own terms.
 
-Positions carry the sign of the settings file (`Axis.settings_sign`), HC, VC and COR are measured
-from the pixel's edge, and every field may be absent (None). `rebuild` interprets it,
+Positions carry the sign of the settings file (`Axis.settings_sign`), HC, VC and COR are
+measured from the pixel's edge, and every field may be absent (None). `rebuild` interprets it,
 `scan_settings_text` writes and reads it.
 """
 
@@ -22,7 +22,16 @@ Kind = Literal["text", "number", "count", "mm", "minutes", "whole minutes", "roi
 """Name of the form in which a value is written."""
 _SCAN, _SAMPLE, _TUBE = "Scan info", "Sample info", "Tube settings"
 _CAMERA, _ACQUISITION, _CT = "Camera settings", "Acquisition settings", "CT-parameters IN"
-_ORDER = ("mag_obj", "mag_det", "rot_obj", "tra_obj", "tra_det", "tra_tube", "ver_tube", "ver_det")
+_ORDER = (
+    "mag_obj",
+    "mag_det",
+    "rot_obj",
+    "tra_obj",
+    "tra_det",
+    "tra_tube",
+    "ver_tube",
+    "ver_det",
+)
 
 
 @dataclass(frozen=True)
@@ -102,14 +111,18 @@ class ScanSettings:
     filament_mode: str | None = _text("Filament mode")
     output_mode: str | None = _text("Output mode")
     camera: str | None = _text("Camera", _CAMERA, "Camera name")
-    exposure_ms: float | None = _number("Exposure time (ms)", _CAMERA, "Exposure time (ms)")
+    exposure_ms: float | None = _number(
+        "Exposure time (ms)", _CAMERA, "Exposure time (ms)"
+    )
     averages: float | None = _number("Number of averages", _CAMERA, "Nr. of averages")
     original_pixel_mm: float | None = _number(
         "Original pixel size", _CAMERA, "Unbinned pixelsize (mm)"
     )
     mode: str | None = _text("Imaging mode", _CAMERA, "Imaging mode")
     binning: int | None = _count("Binning value", _CAMERA, "Binning value")
-    binned_pixel_mm: float | None = _number("Binned pixel size", _CAMERA, "Binned pixelsize (mm)")
+    binned_pixel_mm: float | None = _number(
+        "Binned pixel size", _CAMERA, "Binned pixelsize (mm)"
+    )
     roi: Roi | None = field(
         default=None, metadata={"entry": Entry("roi", "ROI (LTRB)", None, " : ")}
     )
@@ -123,15 +136,24 @@ class ScanSettings:
     post_flats: int | None = _total("# post flat fields", _ACQUISITION, "nr FF after")
     darks: int | None = _total("# offset images", _ACQUISITION, "nr DI before")
     reference_every: int | None = None
-    preheating_minutes: int | None = _stated("whole minutes", "Preheating time", separator=": ")
-    flat_axis: str | None = _text("Axis for flat field movement", _ACQUISITION, "Flat field axis")
+    preheating_minutes: int | None = _stated(
+        "whole minutes", "Preheating time", separator=": "
+    )
+    flat_axis: str | None = _text(
+        "Axis for flat field movement", _ACQUISITION, "Flat field axis"
+    )
 
     @property
     def figures(self) -> Figures | None:
         """SOD, SDD, HC, VC, COR and pixel, if all are stated, else None."""
         values = (
-            self.sod_mm, self.sdd_mm, self.hc_px, self.vc_px, self.cor_px, self.binned_pixel_mm,
-        )  # fmt: skip
+            self.sod_mm,
+            self.sdd_mm,
+            self.hc_px,
+            self.vc_px,
+            self.cor_px,
+            self.binned_pixel_mm,
+        )
         known = [v for v in values if v is not None]
         return Figures(*known) if len(known) == len(values) else None
 
@@ -211,7 +233,9 @@ def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
     machine = record.machine
     for name, virtual in machine.virtual_axes.items():
         reading = virtual.constant + virtual.factor * record.positions[virtual.of]
-        out[name] = MotorLine(reading, record.speeds[virtual.of], record.accelerations[virtual.of])
+        out[name] = MotorLine(
+            reading, record.speeds[virtual.of], record.accelerations[virtual.of]
+        )
     for name in sorted(machine.axes, key=_place):
         sign = machine.axes[name].settings_sign
         value = sign * record.positions[name] + 0.0  # no minus zero

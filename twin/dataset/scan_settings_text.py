@@ -1,9 +1,10 @@
-"""`scan settings.txt` as text: written as the scanner writes it, read as scanners have written it.
+"""`scan settings.txt` as text: written as the scanner writes it, read as scanners have written
+it.
 
-The fields of `ScanSettings` drive both directions, their order, keys and number formats are those
-of the real files. Reading is tolerant where real files vary (`:` or `=`, `value;`, decimal commas,
-missing lines, any case) and strict where a wrong number would do harm: a figure that is not a
-finite number is an error with its line.
+The fields of `ScanSettings` drive both directions, their order, keys and number formats are
+those of the real files. Reading is tolerant where real files vary (`:` or `=`, `value;`,
+decimal commas, missing lines, any case) and strict where a wrong number would do harm: a figure
+that is not a finite number is an error with its line.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ from typing import Any, Final
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import SCAN_SETTINGS
 from flexdt.twin.dataset.flexdt_json import ScanRecord
-from flexdt.twin.dataset.scan_settings import ENTRIES, Kind, MotorLine, ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings import (
+    ENTRIES,
+    Kind,
+    MotorLine,
+    ScanSettings,
+    settings_of,
+)
 from flexdt.twin.machine.camera import Roi
 
 EOL: Final = "\r\n"
@@ -30,19 +37,27 @@ _STOP: Final = "STOP"
 _SERIAL: Final = "Scanner S/N"
 _BEFORE: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(
-        ("stopped", "duration_minutes", "operator", "camera", "motors", "cancelled"), ("",)
+        ("stopped", "duration_minutes", "operator", "camera", "motors", "cancelled"),
+        ("",),
     ),
     "tube": ("", ""),
     "scan_type": ("Script summary:", ""),
 }
 """Field -> lines written before its own, even if that is absent."""
-_BY_KEY: Final = {entry.key.lower(): field for field, entry in ENTRIES.items() if entry.key}
+_BY_KEY: Final = {
+    entry.key.lower(): field for field, entry in ENTRIES.items() if entry.key
+}
 _MOTOR_WORD: Final = re.compile(r"[A-Za-z][A-Za-z0-9_ ]*")
 _EVERY: Final = re.compile(r"reference images every\s+(\d+)\s+projections", re.IGNORECASE)
-_DATE: Final = re.compile(r"date\s*[:=]\s*(?P<date>[^;]*);\s*time\s*[:=]\s*(?P<time>.*)", re.I)
+_DATE: Final = re.compile(
+    r"date\s*[:=]\s*(?P<date>[^;]*);\s*time\s*[:=]\s*(?P<time>.*)", re.I
+)
 _DATE_FORMATS: Final = (
-    "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y %H:%M:%S", "%d-%m-%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S",
-)  # fmt: skip
+    "%m/%d/%Y %I:%M:%S %p",
+    "%m/%d/%Y %H:%M:%S",
+    "%d-%m-%Y %H:%M:%S",
+    "%Y-%m-%d %H:%M:%S",
+)
 
 
 def clean(text: str) -> str:
@@ -140,7 +155,9 @@ def _date(moment: datetime) -> str:
 
 def _motor(name: str, motor: MotorLine) -> str:
     said = {name: motor.value, "speed": motor.speed, "acceleration": motor.acceleration}
-    return " ; ".join(f"{key} : {value:f}" for key, value in said.items() if value is not None)
+    return " ; ".join(
+        f"{key} : {value:f}" for key, value in said.items() if value is not None
+    )
 
 
 def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
@@ -232,7 +249,9 @@ def _is_motor(key: str, value: str) -> bool:
         return False
     if re.search(r";\s*speed\s*[:=]", value, re.IGNORECASE):
         return True
-    return "_" in key and re.fullmatch(r"[-+]?[\d.,]+(?:[eE][-+]?\d+)?;?", value) is not None
+    return (
+        "_" in key and re.fullmatch(r"[-+]?[\d.,]+(?:[eE][-+]?\d+)?;?", value) is not None
+    )
 
 
 def _read_motor(value: str) -> MotorLine:

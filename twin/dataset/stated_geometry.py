@@ -1,8 +1,9 @@
 """A geometry as the settings texts state it: SOD, SDD, HC, VC and COR, and the poses of these.
 
-HC and VC are the piercing point's column and row, COR the rotation axis's column, in binned pixels
-from the region's corner, measured from the pixel's EDGE: half a pixel more than the integer-centre
-coordinates used everywhere else. This module is the only place that adds or takes that half.
+HC and VC are the piercing point's column and row, COR the rotation axis's column, in binned
+pixels from the region's corner, measured from the pixel's EDGE: half a pixel more than the
+integer-centre coordinates used everywhere else. This module is the only place that adds or
+takes that half.
 """
 
 from __future__ import annotations
@@ -46,11 +47,15 @@ class Figures:
     @property
     def stated(self) -> dict[str, Any]:
         """The corresponding members of `ScanSettings`."""
-        numbers = {name: value for name, value in vars(self).items() if name != "pixel_mm"}
+        numbers = {
+            name: value for name, value in vars(self).items() if name != "pixel_mm"
+        }
         return {
-            **numbers, "binned_pixel_mm": self.pixel_mm, "voxel_um": self.voxel_um,
+            **numbers,
+            "binned_pixel_mm": self.pixel_mm,
+            "voxel_um": self.voxel_um,
             "magnification": self.magnification,
-        }  # fmt: skip
+        }
 
     @property
     def voxel_um(self) -> float:

@@ -21,10 +21,10 @@ from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_
 
 Value = str | bool | int | float
 Sections = Mapping[str, Mapping[str, Value]]
-# `[POIs]` are places in the scanner's world, as it prints them. That world has x across, y along
-# the beam and z up, with the origin at the focal spot's foot: the same directions as here. A
-# detector's entry is its top left corner with pixels per mm along rows and columns. Hardware that
-# the twin does not model has no entry.
+# `[POIs]` are places in the scanner's world, as it prints them. That world has x across, y
+# along the beam and z up, with the origin at the focal spot's foot: the same directions as
+# here. A detector's entry is its top left corner with pixels per mm along rows and columns.
+# Hardware that the twin does not model has no entry.
 _NOWHERE: Final = (0.0, 0.0, 0.0)
 _TALL_MM: Final = 2000.0
 """Height of the sample when the record has none [mm]."""
@@ -43,7 +43,9 @@ def format_xre(record: ScanRecord) -> str:
     absent = {name: motors.get(name, 0.0) for name in ("mag_tube", "tra_tube")}
     moved = {name: value for name, value in motors.items() if name != rotation} | absent
     flat = next((b for b in record.blocks if b.kind == "flat"), None)
-    if flat is not None and record.flat_axis in motors:  # where it took the sample for the flats
+    if (
+        flat is not None and record.flat_axis in motors
+    ):  # where it took the sample for the flats
         sign = record.machine.axes[record.flat_axis].settings_sign
         moved |= {
             "Flat field axis": record.flat_axis,
@@ -67,7 +69,9 @@ def format_xre(record: ScanRecord) -> str:
         "right": camera.shape[1] - 1.0,
         "voxel_mm": (s.voxel_um or 0.0) / 1000.0,
         "last": max(images - 1, 0),
-        "per_turn": round((images - 1) * 360.0 / turn) + 1 if images > 1 and turn > 0 else images,
+        "per_turn": round((images - 1) * 360.0 / turn) + 1
+        if images > 1 and turn > 0
+        else images,
         "sections": record.sections(),
         "darks": record.count("dark"),
         "flats": record.count("flat"),
@@ -77,7 +81,10 @@ def format_xre(record: ScanRecord) -> str:
     }
     template = resources.files("flexdt.twin") / "data" / "texts" / "xre.txt"
     lines = template.read_text(encoding="utf-8").splitlines(keepends=False)
-    return EOL.join(_Filled().format(line, record=record, s=s, **values) for line in lines) + EOL
+    return (
+        EOL.join(_Filled().format(line, record=record, s=s, **values) for line in lines)
+        + EOL
+    )
 
 
 class _Filled(string.Formatter):
@@ -103,7 +110,9 @@ def format_settings(settings: ScanSettings) -> str:
 
 def format_sections(sections: Sections) -> str:
     """Write sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
-    blocks = [f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()]
+    blocks = [
+        f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()
+    ]
     return (EOL + EOL).join(block.strip() for block in blocks) + EOL
 
 
@@ -117,13 +126,17 @@ def _utc(moment: datetime) -> str:
 
 
 def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
-    """Name -> entry: axis, piercing point, image, sample, source at the settings file's moment."""
+    """Name -> entry: axis, piercing point, image, sample, source at the settings file's
+    moment."""
     pose = record.settings_pose()
     source, axis = pose.source[0], pose.axis[0]
     rows, cols = record.camera.shape
     u, v = pose.u[0], pose.v[0]
     corner = pose.detector[0] - u * cols / 2.0 - v * rows / 2.0
-    right, down = u / float(u @ u), v / float(v @ v)  # pixels per mm along rows and columns
+    right, down = (
+        u / float(u @ u),
+        v / float(v @ v),
+    )  # pixels per mm along rows and columns
     at_source_height = np.array([axis[0], axis[1], source[2]])
     towards_source = np.cross(down, right)
     towards_source /= float(np.linalg.norm(towards_source))

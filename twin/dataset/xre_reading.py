@@ -27,7 +27,9 @@ class XreSettings:
         """Return a value's text for a section and key in any case; None if absent or
         empty.
         """
-        return next((v for k, v in self._entries(section) if k.lower() == key.lower() and v), None)
+        return next(
+            (v for k, v in self._entries(section) if k.lower() == key.lower() and v), None
+        )
 
     def number(self, section: str, key: str) -> float | None:
         """Return a value as a number; None if absent.
@@ -65,11 +67,15 @@ class XreSettings:
                 number = self.number(*entry.xre)
                 whole = entry.kind == "count"
                 values[field] = round(number) if whole and number is not None else number
-        smooth = (self.text("Acquisition settings", "Rotation mode") or "").lower() == "smooth"
+        smooth = (
+            self.text("Acquisition settings", "Rotation mode") or ""
+        ).lower() == "smooth"
         try:
             values["roi"] = None if roi is None else parse_roi(roi)
         except ValueError:
-            raise _wrong("Camera settings", "ROI", str(roi), "four whole numbers") from None
+            raise _wrong(
+                "Camera settings", "ROI", str(roi), "four whole numbers"
+            ) from None
         return ScanSettings(
             **values,
             motors=motors,

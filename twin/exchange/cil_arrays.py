@@ -1,9 +1,10 @@
-"""CIL's geometry with a pose a view: the arguments of `AcquisitionGeometry.create_Cone3D_Flex` and
-of its `set_panel`, by name (CIL 25 or newer has it; compared with commit d051455, version 26).
+"""CIL's geometry with a pose a view: the arguments of `AcquisitionGeometry.create_Cone3D_Flex`
+and of its `set_panel`, by name (CIL 25 or newer has it; compared with commit d051455, version
+26).
 
-CIL's frame is any; ours is kept. Its detector_direction_y points upwards while the data's row 0 is
-on top, which the panel's origin says: `top-left`. One pixel size holds for all views, and rows and
-columns are orthogonal.
+CIL's frame is any; ours is kept. Its detector_direction_y points upwards while the data's row 0
+is on top, which the panel's origin says: `top-left`. One pixel size holds for all views, and
+rows and columns are orthogonal.
 """
 
 from __future__ import annotations
@@ -35,8 +36,12 @@ PANEL: Final = ("num_pixels", "pixel_size", "origin")
 """Arguments of `set_panel`; counts and sizes along columns come first."""
 ORIGIN: Final = "top-left"
 """CIL's name for the corner of our first pixel."""
-ORIGINS: Final = {"top-left": (1, -1), "top-right": (-1, -1),
-                  "bottom-left": (1, 1), "bottom-right": (-1, 1)}  # fmt: skip
+ORIGINS: Final = {
+    "top-left": (1, -1),
+    "top-right": (-1, -1),
+    "bottom-left": (1, 1),
+    "bottom-right": (-1, 1),
+}
 """Origin of the data -> signs of our u and v along CIL's directions x and y."""
 
 
@@ -68,7 +73,9 @@ def read_cil(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """
     require_names(arrays, (*POSES, *PANEL), file)
     source, detector = vectors_of(arrays, (SOURCE, DETECTOR), file)
-    right, up = (directions_of(arrays, name, file, len(source)) for name in (COLUMNS, ROWS))
+    right, up = (
+        directions_of(arrays, name, file, len(source)) for name in (COLUMNS, ROWS)
+    )
     columns, rows = counts_of(arrays, "num_pixels", file, (2,))
     pitch_u, pitch_v = sizes_of(arrays, "pixel_size", file, (2,))
     origin = str(arrays["origin"])

@@ -1,9 +1,9 @@
 """flexDATA's `geometry.toml`: one circle, steps of equal angle, everything else standing still.
 
-Its detector has rows that grow upwards, so a geometry written here belongs to images turned upside
-down, which flexDATA's reader does by itself. Source, panel and axis may stand anywhere and the
-panel may be tilted in any way. The format has no list of angles and no skew pixels, so uneven
-angles, more than one circle and panels with skew pixels are errors.
+Its detector has rows that grow upwards, so a geometry written here belongs to images turned
+upside down, which flexDATA's reader does by itself. Source, panel and axis may stand anywhere
+and the panel may be tilted in any way. The format has no list of angles and no skew pixels, so
+uneven angles, more than one circle and panels with skew pixels are errors.
 """
 
 from __future__ import annotations
@@ -19,7 +19,12 @@ import numpy as np
 from flexdt.twin.exchange import geometry as g
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import cone_vec_of
-from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
+from flexdt.twin.geometry.conventions import (
+    FloatArray,
+    rotation_x,
+    rotation_y,
+    rotation_z,
+)
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
@@ -32,11 +37,13 @@ UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
 _NUMBERS: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("src2obj", "det2obj", "src2det"), math.nan),
     **dict.fromkeys(("det_rows", "det_cols", "det_pixel"), math.nan),
-    "ang_range": (math.nan, math.nan), "det_sample": (1.0, 1.0),
-    "vol_tra": (0.0, 0.0, 0.0), "vol_rot": (0.0, 0.0, 0.0),
+    "ang_range": (math.nan, math.nan),
+    "det_sample": (1.0, 1.0),
+    "vol_tra": (0.0, 0.0, 0.0),
+    "vol_rot": (0.0, 0.0, 0.0),
     **dict.fromkeys(("src_tan", "src_ort", "det_tan", "det_ort", "axs_tan"), 0.0),
     **dict.fromkeys(("axs_roll", "axs_pitch", "det_roll", "det_yaw", "det_pitch"), 0.0),
-}  # fmt: skip
+}
 """Name -> default values, as many as a file must give."""
 
 
@@ -61,7 +68,11 @@ def flexdata_text(geometry: ScanGeometry) -> str:
     if source[1] >= 0.0 or detector[1] - source[1] <= 0.0:
         raise ExchangeError("flexDATA: the source must stand before axis and detector")
     axes = np.stack(
-        [circle.u / pitch_u, np.cross(circle.v / pitch_v, circle.u / pitch_u), circle.v / pitch_v],
+        [
+            circle.u / pitch_u,
+            np.cross(circle.v / pitch_v, circle.u / pitch_u),
+            circle.v / pitch_v,
+        ],
         axis=1,
     )
     roll, yaw, pitch = _angles(axes)
@@ -109,7 +120,10 @@ def _angles(axes: FloatArray) -> tuple[float, float, float]:
 
 
 def read_flexdata(
-    text: str, views: int | None = None, shape: tuple[int, int] | None = None, file: str = "<toml>"
+    text: str,
+    views: int | None = None,
+    shape: tuple[int, int] | None = None,
+    file: str = "<toml>",
 ) -> ScanGeometry:
     """Read a `geometry.toml`; the result is for images as they are, with row 0 on top.
 
@@ -127,7 +141,9 @@ def read_flexdata(
     try:
         records = tomllib.loads(repaired)
     except tomllib.TOMLDecodeError as error:
-        raise ExchangeError(f"{file} is not valid TOML: {error}", {"path": file}) from None
+        raise ExchangeError(
+            f"{file} is not valid TOML: {error}", {"path": file}
+        ) from None
     found = {name: _values(name, records, file) for name in _NUMBERS}
     for name in UNSUPPORTED:
         if np.any(found[name]):
@@ -138,16 +154,23 @@ def read_flexdata(
             )
     count = records.get("proj_count", views) if views is None else views
     if not isinstance(count, int) or count < 1:
-        raise ExchangeError(f"{file} does not say how many views there are; it must be given")
+        raise ExchangeError(
+            f"{file} does not say how many views there are; it must be given"
+        )
     if shape is None and "det_rows" in records and "det_cols" in records:
         shape = (int(found["det_rows"]), int(found["det_cols"]))
     sod, odd, sdd = (float(found[name]) for name in ("src2obj", "det2obj", "src2det"))
-    sod, odd = (sdd - odd if math.isnan(sod) else sod), (sdd - sod if math.isnan(odd) else odd)
+    sod, odd = (
+        (sdd - odd if math.isnan(sod) else sod),
+        (sdd - sod if math.isnan(odd) else odd),
+    )
     if math.isnan(sod) or math.isnan(odd):
         raise ExchangeError(f"{file}: two of src2obj, det2obj and src2det are needed")
     given = distance_findings(sod, sod + odd, found["det_pixel"], ("src2obj", "src2det"))
     settled(given, ExchangeError, file)
-    roll, yaw, pitch = (math.radians(found[f"det_{name}"]) for name in ("roll", "yaw", "pitch"))
+    roll, yaw, pitch = (
+        math.radians(found[f"det_{name}"]) for name in ("roll", "yaw", "pitch")
+    )
     axes = rotation_y(roll) @ rotation_z(yaw) @ rotation_x(pitch)
     axis, moved, sample = found["axs_tan"], found["vol_tra"], found["det_sample"]
     circle = g.CircularScan(
@@ -172,9 +195,17 @@ def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
     each = given if isinstance(given, list) else [given]
     try:
         known = len(each) == usual.size and all(type(v) in (int, float) for v in each)
-        values = np.reshape([float(v) for v in each], usual.shape) if known else usual * math.nan
+        values = (
+            np.reshape([float(v) for v in each], usual.shape)
+            if known
+            else usual * math.nan
+        )
     except OverflowError:
         values = usual * math.nan
-    if (name in records or name in ("det_pixel", "ang_range")) and not np.isfinite(values).all():
-        raise ExchangeError(f"{file}: {name} must be {usual.size} finite numbers", {"path": name})
+    if (name in records or name in ("det_pixel", "ang_range")) and not np.isfinite(
+        values
+    ).all():
+        raise ExchangeError(
+            f"{file}: {name} must be {usual.size} finite numbers", {"path": name}
+        )
     return values

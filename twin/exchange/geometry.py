@@ -58,7 +58,9 @@ class ScanGeometry:
                 said = f"{len(self)} views but {len(count)} {what}"
                 raise ExchangeError.instead(said, len(count), len(self))
         if self.shape is not None and min(self.shape) < 1:
-            raise ExchangeError(f"detector shape {self.shape}; allowed: at least one pixel")
+            raise ExchangeError(
+                f"detector shape {self.shape}; allowed: at least one pixel"
+            )
 
     def __len__(self) -> int:
         return len(self.cone_vec)
@@ -105,7 +107,9 @@ class CircularScan:
         )
 
 
-def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM) -> CircularScan:
+def circle_of(
+    cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
+) -> CircularScan:
     """Find the circle that `cone_vec` describes.
 
     Args:
@@ -131,7 +135,9 @@ def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
     moved = cone_vec.moved(np.eye(3), np.array([-center[0], -center[1], 0.0]))
     world = moved.moved(rotation_z(-angle), np.zeros(3))
     middle = world.rows.mean(axis=0)
-    found = CircularScan(angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12])
+    found = CircularScan(
+        angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12]
+    )
     miss = np.abs(found.cone_vec().rows - cone_vec.rows).max(axis=1)
     what = f"{format_name} knows one circle with everything else standing still; the distance [mm]"
     require_each(f"{what} from it", miss, tolerance_mm)
@@ -150,7 +156,9 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     what = f"{format_name} knows panels with orthogonal rows and columns; their cosine"
     require_each(what, cosine, SQUARE_TOLERANCE)
     change = np.abs(lengths / lengths[0] - 1.0).max(axis=1)
-    require_each(f"{format_name} knows one pixel size; its change", change, SQUARE_TOLERANCE)
+    require_each(
+        f"{format_name} knows one pixel size; its change", change, SQUARE_TOLERANCE
+    )
     return float(lengths[:, 0].mean()), float(lengths[:, 1].mean())
 
 

@@ -1,12 +1,12 @@
 """LEAP's modular beam: the arguments of its `set_modularbeam`, by name (compared with commit
 0c8846f).
 
-LEAP's frame is ours, with the object's centre in the middle of its volume. A colVector points to
-the next column and a rowVector to the next row; the module's centre is the middle of all pixels.
-One pixel size holds for all views, and rows and columns are orthogonal. LEAP keeps single
-precision. Its filtered backprojection wants rows that grow upwards (rowVectors within 5 deg of +z)
-and heights of the source that differ by less than half a panel: `ScanGeometry.rows_up` and images
-turned upside down; its iterative methods take any view.
+LEAP's frame is ours, with the object's centre in the middle of its volume. A colVector points
+to the next column and a rowVector to the next row; the module's centre is the middle of all
+pixels. One pixel size holds for all views, and rows and columns are orthogonal. LEAP keeps
+single precision. Its filtered backprojection wants rows that grow upwards (rowVectors within 5
+deg of +z) and heights of the source that differ by less than half a panel:
+`ScanGeometry.rows_up` and images turned upside down; its iterative methods take any view.
 """
 
 from __future__ import annotations

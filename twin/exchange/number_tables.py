@@ -1,8 +1,8 @@
 """Geometry as plain numbers: csv, ASTRA's text, tomosipo's arrays, the project's own JSON file.
 
-Numbers are written so that reading gives the same float64. A table of another size is an error that
-names the number of values found. The JSON document stores the real geometry separately from the one
-that reconstruction knows; files of another version are errors.
+Numbers are written so that reading gives the same float64. A table of another size is an error
+that names the number of values found. The JSON document stores the real geometry separately
+from the one that reconstruction knows; files of another version are errors.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.json_text import parse_json
 
-VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
-                            for axis in "xyz")  # fmt: skip
+VECTOR_NAMES: Final = tuple(
+    f"{part}_{axis}" for part in ("source", "detector", "u", "v") for axis in "xyz"
+)
 TOMOSIPO_NAMES: Final = ("shape", "src_pos", "det_pos", "det_v", "det_u")
 _SHAPE = re.compile(r"^\s*#\s*detector rows (\d+), columns (\d+)\s*$", re.MULTILINE)
 KIND: Final = "flexdt geometry"
@@ -35,7 +36,9 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 def vectors_text(geometry: ScanGeometry) -> str:
     """Write ASTRA's cone_vec, twelve numbers a line."""
-    return "".join(" ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist())
+    return "".join(
+        " ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist()
+    )
 
 
 def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
@@ -123,7 +126,9 @@ def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]
         ExchangeError: the detector's shape is unknown.
     """
     if geometry.shape is None:
-        raise ExchangeError("tomosipo's cone_vec needs the detector's shape, which is unknown")
+        raise ExchangeError(
+            "tomosipo's cone_vec needs the detector's shape, which is unknown"
+        )
     c = geometry.cone_vec
     parts = (c.source, c.detector, c.v, c.u)
     vectors = [np.ascontiguousarray(part[:, ::-1]) for part in parts]
@@ -149,7 +154,11 @@ def read_tomosipo(
         if array.ndim != 2 or array.shape != (len(vectors[0]), 3) or not _real(array):
             what, like = f"{file}: {name}", " like the others"
             raise ExchangeError.of_shape(what, array.shape, ("n", 3), like)
-    if shape.shape != (2,) or not np.issubdtype(shape.dtype, np.integer) or shape.min() < 1:
+    if (
+        shape.shape != (2,)
+        or not np.issubdtype(shape.dtype, np.integer)
+        or shape.min() < 1
+    ):
         raise ExchangeError(f"{file}: shape must be two whole numbers (rows, columns)")
     source, detector, v, u = (np.asarray(a, dtype=np.float64)[:, ::-1] for a in vectors)
     rows = np.concatenate([source, detector, u, v], axis=1)
@@ -195,7 +204,9 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
 
 
 def _real(array: npt.NDArray[np.generic]) -> bool:
-    return np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
+    return np.issubdtype(array.dtype, np.floating) or np.issubdtype(
+        array.dtype, np.integer
+    )
 
 
 class _Panel(BaseModel):
@@ -227,7 +238,9 @@ def geometry_text(geometry: ScanGeometry) -> str:
         "files": list(geometry.files),
         **({} if geometry.full_scale is None else {"full_scale": geometry.full_scale}),
     }
-    parts = [f" {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()]
+    parts = [
+        f" {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()
+    ]
     parts.append(_rows("cone_vec", geometry.cone_vec))
     if geometry.real is not None:
         parts.append(_rows("real_cone_vec", geometry.real))
@@ -250,14 +263,18 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         what = f"{file}: kind {said[0]!r}, schema {said[1]!r}"
         raise ExchangeError.instead(what, list(said), f"{KIND!r}, schema {SCHEMA}")
     try:
-        found = _Document.model_validate({k: v for k, v in document.items() if v is not None})
+        found = _Document.model_validate(
+            {k: v for k, v in document.items() if v is not None}
+        )
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise ExchangeError(f"{file}: {where}: {first['msg']}", {"path": where}) from None
     rows, columns, real = found.detector.rows, found.detector.columns, found.real_cone_vec
     if (rows is None) != (columns is None):
-        raise ExchangeError(f"{file}: detector: rows and columns must be whole numbers above 0")
+        raise ExchangeError(
+            f"{file}: detector: rows and columns must be whole numbers above 0"
+        )
     return ScanGeometry(
         cone_vec_of(found.cone_vec, f"{file}: cone_vec"),
         None if rows is None or columns is None else (rows, columns),
@@ -278,7 +295,9 @@ def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[s
     try:
         document = parse_json(text, kind)
     except ValueError as error:
-        raise ExchangeError(f"{file} is not valid JSON: {error}", {"path": file}) from None
+        raise ExchangeError(
+            f"{file} is not valid JSON: {error}", {"path": file}
+        ) from None
     if not isinstance(document, dict):
         raise ExchangeError(f"{file}: not a JSON object", {"path": file})
     return document

@@ -1,10 +1,10 @@
 """RTK's circular geometry as XML: nine numbers per view, any source and any flat panel.
 
-RTK turns about its y with the source on +z: its (x, y, z) is our (x, z, -y). Nine numbers describe
-every view of a flat panel with orthogonal rows and columns; the file has neither pixel size nor
-shape, which belong to the images (spacing, and an origin of -(n - 1) / 2 pixels). A detector whose
-rows grow downwards has its u x v away from the source, which RTK writes with negative distances.
-Curved detectors are not supported.
+RTK turns about its y with the source on +z: its (x, y, z) is our (x, z, -y). Nine numbers
+describe every view of a flat panel with orthogonal rows and columns; the file has neither pixel
+size nor shape, which belong to the images (spacing, and an origin of -(n - 1) / 2 pixels). A
+detector whose rows grow downwards has its u x v away from the source, which RTK writes with
+negative distances. Curved detectors are not supported.
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ import numpy as np
 
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
 from flexdt.twin.exchange.number_tables import cone_vec_of
-from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
+from flexdt.twin.geometry.conventions import (
+    FloatArray,
+    rotation_x,
+    rotation_y,
+    rotation_z,
+)
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
@@ -26,12 +31,25 @@ TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 ROUNDING_TOLERANCE: Final = 1e-9
 """Largest relative difference of distances that counts as rounding."""
 VERSION: Final = "3"
-NAMES: Final = ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle", "SourceToIsocenterDistance",
-                "SourceToDetectorDistance", "SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX",
-                "ProjectionOffsetY")  # fmt: skip
+NAMES: Final = (
+    "GantryAngle",
+    "OutOfPlaneAngle",
+    "InPlaneAngle",
+    "SourceToIsocenterDistance",
+    "SourceToDetectorDistance",
+    "SourceOffsetX",
+    "SourceOffsetY",
+    "ProjectionOffsetX",
+    "ProjectionOffsetY",
+)
 """Names of the nine numbers: angles [deg], then lengths [mm]."""
-_PASSED_OVER = ("Matrix", "CollimationUInf", "CollimationUSup", "CollimationVInf",
-                "CollimationVSup")  # fmt: skip
+_PASSED_OVER = (
+    "Matrix",
+    "CollimationUInf",
+    "CollimationUSup",
+    "CollimationVInf",
+    "CollimationVSup",
+)
 _ROOT = "RTKThreeDCircularGeometry"
 
 
@@ -42,7 +60,11 @@ def rtk_text(geometry: ScanGeometry) -> str:
         ExchangeError: nine numbers cannot express a view.
     """
     require_panel(geometry.cone_vec, "RTK")
-    lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>", f'<{_ROOT} version="{VERSION}">']
+    lines = [
+        '<?xml version="1.0"?>',
+        "<!DOCTYPE RTKGEOMETRY>",
+        f'<{_ROOT} version="{VERSION}">',
+    ]
     for view, row in enumerate(geometry.cone_vec.rows):
         values = parameters_of(row, view)
         lines.append("  <Projection>")
@@ -72,7 +94,9 @@ def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
     axes = rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
     s, d = axes.T @ source, axes.T @ centre
     if abs(s[2] - d[2]) < 1e-6:
-        raise ExchangeError(f"view {view}: the source lies in the panel's plane", {"row": view})
+        raise ExchangeError(
+            f"view {view}: the source lies in the panel's plane", {"row": view}
+        )
     angles = (math.degrees(gantry) % 360.0, math.degrees(out), math.degrees(turn))
     lengths = (s[2], s[2] - d[2], s[0], s[1], d[0], d[1])
     return (*angles, *(float(x) for x in lengths))
@@ -128,10 +152,14 @@ def read_rtk(
             for entry in element:
                 _take(entry, values, file)
             if values["SourceToDetectorDistance"] == 0.0:
-                said = f"{file}: view {len(rows)} is parallel (no source-detector distance)"
+                said = (
+                    f"{file}: view {len(rows)} is parallel (no source-detector distance)"
+                )
                 raise ExchangeError.instead(said, 0.0, "a cone beam", row=len(rows))
             rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
-            stated.append((values["SourceToIsocenterDistance"], values["SourceToDetectorDistance"]))
+            stated.append(
+                (values["SourceToIsocenterDistance"], values["SourceToDetectorDistance"])
+            )
         else:
             _take(element, common, file)
     _require_distances(stated, file)
@@ -162,7 +190,9 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
     sid, sdd, sx, sy, px, py = values[3:]
     axes = TO_RTK.T @ rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
     source, centre = axes @ [sx, sy, sid], axes @ [px, py, sid - sdd]
-    return np.concatenate([source, centre, axes[:, 0] * pitch_mm[0], axes[:, 1] * pitch_mm[1]])
+    return np.concatenate(
+        [source, centre, axes[:, 0] * pitch_mm[0], axes[:, 1] * pitch_mm[1]]
+    )
 
 
 def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:

@@ -1,5 +1,5 @@
-"""TIGRE's cone geometry: the attributes of its `Geometry`, with an offset a view where it varies,
-and the angles (compared with the source of version 3.1.3, commit e702473).
+"""TIGRE's cone geometry: the attributes of its `Geometry`, with an offset a view where it
+varies, and the angles (compared with the source of version 3.1.3, commit e702473).
 
 TIGRE's frame is ours. At angle a its source stands at DSO (cos a, sin a, 0), a panel
 without offset opposite; u points to +y and the rows grow upwards at a = 0. So its angle
@@ -18,7 +18,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_each, require_panel
+from flexdt.twin.exchange.geometry import (
+    ExchangeError,
+    ScanGeometry,
+    require_each,
+    require_panel,
+)
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.exchange.view_arrays import (
     SPACE,
@@ -64,7 +69,9 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     require_each(what, np.sqrt(np.maximum(1.0 - level**2, 0.0)), 1.0 - MIN_LEVEL_PART)
     angles = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
     back = rotation_z(-angles)
-    source, apart, u, v = (np.einsum("nij,nj->ni", back, p) for p in (c.source, apart, u, v))
+    source, apart, u, v = (
+        np.einsum("nij,nj->ni", back, p) for p in (c.source, apart, u, v)
+    )
     what = "TIGRE knows sources before the object's origin; the distance [mm] that it is behind"
     require_each(what, -source[:, 0], 0.0)
     what = "TIGRE knows panels behind the source; the distance [mm] before it"
@@ -106,7 +113,9 @@ def _turns(axes: FloatArray) -> FloatArray:
     found: FloatArray = whole[nearer, np.arange(len(axes))]
     # Half a turn either way is one pose; all views of a scan have the same sign.
     return np.where(
-        np.isclose(found, -np.pi, rtol=0.0, atol=CONSTANT_TOLERANCE), found + 2.0 * np.pi, found
+        np.isclose(found, -np.pi, rtol=0.0, atol=CONSTANT_TOLERANCE),
+        found + 2.0 * np.pi,
+        found,
     )
 
 
@@ -119,7 +128,9 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """
     require_names(arrays, (*PER_VIEW, "nDetector", "dDetector", ANGLES), file)
     if "COR" in arrays and np.any(arrays["COR"]):
-        raise ExchangeError.instead(f"{file}: COR is not zero", "COR", "offOrigin", path="COR")
+        raise ExchangeError.instead(
+            f"{file}: COR is not zero", "COR", "offOrigin", path="COR"
+        )
     views = views_of(arrays, ANGLES, file)
     angles = numbers_of(arrays, ANGLES, file, (views,))
     dso, dsd, off_origin, off_detector, turned = (
@@ -151,10 +162,20 @@ def _axes(turns: FloatArray) -> FloatArray:
     """Compute Rz Ry Rx (n, 3, 3) of turns about x, y and z (n, 3) [rad]."""
     yaw, pitch, roll = turns.T
     one, zero = np.ones_like(yaw), np.zeros_like(yaw)
-    about_x = _stacked(one, zero, zero, zero, np.cos(yaw), -np.sin(yaw), zero, np.sin(yaw),
-                       np.cos(yaw))  # fmt: skip
-    about_y = _stacked(np.cos(pitch), zero, np.sin(pitch), zero, one, zero, -np.sin(pitch), zero,
-                       np.cos(pitch))  # fmt: skip
+    about_x = _stacked(
+        one, zero, zero, zero, np.cos(yaw), -np.sin(yaw), zero, np.sin(yaw), np.cos(yaw)
+    )
+    about_y = _stacked(
+        np.cos(pitch),
+        zero,
+        np.sin(pitch),
+        zero,
+        one,
+        zero,
+        -np.sin(pitch),
+        zero,
+        np.cos(pitch),
+    )
     product: FloatArray = rotation_z(roll) @ about_y @ about_x
     return product
 

@@ -63,7 +63,9 @@ def vectors_of(arrays: Arrays, names: Sequence[str], file: str) -> list[FloatArr
     return [numbers_of(arrays, name, file, (count, SPACE)) for name in names]
 
 
-def numbers_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
+def numbers_of(
+    arrays: Arrays, name: str, file: str, shape: tuple[int, ...]
+) -> FloatArray:
     """Read one array of finite numbers.
 
     Raises:
@@ -74,11 +76,15 @@ def numbers_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> 
         raise ExchangeError.of_shape(f"{file}: {name}", array.shape, shape, ", numbers")
     found = array.astype(np.float64)
     if not np.isfinite(found).all():
-        raise ExchangeError(f"{file}: {name} holds a number that is not finite", {"path": name})
+        raise ExchangeError(
+            f"{file}: {name} holds a number that is not finite", {"path": name}
+        )
     return found
 
 
-def counts_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+def counts_of(
+    arrays: Arrays, name: str, file: str, shape: tuple[int, ...]
+) -> tuple[int, ...]:
     """Read one array of whole numbers above 0.
 
     Raises:
@@ -86,7 +92,9 @@ def counts_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> t
     """
     found = numbers_of(arrays, name, file, shape).ravel()
     if (found < 1).any() or (found % 1 != 0).any():
-        raise ExchangeError.instead(f"{file}: {name}", found.tolist(), "whole numbers above 0")
+        raise ExchangeError.instead(
+            f"{file}: {name}", found.tolist(), "whole numbers above 0"
+        )
     return tuple(int(count) for count in found)
 
 
@@ -112,6 +120,8 @@ def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArra
     lengths = np.linalg.norm(found, axis=1, keepdims=True)
     if (lengths == 0.0).any():
         view = int(np.argmin(lengths))
-        raise ExchangeError(f"{file}: {name} has no direction in view {view}", {"row": view})
+        raise ExchangeError(
+            f"{file}: {name} has no direction in view {view}", {"row": view}
+        )
     unit: FloatArray = found / lengths
     return unit

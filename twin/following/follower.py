@@ -54,12 +54,23 @@ WIDENING_WIDTHS: Final = 3.0
 A good machine's is that far out less than once a day, for a normal or log-normal spread
 of up to 50 %.
 """
-_KINDS_OF_A_MOVE: Final = ("limit", "limit_near", "slow", "fast", "off_path", "offset", "moved")
+_KINDS_OF_A_MOVE: Final = (
+    "limit",
+    "limit_near",
+    "slow",
+    "fast",
+    "off_path",
+    "offset",
+    "moved",
+)
 """Kinds of alarms about an axis's last move, cleared by the next."""
 _KIND_OF_PROBLEM: Final = {
-    "limit": "limit", "limit_clamped": "limit", "mode": "mode", "roi": "roi",
+    "limit": "limit",
+    "limit_clamped": "limit",
+    "mode": "mode",
+    "roi": "roi",
     "xray_never_ready": "xray_never_ready",
-}  # fmt: skip
+}
 """Codes of problems that the plan of one command can find, and their kinds of alarm.
 
 The others, such as no image to save, come from planning it alone.
@@ -106,11 +117,16 @@ class Follower:
         if heard.what == "SEND":
             return self._sent(mirror, heard, now)
         waiting = mirror.asked(heard)
-        if waiting is None and any(map(heard.may_answer, mirror.ended)):  # doubled, or late
+        if waiting is None and any(
+            map(heard.may_answer, mirror.ended)
+        ):  # doubled, or late
             return mirror
         if waiting is not None:
             about = waiting.heard.words[0]
-            if ("silent", about) in mirror.active and now - waiting.told_s > MAX_SILENCE_S:
+            if (
+                "silent",
+                about,
+            ) in mirror.active and now - waiting.told_s > MAX_SILENCE_S:
                 mirror = replace(mirror, speaks=False)
             mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
         if heard.what == "FDB":
@@ -137,7 +153,12 @@ class Follower:
             if expected and overdue and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
                 mirror = replace(mirror, ends=mirror.ends or False)
-            if expected and not overdue and quiet > MAX_SILENCE_S and mirror.speaks is not False:
+            if (
+                expected
+                and not overdue
+                and quiet > MAX_SILENCE_S
+                and mirror.speaks is not False
+            ):
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
                 mirror = replace(mirror, speaks=mirror.speaks or False)
@@ -150,10 +171,14 @@ class Follower:
                 mirror = self._arrival(mirror, name, axis.position, path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             due = f"{self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
-            mirror = _alarm(mirror, now, "error", "late", "script", f"the script is late: {due}")
+            mirror = _alarm(
+                mirror, now, "error", "late", "script", f"the script is late: {due}"
+            )
         return mirror
 
-    def linked(self, mirror: Mirror, connected: bool, now: float, why: str = "") -> Mirror:
+    def linked(
+        self, mirror: Mirror, connected: bool, now: float, why: str = ""
+    ) -> Mirror:
         """Update the mirror after the link has come up or gone down, which forgets
         commands under way."""
         if connected:
@@ -198,7 +223,9 @@ class Follower:
         )
         collision = self.collision if self.machine.components else None
         report = check_plan(plan, (), collision)
-        assumed = f" ({', '.join(mirror.assumed)} assumed at home)" if mirror.assumed else ""
+        assumed = (
+            f" ({', '.join(mirror.assumed)} assumed at home)" if mirror.assumed else ""
+        )
         found: dict[tuple[str, int], Alarm] = {}
         exposures = [p for p in report.warnings if p.code in OPEN_BEAM_CODES]
         for p in (*report.errors, *exposures):  # of the contacts of one line, the first
@@ -229,12 +256,17 @@ class Follower:
         if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
         ends = [(i[0], i[2][:2]) for i, unheard in mirror.ended.items() if unheard]
-        if heard.named and (heard.key, heard.words[:2]) in ends:  # its end was heard before it
+        if (
+            heard.named and (heard.key, heard.words[:2]) in ends
+        ):  # its end was heard before it
             return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
             mirror = self._over(_flushed(mirror, now), heard.words[0], now)
         name, argument = heard.words[:2]
-        if not (name in FIXED or self.machine.has(name)) and find(name, argument) is not None:
+        if (
+            not (name in FIXED or self.machine.has(name))
+            and find(name, argument) is not None
+        ):
             what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
             mirror = _alarm(mirror, now, "error", "unknown_axis", name, what)
         if argument.lower() == "stop":
@@ -249,8 +281,14 @@ class Follower:
     def _over(self, mirror: Mirror, component: str, now: float) -> Mirror:
         """End the commands of a component, or of all, whose predicted time is over."""
         for waiting in mirror.waiting.values():
-            over = now + waiting.heard.late_s - waiting.sent_s > (waiting.predicted_s or 0.0)
-            if over and not waiting.superseded and component in ("", waiting.heard.words[0]):
+            over = now + waiting.heard.late_s - waiting.sent_s > (
+                waiting.predicted_s or 0.0
+            )
+            if (
+                over
+                and not waiting.superseded
+                and component in ("", waiting.heard.words[0])
+            ):
                 mirror = _after(mirror, waiting.heard.command, self.machine, now)
                 mirror = mirror.with_waiting(waiting, superseded=True)
         return mirror
@@ -279,12 +317,16 @@ class Follower:
             sim.motors.all[name].moves.append((path.start, path))
         sim.run((replace(command, wait=c.Wait.ACK),))
         step = sim.steps[0]
-        moved = tuple(n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now)
+        moved = tuple(
+            n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now
+        )
         about = getattr(command, "component", "") or waiting.heard.words[0]
         if isinstance(command, c.MoveAbsolute):
             mirror = mirror.cleared(about, *_KINDS_OF_A_MOVE)
         for p in sim.findings.problems:
-            if p.code in _KIND_OF_PROBLEM and not (mirror.xrays_on is None and "xray" in p.code):
+            if p.code in _KIND_OF_PROBLEM and not (
+                mirror.xrays_on is None and "xray" in p.code
+            ):
                 kind = _KIND_OF_PROBLEM[p.code]
                 mirror = _alarm(mirror, now, p.severity, kind, about, p.message)
         low, high = _bounds(step, self.machine)
@@ -303,7 +345,11 @@ class Follower:
             mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
-        motors = self.machine.moves(about) if isinstance(command, c.MoveAbsolute) and known else ()
+        motors = (
+            self.machine.moves(about)
+            if isinstance(command, c.MoveAbsolute) and known
+            else ()
+        )
         targets = {n: mirror.axes[n].target for n in motors}
         return mirror, replace(
             waiting, predicted_s=step.holds_s, least_s=low, most_s=high, targets=targets
@@ -338,7 +384,11 @@ class Follower:
             steps = self._steps[: at + 1]
             holds = sum(s.holds_s for s in steps)
             found = total_range(steps, holds, self.machine.timing)
-            bounds = [_bounds(s, self.machine) for s in steps] if found is None else [_wider(found)]
+            bounds = (
+                [_bounds(s, self.machine) for s in steps]
+                if found is None
+                else [_wider(found)]
+            )
             high = sum(b[1] for b in bounds)
             due = began + high if at + 1 < len(lines) else None
             mirror = mirror.cleared("script")
@@ -372,7 +422,9 @@ class Follower:
 
     # -- replies -----------------------------------------------------------------------------
 
-    def _ended(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
+    def _ended(
+        self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
+    ) -> Mirror:
         """Update the mirror with the end of a command: record, range, positions, settings.
 
         Args:
@@ -412,7 +464,9 @@ class Follower:
             return self._read(mirror, heard, waiting, now)
         return _after(mirror, waiting.heard.command, self.machine, now)
 
-    def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
+    def _arrived(
+        self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float
+    ) -> Mirror:
         """Update positions, limits and rates with the reply at the end of a move.
 
         Args:
@@ -437,7 +491,9 @@ class Follower:
             return mirror
         return self._compared(mirror, name, motor, now)
 
-    def _arrival(self, mirror: Mirror, name: str, there: float, meant: float, now: float) -> Mirror:
+    def _arrival(
+        self, mirror: Mirror, name: str, there: float, meant: float, now: float
+    ) -> Mirror:
         """Raise an alarm if a motor is not where its move led."""
         if abs(there - meant) <= TARGET_TOLERANCE:
             return mirror
@@ -445,7 +501,9 @@ class Follower:
         what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
         return _alarm(mirror, now, "error", "offset", name, what)
 
-    def _compared(self, mirror: Mirror, name: str, motor: MotorReply, now: float) -> Mirror:
+    def _compared(
+        self, mirror: Mirror, name: str, motor: MotorReply, now: float
+    ) -> Mirror:
         """Compare limits and rates of a motor's reply with those of the machine file.
 
         Args:
@@ -463,15 +521,21 @@ class Follower:
                 (axis.max_speed, axis.max_acceleration),
             ),
         ):
-            if any(abs(a - b) > 1e-6 * (1.0 + abs(b)) for a, b in zip(theirs, ours, strict=True)):
+            if any(
+                abs(a - b) > 1e-6 * (1.0 + abs(b))
+                for a, b in zip(theirs, ours, strict=True)
+            ):
                 text = (
-                    f"{name}: the motor's own {what} are {theirs[0]:g} and {theirs[1]:g}, machine "
+                    f"{name}: the motor's own {what} are {theirs[0]:g} and "
+                    f"{theirs[1]:g}, machine "
                     f"{self.machine.name} has {ours[0]:g} and {ours[1]:g}"
                 )
                 mirror = _alarm(mirror, now, "error", what, name, text)
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
-    def _read(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
+    def _read(
+        self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
+    ) -> Mirror:
         """Compare a reading of a motor's position with its predicted path.
 
         Args:
@@ -485,7 +549,9 @@ class Follower:
         motor = motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
         moves = waiting is not None and bool(waiting.targets)
-        known = self.machine.has(axis) and (moves or asks == "position" or motor is not None)
+        known = self.machine.has(axis) and (
+            moves or asks == "position" or motor is not None
+        )
         if at is None or not known:
             return mirror
         name, x = self._motor(axis, at)
@@ -498,7 +564,11 @@ class Follower:
         if path is None:
             mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
             moved = waiting is None and heard.words[1].startswith("move")
-            if seen.heard_s is not None and abs(x - seen.position) > TARGET_TOLERANCE and not moved:
+            if (
+                seen.heard_s is not None
+                and abs(x - seen.position) > TARGET_TOLERANCE
+                and not moved
+            ):
                 stood = f"not at {seen.position:.6g}, and no move of it was heard"
                 what = f"{name} stands at {x:.6g} {unit}, {stood}"
                 mirror = _alarm(mirror, now, "error", "moved", name, what)
@@ -506,10 +576,16 @@ class Follower:
         arrived = abs(x - path.target) <= TARGET_TOLERANCE
         passes = path.end if arrived else path.time_at(x)
         here = mirror.with_axis(name, position=x, heard_s=now)
-        if moves and passes is not None and passes < seen.passed_s:  # old, if not the last
+        if (
+            moves and passes is not None and passes < seen.passed_s
+        ):  # old, if not the last
             last = mirror.ends is False and now > path.end > seen.passed_s
             return here if last else mirror
-        if moves and passes == seen.passed_s and now - (seen.heard_s or now) < MAX_SILENCE_S:
+        if (
+            moves
+            and passes == seen.passed_s
+            and now - (seen.heard_s or now) < MAX_SILENCE_S
+        ):
             return mirror  # a repeated reading
         if arrived or abs(x - path.pieces[0].position) <= TARGET_TOLERANCE:
             if passes is None:
@@ -524,7 +600,9 @@ class Follower:
         if least > seen.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
             what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
             here = _alarm(here, now, "error", "slow", name, what)
-        elif most + seen.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > MAX_DRIFT_S):
+        elif most + seen.begun_s < -SLACK_S or (
+            most < 0.0 and first[0] - most > MAX_DRIFT_S
+        ):
             what = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
             here = _alarm(here, now, "error", "fast", name, what)
         promptest = min(first, (least, most), key=lambda behind: behind[1])
@@ -537,7 +615,9 @@ class Follower:
             return axis, at
         return virtual.of, (at - virtual.constant) / virtual.factor
 
-    def _outside(self, mirror: Mirror, waiting: Waiting, took: float, now: float) -> Mirror:
+    def _outside(
+        self, mirror: Mirror, waiting: Waiting, took: float, now: float
+    ) -> Mirror:
         """Raise an alarm about a time outside its range."""
         longer = "more" if took > waiting.most_s else "less"
         bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
@@ -573,7 +653,9 @@ def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
     """Bring the motors of a move to rest, except those that another move has sent on."""
     for name in () if waiting is None else waiting.targets:
         if waiting is not None and _stays(mirror, name, waiting):
-            mirror = replace(mirror, axes={**mirror.axes, name: mirror.axes[name].at_rest})
+            mirror = replace(
+                mirror, axes={**mirror.axes, name: mirror.axes[name].at_rest}
+            )
     return mirror
 
 
@@ -585,7 +667,9 @@ def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
 def _bare(command: c.Command) -> c.Command:
     """Strip a command of its place in the text, its wait, its times and the
     case of its axis."""
-    bare = replace(command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None)
+    bare = replace(
+        command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None
+    )
     if isinstance(bare, c.MotorCommand):
         bare = replace(bare, component=bare.component.lower())
     if isinstance(bare, c.MoveAbsolute):
@@ -599,7 +683,9 @@ def _flushed(mirror: Mirror, now: float) -> Mirror:
         if waiting.written or waiting.heard.asks:
             continue
         trigger = getattr(waiting.heard.command, "trigger", None)
-        wait, took = ("no wait", 0.0) if trigger is None else ("POS", now - waiting.sent_s)
+        wait, took = (
+            ("no wait", 0.0) if trigger is None else ("POS", now - waiting.sent_s)
+        )
         lines = (*mirror.lines, *_line(waiting, wait, took, "command sent"))
         mirror = replace(mirror, lines=lines).with_waiting(waiting, written=True)
     return mirror
@@ -624,7 +710,9 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: float) -> Mirror:
+def _after(
+    mirror: Mirror, command: c.Command | None, machine: Machine, now: float
+) -> Mirror:
     """Apply the end of a command to the mirror's settings.
 
     Args:
@@ -639,7 +727,9 @@ def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: flo
         case c.TubeSetting():
             return replace(mirror, **command.arguments)
         case c.XrayOn():
-            return replace(mirror, xrays_on=True, ready_s=now + machine.timing.xray_ready_s)
+            return replace(
+                mirror, xrays_on=True, ready_s=now + machine.timing.xray_ready_s
+            )
         case c.XrayOff():
             return replace(mirror, xrays_on=False)
         case c.WaitXrayReady():
@@ -647,5 +737,7 @@ def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: flo
         case c.SetSpeed() | c.SetAcceleration() if machine.has(command.component):
             rates = command.arguments
             for motor, share in machine.moves(rates.pop("component")).items():
-                mirror = mirror.with_axis(motor, **{n: x * abs(share) for n, x in rates.items()})
+                mirror = mirror.with_axis(
+                    motor, **{n: x * abs(share) for n, x in rates.items()}
+                )
     return mirror

@@ -202,7 +202,8 @@ class Mirror:
     def of(cls, machine: Machine) -> Mirror:
         """Make the mirror before any message: homes and defaults, all of them assumed."""
         axes = {
-            n: SeenAxis(a.home, a.home, a.speed, a.acceleration) for n, a in machine.axes.items()
+            n: SeenAxis(a.home, a.home, a.speed, a.acceleration)
+            for n, a in machine.axes.items()
         }
         return cls(axes, machine.detector.camera, machine.tube.kV, machine.tube.power_W)
 
@@ -238,7 +239,9 @@ class Mirror:
 
         def alike(asked: Waiting) -> tuple[bool, bool]:
             """Rank a waiting command by agreement with the reply."""
-            return asked.heard.words[:2] == reply.words[:2], asked.heard.tick == reply.tick
+            return asked.heard.words[:2] == reply.words[
+                :2
+            ], asked.heard.tick == reply.tick
 
         found = (w for i, w in self.waiting.items() if reply.may_answer(i))
         return max(found, key=alike, default=None)
@@ -276,7 +279,9 @@ class Mirror:
         if key in self.active:
             return self
         kept = (*self.alarms, alarm)[-MAX_ALARMS:]
-        return replace(self, alarms=kept, raised=self.raised + 1, active=self.active | {key})
+        return replace(
+            self, alarms=kept, raised=self.raised + 1, active=self.active | {key}
+        )
 
     def cleared(self, about: str, *kinds: str) -> Mirror:
         """End the conditions about something, of these kinds or of all."""
@@ -316,7 +321,10 @@ class Mirror:
             "waiting": list(self.under_way),
             "next_line": self.next_line,
             "alarms": [
-                {"age_s": ago(a.at_s), **{n: x for n, x in vars(a).items() if n != "at_s"}}
+                {
+                    "age_s": ago(a.at_s),
+                    **{n: x for n, x in vars(a).items() if n != "at_s"},
+                }
                 for a in self.alarms
             ],
             "raised": self.raised,

@@ -101,7 +101,10 @@ class ConeVec:
             (2, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
         """
         parts = np.broadcast_arrays(
-            *(np.atleast_2d(np.asarray(p, dtype=np.float64)) for p in (source, detector, u, v))
+            *(
+                np.atleast_2d(np.asarray(p, dtype=np.float64))
+                for p in (source, detector, u, v)
+            )
         )
         return cls(np.concatenate(parts, axis=1), shape)
 
@@ -199,7 +202,9 @@ class ConeVec:
         columns, down = _numbers("offset", offset, 2, "mm")
         roll, tilt, yaw = (math.radians(a) for a in _numbers("tilts", tilts, 3, "deg"))
         places = {"sod": sod, "sdd": sdd, "height": height}
-        sod, sdd, height = (_numbers(name, value, 1, "mm")[0] for name, value in places.items())
+        sod, sdd, height = (
+            _numbers(name, value, 1, "mm")[0] for name, value in places.items()
+        )
         if not 0.0 < sod <= sdd:
             request = f"sod {sod:g} mm and sdd {sdd:g} mm"
             raise GeometryError.instead(request, [sod, sdd], "0 < sod <= sdd")
@@ -423,7 +428,9 @@ class ConeVec:
             (3, 76, 96)
         """
         if not parts:
-            raise GeometryError("no geometries to stack; allowed: at least one", {"asked": 0})
+            raise GeometryError(
+                "no geometries to stack; allowed: at least one", {"asked": 0}
+            )
         shapes = {p.detector_shape for p in parts}
         rows = np.concatenate([p.rows for p in parts], axis=0)
         return cls(rows, shapes.pop() if len(shapes) == 1 else None)
@@ -466,7 +473,9 @@ class ConeVec:
         )
 
     def _repr_html_(self) -> str:
-        cells = "".join(f"<tr><th>{k}</th><td>{v}</td></tr>" for k, v in self._facts().items())
+        cells = "".join(
+            f"<tr><th>{k}</th><td>{v}</td></tr>" for k, v in self._facts().items()
+        )
         return f"<table><caption>ConeVec</caption>{cells}</table>"
 
     def _facts(self) -> dict[str, str]:
@@ -474,7 +483,11 @@ class ConeVec:
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
         pitch = steps[0] if steps[0] == steps[1] else " x ".join(steps)
         shape = self.detector_shape
-        pixels = "pixels" if shape is None else f"{shape[0]} x {shape[1]} pixels (rows x columns)"
+        pixels = (
+            "pixels"
+            if shape is None
+            else f"{shape[0]} x {shape[1]} pixels (rows x columns)"
+        )
         return {
             "views": f"{len(self)} view{'' if len(self) == 1 else 's'}",
             "detector": f"{pixels} of {pitch} mm",
@@ -491,7 +504,11 @@ class ConeVec:
             >>> sorted(scan.to_dict()), scan.to_dict()["detector_shape"]
             (['detector_shape', 'rows'], [76, 96])
         """
-        known = {} if self.detector_shape is None else {"detector_shape": list(self.detector_shape)}
+        known = (
+            {}
+            if self.detector_shape is None
+            else {"detector_shape": list(self.detector_shape)}
+        )
         return {"rows": self.rows.tolist(), **known}
 
     @classmethod
@@ -511,7 +528,9 @@ class ConeVec:
             rows = np.asarray(document["rows"], dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
             what = f"a geometry's document has rows of twelve numbers: {error!r}"
-            raise GeometryError(what, {"asked": repr(document)[:100], "allowed": "rows"}) from None
+            raise GeometryError(
+                what, {"asked": repr(document)[:100], "allowed": "rows"}
+            ) from None
         return cls(rows, document.get("detector_shape"))
 
     @property
@@ -541,7 +560,8 @@ class ConeVec:
         given = None if shape is None else check_shape(shape)
         if given is not None and own is not None and given != own:
             raise GeometryError(
-                f"detector shape {given}; this geometry is of a detector of {own} (rows, columns)",
+                f"detector shape {given}; this geometry is of a detector of {own} (rows, "
+                "columns)",
                 {"asked": list(given), "allowed": list(own)},
             )
         found = own if given is None else given
@@ -646,10 +666,17 @@ class ConeVec:
             ((4, 12), [-7.125, 1059.0, 5.625])
         """
         rows, cols = self.of_shape(shape)
-        first = self.detector - (cols - 1) / 2 * self.u - (rows - 1) / 2 * self.v - self.source
+        first = (
+            self.detector
+            - (cols - 1) / 2 * self.u
+            - (rows - 1) / 2 * self.v
+            - self.source
+        )
         return np.concatenate([self.source, first, self.u, self.v], axis=1)
 
-    def project_points(self, points: npt.ArrayLike, shape: Shape2 | None = None) -> FloatArray:
+    def project_points(
+        self, points: npt.ArrayLike, shape: Shape2 | None = None
+    ) -> FloatArray:
         """Project points through the focal spot onto the detector.
 
         Args:
@@ -740,7 +767,9 @@ class ConeVec:
         """
         r = np.broadcast_to(np.asarray(rotation, dtype=np.float64), (len(self), 3, 3))
         t = np.broadcast_to(np.asarray(translation, dtype=np.float64), (len(self), 3))
-        turned = [np.einsum("nij,nj->ni", r, part) for part in (self.source, self.detector)]
+        turned = [
+            np.einsum("nij,nj->ni", r, part) for part in (self.source, self.detector)
+        ]
         steps = [np.einsum("nij,nj->ni", r, part) for part in (self.u, self.v)]
         rows = np.concatenate([turned[0] + t, turned[1] + t, *steps], axis=1)
         return ConeVec(rows, self.detector_shape)
@@ -763,11 +792,15 @@ class ConeVec:
         rows, cols = self.of_shape(shape)
         if factor not in range(1, min(rows, cols) + 1):
             what = f"binning by {factor!r}; allowed: a whole number from 1 to {min(rows, cols)}"
-            raise GeometryError(what, {"asked": repr(factor), "allowed": [1, min(rows, cols)]})
+            raise GeometryError(
+                what, {"asked": repr(factor), "allowed": [1, min(rows, cols)]}
+            )
         shift_u = (cols // factor * factor - cols) / 2
         shift_v = (rows // factor * factor - rows) / 2
         centre = self.detector + shift_u * self.u + shift_v * self.v
-        binned_shape = None if self.detector_shape is None else (rows // factor, cols // factor)
+        binned_shape = (
+            None if self.detector_shape is None else (rows // factor, cols // factor)
+        )
         return ConeVec.from_vectors(
             self.source, centre, self.u * factor, self.v * factor, binned_shape
         )
@@ -791,11 +824,15 @@ def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray
     """
     found: FloatArray = np.asarray(angles, dtype=np.float64)
     if isinstance(angles, int | np.integer):
-        found = np.linspace(0.0, FULL_TURN_DEG * turns, max(int(angles), 0), endpoint=False)
+        found = np.linspace(
+            0.0, FULL_TURN_DEG * turns, max(int(angles), 0), endpoint=False
+        )
     if found.ndim != 1 or len(found) == 0 or not np.isfinite(found).all():
         shown = angles if np.ndim(angles) == 0 else f"an array of shape {found.shape}"
         what = f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]"
-        raise GeometryError(what, {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"})
+        raise GeometryError(
+            what, {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"}
+        )
     return found
 
 
@@ -913,7 +950,8 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
     if (distance <= 0).any():
         i = int(np.argmin(distance))
         raise GeometryError(
-            f"cone_vec row {i}: the source-detector distance is {distance[i]:.6g} mm; it must be "
+            f"cone_vec row {i}: the source-detector distance is {distance[i]:.6g} mm; it "
+            "must be "
             "positive",
             {"row": i, "check": "sdd", "asked": float(distance[i]), "allowed": "> 0"},
         )

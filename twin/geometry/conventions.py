@@ -52,7 +52,9 @@ ROW_DIRECTION = (0.0, 0.0, -1.0)
 """Direction of v, the step to the next row, for an untilted detector."""
 
 
-def as_numbers(what: str, value: object, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+def as_numbers(
+    what: str, value: object, dtype: npt.DTypeLike = np.float64
+) -> npt.NDArray[Any]:
     """Convert to an array of real numbers.
 
     Raises:
@@ -67,7 +69,8 @@ def as_numbers(what: str, value: object, dtype: npt.DTypeLike = np.float64) -> n
     except (TypeError, ValueError):
         kind = type(value).__name__
         raise GeometryError(
-            f"{what}: {'an' if kind[0] in 'aeiou' else 'a'} {kind}; allowed: an array of numbers",
+            f"{what}: {'an' if kind[0] in 'aeiou' else 'a'} {kind}; allowed: an array of "
+            "numbers",
             {"asked": kind, "allowed": "numbers"},
         ) from None
 

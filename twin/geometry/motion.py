@@ -126,16 +126,25 @@ class Motion:
         for name in require_movable(tuple(document)):
             try:
                 values, sigmas = (
-                    np.array(document[name][key], dtype=np.float64) for key in ("values", "sigmas")
+                    np.array(document[name][key], dtype=np.float64)
+                    for key in ("values", "sigmas")
                 )
                 evidence = float(str(document[name]["evidence"]))
             except (KeyError, TypeError, ValueError) as error:
                 raise TwinError(f"motion of {name}: {error}") from None
-            if values.ndim != 1 or values.shape != sigmas.shape or not np.isfinite(values).all():
-                raise TwinError(f"motion of {name}: values and sigmas are not a number a frame")
+            if (
+                values.ndim != 1
+                or values.shape != sigmas.shape
+                or not np.isfinite(values).all()
+            ):
+                raise TwinError(
+                    f"motion of {name}: values and sigmas are not a number a frame"
+                )
             columns[name] = (values, sigmas, evidence)
         if len({len(c[0]) for c in columns.values()}) != 1:
-            raise TwinError("motion: parameters have different numbers of frames, or there is none")
+            raise TwinError(
+                "motion: parameters have different numbers of frames, or there is none"
+            )
         unit = np.array([to_internal(name, 1.0) for name in columns])
         return cls(
             tuple(columns),

@@ -16,7 +16,14 @@ from typing import Final
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 
-_IN_DEG: Final = ("alpha", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
+_IN_DEG: Final = (
+    "alpha",
+    "det_roll",
+    "det_pitch",
+    "det_yaw",
+    "axis_tilt_x",
+    "axis_tilt_z",
+)
 MAX_TILT_DEG: Final = 45.0
 """Largest plausible tilt [deg] (assumed)."""
 ANGLE_SCALE_RANGE: Final = (0.5, 2.0)
@@ -95,7 +102,9 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
         if name != "alpha" and not low <= value <= high:
             unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
             what = f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}"
-            raise GeometryError(what, {"check": name, "asked": value, "allowed": [low, high]})
+            raise GeometryError(
+                what, {"check": name, "asked": value, "allowed": [low, high]}
+            )
 
 
 def to_internal(name: str, value: float) -> float:

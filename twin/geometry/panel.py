@@ -134,9 +134,13 @@ class Panel:
         rows, cols = self.model.shape
         places = np.moveaxis(np.mgrid[:rows, :cols][::-1], 0, -1).astype(np.float64)
         out = places
-        for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
+        for _ in range(
+            4
+        ):  # A distortion is smooth: each time, little is left of the error.
             out = places + self.shift(out)
-        for border in self.model.borders:  # A pixel in a gap is between the lines beside it.
+        for (
+            border
+        ) in self.model.borders:  # A pixel in a gap is between the lines beside it.
             axis = border.axis
             first = math.ceil(border.at)
             sides = np.stack([places[:, :1] if axis == 0 else places[:1]] * 2)
@@ -153,7 +157,9 @@ class Panel:
         share = self.lag / (1.0 - self.lag)
         shown = np.exp(-image)
         light = (shown - share * np.exp(-before)) / (1.0 - share)
-        return np.asarray(-np.log(np.maximum(light, MIN_LIGHT_SHARE * shown)), dtype=np.float32)
+        return np.asarray(
+            -np.log(np.maximum(light, MIN_LIGHT_SHARE * shown)), dtype=np.float32
+        )
 
     def undistorted(self, image: Float32Array) -> Float32Array:
         """Resample an image (rows, cols) as a panel without distortion would have taken it.
@@ -168,9 +174,14 @@ class Panel:
             return image
         if image.shape != self.model.shape:
             raise TwinError.of_shape(
-                "an image", image.shape, self.model.shape, ": the panel's distortion is of those"
+                "an image",
+                image.shape,
+                self.model.shape,
+                ": the panel's distortion is of those",
             )
-        out = cv2.remap(image, *self._map, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        out = cv2.remap(
+            image, *self._map, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+        )
         return np.asarray(out, dtype=np.float32)
 
     def to_json(self) -> dict[str, Any]:
@@ -179,7 +190,8 @@ class Panel:
             "model": "cubic",
             "shape": list(self.model.shape),
             "borders": [
-                {"axis": ("column", "row")[b.axis], "from": b.at} for b in self.model.borders
+                {"axis": ("column", "row")[b.axis], "from": b.at}
+                for b in self.model.borders
             ],
             "coefficients": dict(zip(self.model.names, self.coefficients, strict=True)),
             **({"lag": self.lag} if self.lag else {}),

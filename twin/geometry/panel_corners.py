@@ -19,5 +19,7 @@ def panel_corners(cone_vec: ConeVec) -> FloatArray:
     """
     _, rows, cols = cone_vec.shape
     across, down = cone_vec.u * cols / 2, cone_vec.v * rows / 2
-    offsets = np.stack([-across - down, across - down, across + down, down - across], axis=1)
+    offsets = np.stack(
+        [-across - down, across - down, across + down, down - across], axis=1
+    )
     return np.asarray(cone_vec.detector[:, None] + offsets)

@@ -69,7 +69,8 @@ class Poses:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Poses) and all(
-            np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)
+            np.array_equal(getattr(self, f.name), getattr(other, f.name))
+            for f in fields(self)
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -79,13 +80,17 @@ class Poses:
         if len(self) > MAX_PRINTED_VIEWS:
             turn = np.degrees(self.angle)
             return f"<Poses: {len(self)} views, {turn[0]:.6g} to {turn[-1]:.6g} deg>"
-        values = ", ".join(f"{f.name}={getattr(self, f.name).tolist()!r}" for f in fields(self))
+        values = ", ".join(
+            f"{f.name}={getattr(self, f.name).tolist()!r}" for f in fields(self)
+        )
         return f"Poses({values})"
 
     @classmethod
     def concatenate(cls, parts: Sequence[Poses]) -> Poses:
         """Stack several sets of poses, in order."""
-        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+        return cls(
+            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls))
+        )
 
     @classmethod
     def upright(

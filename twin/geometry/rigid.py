@@ -52,12 +52,17 @@ class Rigid:
     shift: FloatArray
 
     def __post_init__(self) -> None:
-        turn, shift = (np.array(part, dtype=np.float64) for part in (self.turn, self.shift))
+        turn, shift = (
+            np.array(part, dtype=np.float64) for part in (self.turn, self.shift)
+        )
         if turn.shape != (3, 3) or shift.shape != (3,) or not np.isfinite(shift).all():
             raise GeometryError(
                 f"a rigid motion of shapes {turn.shape} and {shift.shape}; allowed: a rotation "
                 "(3, 3) and a finite shift (3,) [mm]",
-                {"asked": [list(turn.shape), list(shift.shape)], "allowed": [[3, 3], [3]]},
+                {
+                    "asked": [list(turn.shape), list(shift.shape)],
+                    "allowed": [[3, 3], [3]],
+                },
             )
         off = float(np.abs(turn @ turn.T - np.eye(3)).max())
         if not (off < ORTHOGONAL_TOLERANCE and np.linalg.det(turn) > 0):
@@ -82,7 +87,10 @@ class Rigid:
 
     @classmethod
     def rotate(
-        cls, axis: str | npt.ArrayLike, angle_deg: float, about: npt.ArrayLike = (0.0, 0.0, 0.0)
+        cls,
+        axis: str | npt.ArrayLike,
+        angle_deg: float,
+        about: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> Rigid:
         """Make a right-handed turn.
 

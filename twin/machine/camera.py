@@ -54,7 +54,10 @@ class PixelGrid:
     @property
     def edges_mm(self) -> tuple[float, float]:
         """Pitch from column to column and from row to row [mm]."""
-        return self.pitch_mm, self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm
+        return (
+            self.pitch_mm,
+            self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm,
+        )
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -190,7 +193,8 @@ def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
             )
     if roi.right - roi.left + 1 < binning or roi.bottom - roi.top + 1 < binning:
         raise LimitError(
-            f"ROI {roi} holds no pixel at binning {binning}: right and bottom are inclusive and "
+            f"ROI {roi} holds no pixel at binning {binning}: right and bottom are "
+            "inclusive and "
             "must exceed left and top",
             {"asked": str(roi), "binning": binning},
         )

@@ -48,8 +48,19 @@ Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
 Vector3 = tuple[Length, Length, Length]
 _M = TypeVar("_M", bound=BaseModel)
-QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
-              "detector_y", "detector_z", "angle", "mount_x", "mount_y")  # fmt: skip
+QUANTITIES = (
+    "source_x",
+    "source_z",
+    "object_x",
+    "object_y",
+    "object_z",
+    "detector_x",
+    "detector_y",
+    "detector_z",
+    "angle",
+    "mount_x",
+    "mount_y",
+)
 """Quantities that motors move, world frame: object_y is the SOD, detector_y the SDD.
 
 angle is the stage's. mount_x and mount_y are those of a stage on the turntable: they turn
@@ -101,8 +112,12 @@ _KEY_LIMITS: Final = {
 
 def _one_word(name: str) -> str:
     """Check that a name is one printable word of at most 100 characters."""
-    if not (0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)):
-        raise PydanticCustomError("word", "must be one word, 1 to 100 printable characters")
+    if not (
+        0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)
+    ):
+        raise PydanticCustomError(
+            "word", "must be one word, 1 to 100 printable characters"
+        )
     return name
 
 
@@ -140,14 +155,19 @@ class Axis(_Frozen):
     @model_validator(mode="after")
     def _ordered(self) -> Axis:
         """Check that home, speed and acceleration are within their limits."""
-        _refuse_if(self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}")
+        _refuse_if(
+            self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}"
+        )
         allowed = f"within lower and upper, [{self.lower}, {self.upper}]"
         _refuse_if(not self.lower <= self.home <= self.upper, "home", self.home, allowed)
         allowed = f"at most max_speed, {self.max_speed}"
         _refuse_if(self.speed > self.max_speed, "speed", self.speed, allowed)
         allowed = f"at most max_acceleration, {self.max_acceleration}"
         _refuse_if(
-            self.acceleration > self.max_acceleration, "acceleration", self.acceleration, allowed
+            self.acceleration > self.max_acceleration,
+            "acceleration",
+            self.acceleration,
+            allowed,
         )
         return self
 
@@ -169,10 +189,19 @@ class VirtualAxis(_Frozen):
         allowed = f"shares of motors, {self.of!r} (the `of`) among them"
         _refuse_if(self.of not in self.moves, "moves", self.moves, allowed)
         for motor, share in self.moves.items():
-            _refuse_if(share == 0.0, f"moves.{motor}", share, "a number other than 0, or left out")
+            _refuse_if(
+                share == 0.0,
+                f"moves.{motor}",
+                share,
+                "a number other than 0, or left out",
+            )
         share = self.moves[self.of]
-        allowed = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
-        _refuse_if(abs(self.factor * share - 1.0) > 1e-6, f"moves.{self.of}", share, allowed)
+        allowed = (
+            f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
+        )
+        _refuse_if(
+            abs(self.factor * share - 1.0) > 1e-6, f"moves.{self.of}", share, allowed
+        )
         return self
 
 
@@ -242,7 +271,9 @@ class DetectorSpec(_Frozen):
         Returns:
             `mode`, unchanged.
         """
-        unnumbered = {without_number(name) for name in self.mode_names if name not in self.modes}
+        unnumbered = {
+            without_number(name) for name in self.mode_names if name not in self.modes
+        }
         if mode.strip() not in self.modes and without_number(mode) not in unnumbered:
             raise no_mode(mode, self.mode_names)
         return mode
@@ -253,7 +284,9 @@ class DetectorSpec(_Frozen):
         try:
             binning = binning_of(self.mode, self.modes)
         except LimitError:
-            raise _refused("mode", self.mode, ", ".join([*self.modes, MODE_FORM])) from None
+            raise _refused(
+                "mode", self.mode, ", ".join([*self.modes, MODE_FORM])
+            ) from None
         try:
             check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:
@@ -299,7 +332,9 @@ class TubeSpec(_Frozen):
     warm_up_s: float = Field(300.0, ge=0)
     """How long that takes [s] (assumed: makers of microfocus tubes require some minutes)."""
     filters: tuple[FilterSpec, ...] = Field(
-        default_factory=lambda: (FilterSpec.model_construct(material="Al@2.70", thickness_mm=0.5),)
+        default_factory=lambda: (
+            FilterSpec.model_construct(material="Al@2.70", thickness_mm=0.5),
+        )
     )
     """Layers in the path of the beam (assumed: instead of window and inherent filtration)."""
     spot_mm_per_W: float = Field(0.001, ge=0, le=1)
@@ -368,10 +403,17 @@ class Component(_Frozen):
     def _round(self) -> Component:
         """Check that size and centre agree with the shape."""
         if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
-            raise _refused("size_mm", self.size_mm, "as wide in x as in y, for a cylinder")
+            raise _refused(
+                "size_mm", self.size_mm, "as wide in x as in y, for a cylinder"
+            )
         if (self.shape == "hull") != bool(self.points_mm):
-            raise _refused("points_mm", len(self.points_mm), "there for a hull, and for it alone")
-        if self.points_mm and _box_around(self.points_mm) != (self.size_mm, self.center_mm):
+            raise _refused(
+                "points_mm", len(self.points_mm), "there for a hull, and for it alone"
+            )
+        if self.points_mm and _box_around(self.points_mm) != (
+            self.size_mm,
+            self.center_mm,
+        ):
             raise _refused("size_mm", self.size_mm, "those of the box around points_mm")
         return self
 
@@ -447,7 +489,9 @@ class Timing(_Frozen):
         for kind, found in self.spread.items():
             middle = self.seconds(kind)
             allowed = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
-            _refuse_if(not found.p5_s <= middle <= found.p95_s, f"{kind}_s", middle, allowed)
+            _refuse_if(
+                not found.p5_s <= middle <= found.p95_s, f"{kind}_s", middle, allowed
+            )
         return self
 
 
@@ -469,7 +513,9 @@ def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
     return priors
 
 
-Priors = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_known_offsets)]
+Priors = Annotated[
+    dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_known_offsets)
+]
 """Offset -> standard deviation of the knowledge before a calibration
 [mm, deg; 1 for angle_scale]; 0 is exactly known, and those left out are
 as `flexdt.twin.calibration.fit.priors` assumes."""
@@ -555,7 +601,9 @@ class Machine(_Frozen):
                 allowed = "a number other than 0, or left out"
                 _refuse_if(factor == 0.0, f"geometry.{quantity}.{name}", factor, allowed)
                 allowed = f"driven by {kind} axes alone; {NOT_MODELLED}"
-                _refuse_if(self.axes[name].kind != kind, f"geometry.{quantity}", name, allowed)
+                _refuse_if(
+                    self.axes[name].kind != kind, f"geometry.{quantity}", name, allowed
+                )
         for quantity in ("mount_x", "mount_y"):
             if quantity in self.fixed and not self.geometry.get(quantity):
                 allowed = "left out where no stage on the turntable moves along it"
@@ -566,7 +614,9 @@ class Machine(_Frozen):
             raise _refused("detector.response", response[-1], allowed)
         taken = [*_COMPONENTS_OF_SCRIPTS, self.tube.name.lower()]
         for name in (*self.axes, *self.virtual_axes):
-            allowed = "another name: scripts, which tell no case apart, say it of other things"
+            allowed = (
+                "another name: scripts, which tell no case apart, say it of other things"
+            )
             _refuse_if(name.lower() in taken, f"axes.{name}", name, allowed)
             taken.append(name.lower())
         for name, virtual in self.virtual_axes.items():
@@ -596,13 +646,19 @@ class Machine(_Frozen):
         for component in self.components:
             where = f"components.{component.name}"
             if names.count(component.name) > 1:
-                raise _refused(f"{where}.name", component.name, "a name that is used once")
+                raise _refused(
+                    f"{where}.name", component.name, "a name that is used once"
+                )
             if component.name == SAMPLE:
-                raise _refused(f"{where}.name", SAMPLE, "another name: it is the sample's")
+                raise _refused(
+                    f"{where}.name", SAMPLE, "another name: it is the sample's"
+                )
             if component.parent is not None:
                 # Parents come first, so that a chain can never be a circle.
                 earlier = names[: names.index(component.name)]
-                _require([component.parent], earlier, f"{where}.parent", "earlier component")
+                _require(
+                    [component.parent], earlier, f"{where}.parent", "earlier component"
+                )
             if component.axis is not None:
                 _require([component.axis], self.axes, f"{where}.axis", "axis")
         for component in self.components:
@@ -610,10 +666,18 @@ class Machine(_Frozen):
             driving = self._motors_of(component.anchor)
             what = f"motor of anchor {component.anchor!r}"
             _require(chain, driving, f"components.{component.name}.axis", what)
-            carrier = next((c for c in self.components if c.name == component.parent), None)
-            if carrier is not None and self.chain(carrier) and carrier.anchor != component.anchor:
+            carrier = next(
+                (c for c in self.components if c.name == component.parent), None
+            )
+            if (
+                carrier is not None
+                and self.chain(carrier)
+                and carrier.anchor != component.anchor
+            ):
                 allowed = f"{carrier.anchor!r}, as that of the part that carries it, {carrier.name}"
-                raise _refused(f"components.{component.name}.anchor", component.anchor, allowed)
+                raise _refused(
+                    f"components.{component.name}.anchor", component.anchor, allowed
+                )
             turns = self.geometry.get("angle", {})
             centring = [i for i, motor in enumerate(chain) if self._on_turntable(motor)]
             turning = [chain.index(motor) if motor in chain else -1 for motor in turns]
@@ -623,12 +687,17 @@ class Machine(_Frozen):
                 and min(turning, default=-1) < centring[-1]
             ):
                 allowed = (
-                    f"carried by the turntable ({', '.join(turns)}), as mount_x and mount_y are"
+                    f"carried by the turntable ({', '.join(turns)}), as mount_x and "
+                    "mount_y are"
                 )
-                raise _refused(f"components.{component.name}.axis", component.axis, allowed)
+                raise _refused(
+                    f"components.{component.name}.axis", component.axis, allowed
+                )
             twice = next((motor for motor in chain if chain.count(motor) > 1), None)
             allowed = "a motor that no part which carries this one has already"
-            _refuse_if(twice is not None, f"components.{component.name}.axis", twice, allowed)
+            _refuse_if(
+                twice is not None, f"components.{component.name}.axis", twice, allowed
+            )
 
     def _check_roles(self) -> None:
         """Check that focal spot, active area and holder are where the X-ray geometry has them.
@@ -646,19 +715,24 @@ class Machine(_Frozen):
             parts = [part for part in self.components if part.role == role]
             if self.components and len(parts) != 1 and role != "sample_mount":
                 allowed = (
-                    f"one component with role = {role!r}; or no components and no check at all"
+                    f"one component with role = {role!r}; or no components and no check "
+                    "at all"
                 )
                 raise _refused("components", [part.name for part in parts], allowed)
             for part in parts:
                 where = f"components.{part.name}"
                 if part.anchor != anchor:
-                    raise _refused(f"{where}.anchor", part.anchor, f"{anchor!r}, for a {role}")
+                    raise _refused(
+                        f"{where}.anchor", part.anchor, f"{anchor!r}, for a {role}"
+                    )
                 chain = self.chain(part)
                 left = [motor for motor in self._motors_of(anchor) if motor not in chain]
                 if left:
                     allowed = (
-                        f"carried by every motor that [geometry] gives the {anchor}, so that it "
-                        f"goes where the X-ray geometry goes: say axis = {left[0]!r} of it or of "
+                        f"carried by every motor that [geometry] gives the {anchor}, so "
+                        "that it "
+                        f"goes where the X-ray geometry goes: say axis = {left[0]!r} of "
+                        "it or of "
                         "a part that carries it"
                     )
                     raise _refused(f"{where}.axis", part.axis, allowed)
@@ -666,9 +740,14 @@ class Machine(_Frozen):
                 reach = [abs(c) + r for c, r in zip(part.center_mm, half, strict=False)]
                 if part.shape == "cylinder":
                     reach[:2] = [math.hypot(reach[0], reach[1]), 0.0]
-                if any(b > side / 2 + slack for b, side in zip(reach, part.size_mm, strict=False)):
+                if any(
+                    b > side / 2 + slack
+                    for b, side in zip(reach, part.size_mm, strict=False)
+                ):
                     held = _CONTAINED_PLACES[role]
-                    allowed = f"such that the {part.shape}, {part.size_mm} mm, holds {held}"
+                    allowed = (
+                        f"such that the {part.shape}, {part.size_mm} mm, holds {held}"
+                    )
                     raise _refused(f"{where}.center_mm", part.center_mm, allowed)
 
     def _on_turntable(self, motor: str) -> bool:
@@ -733,10 +812,14 @@ def _refuse_if(wrong: bool, at: str, value: object, allowed: str) -> None:
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
     """Make the error for an axis that `machine` does not have."""
     allowed = [*machine.axes, *machine.virtual_axes]
-    return UnknownNameError.among(f"unknown axis {name!r}; {machine.name} has", name, allowed)
+    return UnknownNameError.among(
+        f"unknown axis {name!r}; {machine.name} has", name, allowed
+    )
 
 
-def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = None) -> Machine:
+def parse_machine(
+    text: str, file: str = "<machine>", corners: Corners | None = None
+) -> Machine:
     """Parse a machine description.
 
     `base = NAME` at the top of the text inherits everything else from a machine that
@@ -759,9 +842,12 @@ def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = 
     idle = [name for name in machine.axes if name not in driving]
     if idle or not machine.geometry.get("angle"):
         path = f"axes.{idle[0]}" if idle else "geometry.angle"
-        allowed = "in [geometry] with what it moves" if idle else "motors that turn the sample"
+        allowed = (
+            "in [geometry] with what it moves" if idle else "motors that turn the sample"
+        )
         raise MachineFileError(
-            f"{file}: {path}: must be {allowed}; {NOT_MODELLED}", {"file": file, "path": path}
+            f"{file}: {path}: must be {allowed}; {NOT_MODELLED}",
+            {"file": file, "path": path},
         )
     return machine
 
@@ -837,13 +923,17 @@ def builtin_machines() -> tuple[str, ...]:
 def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
     """List the names of the shipped profiles, of one machine or of all."""
     names = _names("profiles")
-    return tuple(n for n in names if machine is None or builtin_profile(n).machine == machine)
+    return tuple(
+        n for n in names if machine is None or builtin_profile(n).machine == machine
+    )
 
 
 def _names(kind: str) -> tuple[str, ...]:
     """List the names of the shipped files of a kind, machines or profiles."""
     folder = resources.files("flexdt.twin") / "data" / kind
-    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
+    return tuple(
+        sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
+    )
 
 
 def _data(kind: str, name: str) -> str:
@@ -870,13 +960,19 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
     for part in meshed:
         where = f"components.{part.get('name')}"
         name = part["mesh"]
-        keys = [key for key in ("shape", "size_mm", "center_mm", "points_mm") if key in part]
+        keys = [
+            key for key in ("shape", "size_mm", "center_mm", "points_mm") if key in part
+        ]
         if keys:
-            raise UnknownNameError(f"{where}.{keys[0]}: must be left out: the mesh says it")
+            raise UnknownNameError(
+                f"{where}.{keys[0]}: must be left out: the mesh says it"
+            )
         at = part.get("mesh_at_mm", (0.0, 0.0, 0.0))
         number = lambda v: isinstance(v, (int, float)) and not isinstance(v, bool)  # noqa: E731
         if not isinstance(at, Sequence) or len(at) != 3 or not all(map(number, at)):
-            raise UnknownNameError(f"{where}.mesh_at_mm: must be three numbers (value: {at!r})")
+            raise UnknownNameError(
+                f"{where}.mesh_at_mm: must be three numbers (value: {at!r})"
+            )
         if not isinstance(name, str) or corners is None:
             allowed = "a file's name" if corners else "left out: no files are read here"
             raise UnknownNameError(f"{where}.mesh: must be {allowed} (value: {name!r})")
@@ -907,12 +1003,16 @@ def _inherited(own: Raw) -> Raw:
     if name is None and not without:
         return own
     if not isinstance(name, str):
-        raise UnknownNameError(f"base must be the name of a machine that ships (value: {name!r})")
+        raise UnknownNameError(
+            f"base must be the name of a machine that ships (value: {name!r})"
+        )
     base = _inherited(tomllib.loads(_data("machines", name)))
     for key, value in own.items():
         parts = value if isinstance(value, list) else [0]
         if key == "components" and not all(isinstance(part, dict) for part in parts):
-            raise UnknownNameError(f"components must be tables, [[components]] (value: {value!r})")
+            raise UnknownNameError(
+                f"components must be tables, [[components]] (value: {value!r})"
+            )
         if isinstance(base.get(key), dict) and not isinstance(value, dict):
             allowed = f"must be a table, [{key}]{_limit(key)}"
             raise UnknownNameError(f"{key} {allowed} (value: {value!r})")
@@ -969,7 +1069,9 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
         if key == "components" and isinstance(old, list) and isinstance(value, list):
             out[key] = _merged_parts(old, value)
         elif isinstance(old, dict) and isinstance(value, dict) and key not in whole:
-            out[key] = _merged(old, value, tuple(value) if key == "geometry" else ("moves",))
+            out[key] = _merged(
+                old, value, tuple(value) if key == "geometry" else ("moves",)
+            )
             _credit(out[key], old, value)
         else:
             out[key] = value
@@ -981,7 +1083,9 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 
     Two components of one name are both kept, so that the check of names finds them.
     """
-    first = {part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)}
+    first = {
+        part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)
+    }
     known = [part["name"] for part in old]
     taken = [first[name] for name in known if name in first]
     merged = [{**part, **first.get(part["name"], {})} for part in old]
@@ -994,7 +1098,9 @@ def _credit(merged: Raw, old: Raw, own: Raw) -> None:
     """Write into `source` which values come from this file and which from the base."""
     if own and isinstance(old.get("source"), str) and "source" not in own:
         keys = ", ".join(key for key in own if key != "name")
-        merged["source"] = f"{keys}: this file; else {old['source'] or 'as the base has it'}"
+        merged["source"] = (
+            f"{keys}: this file; else {old['source'] or 'as the base has it'}"
+        )
 
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:
@@ -1012,13 +1118,17 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise MachineFileError(f"{file}: not valid TOML: {error}", {"file": file}) from None
+        raise MachineFileError(
+            f"{file}: not valid TOML: {error}", {"file": file}
+        ) from None
     try:
         return model.model_validate(prepared(content))
     except UnknownNameError as error:
         raise MachineFileError(f"{file}: {error.message}", {"file": file}) from None
     except OverflowError as error:
-        raise MachineFileError(f"{file}: a number is too large: {error}", {"file": file}) from None
+        raise MachineFileError(
+            f"{file}: a number is too large: {error}", {"file": file}
+        ) from None
     except ValidationError as error:
         lines = []
         data = []
@@ -1030,18 +1140,26 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 data.append({"path": path, "message": "is missing"})
                 continue
             value = e["input"] if at is None else e["ctx"]["value"]
-            message = "there is no such key" if e["type"] == "extra_forbidden" else message_of(e)
+            message = (
+                "there is no such key"
+                if e["type"] == "extra_forbidden"
+                else message_of(e)
+            )
             if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
                 message += _limit(path)
             lines.append(f"{file}: {path}: {message} (value: {value!r})")
             data.append({"path": path, "message": message, "value": repr(value)})
-        raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
+        raise MachineFileError(
+            "\n".join(lines), {"file": file, "problems": data}
+        ) from None
 
 
 def _limit(path: str) -> str:
     """Return the limitation by docs/limits.md of a key, to end an error with, or ""."""
     last = path.rpartition(".")[2].lower()
-    limit = next((text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None)
+    limit = next(
+        (text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None
+    )
     if limit:
         return f"; {limit} (docs/limits.md)"
     return ""

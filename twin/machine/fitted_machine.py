@@ -90,11 +90,19 @@ def _timing_table(timing: Timing) -> str:
         kind = line.split("_s = ")[0]
         found = timing.spread.get(kind)
         measured = found is not None or kind.startswith("drift")
-        origin = "" if kind.startswith("source") else "measured, log" if measured else "assumed"
+        origin = (
+            ""
+            if kind.startswith("source")
+            else "measured, log"
+            if measured
+            else "assumed"
+        )
         lines.append(line + (f"  # {origin}" if origin else ""))
     lines += ["", "[timing.spread]"]
     for kind, spread in timing.spread.items():
-        inner = ", ".join(f"{key} = {value!r}" for key, value in spread.model_dump().items())
+        inner = ", ".join(
+            f"{key} = {value!r}" for key, value in spread.model_dump().items()
+        )
         lines.append(f"{kind} = {{ {inner} }}")
     return "\n".join(lines)
 

@@ -166,7 +166,9 @@ def resolve_targets(
         asked = motor_targets(machine, name, value, positions, relative=relative)
         found = arrival(machine, name, asked)
         if found.beyond is not None:
-            raise _too_far(machine, name, value, positions, found.beyond, relative=relative)
+            raise _too_far(
+                machine, name, value, positions, found.beyond, relative=relative
+            )
         out.update(found.motors)
     return out
 
@@ -267,7 +269,8 @@ def places(machine: Machine) -> list[Place]:
     return [
         place(machine, quantity)
         for quantity in _QUANTITY_NAMES
-        if machine.geometry.get(quantity) or quantity in (*machine.fixed, "object_y", "detector_y")
+        if machine.geometry.get(quantity)
+        or quantity in (*machine.fixed, "object_y", "detector_y")
     ]
 
 
@@ -295,4 +298,6 @@ def place(machine: Machine, quantity: str) -> Place:
         times = "" if abs(factor) == 1.0 else f"{abs(factor):g} "
         sign = "- " if factor < 0 else "+ " if words else ""
         words.append(f"{sign}{times}{motor}")
-    return Place(_QUANTITY_NAMES[quantity], " ".join(words) or "0", ends[0], ends[1], home)
+    return Place(
+        _QUANTITY_NAMES[quantity], " ".join(words) or "0", ends[0], ends[1], home
+    )

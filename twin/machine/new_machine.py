@@ -15,10 +15,13 @@ _HOUSING_MARGIN_MM = 60.0
 _RAIL_AXIS = "D"
 """Name of the motor of a panel for which the base has none."""
 _RAIL_VALUES: dict[str, object] = {
-    "speed": 30.0, "max_speed": 50.0, "acceleration": 50.0, "max_acceleration": 100.0,
+    "speed": 30.0,
+    "max_speed": 50.0,
+    "acceleration": 50.0,
+    "max_acceleration": 100.0,
     "description": "panel away from the source (+); it is the SDD",
     "source": "assumed but for its travel",
-}  # fmt: skip
+}
 """Values of that motor."""
 
 
@@ -74,7 +77,9 @@ def new_machine_text(answers: Answers) -> str:
         >>> parse_machine(text).fixed["object_y"], len(text.splitlines()) < 20
         (80.0, True)
     """
-    base = parse_machine(_lines({"base": answers.base, "name": answers.name}), "the new machine")
+    base = parse_machine(
+        _lines({"base": answers.base, "name": answers.name}), "the new machine"
+    )
     panel = next((part for part in base.components if part.role == "panel"), None)
     fixed: dict[str, float] = {}
     rail: dict[str, object] = {}
@@ -104,10 +109,16 @@ def new_machine_text(answers: Answers) -> str:
             # A cabinet whose panel runs on a rail: the fixed distance is a motor's reading now.
             fixed[quantity] = 0.0
             home = min(max(base.fixed.get(quantity, 0.0), distance[0]), distance[1])
-            rail = {"lower": distance[0], "upper": distance[1], "home": home, **_RAIL_VALUES}
+            rail = {
+                "lower": distance[0],
+                "upper": distance[1],
+                "home": home,
+                **_RAIL_VALUES,
+            }
         else:
             raise LimitError(
-                f"{answers.base} has no motor along the {what}, so it is one number; for a range "
+                f"{answers.base} has no motor along the {what}, so it is one number; for "
+                "a range "
                 "begin with another machine (flexdt machine list)",
                 {"asked": list(distance), "base": answers.base},
             )
@@ -126,7 +137,8 @@ def new_machine_text(answers: Answers) -> str:
             "min_kV": answers.min_kV,
             "max_kV": answers.max_kV,
             "max_W": answers.max_W,
-            "kV": answers.max_kV and min(max(base.tube.kV, answers.min_kV or 0.0), answers.max_kV),
+            "kV": answers.max_kV
+            and min(max(base.tube.kV, answers.min_kV or 0.0), answers.max_kV),
             "power_W": answers.max_W and min(base.tube.power_W, answers.max_W),
         },
         "fixed": dict(fixed),
@@ -137,18 +149,27 @@ def new_machine_text(answers: Answers) -> str:
         home = min(max(base.axis(name).home, lower), upper)
         tables[f"axes.{name}"] = {"lower": lower, "upper": upper, "home": home}
     text = (
-        f"# Made by `flexdt machine new`. What is not said here is as in {answers.base}: times,\n"
-        "# rates, bodies and filters too, so compare them with your scanner.\n" + _lines(head)
+        f"# Made by `flexdt machine new`. What is not said here is as in {answers.base}: "
+        "times,\n"
+        "# rates, bodies and filters too, so compare them with your scanner.\n"
+        + _lines(head)
     )
     for title, values in tables.items():
         if any(value is not None for value in values.values()):
             text += f"\n[{title}]\n{_lines(values)}"
     seen = {key: value for key, value in tables["detector"].items() if value is not None}
     if panel is not None and (rail or seen.keys() & {"columns", "rows", "pitch_mm"}):
-        part: dict[str, object] = {"name": panel.name, "axis": _RAIL_AXIS if rail else None}
+        part: dict[str, object] = {
+            "name": panel.name,
+            "axis": _RAIL_AXIS if rail else None,
+        }
         across, up = base.detector.model_copy(update=seen).pixels.size_mm
         if (across, up) != base.detector.pixels.size_mm:
-            sides = (across + _HOUSING_MARGIN_MM, panel.size_mm[1], up + _HOUSING_MARGIN_MM)
+            sides = (
+                across + _HOUSING_MARGIN_MM,
+                panel.size_mm[1],
+                up + _HOUSING_MARGIN_MM,
+            )
             part |= {"size_mm": [round(side, 1) for side in sides], "source": "assumed"}
         text += f"\n[[components]]\n{_lines(part)}"
     parse_machine(text, "the new machine")
@@ -174,7 +195,10 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
     if answers.columns is not None or answers.rows is not None:
         columns = answers.columns or own.columns
         rows = answers.rows or own.rows
-        out |= {"model": f"panel {columns} x {rows}", "roi": [0, 0, columns - 1, rows - 1]}
+        out |= {
+            "model": f"panel {columns} x {rows}",
+            "roi": [0, 0, columns - 1, rows - 1],
+        }
     return out
 
 

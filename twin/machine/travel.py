@@ -90,8 +90,12 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
         limit = a.max_speed if what == "speed" else a.max_acceleration
         if not requested <= limit * (1.0 + POSITION_ROUNDING):  # as one that is no number
             unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
-            messages.append(f"{motor} {what} {requested:g} {unit} is above {limit:g} {unit}")
-            beyond = beyond or LimitError.of_axis(messages[-1], motor, requested, limit, unit)
+            messages.append(
+                f"{motor} {what} {requested:g} {unit} is above {limit:g} {unit}"
+            )
+            beyond = beyond or LimitError.of_axis(
+                messages[-1], motor, requested, limit, unit
+            )
         motors[motor] = min(requested, limit)
     return Arrival(motors, tuple(messages), beyond)
 
@@ -117,7 +121,9 @@ def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str
     if axis in machine.axes or bounded == targets:
         return bounded
     moves = machine.moves(axis)
-    back = max(((targets[m] - bounded[m]) / f for m, f in moves.items()), key=abs, default=0.0)
+    back = max(
+        ((targets[m] - bounded[m]) / f for m, f in moves.items()), key=abs, default=0.0
+    )
     return _bounded(machine, {m: targets[m] - f * back for m, f in moves.items()})
 
 

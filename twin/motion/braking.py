@@ -114,7 +114,9 @@ def braked_apart(
             rest = motion.at_rest(current.position(now), now)
             if takes > 0.0:
                 acceleration = abs(velocity[name]) / takes
-                rest = motion.stop(current.position(now), velocity[name], acceleration, now)
+                rest = motion.stop(
+                    current.position(now), velocity[name], acceleration, now
+                )
             # It was braking anyway: where it was bound is where it ends, exactly (and not a
             # rounding error beyond its limit).
             near = abs(rest.target - current.target) < POSITION_ROUNDING
@@ -142,7 +144,9 @@ def coasting(
             continue
         current = drive.at(now)
         axis = machine.axes[name]
-        free = motion.stop(current.position(now), current.velocity(now), decelerations[name], now)
+        free = motion.stop(
+            current.position(now), current.velocity(now), decelerations[name], now
+        )
         end = min(max(free.target, axis.lower), axis.upper)
         met = None if end == free.target else free.time_at(end)
         if met is not None:
@@ -255,7 +259,9 @@ class _State:
         programme seconds [1/s]."""
         speed = abs(self.velocity)
         a = abs(self.acceleration)
-        if self.velocity * self.acceleration < 0.0:  # it brakes: both are greatest at the start
+        if (
+            self.velocity * self.acceleration < 0.0
+        ):  # it brakes: both are greatest at the start
             return max(0.0, self.most - a * rate * rate) / speed
         fastest = speed + a * ahead
         if fastest == 0.0:
@@ -271,7 +277,10 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
     leg = drive.at(s)
     velocity, acceleration, until = leg.law(s)
     return _State(
-        velocity, acceleration, greatest(name, leg, s, most), min(until, drive.next_start(s))
+        velocity,
+        acceleration,
+        greatest(name, leg, s, most),
+        min(until, drive.next_start(s)),
     )
 
 
@@ -314,8 +323,8 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
             # Two halves of constant acceleration that meet position and velocity at both ends.
             length = cell.length
             half = 0.5 * cell.length
-            # Not `reached - x`: its rounding, over a short length twice, would put motors that run
-            # in step out of it.
+            # Not `reached - x`: its rounding, over a short length twice, would put motors that
+            # run in step out of it.
             gained = arrives - v
             moved = distance - v * length
             first = 4.0 * moved / length**2 - gained / length

@@ -160,7 +160,12 @@ def plan_move(
 
 
 def plan_jog(
-    machine: Machine, drives: Drives, axis: str, velocity: float, lease_s: float, now: float
+    machine: Machine,
+    drives: Drives,
+    axis: str,
+    velocity: float,
+    lease_s: float,
+    now: float,
 ) -> dict[str, Trajectory]:
     """Plan a jog: run until the lease ends, brake; brake in time for a travel limit.
 
@@ -187,7 +192,9 @@ def plan_jog(
     limit, name = min((machine.axes[n].max_speed / abs(f), n) for n, f in moves.items())
     if not abs(velocity) <= limit:
         unit = machine.axes[name].unit
-        message = f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s"
+        message = (
+            f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s"
+        )
         raise LimitError.of_axis(message, axis, str(velocity), limit, f"{unit}/s")
 
     def run(name: str, lease: float) -> Trajectory:
@@ -250,7 +257,9 @@ def with_settings(
             continue
         low = MIN_RATE / min(shares.values())
         axes = machine.axes
-        high = min(getattr(axes[name], f"max_{what}") / share for name, share in shares.items())
+        high = min(
+            getattr(axes[name], f"max_{what}") / share for name, share in shares.items()
+        )
         raise LimitError(
             f"{axis} {what} {value:g} is outside [{low:g}, {high:g}]",
             {"axis": axis, "setting": what, "asked": value, "allowed": [low, high]},

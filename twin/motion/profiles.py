@@ -142,7 +142,9 @@ class Trajectory:
     @property
     def top_speed(self) -> float:
         """Largest speed of the motion, >= 0: a piece has it at one of its ends."""
-        ends = zip(self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True)
+        ends = zip(
+            self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True
+        )
         return max(
             max(abs(p.velocity), abs(p.velocity + p.acceleration * (stop - p.start)))
             if p.acceleration
@@ -154,12 +156,15 @@ class Trajectory:
         self, target: float, speed: float, acceleration: float, time: float
     ) -> Trajectory:
         """Plan the motion to rest at `target` from the state at `time`; see `move`."""
-        return move(self.position(time), self.velocity(time), target, speed, acceleration, time)
+        return move(
+            self.position(time), self.velocity(time), target, speed, acceleration, time
+        )
 
     def shifted(self, dt: float) -> Trajectory:
         """Return the same motion `dt` seconds later."""
         pieces = tuple(
-            Piece(p.start + dt, p.position, p.velocity, p.acceleration) for p in self.pieces
+            Piece(p.start + dt, p.position, p.velocity, p.acceleration)
+            for p in self.pieces
         )
         return Trajectory(pieces, self.end + dt, self.target)
 
@@ -167,7 +172,9 @@ class Trajectory:
         """Find the first time at which the motor passes `position`, or None."""
         for i, piece in enumerate(self.pieces):
             stop = self.pieces[i + 1].start if i + 1 < len(self.pieces) else self.end
-            dt = _first_root(0.5 * piece.acceleration, piece.velocity, piece.position - position)
+            dt = _first_root(
+                0.5 * piece.acceleration, piece.velocity, piece.position - position
+            )
             # Rounding may put the root a hair past the piece that reaches the position exactly.
             if dt is not None and piece.start + dt <= stop + 1e-9 + 4.0 * math.ulp(stop):
                 return min(piece.start + dt, stop)
@@ -194,14 +201,18 @@ class AxisPath(ArrayValue):
     a: FloatArray
 
     @classmethod
-    def of(cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]) -> AxisPath:
+    def of(
+        cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]
+    ) -> AxisPath:
         """Join trajectories, each in force from its time until the next one's."""
         return cls.along(joined([at_rest(start), *(later for _, later in trajectories)]))
 
     @classmethod
     def along(cls, trajectory: Trajectory) -> AxisPath:
         """Convert one trajectory, with the rest after it."""
-        rows = [(p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces]
+        rows = [
+            (p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces
+        ]
         if math.isfinite(trajectory.end):
             rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
         return cls(*np.array(rows).T)
@@ -240,7 +251,12 @@ def at_rest(position: float, time: float = 0.0) -> Trajectory:
 
 
 def move(
-    position: float, velocity: float, target: float, speed: float, acceleration: float, time: float
+    position: float,
+    velocity: float,
+    target: float,
+    speed: float,
+    acceleration: float,
+    time: float,
 ) -> Trajectory:
     """Plan the fastest trapezoidal motion to rest at `target` from any state of motion.
 
@@ -286,7 +302,9 @@ def move(
     return build.rest_at(target)
 
 
-def stop(position: float, velocity: float, acceleration: float, time: float) -> Trajectory:
+def stop(
+    position: float, velocity: float, acceleration: float, time: float
+) -> Trajectory:
     """Plan the fastest stop.
 
     Example:
@@ -301,7 +319,12 @@ def stop(position: float, velocity: float, acceleration: float, time: float) -> 
 
 
 def jog(
-    position: float, velocity: float, wanted: float, lease: float, acceleration: float, time: float
+    position: float,
+    velocity: float,
+    wanted: float,
+    lease: float,
+    acceleration: float,
+    time: float,
 ) -> Trajectory:
     """Plan a run at velocity `wanted` (signed) for `lease` seconds, then braking to rest.
 
@@ -352,9 +375,14 @@ def continued(trajectory: Trajectory, at: float) -> Trajectory:
         return at_rest(trajectory.target, at)
     index = bisect_right([p.start for p in trajectory.pieces], at) - 1
     now = Piece(
-        at, trajectory.position(at), trajectory.velocity(at), trajectory.pieces[index].acceleration
+        at,
+        trajectory.position(at),
+        trajectory.velocity(at),
+        trajectory.pieces[index].acceleration,
     )
-    return Trajectory((now, *trajectory.pieces[index + 1 :]), trajectory.end, trajectory.target)
+    return Trajectory(
+        (now, *trajectory.pieces[index + 1 :]), trajectory.end, trajectory.target
+    )
 
 
 def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
@@ -373,7 +401,9 @@ def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
     pieces: list[Piece] = []
     for trajectory, later in pairwise(trajectories):
         begins = later.start
-        pieces += [p for p in trajectory.pieces if p.start < begins]  # or sent elsewhere on its way
+        pieces += [
+            p for p in trajectory.pieces if p.start < begins
+        ]  # or sent elsewhere on its way
         if trajectory.end < begins:
             pieces.append(Piece(trajectory.end, trajectory.target, 0.0, 0.0))
     last = trajectories[-1]

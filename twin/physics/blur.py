@@ -39,7 +39,11 @@ def kernel(sigma_px: float) -> Float32Array:
     t = sigma_px * sigma_px
     reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
     n = np.arange(-reach, reach + 1)
-    weights = np.exp(n * n / (-2.0 * t)) if sigma_px >= MIN_SAMPLED_SIGMA_PX else ive(np.abs(n), t)
+    weights = (
+        np.exp(n * n / (-2.0 * t))
+        if sigma_px >= MIN_SAMPLED_SIGMA_PX
+        else ive(np.abs(n), t)
+    )
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
@@ -58,7 +62,9 @@ def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
     """Compute the noise power of a flat image by frequency [cycles a pixel], 1 at none:
     light's and aperture's modulation squared, with all that is folded back."""
     f = frequency[..., None] + np.arange(-FOLDS, FOLDS + 1)
-    return np.asarray((np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1))
+    return np.asarray(
+        (np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1)
+    )
 
 
 def blurred(

@@ -123,12 +123,16 @@ def expected_signal(
     spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
     across = spot * float(np.linalg.norm(row[6:9]) / np.linalg.norm(row[9:12]))
     flux = flux_of(row, shape) * np.float32(mAs(exposure))
-    return Expected(blurred(one, spot, across) * flux, blurred(spread, spot, across) * flux)
+    return Expected(
+        blurred(one, spot, across) * flux, blurred(spread, spot, across) * flux
+    )
 
 
 def without_spot(chain: Chain) -> Chain:
     """Remove the spot's blur from a chain, for views from `spot_views`, whose mean has it."""
-    return replace(chain, tube=replace(chain.tube, spot_mm_per_W=0.0, smallest_spot_mm=0.0))
+    return replace(
+        chain, tube=replace(chain.tube, spot_mm_per_W=0.0, smallest_spot_mm=0.0)
+    )
 
 
 def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
@@ -193,7 +197,11 @@ class Scattered:
     variance: Float32Array
 
     def added_to(
-        self, expected: Expected, chain: Chain, view: FloatArray, exposure: ExposureSettings
+        self,
+        expected: Expected,
+        chain: Chain,
+        view: FloatArray,
+        exposure: ExposureSettings,
     ) -> Expected:
         """Add the scatter to the expected electrons of primary radiation.
 
@@ -256,7 +264,9 @@ def radiographs(
         expected = expected_signal(chain, paths_mm[:, part], view, exposure)
         if scatter:
             expected = scatter[i].added_to(expected, chain, view, exposure)
-        images.append(Radiograph(_as_line_integrals(chain, expected, view, exposure), expected))
+        images.append(
+            Radiograph(_as_line_integrals(chain, expected, view, exposure), expected)
+        )
     return images
 
 

@@ -42,14 +42,28 @@ USUAL_MS = 100.0
 of its images [ms]."""
 _OPTIONAL_FIGURES = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
 _BOUNDS = {
-    "pixel_mm": (1e-6, 100.0), "exposure_ms": EXPOSURES_MS, "averages": (1, 1_000_000),
-    "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),
-    "scintillator_mm": (1e-6, 100.0), "packing": (1e-3, 1.0), "swank": (1e-3, 1.0),
-    "read_noise_e": (0.0, 1e9), "offset_counts": (0.0, 65535.0), "dark_e_per_s": (0.0, 1e18),
-    "blur_mm": (0.0, 10.0), "gain_sigma": (0.0, 1.0), "offset_sigma_counts": (0.0, 65535.0),
-    "dead_fraction": (0.0, 1.0), "serial": (0, 2**63 - 1), "lag_fraction": (0.0, 1.0),
-    "lag_s": (1e-6, 1e7), "long_lag_fraction": (0.0, 1.0), "long_lag_s": (1e-6, 1e7),
-}  # fmt: skip
+    "pixel_mm": (1e-6, 100.0),
+    "exposure_ms": EXPOSURES_MS,
+    "averages": (1, 1_000_000),
+    "bits": (1, 16),
+    "electrons_per_count": (1e-18, 1e18),
+    "electrons_per_keV": (1e-6, 1e6),
+    "scintillator_mm": (1e-6, 100.0),
+    "packing": (1e-3, 1.0),
+    "swank": (1e-3, 1.0),
+    "read_noise_e": (0.0, 1e9),
+    "offset_counts": (0.0, 65535.0),
+    "dark_e_per_s": (0.0, 1e18),
+    "blur_mm": (0.0, 10.0),
+    "gain_sigma": (0.0, 1.0),
+    "offset_sigma_counts": (0.0, 65535.0),
+    "dead_fraction": (0.0, 1.0),
+    "serial": (0, 2**63 - 1),
+    "lag_fraction": (0.0, 1.0),
+    "lag_s": (1e-6, 1e7),
+    "long_lag_fraction": (0.0, 1.0),
+    "long_lag_s": (1e-6, 1e7),
+}
 """Smallest and largest allowed value of each figure."""
 
 
@@ -204,7 +218,8 @@ class Detector:
         pitch = pixels.pitch_mm
         if self.pixel_mm is not None and abs(self.pixel_mm - pitch) > 1e-6 * pitch:
             message = (
-                f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pitch:g} mm"
+                f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's "
+                f"{pitch:g} mm"
             )
             raise LimitError.instead(message, self.pixel_mm, pitch, unit="mm")
         across, up = pixels.edges_mm
@@ -215,7 +230,9 @@ class Detector:
         return replace(
             self,
             pixels=pixels,
-            electrons_per_count=FULL_WELL_E[0] * area / 2.0**self.bits if gain is None else gain,
+            electrons_per_count=FULL_WELL_E[0] * area / 2.0**self.bits
+            if gain is None
+            else gain,
             dark_e_per_s=4.0 * DARK_E_PER_S * area if dark is None else dark,
         )
 
@@ -295,8 +312,16 @@ class Detector:
             >>> Detector(bits=12).figures()["bits"]
             12.0
         """
-        left_out = {"pixel_mm", "exposure_ms", "averages", "electrons_per_count", "read_noise_e"}
-        if self.long_lag_fraction == 0.0:  # as before there was any, so that older scans go on
+        left_out = {
+            "pixel_mm",
+            "exposure_ms",
+            "averages",
+            "electrons_per_count",
+            "read_noise_e",
+        }
+        if (
+            self.long_lag_fraction == 0.0
+        ):  # as before there was any, so that older scans go on
             left_out |= {"long_lag_fraction", "long_lag_s"}
         held = {
             name: float(value)
@@ -309,7 +334,9 @@ class Detector:
             held[f"read_noise_e_{well.lower()}"] = self.read_noise(camera)
         held["dark_e_per_s"] = self.dark_charge(camera)
         held[f"scintillator_{self.scintillator}"] = 1.0
-        return held | {f"response_{energy:g}_keV": float(left) for energy, left in self.response}
+        return held | {
+            f"response_{energy:g}_keV": float(left) for energy, left in self.response
+        }
 
     def charge_of_photons(self) -> tuple[FloatArray, FloatArray]:
         """Compute the mean charge of a photon of each energy [electrons], and its
@@ -389,7 +416,9 @@ def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pa
     def blocks(values: npt.NDArray[np.float32]) -> Float32Array:
         """Average the unbinned pixels of each image pixel."""
         part = values[top : top + rows * b, left : left + cols * b]
-        mean: Float32Array = part.reshape(rows, b, cols, b).mean(axis=(1, 3), dtype=np.float32)
+        mean: Float32Array = part.reshape(rows, b, cols, b).mean(
+            axis=(1, 3), dtype=np.float32
+        )
         return mean
 
     living = blocks(alive.astype(np.float32))

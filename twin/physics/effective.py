@@ -110,7 +110,9 @@ def effective_beam(
         message = "no photon leaves anything in the detector"
         raise LimitError.instead(message, 0.0, "one that absorbs some of the spectrum")
     used = np.flatnonzero(signal > signal.max() * 1e-9)
-    mu = np.array([s.attenuation()[used] for s in substances]).reshape(len(substances), len(used))
+    mu = np.array([s.attenuation()[used] for s in substances]).reshape(
+        len(substances), len(used)
+    )
     paths = sample_paths(mu, signal[used], thickest_mm)
     chosen: list[int] = []
     for turn in range(MAX_ROUNDS):
@@ -170,7 +172,9 @@ def sample_paths(
     random = np.random.default_rng([m, seed])
     rows = [np.zeros((1, m))]
     opaque = np.log(1e6 * len(signal)) / np.maximum(mu.min(axis=1, initial=np.inf), 1e-12)
-    limit = np.minimum(np.maximum(np.asarray(thickest_mm, dtype=np.float64), 1e-6), opaque)
+    limit = np.minimum(
+        np.maximum(np.asarray(thickest_mm, dtype=np.float64), 1e-6), opaque
+    )
     least = np.minimum(
         MIN_OPTICAL_DEPTH / np.maximum(mu.max(axis=1, initial=0.0), 1e-12), limit / 2
     )

@@ -26,7 +26,9 @@ from flexdt.twin.physics.readout import expected_counts
 from flexdt.twin.physics.tube import tube_spectrum
 
 AIR: Final = Substance(
-    "air", (("N", 0.755268), ("O", 0.231781), ("Ar", 0.012827), ("C", 0.000124)), 1.20479e-3
+    "air",
+    (("N", 0.755268), ("O", 0.231781), ("Ar", 0.012827), ("C", 0.000124)),
+    1.20479e-3,
 )
 """Dry air near sea level, composition and density of NIST's tables."""
 GRAY_PER_KEV_PER_G: Final = 1.602176634e-13
@@ -86,9 +88,12 @@ def pixel_reading(
     through = np.exp(-depth)
     scale = mAs(exposure) * flux
     panel = chain.panel
-    variance = pixel_variance(panel, camera, exposure.averages, float(noise @ through) * scale)
+    variance = pixel_variance(
+        panel, camera, exposure.averages, float(noise @ through) * scale
+    )
     return PixelValue(
-        expected_counts(panel, camera, float(signal @ through) * scale), math.sqrt(variance)
+        expected_counts(panel, camera, float(signal @ through) * scale),
+        math.sqrt(variance),
     )
 
 
@@ -112,7 +117,9 @@ def air_kerma_mGy(chain: Chain, exposure: ExposureSettings, distance_mm: float) 
         distance_mm: source to the point [mm].
     """
     spectrum = tube_spectrum(exposure.kV, chain.tube)
-    fluence = spectrum.fluence * mAs(exposure) * exposure.averages * (1000.0 / distance_mm) ** 2
+    fluence = (
+        spectrum.fluence * mAs(exposure) * exposure.averages * (1000.0 / distance_mm) ** 2
+    )
     released = float(fluence @ (spectrum.energy_keV * mass_energy_transfer(AIR)))
     return 1e3 * released * GRAY_PER_KEV_PER_G
 
@@ -134,7 +141,9 @@ def compton_share(energy_keV: npt.ArrayLike) -> FloatArray:
     """Compute the mean part of a photon's energy that a free electron takes in
     Compton scattering, (e,)."""
     cosine, weight = np.polynomial.legendre.leggauss(64)
-    alpha = np.atleast_1d(np.asarray(energy_keV, dtype=np.float64))[:, None] / ELECTRON_KEV
+    alpha = (
+        np.atleast_1d(np.asarray(energy_keV, dtype=np.float64))[:, None] / ELECTRON_KEV
+    )
     left = 1.0 / (1.0 + alpha * (1.0 - cosine))
     section = left**2 * (left + 1.0 / left - (1.0 - cosine**2)) * weight
     return np.asarray((section * (1.0 - left)).sum(axis=1) / section.sum(axis=1))

@@ -99,7 +99,9 @@ def quantum_variance(panel: Detector, camera: CameraSettings, xrays_e2: float) -
     return xrays_e2
 
 
-def electronic_variance(panel: Detector, camera: CameraSettings, xrays_e2: float) -> float:
+def electronic_variance(
+    panel: Detector, camera: CameraSettings, xrays_e2: float
+) -> float:
     """Return the variance of the read noise [electrons^2]."""
     return panel.read_noise(camera) ** 2
 
@@ -112,7 +114,9 @@ NOISE: tuple[NoiseTerm, ...] = (
 that spread first."""
 
 
-def drawn(exposed: Exposed, rng: np.random.Generator, *, spreads: bool) -> Iterator[Float32Array]:
+def drawn(
+    exposed: Exposed, rng: np.random.Generator, *, spreads: bool
+) -> Iterator[Float32Array]:
     """Draw the noise of each term that spreads, spread as it is, or of each that does not.
 
     Yields:
@@ -154,4 +158,6 @@ def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
     where light spreads."""
     if max(sigmas_px) < MIN_SIGMA_PX:
         return 1.0
-    return math.prod(float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas_px)
+    return math.prod(
+        float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas_px
+    )

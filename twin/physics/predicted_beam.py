@@ -152,13 +152,17 @@ def open_beam_of(
     panel = detector_of(machine.detector)
     brightest = float(flux_of(view, camera.shape).max())
     try:
-        reading = pixel_reading(Chain(panel, tube_of(machine.tube)), camera, exposure, brightest)
+        reading = pixel_reading(
+            Chain(panel, tube_of(machine.tube)), camera, exposure, brightest
+        )
     except LimitError:
         return None
     return OpenBeam(reading.signal, saturating_counts(panel))
 
 
-def open_beam_doubt(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str | None:
+def open_beam_doubt(
+    machine: Machine, exposure: ExposureSettings, beam: OpenBeam
+) -> str | None:
     """Describe an open beam that saturates or starves the panel, and a better exposure;
     None if neither.
 

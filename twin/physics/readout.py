@@ -128,6 +128,10 @@ def trapped_after(
     """
     left = trapped * np.float32(np.exp(-(exposure.duration_s + gap_s) / panel.long_lag_s))
     if expected is not None:
-        taken = panel.long_lag_fraction * exposure.averages * np.exp(-gap_s / panel.long_lag_s)
+        taken = (
+            panel.long_lag_fraction
+            * exposure.averages
+            * np.exp(-gap_s / panel.long_lag_s)
+        )
         left += np.float32(taken) * expected.mean_e
     return left

@@ -212,7 +212,9 @@ def scatter_image(
     u = row[6:9]
     v = row[9:12]
     rows, cols = shape
-    nv, nu = _node_counts(shape, float(np.linalg.norm(v) / np.linalg.norm(u)), wanted.nodes)
+    nv, nu = _node_counts(
+        shape, float(np.linalg.norm(v) / np.linalg.norm(u)), wanted.nodes
+    )
     sections = cross_sections(thing.substances)
     row_of = np.linspace(0, rows - 1, nv)[:, None, None] - (rows - 1) / 2
     col_of = np.linspace(0, cols - 1, nu)[None, :, None] - (cols - 1) / 2
@@ -231,12 +233,16 @@ def scatter_image(
     area = float(np.linalg.norm(np.cross(along_u, along_v)))
     if not area > 0.0:
         blank = np.zeros((nv, nu))
-        return ScatterImage(blank, blank, blank, blank, shape, 0, np.zeros(kernels.TALLIES))
+        return ScatterImage(
+            blank, blank, blank, blank, shape, 0, np.zeros(kernels.TALLIES)
+        )
 
     bins = np.flatnonzero(beam.signal > 0.0)
     share = beam.signal[bins] / beam.signal.sum()
     chance = _energy_chances(thing, row, sections.total[:, bins], share)
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([wanted.seed, stream])))
+    rng = np.random.Generator(
+        np.random.PCG64(np.random.SeedSequence([wanted.seed, stream]))
+    )
     keys = rng.integers(0, 2**64, BATCHES, dtype=np.uint64)
     sequences = [qmc.Sobol(kernels.DIMENSIONS, rng=one) for one in rng.spawn(BATCHES)]
     images = np.zeros((BATCHES, nv * nu, 3))
@@ -348,14 +354,19 @@ def _lit(
     u = row[6:9]
     v = row[9:12]
     box = np.array(thing.corners)
-    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
+    corners = np.array(
+        [[box[i, 0], box[j, 1], box[k, 2]] for i, j, k in np.ndindex(2, 2, 2)]
+    )
     normal = np.cross(u, v)
     depth = (corners - source) @ normal / ((centre - source) @ normal)
     if depth.min() <= 1e-3:
         message = (
-            "the X-ray source lies in or beside the sample's box: its scatter is not simulated"
+            "the X-ray source lies in or beside the sample's box: its scatter is not "
+            "simulated"
         )
-        raise GeometryError.instead(message, source.tolist(), "a sample in front of the source")
+        raise GeometryError.instead(
+            message, source.tolist(), "a sample in front of the source"
+        )
     on_panel = source + (corners - source) / depth[:, None] - centre
     plane = np.linalg.lstsq(np.stack([u, v], axis=1), on_panel.T, rcond=None)[0]
     low = plane.min(axis=1)
@@ -420,7 +431,9 @@ class ScanScatter:
     def _stack(self) -> dict[str, FloatArray]:
         """Arrays of the simulated views by name, (k, v, u)."""
         names = ("mean", "error", "spread")
-        return {name: np.array([getattr(one, name) for one in self.images]) for name in names}
+        return {
+            name: np.array([getattr(one, name) for one in self.images]) for name in names
+        }
 
     def _spread_out(self, index: int, name: str) -> Float32Array:
         """Interpolate an array of a view at every pixel, not below zero."""
@@ -446,7 +459,9 @@ class ScanScatter:
         before = max(after - 1, 0)
         span = known[after] - known[before]
         part = 1.0 if span <= 0.0 else min(max((place - known[before]) / span, 0.0), 1.0)
-        return np.asarray((1.0 - part) ** power * values[before] + part**power * values[after])
+        return np.asarray(
+            (1.0 - part) ** power * values[before] + part**power * values[after]
+        )
 
 
 def view_scatter(
@@ -473,7 +488,9 @@ def view_scatter(
     stream = int.from_bytes(blake2b(row.tobytes(), digest_size=8).digest(), "little")
     image = scatter_image(thing, row, shape, beam, settings, stream)
     zero = np.float32(0.0)
-    return Scattered(np.maximum(image.full(), zero), np.maximum(image.full(image.spread), zero))
+    return Scattered(
+        np.maximum(image.full(), zero), np.maximum(image.full(image.spread), zero)
+    )
 
 
 def scan_scatter(
@@ -499,10 +516,14 @@ def scan_scatter(
     wanted = ScatterSettings() if settings is None else settings
     rows = np.asarray(views, dtype=np.float64)
     if not len(rows):
-        raise LimitError("no views to simulate scatter for", {"asked": 0, "allowed": "> 0"})
+        raise LimitError(
+            "no views to simulate scatter for", {"asked": 0, "allowed": "> 0"}
+        )
     way = way_of(rows)
     simulated = _simulated(way, np.radians(wanted.step_deg))
-    images = tuple(scatter_image(thing, rows[i], shape, beam, wanted, i) for i in simulated)
+    images = tuple(
+        scatter_image(thing, rows[i], shape, beam, wanted, i) for i in simulated
+    )
     return ScanScatter(wanted, images, tuple(simulated), way, way[list(simulated)])
 
 

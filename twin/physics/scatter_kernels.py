@@ -292,9 +292,33 @@ def turn(d, cosine, azimuth):
 
 @kernel
 def detect(
-    amounts, lower, edge, nodes, normal, per_open, total, first_keV, step_keV, form, shell,
-    root_step, response, spread, p, d, energy, mu, m, weight, start, fan, v, paths, image, channel,
-):  # fmt: skip
+    amounts,
+    lower,
+    edge,
+    nodes,
+    normal,
+    per_open,
+    total,
+    first_keV,
+    step_keV,
+    form,
+    shell,
+    root_step,
+    response,
+    spread,
+    p,
+    d,
+    energy,
+    mu,
+    m,
+    weight,
+    start,
+    fan,
+    v,
+    paths,
+    image,
+    channel,
+):
     """Send the expected signal of an interaction at p to `fan` of the nodes.
 
     Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any
@@ -307,7 +331,11 @@ def detect(
     same_signal, same_spread = between(response, from_bin), between(spread, from_bin)
     for f in range(fan):
         node = (start + f * number // fan) % number
-        v[0], v[1], v[2] = nodes[node, 0] - p[0], nodes[node, 1] - p[1], nodes[node, 2] - p[2]
+        v[0], v[1], v[2] = (
+            nodes[node, 0] - p[0],
+            nodes[node, 1] - p[1],
+            nodes[node, 2] - p[2],
+        )
         square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
         scale = 1.0 / math.sqrt(square)
         v[0], v[1], v[2] = v[0] * scale, v[1] * scale, v[2] * scale
@@ -319,7 +347,13 @@ def detect(
         column = math.sqrt(x) / root_step
         k = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
         coherent = 0.5 * (1.0 + cosine * cosine) * between(form[m], column)
-        incoherent = 0.5 * k * k * (k + 1.0 / k - 1.0 + cosine * cosine) * between(shell[m], column)
+        incoherent = (
+            0.5
+            * k
+            * k
+            * (k + 1.0 / k - 1.0 + cosine * cosine)
+            * between(shell[m], column)
+        )
         # A coherent photon keeps its energy on the way to the node, an incoherent one has
         # k of it and is weakened more: one walk gives the lengths for both.
         travel(amounts, lower, edge, p, v, mu, np.inf, paths)
@@ -338,10 +372,39 @@ def detect(
 
 @parallel
 def histories(
-    points, first, keys, fans, orders, source, corner, along_u, along_v, normal, lit,
-    nodes, per_open, amounts, lower, edge, first_keV, step_keV, total, coherent, incoherent,
-    root_step, form, shell, cumulated, bins, chances, photons, response, spread, images, tallies,
-):  # fmt: skip
+    points,
+    first,
+    keys,
+    fans,
+    orders,
+    source,
+    corner,
+    along_u,
+    along_v,
+    normal,
+    lit,
+    nodes,
+    per_open,
+    amounts,
+    lower,
+    edge,
+    first_keV,
+    step_keV,
+    total,
+    coherent,
+    incoherent,
+    root_step,
+    form,
+    shell,
+    cumulated,
+    bins,
+    chances,
+    photons,
+    response,
+    spread,
+    images,
+    tallies,
+):
     """Follow histories in each batch and add their signals to the images.
 
     Args:
@@ -378,7 +441,9 @@ def histories(
             sobol = points[batch, history]
             # An even point of the lit rectangle: its solid angle is the history's first weight.
             for a in range(3):
-                d[a] = corner[a] + sobol[0] * along_u[a] + sobol[1] * along_v[a] - source[a]
+                d[a] = (
+                    corner[a] + sobol[0] * along_u[a] + sobol[1] * along_v[a] - source[a]
+                )
                 p[a] = source[a]
             square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
             scale = 1.0 / math.sqrt(square)
@@ -401,7 +466,9 @@ def histories(
             tally[3] += scale * energy
             for order in range(orders):
                 # A hair less than drawn: rounding must not carry the end out at the far side.
-                distance = travel(amounts, lower, edge, p, d, mu, stop * (1.0 - 1e-12), paths)
+                distance = travel(
+                    amounts, lower, edge, p, d, mu, stop * (1.0 - 1e-12), paths
+                )
                 if distance < 0.0:
                     break
                 for a in range(3):
@@ -412,11 +479,33 @@ def histories(
                     pick, turned = sobol[4], sobol[5]
                 m = chosen_material(amounts, lower, edge, p, mu, pick)
                 detect(
-                    amounts, lower, edge, nodes, normal, per_open, total, first_keV, step_keV, form,
-                    shell, root_step, response, spread, p, d, energy, mu, m, scale * weight,
-                    min(int(turned * number), number - 1), fans[min(order, 1)], v, paths, image,
+                    amounts,
+                    lower,
+                    edge,
+                    nodes,
+                    normal,
+                    per_open,
+                    total,
+                    first_keV,
+                    step_keV,
+                    form,
+                    shell,
+                    root_step,
+                    response,
+                    spread,
+                    p,
+                    d,
+                    energy,
+                    mu,
+                    m,
+                    scale * weight,
+                    min(int(turned * number), number - 1),
+                    fans[min(order, 1)],
+                    v,
+                    paths,
+                    image,
                     min(order, 1),
-                )  # fmt: skip
+                )
                 if order == orders - 1:
                     break
                 # Absorption is a loss of weight; the rest goes on, coherent or incoherent.
@@ -431,7 +520,9 @@ def histories(
                 weight *= survives
                 state, pick = draw(state)
                 if pick * (elastic + inelastic) < elastic:
-                    state, cosine = coherent_cosine(state, energy, cumulated[m], root_step)
+                    state, cosine = coherent_cosine(
+                        state, energy, cumulated[m], root_step
+                    )
                 else:
                     state, cosine = incoherent_cosine(state, energy, shell[m], root_step)
                     before = energy

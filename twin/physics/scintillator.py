@@ -76,22 +76,29 @@ def deposited(screen: Filter) -> Deposited:
     stopping = total - sections.coherent[0]
     photo = stopping - compton
     stopped = -np.expm1(-stopping * thick)
-    share = (np.arange(SLICES) + 0.5) / SLICES  # slices in which as many photons are stopped
+    share = (
+        np.arange(SLICES) + 0.5
+    ) / SLICES  # slices in which as many photons are stopped
     depth = -np.log1p(-share * stopped[:, None]) / stopping[:, None]  # (e, slice)
     here = np.broadcast_to((stopped / stopping / SLICES)[:, None], depth.shape)
 
     def escaping(mu: FloatArray) -> FloatArray:
         """Compute the part of isotropic photons that escapes, (e, slice)."""
         return np.asarray(
-            (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth))) / 2.0
+            (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth)))
+            / 2.0
         )
 
     kept = photo * energy * here.sum(axis=1)
     square = kept * energy
     for symbol, part in substance.fractions:
-        edge, jump, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
+        edge, jump, fluorescence, lines = K_SHELL.get(
+            symbol, (np.inf, 0.0, 0.0, (0.0, 0.0))
+        )
         element = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
-        amount = jump * fluorescence * photo * element.attenuation() / total * (energy > edge)
+        amount = (
+            jump * fluorescence * photo * element.attenuation() / total * (energy > edge)
+        )
         for line, often in zip(lines, (K_ALPHA_SHARE, 1.0 - K_ALPHA_SHARE), strict=True):
             lost = escaping(np.interp([line], energy, stopping))
             escapes = amount * often * (here * lost).sum(axis=1)

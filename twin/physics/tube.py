@@ -68,7 +68,11 @@ class TubeModel:
         return {
             "tube_spot_mm_per_W": self.spot_mm_per_W,
             "tube_smallest_spot_mm": self.smallest_spot_mm,
-            **({"tube_spot_points": float(self.spot_points)} if self.spot_points > 1 else {}),
+            **(
+                {"tube_spot_points": float(self.spot_points)}
+                if self.spot_points > 1
+                else {}
+            ),
             **layers,
         }
 
@@ -87,7 +91,9 @@ class TubeModel:
             if name.startswith(_FILTER)
         }
         return cls(
-            tuple(Filter(Substance.called(name), thick) for name, thick in layers.items()),
+            tuple(
+                Filter(Substance.called(name), thick) for name, thick in layers.items()
+            ),
             figures["tube_spot_mm_per_W"],
             figures["tube_smallest_spot_mm"],
             int(figures.get("tube_spot_points", 1)),
@@ -163,7 +169,9 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     layers = (TubeModel() if tube is None else tube).filters
     behind = Spectrum(bare).behind(*layers)
     if not behind.photons > MIN_PHOTONS:
-        names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)
+        names = ", ".join(
+            f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers
+        )
         message = f"at {kV:g} kV nothing comes through the tube's filters ({names})"
         raise LimitError.instead(message, kV, "thinner filters or a higher voltage")
     return behind
@@ -235,7 +243,9 @@ class Tube:
             0.02
         """
         given = TubeModel() if design is None else design
-        layers = given.filters if self.filters is None else tuple(map(_filter, self.filters))
+        layers = (
+            given.filters if self.filters is None else tuple(map(_filter, self.filters))
+        )
         if self.spot_mm is None:
             return TubeModel(layers, given.spot_mm_per_W, given.smallest_spot_mm)
         return TubeModel(layers, 0.0, self.spot_mm)
@@ -245,7 +255,8 @@ class Tube:
 
         Example:
             >>> Tube(kV=60, power_W=30).exposure(100.0, averages=4)
-            ExposureSettings(kV=60.0, power_W=30.0, exposure_ms=100.0, averages=4, xrays_on=True)
+            ExposureSettings(kV=60.0, power_W=30.0, exposure_ms=100.0, averages=4,
+            xrays_on=True)
         """
         return ExposureSettings(
             float(self.kV), float(self.power_W), float(exposure_ms), int(averages)

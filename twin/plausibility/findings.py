@@ -84,7 +84,10 @@ class PlausibilityWarning(UserWarning):
 
 
 def warn_of(
-    findings: Iterable[Finding], error: type[TwinError] = TwinError, *, stacklevel: int = 3
+    findings: Iterable[Finding],
+    error: type[TwinError] = TwinError,
+    *,
+    stacklevel: int = 3,
 ) -> None:
     """Raise an error for refusals as `settled` does, and warn about the other findings.
 

@@ -1,7 +1,7 @@
 """The order of image files by the numbers in their names, and errors in it.
 
-Names hold whole numbers, decimals, negative numbers or angles (`p_0.25`, `a-10`, `x_180deg`). How
-they are written is found from all names together: 1.10 follows 1.9 where 1.1 is there, too.
+Names hold whole numbers, decimals, negative numbers or angles (`p_0.25`, `a-10`, `x_180deg`).
+How they are written is found from all names together: 1.10 follows 1.9 where 1.1 is there, too.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def ordered(names: Sequence[str]) -> Ordered:
 
 
 def _numbered(names: list[str]) -> Ordered | None:
-    """Sorted names that differ by a whole number of fixed width alone, without a gap; else None."""
+    """Sorted names that differ by a whole number of fixed width alone, without a gap; else
+    None."""
     if len(names) < 2 or len({*map(len, names)}) != 1:
         return None
     first, last = names[0], names[-1]
@@ -74,7 +75,11 @@ def _numbered(names: list[str]) -> Ordered | None:
     start = len(first[:at].rstrip("0123456789"))
     end = start + len(first[start:]) - len(first[start:].lstrip("0123456789"))
     before, after = first[:start], first[end:]
-    if end == start or before.endswith(("-", "+", ".")) or NUMBER.match(after[:2].lstrip(".")):
+    if (
+        end == start
+        or before.endswith(("-", "+", "."))
+        or NUMBER.match(after[:2].lstrip("."))
+    ):
         return None
     parts = [name[start:end] for name in names]
     if not all(map(str.isdigit, parts)):
@@ -99,7 +104,9 @@ def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
 def duplicate(one: str, other: str) -> Finding:
     """Make the refusal of two files with one number."""
     cause = f"{one} and {other} have one number: which of them is meant is not known"
-    return Finding("duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0)
+    return Finding(
+        "duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0
+    )
 
 
 def _is(names: Sequence[str]) -> str:
@@ -109,12 +116,18 @@ def _is(names: Sequence[str]) -> str:
 def _keys(names: Sequence[str]) -> dict[str, Key]:
     """Compute sort keys of names: their text without the numbers, and the numbers."""
     stems = {name: re.sub(r"\.[A-Za-z]\w*$", "", name) for name in names}
-    plain = {name: _key(stem, signed=False, decimals=False) for name, stem in stems.items()}
-    signs = {name: _key(stem, signed=True, decimals=False) for name, stem in stems.items()}
+    plain = {
+        name: _key(stem, signed=False, decimals=False) for name, stem in stems.items()
+    }
+    signs = {
+        name: _key(stem, signed=True, decimals=False) for name, stem in stems.items()
+    }
     # A hyphen that only some names have is a sign; one that all have separates.
     signed = len(_texts(signs)) < len(_texts(plain))
     whole = signs if signed else plain
-    decimal = {name: _key(stem, signed=signed, decimals=True) for name, stem in stems.items()}
+    decimal = {
+        name: _key(stem, signed=signed, decimals=True) for name, stem in stems.items()
+    }
     return decimal if _decimal(decimal, whole, stems) else whole
 
 
@@ -147,11 +160,15 @@ def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
     return (*parts, stem[at:])
 
 
-def _decimal(decimal: dict[str, Key], whole: dict[str, Key], stems: dict[str, str]) -> bool:
+def _decimal(
+    decimal: dict[str, Key], whole: dict[str, Key], stems: dict[str, str]
+) -> bool:
     """Return whether points in names are decimal points and not separators of numbers."""
     if len(set(decimal.values())) < len(set(whole.values())):
         return len(_texts(decimal)) < len(_texts(whole))
-    parts = [m["part"][1:] for s in stems.values() for m in NUMBER.finditer(s) if m["part"]]
+    parts = [
+        m["part"][1:] for s in stems.values() for m in NUMBER.finditer(s) if m["part"]
+    ]
     if not parts:
         return False
     widths = {len(part) for part in parts}
@@ -189,7 +206,9 @@ def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
     steps = np.diff(table[:, varying[0]])
     usual = float(np.median(steps))
     wide = np.flatnonzero(steps > 1.5 * usual)
-    alike = np.abs(steps / usual - np.round(steps / usual)) < 1e-3 if usual > 0 else steps < 0
+    alike = (
+        np.abs(steps / usual - np.round(steps / usual)) < 1e-3 if usual > 0 else steps < 0
+    )
     if (
         len(wide)
         and alike.all()
@@ -198,7 +217,8 @@ def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
         at = int(wide[0])
         lost = int(np.sum(np.round(steps[wide] / usual) - 1))
         cause = (
-            f"{lost} {'image is' if lost == 1 else 'images are'} missing between {names[at]} and "
+            f"{lost} {'image is' if lost == 1 else 'images are'} missing between "
+            f"{names[at]} and "
             f"{names[at + 1]}{' and elsewhere' if len(wide) > 1 else ''}"
         )
         remedy = "views are taken in the order of the images that are there"

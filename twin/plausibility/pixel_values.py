@@ -1,4 +1,5 @@
-"""Values of images and volumes: line integrals, counts, transmission, attenuation, Hounsfield."""
+"""Values of images and volumes: line integrals, counts, transmission, attenuation,
+Hounsfield."""
 
 from __future__ import annotations
 
@@ -40,12 +41,16 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
         return
     if values.dtype.kind in "ui" and int(values.max()) > MAX_LINE_INTEGRAL:
         cause = f"line integrals of {values.dtype} up to {values.max()}, as counts have"
-        yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, float(values.max()))
+        yield Finding(
+            "counts", cause, _FROM_COUNTS, Severity.REFUSAL, float(values.max())
+        )
         return
     if values.dtype.kind in "ui" and values.any():
         cause = f"line integrals of {values.dtype} have no fractions"
         remedy = "give floating-point numbers"
-        yield Finding("whole numbers", cause, remedy, Severity.WARNING, float(values.max()))
+        yield Finding(
+            "whole numbers", cause, remedy, Severity.WARNING, float(values.max())
+        )
         return
     beam = _beam(values)
     if beam is None:
@@ -53,7 +58,9 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
     darker = float((values < MAX_OBJECT_TRANSMISSION * beam).mean())
     brighter = float((values > 1.2 * beam).mean())
     if beam > MAX_LINE_INTEGRAL and brighter < MAX_BRIGHT_SHARE:
-        cause = f"line integrals of {beam:.4g} at the images' edges, less behind the object"
+        cause = (
+            f"line integrals of {beam:.4g} at the images' edges, less behind the object"
+        )
         yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, beam)
     elif OPEN[0] < beam < OPEN[1] and darker > 1e-3 and brighter < MAX_BRIGHT_SHARE:
         open_share = float(((values > OPEN[0] * beam) & (values < OPEN[1] * beam)).mean())
@@ -66,7 +73,9 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
             yield Finding("transmission", cause, remedy, Severity.WARNING, beam)
 
 
-_FROM_COUNTS: Final = "give counts with their flat image, as DataSet.from_arrays(counts, flat=)"
+_FROM_COUNTS: Final = (
+    "give counts with their flat image, as DataSet.from_arrays(counts, flat=)"
+)
 
 
 def _beam(images: npt.NDArray[Any]) -> float | None:
@@ -95,7 +104,8 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
         if bad.any():
             share = float(bad.mean())
             cause = (
-                f"{100 * share:.3g} % of the voxels are no numbers, as beside the field of view: "
+                f"{100 * share:.3g} % of the voxels are no numbers, as beside the field "
+                "of view: "
                 "neither are line integrals through them"
             )
             remedy = "give them a value first, such as np.nan_to_num(volume.data)"

@@ -67,7 +67,9 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
         return
     levels = np.array(found)
     high, apart = float(levels.max()), float(np.ptp(levels))
-    if high <= 1.0 + MAX_BEAM_DIFFERENCE and not (apart > MAX_BEAM_DIFFERENCE and _drifts(levels)):
+    if high <= 1.0 + MAX_BEAM_DIFFERENCE and not (
+        apart > MAX_BEAM_DIFFERENCE and _drifts(levels)
+    ):
         return  # an object that reaches beyond both edges is as dark
     span = " to ".join(dict.fromkeys(f"{level:.3g}" for level in (levels.min(), high)))
     cause = f"the open beam beside the object is {span} times the flat image"
@@ -77,7 +79,9 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
 
 def _drifts(levels: FloatArray) -> bool:
     """Return whether levels rise or fall throughout the scan."""
-    line = np.polyval(np.polyfit(np.arange(len(levels)), levels, 1), np.arange(len(levels)))
+    line = np.polyval(
+        np.polyfit(np.arange(len(levels)), levels, 1), np.arange(len(levels))
+    )
     return float(np.abs(levels - line).max()) < 0.3 * float(np.ptp(levels))
 
 

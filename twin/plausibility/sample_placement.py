@@ -24,7 +24,11 @@ UNITS: Final = "are all lengths in mm?"
 
 
 def placement_findings(
-    cone_vec: ConeVec, shape: tuple[int, int], boxes: npt.ArrayLike, *, exposed: bool = False
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
+    boxes: npt.ArrayLike,
+    *,
+    exposed: bool = False,
 ) -> Iterator[Finding]:
     """Find doubts about the views of a sample.
 
@@ -38,7 +42,8 @@ def placement_findings(
         >>> scan = ConeVec.circular(sod=0.6, sdd=1.06, angles=4, pixel=1.5e-4)
         >>> found = placement_findings(scan, (760, 956), [[[-5, -5, -5], [5, 5, 5]]])
         >>> [one.said for one in found]
-        ['the source is inside the box around the sample in 4 of 4 views; are all lengths in mm?']
+        ['the source is inside the box around the sample in 4 of 4 views; are all lengths in
+        mm?']
     """
     parts = np.asarray(boxes, dtype=np.float64)
     if not len(parts) or not len(cone_vec):
@@ -50,7 +55,9 @@ def placement_findings(
     if inside.any():
         count = f"{inside.sum()} of {len(inside)} views"
         cause = f"the source is inside the box around the sample in {count}"
-        yield Finding("source in the sample", cause, UNITS, Severity.WARNING, float(inside.mean()))
+        yield Finding(
+            "source in the sample", cause, UNITS, Severity.WARNING, float(inside.mean())
+        )
         return
     toward = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
     distance = np.abs(cone_vec.source_detector_distance)
@@ -65,10 +72,13 @@ def placement_findings(
     cut = stretches(cone_vec, corners) > 1.0
     if exposed and cut.any():
         cause = (
-            f"the panel stands before or in the box around the sample in {cut.sum()} of {len(cut)} "
+            f"the panel stands before or in the box around the sample in {cut.sum()} of "
+            f"{len(cut)} "
             "views: rays run through it, as through a virtual one"
         )
-        yield Finding("panel in the sample", cause, UNITS, Severity.WARNING, float(cut.mean()))
+        yield Finding(
+            "panel in the sample", cause, UNITS, Severity.WARNING, float(cut.mean())
+        )
         return
     magnified = float((distance / np.maximum(depths.mean(axis=1), 1e-9)).max())
     pixel = float(np.linalg.norm(cone_vec.u, axis=1).max())
@@ -77,7 +87,8 @@ def placement_findings(
         yield Finding("units", cause, UNITS, Severity.WARNING, magnified)
     if (largest := float((high - low).max())) * magnified < pixel:
         cause = (
-            f"the sample measures {largest:.3g} mm, magnified {magnified:.3g} times less than a "
+            f"the sample measures {largest:.3g} mm, magnified {magnified:.3g} times less "
+            "than a "
             f"pixel of {pixel:.3g} mm"
         )
         yield Finding("units", cause, UNITS, Severity.WARNING, largest)

@@ -62,7 +62,11 @@ def distance_findings(
     if not (np.isfinite(pitches).all() and (pitches > 0.0).all()):
         cause = f"the pixel is {' x '.join(f'{p:g}' for p in pitches)} mm"
         yield Finding(
-            "impossible distances", cause, "allowed: above 0", Severity.REFUSAL, float(pitches[0])
+            "impossible distances",
+            cause,
+            "allowed: above 0",
+            Severity.REFUSAL,
+            float(pitches[0]),
         )
         return
     if float(pitches.max()) > MOST_PITCH * sdd:
@@ -71,7 +75,9 @@ def distance_findings(
         yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, sdd)
 
 
-def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Iterator[Finding]:
+def geometry_findings(
+    cone_vec: ConeVec, shape: tuple[int, int] | None
+) -> Iterator[Finding]:
     """Find rows of a geometry that no scanner has.
 
     Args:
@@ -83,7 +89,9 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
     normal = np.cross(cone_vec.u, cone_vec.v)
     with np.errstate(all="ignore"):
         beam = np.einsum("ni,ni->n", cone_vec.detector - cone_vec.source, normal)
-        distance = np.nan_to_num(np.abs(beam) / np.sqrt(np.einsum("ni,ni->n", normal, normal)))
+        distance = np.nan_to_num(
+            np.abs(beam) / np.sqrt(np.einsum("ni,ni->n", normal, normal))
+        )
     edges = (np.einsum("ni,ni->n", edge, edge) for edge in (cone_vec.u, cone_vec.v))
     pitch = np.sqrt(np.maximum(*edges))
     worst = int(np.argmax(pitch - MOST_PITCH * distance))
@@ -121,7 +129,10 @@ def geometry_findings(cone_vec: ConeVec, shape: tuple[int, int] | None) -> Itera
 
 def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
     """Return whether all views have one source, with beams all around it."""
-    if len(cone_vec) < 3 or float(np.ptp(cone_vec.source, axis=0).max()) > 1e-9 * distance.max():
+    if (
+        len(cone_vec) < 3
+        or float(np.ptp(cone_vec.source, axis=0).max()) > 1e-9 * distance.max()
+    ):
         return False
     beam = cone_vec.detector - cone_vec.source
     unit = beam / np.linalg.norm(beam, axis=1, keepdims=True)
@@ -158,7 +169,8 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
 def _round_degrees(span: float, step: float) -> bool:
     """Return whether a span, alone or with a step, is a usual number of degrees."""
     return any(
-        abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0 for whole in (span, span + step)
+        abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0
+        for whole in (span, span + step)
     )
 
 
@@ -192,7 +204,9 @@ def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     span = arc_deg(cone_vec)
     if 0.0 < span < RADIANS_SPAN:
         cause = f"{len(cone_vec)} views span {span:.4g} deg"
-        remedy = f"were radians given as degrees? np.rad2deg makes them {np.rad2deg(span):.4g}"
+        remedy = (
+            f"were radians given as degrees? np.rad2deg makes them {np.rad2deg(span):.4g}"
+        )
         yield Finding("angles in radians", cause, remedy, Severity.WARNING, span)
 
 
@@ -215,7 +229,9 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
             f"the views leave out {widest:.3g} of 180 deg of directions: edges along those are "
             "blurred or missing, and values off"
         )
-        remedy = "views over half a turn and the fan are needed for a volume that is right"
+        remedy = (
+            "views over half a turn and the fan are needed for a volume that is right"
+        )
         yield Finding("limited arc", cause, remedy, Severity.WARNING, widest)
 
 
@@ -229,20 +245,23 @@ def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[F
     if (
         len(cone_vec) < 3
         or not about_z(cone_vec)
-        or np.ptp(cone_vec.source[:, 2]) > 1e-3 * (np.abs(cone_vec.source_detector_distance).max())
+        or np.ptp(cone_vec.source[:, 2])
+        > 1e-3 * (np.abs(cone_vec.source_detector_distance).max())
     ):
         return
     beam = cone_vec.detector - cone_vec.source
     towards = np.asarray(centre, dtype=np.float64) - cone_vec.source
     angles = [
-        np.rad2deg(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))) for ray in (beam, towards)
+        np.rad2deg(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1])))
+        for ray in (beam, towards)
     ]
     if np.sign(angles[0].mean()) != np.sign(angles[1].mean()):
         return
     inclined = float(min(np.abs(one).min() for one in angles))
     if inclined > INCLINED_DEG[0]:
         cause = (
-            f"the beam is inclined by {inclined:.3g} deg to the plane in which the source turns "
+            f"the beam is inclined by {inclined:.3g} deg to the plane in which the "
+            "source turns "
             "(laminography), where FDK is wrong"
         )
         refused = inclined > INCLINED_DEG[1]

@@ -45,7 +45,9 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
     for scale, words in ((math.pi / 180, "degrees"), (180 / math.pi, "radians")):
         if _worst(own, scale * stated) <= allowed:
             span = float(np.ptp(stated))
-            cause = f"the file's angles span {span:.4g} rad and are the geometry's as {words}"
+            cause = (
+                f"the file's angles span {span:.4g} rad and are the geometry's as {words}"
+            )
             remedy = "does the file state the right unit?"
             kind = "angles in degrees" if words == "degrees" else "angles in radians"
             yield Finding(kind, cause, remedy, Severity.WARNING, figure)
@@ -55,7 +57,9 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
         remedy = "give the views in the order of the images"
         yield Finding("order", cause, remedy, Severity.WARNING, figure)
         return
-    cause = f"the file's angles and those of the geometry differ by up to {figure:.3g} deg"
+    cause = (
+        f"the file's angles and those of the geometry differ by up to {figure:.3g} deg"
+    )
     remedy = "is it the geometry of this scan?"
     yield Finding("angles disagree", cause, remedy, Severity.WARNING, figure)
 

@@ -55,14 +55,19 @@ def grid_findings(
         at = views.project_points(points, shape)
         toward = views.normal * np.sign(views.source_detector_distance)[:, None]
         depth = np.einsum("nki,ni->nk", points - views.source[:, None], toward)
-        ahead, before = depth > 0.0, depth <= np.abs(views.source_detector_distance)[:, None]
+        ahead, before = (
+            depth > 0.0,
+            depth <= np.abs(views.source_detector_distance)[:, None],
+        )
         on = (at > -0.5) & (at < np.array(shape[::-1]) - 0.5)
     on_side = np.abs(views.u[:, 2]).mean() > np.abs(views.v[:, 2]).mean()
     beside = on.all(axis=2) if layers else on[..., int(on_side)]
     shown = beside & ahead
     if (shown & before).any():
         shown = shown & before
-    elif shown.mean(axis=0).max() < BEHIND:  # a panel before the complete object is a virtual one
+    elif (
+        shown.mean(axis=0).max() < BEHIND
+    ):  # a panel before the complete object is a virtual one
         shown = np.zeros_like(shown)
     times = shown.mean(axis=0)
     if not times.any() and not _crossed(at, ahead & before, shape):
@@ -72,14 +77,18 @@ def grid_findings(
         remedy = "allowed: a grid in the field of view; are all lengths in mm?"
         yield Finding("grid not seen", cause, remedy, Severity.REFUSAL, 0.0)
         return
-    if np.ptp(cone_vec.source[:, 2]) < LEVEL * np.abs(views.source_detector_distance).max():
+    if (
+        np.ptp(cone_vec.source[:, 2])
+        < LEVEL * np.abs(views.source_detector_distance).max()
+    ):
         usual = 1.0  # a circle's views all see its middle
     else:
         usual = float(times.max())
     unseen = float((times < SELDOM * usual).mean())
     if unseen > MOST_UNSEEN:
         cause = (
-            f"{100 * unseen:.3g} % of the grid lie beside the field of view, where values are not "
+            f"{100 * unseen:.3g} % of the grid lie beside the field of view, where "
+            "values are not "
             "determined"
         )
         remedy = "a smaller grid, such as field_of_view gives, holds what was seen"

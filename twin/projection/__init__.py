@@ -1,7 +1,7 @@
 """X-ray projection: exact path lengths through voxels, analytic solids and closed meshes.
 
-Importing this package is light: the compiled kernels load at the first projection, or all at once
-with `warm_up`.
+Importing this package is light: the compiled kernels load at the first projection, or all at
+once with `warm_up`.
 """
 
 from flexdt.twin.projection.analytic import (
@@ -15,7 +15,12 @@ from flexdt.twin.projection.analytic import (
 )
 from flexdt.twin.projection.analytic_solids import Box, Ellipsoid, Scene, Solid, Sphere
 from flexdt.twin.projection.linear_operator import Operator
-from flexdt.twin.projection.operators import back, forward, geometry_change, geometry_gradient
+from flexdt.twin.projection.operators import (
+    back,
+    forward,
+    geometry_change,
+    geometry_gradient,
+)
 from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
 
 __all__ = [

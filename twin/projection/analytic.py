@@ -1,13 +1,13 @@
 """Projection without voxels: exact chords through analytic scenes and closed triangle meshes.
 
-A solid costs only the pixels its shadow can reach. Results are line integrals, or path lengths for
-each material. A mesh is a value: vertices and outward-turning triangles; one that does not close is
-an error, because its path lengths mean nothing. `project_body` chooses the projection that suits
-solids, voxels or a mesh.
+A solid costs only the pixels its shadow can reach. Results are line integrals, or path lengths
+for each material. A mesh is a value: vertices and outward-turning triangles; one that does not
+close is an error, because its path lengths mean nothing. `project_body` chooses the projection
+that suits solids, voxels or a mesh.
 
-`warm_up` compiles (or loads from the disk cache) the kernels that programs usually run. A server
-calls `warm_up_forward` before it prints `ready`. The kernels of meshes, of FDK and of `back` into
-given memory compile at their first use.
+`warm_up` compiles (or loads from the disk cache) the kernels that programs usually run. A
+server calls `warm_up_forward` before it prints `ready`. The kernels of meshes, of FDK and of
+`back` into given memory compile at their first use.
 """
 
 from __future__ import annotations
@@ -88,7 +88,14 @@ def project_scene(
     shape = geometry.of_shape(shape)
     result = check_out(out, (len(geometry), *shape))
     weight = np.array([solid.mu_per_mm for solid in scene.solids], np.float64)
-    _project(scene.solids, geometry, shape, weight, np.zeros(len(weight), np.int64), result[None])
+    _project(
+        scene.solids,
+        geometry,
+        shape,
+        weight,
+        np.zeros(len(weight), np.int64),
+        result[None],
+    )
     return result
 
 
@@ -156,15 +163,21 @@ def _project(
         return
     shapes = [as_convex(solid.shape) for solid in solids]
     # Input of `analytic_kernels`: has a quadric, M, c; slabs, and which of them are a solid's.
-    quadric = np.array([[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float)
+    quadric = np.array(
+        [[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float
+    )
     ends = np.cumsum([0, *(len(one.slabs) for one in shapes)])
-    rays = run_through(geometry, np.concatenate([hull_points(one) for one in shapes])).rays(shape)
+    rays = run_through(
+        geometry, np.concatenate([hull_points(one) for one in shapes])
+    ).rays(shape)
     slabs = np.concatenate([one.slabs for one in shapes])
     slab_range = np.column_stack([ends[:-1], ends[1:]])
     seen = shadows(shapes, rays, shape)
     band = analytic_kernels.BAND
     jobs = len(rays) * -(-shape[0] // band)
-    for first, last in equal_portions(jobs, CHORD_NS * band * shape[1] * len(shapes), threads()):
+    for first, last in equal_portions(
+        jobs, CHORD_NS * band * shape[1] * len(shapes), threads()
+    ):
         analytic_kernels.project_convex(
             quadric, slabs, slab_range, seen, rays, weight, channel, out, first, last
         )
@@ -184,7 +197,11 @@ def warm_up() -> None:
 
 def warm_up_forward() -> None:
     """Run `project_scene`, and `forward` with rays in fans and alone."""
-    shapes = (Sphere((0, 0, 0), 1.0), Box((0, 0, 0), (1, 1, 1)), Cylinder((0, 0, 0), 1.0, 1.0))
+    shapes = (
+        Sphere((0, 0, 0), 1.0),
+        Box((0, 0, 0), (1, 1, 1)),
+        Cylinder((0, 0, 0), 1.0, 1.0),
+    )
     project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), LEVEL, (5, 6))
     for volume in _tiny_volumes():
         forward(volume, END_ON, (5, 6))
@@ -200,7 +217,13 @@ def warm_up_back() -> None:
         back(images, END_ON, volume)
         target = blank_layout(volume)
         cpu.spread(box_of(target), voxel_rays(LEVEL, target, (5, 6)), images)
-        bring_over(layout_data(target), target.flat, target.stride_x, target.stride_y, adding=True)
+        bring_over(
+            layout_data(target),
+            target.flat,
+            target.stride_x,
+            target.stride_y,
+            adding=True,
+        )
 
 
 def _tiny_volumes() -> tuple[Volume, Volume]:
@@ -214,17 +237,17 @@ def _tiny_volumes() -> tuple[Volume, Volume]:
 class TriangleMesh:
     """A closed surface of triangles, counter-clockwise seen from outside.
 
-    Several separate or nested bodies may share one mesh; where bodies overlap, path counts once for
-    each of them.
+    Several separate or nested bodies may share one mesh; where bodies overlap, path counts once
+    for each of them.
 
     Attributes:
         vertices: float64 (k, 3) [mm], object frame.
-        faces: int64 (m, 3), indices of vertices. Triangles that touch must share vertices (merge
-            equal ones first: STL repeats them).
+        faces: int64 (m, 3), indices of vertices. Triangles that touch must share vertices
+            (merge equal ones first: STL repeats them).
 
     Raises:
-        GeometryError: wrong shapes, indices out of range, or a surface that does not close; names
-            the first open edge.
+        GeometryError: wrong shapes, indices out of range, or a surface that does not close;
+            names the first open edge.
     """
 
     vertices: FloatArray
@@ -233,12 +256,18 @@ class TriangleMesh:
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64)
         faces = np.array(self.faces, dtype=np.int64)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+        if (
+            vertices.ndim != 2
+            or vertices.shape[1] != 3
+            or not np.isfinite(vertices).all()
+        ):
             raise GeometryError(
                 f"mesh vertices have shape {vertices.shape}; allowed: finite (k, 3) in mm"
             )
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise GeometryError(f"mesh faces have shape {faces.shape}; allowed: (m, 3), m > 0")
+            raise GeometryError(
+                f"mesh faces have shape {faces.shape}; allowed: (m, 3), m > 0"
+            )
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise GeometryError(
                 f"a mesh face names vertex {faces.max()}; allowed: 0 to {len(vertices) - 1}"
@@ -320,7 +349,8 @@ def _check_closed(faces: IntArray, vertices: int) -> None:
     if len(open_edges):
         a, b = divmod(int(open_edges[0]), vertices)
         raise GeometryError(
-            f"the mesh is not closed: edge ({a}, {b}) has no partner ({len(open_edges) // 2} such "
+            f"the mesh is not closed: edge ({a}, {b}) has no partner "
+            f"({len(open_edges) // 2} such "
             "edges); merge equal vertices and fill holes first",
             {"edge": [a, b], "open_edges": len(open_edges) // 2},
         )
@@ -330,7 +360,9 @@ Body = Scene | Volume | TriangleMesh
 """Analytic solids, voxels, or a closed mesh."""
 
 
-def project_body(body: Body, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2) -> Float32Array:
+def project_body(
+    body: Body, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2
+) -> Float32Array:
     """Project solids or voxels to line integrals, a mesh to path lengths [mm].
 
     Args:

@@ -1,14 +1,16 @@
 """Analytic solids with exact chords, as frozen values: the parts of a phantom; and the
 arrays that the kernels make of them.
 
-Attenuation is additive: a scene's line integral is the sum over its solids of chord length times
-`mu_per_mm`, so a bead inside a brick carries the difference (bead minus brick) and a hole carries
-minus the surrounding. Coordinates are in the object's frame, mm. `analytic` computes the chords.
+Attenuation is additive: a scene's line integral is the sum over its solids of chord length
+times `mu_per_mm`, so a bead inside a brick carries the difference (bead minus brick) and a hole
+carries minus the surrounding. Coordinates are in the object's frame, mm. `analytic` computes
+the chords.
 
-For the kernels a solid is an optional quadric and a list of slabs. A sphere, ellipsoid or cylinder
+For the kernels a solid is an optional quadric and a list of slabs. A sphere, ellipsoid or
+cylinder
 is |M (p - c)| <= 1; a box, the ends of a cylinder and a convex polyhedron are slabs
-low <= n . p <= high. A ray meets their intersection in one interval. Shapes are encoded here, and
-the pixels found that their shadows can reach.
+low <= n . p <= high. A ray meets their intersection in one interval. Shapes are encoded here,
+and the pixels found that their shadows can reach.
 """
 
 from __future__ import annotations
@@ -81,7 +83,8 @@ Shape = Sphere | Box | Cylinder | Ellipsoid | ConvexPolyhedron
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape filled with `material`, whose attenuation adds `mu_per_mm` [1/mm] (may be < 0)."""
+    """A shape filled with `material`, whose attenuation adds `mu_per_mm` [1/mm] (may be <
+    0)."""
 
     shape: Shape
     material: str
@@ -134,7 +137,9 @@ def as_convex(shape: Shape) -> Convex:
             middle, half = np.array(center), np.array(size) / 2
             at = a @ middle
             slabs = np.column_stack([a, at - half, at + half])
-            return Convex(np.zeros((3, 3)), middle, slabs, corners=_corners(middle, a, half))
+            return Convex(
+                np.zeros((3, 3)), middle, slabs, corners=_corners(middle, a, half)
+            )
         case Cylinder(center, radius, height, axis):
             _positive(shape, radius, height)
             k = _unit(shape, axis)
@@ -148,7 +153,10 @@ def as_convex(shape: Shape) -> Convex:
             slabs = np.array([[*k, at - height / 2, at + height / 2]])
             half = np.array([radius, radius, height / 2])
             return Convex(
-                matrix, middle, slabs, corners=_corners(middle, np.stack([e1, e2, k]), half)
+                matrix,
+                middle,
+                slabs,
+                corners=_corners(middle, np.stack([e1, e2, k]), half),
             )
         case ConvexPolyhedron(normals, offsets):
             corners = polyhedron_corners(shape)
@@ -167,7 +175,9 @@ def hull_points(one: Convex) -> FloatArray:
     return _corners(one.center, np.eye(3), np.linalg.norm(one.semi_axes, axis=0))
 
 
-def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) -> IntArray:
+def shadows(
+    shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]
+) -> IntArray:
     """Find the pixels that each solid can darken.
 
     Args:
@@ -184,7 +194,8 @@ def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) 
         if one.corners is not None:
             result[:, i] = corner_shadows(one.corners, rays, shape)
             continue
-        # With the ellipsoid's centre q and semi-axes F in pixels and depths, a plane through the
+        # With the ellipsoid's centre q and semi-axes F in pixels and depths, a plane through
+        # the
         # source with normal m touches it when (m . q)^2 = |F' m|^2. For the normals of columns and
         # rows, (1, 0, -x) and (0, 1, -x), that is a quadratic in x.
         assert one.semi_axes is not None
@@ -200,7 +211,9 @@ def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) 
     return result
 
 
-def corner_shadows(corners: FloatArray, rays: FloatArray, shape: tuple[int, int]) -> IntArray:
+def corner_shadows(
+    corners: FloatArray, rays: FloatArray, shape: tuple[int, int]
+) -> IntArray:
     """Find the pixels that the convex hull of points can darken.
 
     Args:
@@ -233,13 +246,18 @@ def _inverses(rays: FloatArray) -> FloatArray:
 
 
 def _pixels(
-    low: FloatArray, high: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
+    low: FloatArray,
+    high: FloatArray,
+    ahead: npt.NDArray[np.bool_],
+    shape: tuple[int, int],
 ) -> IntArray:
     """Convert real ranges (n, 2) of columns and rows to whole pixels (n, 4); all if not
     `ahead`.
     """
     first = np.where(ahead[:, None], np.ceil(low - 1e-6), 0).clip(0, shape[::-1])
-    last = np.where(ahead[:, None], np.floor(high + 1e-6) + 1, np.inf).clip(0, shape[::-1])
+    last = np.where(ahead[:, None], np.floor(high + 1e-6) + 1, np.inf).clip(
+        0, shape[::-1]
+    )
     ends = [first[:, 1], last[:, 1], first[:, 0], last[:, 0]]
     return np.column_stack(ends).astype(np.int64)
 
@@ -263,7 +281,8 @@ def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
     d = np.array(shape.offsets, dtype=np.float64)
     if len(n) != len(d) or len(n) < 4:
         raise GeometryError(
-            f"polyhedron with {len(n)} normals and {len(d)} offsets; allowed: the same number of "
+            f"polyhedron with {len(n)} normals and {len(d)} offsets; allowed: the same "
+            "number of "
             "both, at least 4"
         )
     # The centre of the largest inscribed ball is an interior point.

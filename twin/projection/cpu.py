@@ -1,11 +1,13 @@
-"""The projector on the processor: fans of rays where the geometry has them, single rays elsewhere.
+"""The projector on the processor: fans of rays where the geometry has them, single rays
+elsewhere.
 
-Which kernel runs is chosen from the geometry alone, and both give the same numbers. All lengths are
-in voxel units, but for the length of a ray [mm].
+Which kernel runs is chosen from the geometry alone, and both give the same numbers. All lengths
+are in voxel units, but for the length of a ray [mm].
 
-Detectors mounted on their side: the fans of `fan_plan` follow a detector's columns. A view in which
-images of vertical planes run along the rows instead is projected as the view of a detector with u
-and v exchanged, whose image is the transpose; thus the kernels know one orientation only.
+Detectors mounted on their side: the fans of `fan_plan` follow a detector's columns. A view in
+which images of vertical planes run along the rows instead is projected as the view of a
+detector with u and v exchanged, whose image is the transpose; thus the kernels know one
+orientation only.
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ import numpy as np
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic_solids import corner_shadows
-from flexdt.twin.projection.fan_plan import IntArray, exchanged, lying, plan_fans, plan_turns
+from flexdt.twin.projection.fan_plan import (
+    IntArray,
+    exchanged,
+    lying,
+    plan_fans,
+    plan_turns,
+)
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.portions import (
     equal_portions,
@@ -42,7 +50,9 @@ def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, boo
     on_side = lying(views, shape)
     most = max(1, ROOM // (4 * shape[0] * shape[1]))
     edges = np.flatnonzero(np.diff(on_side)) + 1
-    for begin, end in zip([0, *edges.tolist()], [*edges.tolist(), len(views)], strict=True):
+    for begin, end in zip(
+        [0, *edges.tolist()], [*edges.tolist(), len(views)], strict=True
+    ):
         turned = bool(on_side[begin])
         step = most if turned else end - begin
         for at in range(begin, end, step):
@@ -73,7 +83,9 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
         plan, workers = plan_fans(rays, counts, seen), threads()
         if len(plan.jobs):
             shadows = box_shadows(box, rays, (0, box.nz), seen)
-            times = fan_job_ns(plan.lines, plan.jobs, rays, counts, (seen[0], plan.widest))
+            times = fan_job_ns(
+                plan.lines, plan.jobs, rays, counts, (seen[0], plan.widest)
+            )
             for first, last in portions(times, workers):
                 part = plan.fans(rays, slice(first, last))
                 fan_kernels.project_fans(box, part, shadows, workers, images)
@@ -82,7 +94,9 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
             out[some] = images.transpose(0, 2, 1)
 
 
-def _project_alone(box: Box, views: FloatArray, chosen: IntArray, out: Float32Array) -> None:
+def _project_alone(
+    box: Box, views: FloatArray, chosen: IntArray, out: Float32Array
+) -> None:
     """Fill the chosen views of out with rays that are walked one by one."""
     from flexdt.twin.projection.kernels import siddon_kernels
 
@@ -97,7 +111,12 @@ def tile_ns(box: Box, rows: int) -> float:
 
 
 def spread(
-    box: Box, views: FloatArray, values: Float32Array, *, clean: bool = True, fans: bool = True
+    box: Box,
+    views: FloatArray,
+    values: Float32Array,
+    *,
+    clean: bool = True,
+    fans: bool = True,
 ) -> None:
     """Apply the transpose of `project`: add values (n, rows, cols) to box.flat.
 
@@ -112,12 +131,17 @@ def spread(
     for some, turned in runs(views, shape) if fans else [(slice(None), False)]:
         rays, images = views[some], values[some]
         if turned:
-            rays, images = exchanged(rays), np.ascontiguousarray(images.transpose(0, 2, 1))
+            rays, images = (
+                exchanged(rays),
+                np.ascontiguousarray(images.transpose(0, 2, 1)),
+            )
         _spread(box, rays, images, clean, fans)
         clean = True  # from now on it holds what is added to
 
 
-def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool, fans: bool) -> None:
+def _spread(
+    box: Box, views: FloatArray, values: Float32Array, clean: bool, fans: bool
+) -> None:
     from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])
@@ -128,12 +152,22 @@ def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool, fans
     slices = z_slices(box.nz, turns.slices)
     marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)
     if len(plan.jobs):
-        shadows = np.stack([box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()])
+        shadows = np.stack(
+            [box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()]
+        )
         times = fan_job_ns(plan.lines, plan.jobs, views, counts, (shape[0], plan.widest))
         units = np.add.reduceat(times, turns.units[:, 0])
         for some in turn_portions(turns.turns, units, workers):
             fan_kernels.spread_fans(
-                box, plan.fans(views), some, turns.units, slices, shadows, marks, workers, values
+                box,
+                plan.fans(views),
+                some,
+                turns.units,
+                slices,
+                shadows,
+                marks,
+                workers,
+                values,
             )
     if not clean:
         fan_kernels.open_rest(box, slices, marks)
@@ -143,7 +177,9 @@ def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool, fans
         columns = len(alone) * shape[1]
         # All threads meet every ray, each in its slice.
         for first, last in equal_portions(columns, shape[0] * ray_ns(counts), 1):
-            siddon_kernels.spread_rays(box, views, alone, values, slices, marks, first, last)
+            siddon_kernels.spread_rays(
+                box, views, alone, values, slices, marks, first, last
+            )
 
 
 def z_slices(nz: int, count: int) -> IntArray:

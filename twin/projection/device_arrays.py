@@ -1,7 +1,7 @@
 """Images and voxels on a CUDA device with numpy's arithmetic, for methods written in it.
 
-`+`, `-`, `*` and `numpy.maximum`, in place, too, run where the numbers are; nothing is moved but
-the numbers that `dot`, `sum` and `max` return.
+`+`, `-`, `*` and `numpy.maximum`, in place, too, run where the numbers are; nothing is moved
+but the numbers that `dot`, `sum` and `max` return.
 """
 
 from __future__ import annotations
@@ -19,7 +19,12 @@ from flexdt.twin.projection import gpu
 from flexdt.twin.projection.operators import layout_data
 from flexdt.twin.projection.volume import DeviceVolume, Volume, blank_layout
 
-UFUNCS = {np.add: "ADD", np.subtract: "SUBTRACT", np.multiply: "MULTIPLY", np.maximum: "MAXIMUM"}
+UFUNCS = {
+    np.add: "ADD",
+    np.subtract: "SUBTRACT",
+    np.multiply: "MULTIPLY",
+    np.maximum: "MAXIMUM",
+}
 """numpy function -> name in the kernel, for the functions that are supported."""
 
 
@@ -57,7 +62,9 @@ class DeviceArray(NDArrayOperatorsMixin):
         layout = blank_layout(volume)
         layout_data(layout)[...] = volume.data
         layout = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
-        return cls.of_volume(DeviceVolume(layout, volume.shape, volume.voxel_mm, volume.center_mm))
+        return cls.of_volume(
+            DeviceVolume(layout, volume.shape, volume.voxel_mm, volume.center_mm)
+        )
 
     @property
     def images(self) -> Any:
@@ -83,7 +90,9 @@ class DeviceArray(NDArrayOperatorsMixin):
             there, each = self.images, self.size // max(1, self.shape[0])
             some = cuda.device_array(len(views) * each, np.float32)
             for k, view in enumerate(views):
-                some[k * each : (k + 1) * each].copy_to_device(there[int(view)].reshape(each))
+                some[k * each : (k + 1) * each].copy_to_device(
+                    there[int(view)].reshape(each)
+                )
             return DeviceArray(some, (len(views), *self.shape[1:]))
 
         found: DeviceArray = gpu.demand(gather)
@@ -149,7 +158,9 @@ def _combined(
         least: smallest denominator of a ratio; see `DeviceArray.over`.
     """
     if isinstance(b, DeviceArray) and b.shape != a.shape:
-        raise GeometryError.of_shape("an array on the device", b.shape, a.shape, ", the other's")
+        raise GeometryError.of_shape(
+            "an array on the device", b.shape, a.shape, ", the other's"
+        )
 
     def launch() -> DeviceArray:
         from numba import cuda
@@ -164,7 +175,9 @@ def _combined(
         else:
             second = (a.flat, np.float32(b), True)
         blocks = -(-a.flat.size // gpu.LINEAR)
-        kernels.combine[blocks, gpu.LINEAR](getattr(kernels, name), a.flat, *second, made.flat)
+        kernels.combine[blocks, gpu.LINEAR](
+            getattr(kernels, name), a.flat, *second, made.flat
+        )
         return made
 
     found: DeviceArray = gpu.demand(launch)

@@ -5,13 +5,13 @@ source parallel to z; its width is bounded so that its rays stay within one voxe
 other in x and y. Views in which z is seen (nearly) end on have no fans. Pure geometry: no
 voxels are touched.
 
-For the transpose, `Turns` says which fans may add to the voxels at the same time. Seen along z a
-fan is a wedge with its point in the source. Neighbouring fans share voxel columns, fans with enough
-others between them share none. So the jobs of a view are gathered into units, and first all even
-units are worked on, each by one thread, then all odd ones: no locks, no second copy of the volume,
-and sums in the same order every time. Where wedges are too narrow for that (source close to the
-volume), threads share out the range of z instead. The drawing in docs/performance.md shows units
-and turns.
+For the transpose, `Turns` says which fans may add to the voxels at the same time. Seen along z
+a fan is a wedge with its point in the source. Neighbouring fans share voxel columns, fans with
+enough others between them share none. So the jobs of a view are gathered into units, and first
+all even units are worked on, each by one thread, then all odd ones: no locks, no second copy of
+the volume, and sums in the same order every time. Where wedges are too narrow for that (source
+close to the volume), threads share out the range of z instead. The drawing in
+docs/performance.md shows units and turns.
 """
 
 from __future__ import annotations
@@ -30,11 +30,13 @@ IntArray = npt.NDArray[np.int64]
 FANS = 16
 """Fans in a job: their columns fill whole cache lines of the image."""
 SPREAD = 0.9
-"""Largest lateral spread of a fan [voxels]: less than one, as the kernel's corrections demand."""
+"""Largest lateral spread of a fan [voxels]: less than one, as the kernel's corrections
+demand."""
 WIDEST = 4.0
 """Widest fan [columns]."""
 FACING = 0.25
-"""Least cosine between any ray and the view's horizontal direction for the view to have fans."""
+"""Least cosine between any ray and the view's horizontal direction for the view to have
+fans."""
 MIN_GAP_SHARE = 0.25
 """Least distance of two fan boundaries in any row, as a share of that in the middle
 row."""
@@ -101,7 +103,9 @@ class FanPlan:
         return Fans(views, self.lines, self.jobs[some], self.room, self.widest)
 
 
-def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]) -> FanPlan:
+def plan_fans(
+    views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
+) -> FanPlan:
     """Cut views into fans.
 
     Args:
@@ -117,7 +121,10 @@ def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int,
     ahead = flat.mean(axis=1)
     # cosine >= FACING for all corners, without roots of zero
     along = np.einsum("nki,ni->nk", flat, ahead)
-    size = np.einsum("nki,nki->nk", corners, corners) * np.einsum("ni,ni->n", ahead, ahead)[:, None]
+    size = (
+        np.einsum("nki,nki->nk", corners, corners)
+        * np.einsum("ni,ni->n", ahead, ahead)[:, None]
+    )
     facing = ((along > 0) & (along**2 >= FACING**2 * size)).all(axis=1)
     level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
     parts = [_level(np.flatnonzero(facing & level), shape)]
@@ -170,14 +177,16 @@ def _tilted(
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
     middle = corners.mean(axis=1)
-    # The middle row's pixels, along + b u, number the vertical planes by the column b they pass.
+    # The middle row's pixels, along + b u, number the vertical planes by the column b they
+    # pass.
     along = first + (rows - 1) / 2 * v
     with np.errstate(all="ignore"):
         meeting = -_cross(along[:, None], corners) / _cross(u[:, None], corners)
         slope = _cross(v, middle) / _cross(u, middle)
         rays = np.concatenate([corners, middle[:, None]], axis=1)
         step = _step(views[:, 0:3], u, rays, counts)
-        # All boundaries meet where z is seen end on; in rows from there to the middle they spread.
+        # All boundaries meet where z is seen end on; in rows from there to the middle they
+        # spread.
         pole = -_cross(u, first) / _cross(u, v)
         apart = (np.array([[0], [rows - 1]]) - pole) / ((rows - 1) / 2 - pole)
         good = np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
@@ -185,7 +194,14 @@ def _tilted(
         begin, end = meeting.min(axis=1) - 0.5, meeting.max(axis=1) + 0.5
         good &= (end - begin) / step < MAX_FANS_A_PIXEL_LINE * (rows + cols)
     use = np.flatnonzero(good)
-    begin, end, along, first, u, v = begin[use], end[use], along[use], first[use], u[use], v[use]
+    begin, end, along, first, u, v = (
+        begin[use],
+        end[use],
+        along[use],
+        first[use],
+        u[use],
+        v[use],
+    )
     fans = np.maximum(np.ceil((end - begin) / step[use]), 1).astype(np.int64)
     view, number = _counted(fans + 1)
     b = begin[view] + (end - begin)[view] * number / fans[view]
@@ -223,9 +239,13 @@ def _step(
     source: FloatArray, u: FloatArray, rays: FloatArray, counts: tuple[int, int, int]
 ) -> FloatArray:
     """Compute the columns a fan may span so that its rays stay within SPREAD voxels."""
-    ends = np.array([[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64)
+    ends = np.array(
+        [[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64
+    )
     far = np.linalg.norm(ends - source[:, None, :2], axis=2).max(axis=1)
-    turn = np.abs(_cross(rays, u[:, None])) / np.einsum("nki,nki->nk", rays[..., :2], rays[..., :2])
+    turn = np.abs(_cross(rays, u[:, None])) / np.einsum(
+        "nki,nki->nk", rays[..., :2], rays[..., :2]
+    )
     # The spread is measured along a voxel axis, up to sqrt(2) times that across the ray.
     flat = np.abs(rays[..., :2])
     slant = np.linalg.norm(flat, axis=2) / flat.max(axis=2)
@@ -305,8 +325,8 @@ def plan_turns(
 
 
 def _cuts(width: FloatArray) -> list[int]:
-    """List ends of runs of jobs that are at least MIN_UNIT_WIDTH wide; a remainder joins the last
-    run.
+    """List ends of runs of jobs that are at least MIN_UNIT_WIDTH wide; a remainder joins the
+    last run.
     """
     cuts, gathered = [0], 0.0
     for i, w in enumerate(width.tolist()):

@@ -62,7 +62,11 @@ def odl_operator(
 
 
 def cil_operator(
-    project: _Map, spread: _Map, like: Volume, geometry: ConeVec, image_shape: tuple[int, int, int]
+    project: _Map,
+    spread: _Map,
+    like: Volume,
+    geometry: ConeVec,
+    image_shape: tuple[int, int, int],
 ) -> Any:
     """A `LinearOperator` from `ImageData` (vertical, horizontal_y, horizontal_x) to
     `AcquisitionData` (angle, vertical, horizontal).
@@ -76,7 +80,9 @@ def cil_operator(
     from cil.framework import AcquisitionGeometry, ImageGeometry
     from cil.optimisation.operators import LinearOperator
 
-    def filled(function: _Map, x: Any, shape: tuple[int, int, int], geometry: Any, out: Any) -> Any:
+    def filled(
+        function: _Map, x: Any, shape: tuple[int, int, int], geometry: Any, out: Any
+    ) -> Any:
         result = geometry.allocate(None) if out is None else out
         # CIL leaves out dimensions of one element.
         result.fill(function(x.as_array().reshape(shape)).reshape(result.shape))
@@ -96,11 +102,18 @@ def cil_operator(
     nz, ny, nx = like.shape
     x, y, z = like.voxel_xyz
     voxels = ImageGeometry(
-        voxel_num_x=nx, voxel_num_y=ny, voxel_num_z=nz,
-        voxel_size_x=x, voxel_size_y=y, voxel_size_z=z,
-    )  # fmt: skip
+        voxel_num_x=nx,
+        voxel_num_y=ny,
+        voxel_num_z=nz,
+        voxel_size_x=x,
+        voxel_size_y=y,
+        voxel_size_z=z,
+    )
     n, rows, cols = image_shape
-    source, whole = np.linalg.norm(geometry.source[0]), abs(geometry.source_detector_distance[0])
+    source, whole = (
+        np.linalg.norm(geometry.source[0]),
+        abs(geometry.source_detector_distance[0]),
+    )
     images = AcquisitionGeometry.create_Cone3D(
         [0, -float(source), 0], [0, float(whole - source), 0]
     )

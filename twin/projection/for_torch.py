@@ -1,9 +1,9 @@
 """Projector and adjoint for PyTorch, differentiable in voxels, projections and geometry.
 
-The projector is linear in the voxels, so its derivative is the adjoint, and the derivative of the
-adjoint is the projector: any order of derivatives is right. With respect to the geometry there is
-the first derivative, `geometry_gradient`, for projector and adjoint alike; that of the adjoint is
-the same, because <w, A' y> = <A w, y>.
+The projector is linear in the voxels, so its derivative is the adjoint, and the derivative of
+the adjoint is the projector: any order of derivatives is right. With respect to the geometry
+there is the first derivative, `geometry_gradient`, for projector and adjoint alike; that of the
+adjoint is the same, because <w, A' y> = <A w, y>.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from flexdt.twin.projection.volume import DeviceVolume, Volume
 class TorchOperator:
     """The projector as a function of tensors: call it, and call `T` for its transpose.
 
-    Tensors are of any floating type, on the processor or on a CUDA device, where the results stay
-    then and memory is shared in and out; only voxels whose z is not contiguous (as it is in what
-    `T` gives) are brought into that order first, there, and the derivative by the geometry is
-    computed on the processor. Arrays of other libraries come in by DLPack. The values are computed
-    and returned as float32, gradients in the type of their tensor.
+    Tensors are of any floating type, on the processor or on a CUDA device, where the results
+    stay then and memory is shared in and out; only voxels whose z is not contiguous (as it is
+    in what `T` gives) are brought into that order first, there, and the derivative by the
+    geometry is computed on the processor. Arrays of other libraries come in by DLPack. The
+    values are computed and returned as float32, gradients in the type of their tensor.
 
     Attributes:
         geometry: the scan, if the call gives no geometry.
@@ -47,7 +47,9 @@ class TorchOperator:
     @property
     def T(self) -> TorchOperator:
         """The transpose."""
-        return TorchOperator(self.geometry, self.like, self.detector_shape, not self.transposed)
+        return TorchOperator(
+            self.geometry, self.like, self.detector_shape, not self.transposed
+        )
 
     def __call__(self, values: Any, rows: Any = None) -> Any:
         """Project voxels, or spread projections if this is the adjoint.
@@ -89,12 +91,16 @@ class _Project(torch.autograd.Function):
         ctx.a = a
         cone_vec = _cone_vec(rows)
         images = (len(rows), *a.detector_shape)
-        return _each(lambda one: forward(_volume(one, a.like), cone_vec, images[1:]), x, images)
+        return _each(
+            lambda one: forward(_volume(one, a.like), cone_vec, images[1:]), x, images
+        )
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
         x, rows = ctx.saved_tensors
-        by_x = _Spread.apply(g, rows, ctx.a).to(x.dtype) if ctx.needs_input_grad[0] else None
+        by_x = (
+            _Spread.apply(g, rows, ctx.a).to(x.dtype) if ctx.needs_input_grad[0] else None
+        )
         by_rows = _ByRows.apply(x, g, rows, ctx.a) if ctx.needs_input_grad[1] else None
         return by_x, by_rows, None
 
@@ -107,26 +113,37 @@ class _Spread(torch.autograd.Function):
         ctx.save_for_backward(y, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)
-        return _each(lambda one: _voxels(back(_memory(one), cone_vec, a.like)), y, a.like.shape)
+        return _each(
+            lambda one: _voxels(back(_memory(one), cone_vec, a.like)), y, a.like.shape
+        )
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
         y, rows = ctx.saved_tensors
-        by_y = _Project.apply(g, rows, ctx.a).to(y.dtype) if ctx.needs_input_grad[0] else None
+        by_y = (
+            _Project.apply(g, rows, ctx.a).to(y.dtype)
+            if ctx.needs_input_grad[0]
+            else None
+        )
         by_rows = _ByRows.apply(g, y, rows, ctx.a) if ctx.needs_input_grad[1] else None
         return by_y, by_rows, None
 
 
 class _ByRows(torch.autograd.Function):
-    """x, y, rows -> derivative of <A(rows) x, y> with respect to rows, summed over the batch."""
+    """x, y, rows -> derivative of <A(rows) x, y> with respect to rows, summed over the
+    batch."""
 
     @staticmethod
     def forward(ctx: Any, x: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
         cone_vec = _cone_vec(rows)
         total = np.zeros((len(rows), 12))
         images = y.detach().cpu().reshape(-1, len(rows), *a.detector_shape)
-        for one, weights in zip(x.detach().cpu().reshape(-1, *a.like.shape), images, strict=True):
-            total += geometry_gradient(a.like.like(one.numpy()), cone_vec, weights.numpy())
+        for one, weights in zip(
+            x.detach().cpu().reshape(-1, *a.like.shape), images, strict=True
+        ):
+            total += geometry_gradient(
+                a.like.like(one.numpy()), cone_vec, weights.numpy()
+            )
         return torch.as_tensor(total, dtype=rows.dtype, device=rows.device)
 
     @staticmethod
@@ -139,10 +156,14 @@ class _ByRows(torch.autograd.Function):
 
 def _tensor(values: Any) -> Any:
     if isinstance(values, np.ndarray):
-        values = values if values.flags.writeable else values.copy()  # no tensor is read-only
+        values = (
+            values if values.flags.writeable else values.copy()
+        )  # no tensor is read-only
     tensor = values if isinstance(values, torch.Tensor) else torch.from_dlpack(values)
     usable = _is_there(tensor) and gpu.availability().present
-    gpu.check_host(usable or tensor.device.type == "cpu", f"the tensor on {tensor.device}")
+    gpu.check_host(
+        usable or tensor.device.type == "cpu", f"the tensor on {tensor.device}"
+    )
     return tensor
 
 
@@ -176,10 +197,14 @@ def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
 
 def _voxels(volume: Volume | DeviceVolume) -> Any:
     """Return the voxels of a result of `back`, in C order if they are numpy's."""
-    return volume if isinstance(volume, DeviceVolume) else np.array(volume.data, order="C")
+    return (
+        volume if isinstance(volume, DeviceVolume) else np.array(volume.data, order="C")
+    )
 
 
-def _each(function: Callable[[Any], Any], values: Any, shape: tuple[int, int, int]) -> Any:
+def _each(
+    function: Callable[[Any], Any], values: Any, shape: tuple[int, int, int]
+) -> Any:
     """Apply a function of a three-dimensional tensor to each member of a batch, on its
     device.
 
@@ -191,7 +216,9 @@ def _each(function: Callable[[Any], Any], values: Any, shape: tuple[int, int, in
     if _is_there(values):
         with gpu.on(device.index or 0):
             torch.cuda.current_stream(device).synchronize()
-            results = [torch.as_tensor(function(member), device=device) for member in members]
+            results = [
+                torch.as_tensor(function(member), device=device) for member in members
+            ]
             gpu.finish()
     else:
         results = [torch.from_numpy(function(member)) for member in members]

@@ -1,11 +1,12 @@
 """The projector on a CUDA device, used where there is one with room.
 
-Needs the extra `gpu` (numba-cuda). Functions and results (to 1e-4 of the maximum) are those of the
-processor. Probing never loads a library that ends the process without a device: the driver is
-looked for first, and ASTRA is imported only after that succeeded; then one ray is projected,
-because a driver that answers need not have a compiler that works. A call runs wholly on the device
-or wholly on the processor. Where the device fails, now or later, one line of the log says so and
-the processor computes: nothing ends for a device's sake (but for volumes that are there alone).
+Needs the extra `gpu` (numba-cuda). Functions and results (to 1e-4 of the maximum) are those of
+the processor. Probing never loads a library that ends the process without a device: the driver
+is looked for first, and ASTRA is imported only after that succeeded; then one ray is projected,
+because a driver that answers need not have a compiler that works. A call runs wholly on the
+device or wholly on the processor. Where the device fails, now or later, one line of the log
+says so and the processor computes: nothing ends for a device's sake (but for volumes that are
+there alone).
 """
 
 from __future__ import annotations
@@ -108,7 +109,8 @@ def _probed() -> Availability:
 
 
 def leave_after_fork() -> None:
-    """Leave the device to the parent: a forked child cannot use one that its parent has used."""
+    """Leave the device to the parent: a forked child cannot use one that its parent has
+    used."""
     if _probed.cache_info().currsize and _probed().present:
         why = "the device belongs to the parent of this forked process; spawn and forkserver work"
         _failed.insert(0, Availability(False, why))
@@ -150,9 +152,13 @@ def attempt(work: Callable[[], object]) -> bool:
         work()
     except Exception as error:
         if "OUT_OF_MEMORY" in str(error).upper().replace(" ", "_"):
-            LOGGER.warning("the CUDA device lacks memory; the processor computes: %s", error)
+            LOGGER.warning(
+                "the CUDA device lacks memory; the processor computes: %s", error
+            )
         elif not _failed:
-            LOGGER.warning("the CUDA device failed; the processor computes from now on: %s", error)
+            LOGGER.warning(
+                "the CUDA device failed; the processor computes from now on: %s", error
+            )
             _failed.append(Availability(False, f"the CUDA device failed: {error}"))
         return False
     return True
@@ -264,11 +270,15 @@ def demand(work: Callable[[], Any]) -> Any:
     """
     found: list[Any] = []
     if not attempt(lambda: found.append(work())):
-        raise DeviceError("the CUDA device failed at arrays that are on it; the log says of what")
+        raise DeviceError(
+            "the CUDA device failed at arrays that are on it; the log says of what"
+        )
     return found[0]
 
 
-def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]) -> Any:
+def project_there(
+    box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]
+) -> Any:
     """Project a volume on the device to images (n, rows, cols) that stay there."""
     from numba import cuda
 
@@ -359,7 +369,9 @@ def whole_factor(box: Box, values: Any) -> float:
     return 2.0 ** math.floor(62 - math.log2(most)) if 0.0 < most < math.inf else 1.0
 
 
-def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def by_slabs(
+    box: Box, views: FloatArray, shape: tuple[int, int]
+) -> npt.NDArray[np.bool_]:
     """Find the views that the slab walk can project, (n,) bool.
 
     All rays of such a view cross the box from side to side between source and pixel, and
@@ -371,7 +383,8 @@ def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray
 
 
 def rises(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Compute a bound of the voxels that rays rise for each along the faster one of x and y, (n,).
+    """Compute a bound of the voxels that rays rise for each along the faster one of x and y,
+    (n,).
 
     Infinity where rays of a view may go along different ways of these axes.
     """
@@ -386,7 +399,9 @@ def rises(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
     return np.asarray(bounds.max(axis=2).min(axis=1))
 
 
-def clear_of(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def clear_of(
+    box: Box, views: FloatArray, shape: tuple[int, int]
+) -> npt.NDArray[np.bool_]:
     """Find the views whose source is before a box and whose detector plane is behind it.
 
     Boxes too long for the slab walk have no such views.
@@ -411,7 +426,9 @@ def clear_of(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray
     turned = depth < 0.0
     low, high = np.where(turned, -farthest, nearest), np.where(turned, -nearest, farthest)
     depth = np.abs(depth)
-    return np.asarray((low > MIN_CLEARANCE * depth) & (high < (1.0 - MIN_CLEARANCE) * depth))
+    return np.asarray(
+        (low > MIN_CLEARANCE * depth) & (high < (1.0 - MIN_CLEARANCE) * depth)
+    )
 
 
 def _corners(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
@@ -440,8 +457,8 @@ def launcher(
 
     images: flat, on the device. One array goes there: views by kernel, each with the
         number of its
-    image. Views of a detector on its side take its columns for rows, so that lanes are neighbours
-    along z there, too.
+    image. Views of a detector on its side take its columns for rows, so that lanes are
+    neighbours along z there, too.
     """
     from numba import cuda
 
@@ -452,7 +469,9 @@ def launcher(
     rays = np.where(turned[:, None], exchanged(views), views)
     rise = rises(views, (rows, cols))
     slabs = clear_of(box, views, (rows, cols)) & (rise <= 1.0)
-    upright = kernels.LANES_MEET & (rays[:, 9:11] == 0.0).all(axis=1) & (rise <= kernels.RISE)
+    upright = (
+        kernels.LANES_MEET & (rays[:, 9:11] == 0.0).all(axis=1) & (rise <= kernels.RISE)
+    )
     kind = KINDS * turned + slabs + (slabs & upright)
     order = np.argsort(kind, kind="stable")
     table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
@@ -467,10 +486,24 @@ def launcher(
         first = 0
         for which, count in zip(kinds, counts, strict=True):
             lying_down, walk = divmod(int(which), KINDS)
-            lanes, columns, *steps = (cols, rows, 1, cols) if lying_down else (rows, cols, cols, 1)
-            grid = (int(count) * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))
+            lanes, columns, *steps = (
+                (cols, rows, 1, cols) if lying_down else (rows, cols, cols, 1)
+            )
+            grid = (
+                int(count) * -(-columns // kernels.BLOCK[1]),
+                -(-lanes // kernels.BLOCK[0]),
+            )
             walks[walk][grid, kernels.BLOCK](
-                voxels, *box[2:], table, first, int(count), images, lanes, columns, *steps, factor
+                voxels,
+                *box[2:],
+                table,
+                first,
+                int(count),
+                images,
+                lanes,
+                columns,
+                *steps,
+                factor,
             )
             first += int(count)
 

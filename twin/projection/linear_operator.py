@@ -1,4 +1,5 @@
-"""The projector of one scan and one grid as a linear operator, for algorithms written as algebra.
+"""The projector of one scan and one grid as a linear operator, for algorithms written as
+algebra.
 
 `A @ x` is `forward`, `A.T @ y` is `back`, and one is the exact transpose of the other, as
 least squares, proximal methods and automatic differentiation need. Arrays of other
@@ -76,10 +77,10 @@ def _library(x: Any) -> Any:
 class Operator:
     """The linear map from the voxels of a grid to the line integrals of a scan.
 
-    Voxels and projections may be arrays of numpy, of PyTorch, or of any other library that hands
-    out its memory by DLPack; the result is an array of the same library. The values are computed
-    and returned as float32. Voxels that come out of numpy have z contiguous in memory, which the
-    projector reads without a copy; use np.ascontiguousarray where C order matters.
+    Voxels and projections may be arrays of numpy, of PyTorch, or of any other library that
+    hands out its memory by DLPack; the result is an array of the same library. The values are
+    computed and returned as float32. Voxels that come out of numpy have z contiguous in memory,
+    which the projector reads without a copy; use np.ascontiguousarray where C order matters.
 
     Attributes:
         geometry: the scan; an array (n, 12) [mm] is taken for one.
@@ -105,7 +106,10 @@ class Operator:
     dtype: ClassVar = np.dtype(np.float32)
 
     def __init__(
-        self, geometry: ConeVec | npt.ArrayLike, like: Volume | Grid, shape: Shape2 | None = None
+        self,
+        geometry: ConeVec | npt.ArrayLike,
+        like: Volume | Grid,
+        shape: Shape2 | None = None,
     ) -> None:
         scan = as_cone_vec(geometry)
         object.__setattr__(self, "geometry", scan)
@@ -213,7 +217,9 @@ class Operator:
         if not SMALLEST_TOLERANCE <= tolerance < 1.0:
             said = f"the tolerance is {tolerance:g}"
             raise LimitError.instead(said, tolerance, f"{SMALLEST_TOLERANCE:g} to 1")
-        return norm_of(self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance)
+        return norm_of(
+            self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance
+        )
 
     def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:
         """Compute the derivative of sum(weights * (A @ x)) by the geometry, (n, 12)
@@ -241,7 +247,9 @@ class Operator:
             >>> A.change(np.ones((3, 4, 3)), np.ones((1, 12))).shape
             (1, 1, 1)
         """
-        return geometry_change(self._volume(x), self.geometry, change, self.detector_shape)
+        return geometry_change(
+            self._volume(x), self.geometry, change, self.detector_shape
+        )
 
     def _volume(self, x: Volume | npt.ArrayLike) -> Volume:
         return x if isinstance(x, Volume) else self.like.like(np.asarray(x))
@@ -306,7 +314,9 @@ class Operator:
         _require("cil", "conda install -c ccpi cil")
         from flexdt.twin.projection.for_odl_and_cil import cil_operator
 
-        return cil_operator(self._forward, self._back, self.like, self.geometry, self.image_shape)
+        return cil_operator(
+            self._forward, self._back, self.like, self.geometry, self.image_shape
+        )
 
 
 def _require(package: str, how: str) -> None:
@@ -352,7 +362,9 @@ def _is_tensor(x: object) -> bool:
 
 def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> None:
     if got != wanted:
-        raise GeometryError.of_shape(what, got, wanted, " (flat vectors: linear_operator())")
+        raise GeometryError.of_shape(
+            what, got, wanted, " (flat vectors: linear_operator())"
+        )
 
 
 def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:
@@ -374,7 +386,10 @@ dot.register(DeviceArray, DeviceArray.dot)
 
 
 def norm_of(
-    project: Callable[[Any], Any], spread: Callable[[Any], Any], ones: Any, tolerance: float
+    project: Callable[[Any], Any],
+    spread: Callable[[Any], Any],
+    ones: Any,
+    tolerance: float,
 ) -> float:
     """Compute `Operator.norm` of a map and its transpose.
 

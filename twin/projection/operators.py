@@ -1,17 +1,17 @@
-"""Forward projection, its adjoint, and its derivatives by the geometry: the public functions of the
-voxel projectors.
+"""Forward projection, its adjoint, and its derivatives by the geometry: the public functions of
+the voxel projectors.
 
-Arguments are checked and brought into voxel units here. A CUDA device computes where there is one
-with room for the volume, the processor otherwise; both give exact Siddon lengths. Rays run from the
-focal spot through the pixel's centre and on: a panel before or inside the volume cuts none of them
-(`virtual_panel`).
+Arguments are checked and brought into voxel units here. A CUDA device computes where there is
+one with room for the volume, the processor otherwise; both give exact Siddon lengths. Rays run
+from the focal spot through the pixel's centre and on: a panel before or inside the volume cuts
+none of them (`virtual_panel`).
 
 Each view is walked along the axis on which its levels are stacked, or ray by ray. A ray acts
-wherever it passes from one level to the next, so levels should be stacked along the axis that rays
-are most nearly at right angles to. That is z for a source beside the object, and x or y for one
-well above or below it, or for a detector of a single row. Turning the volume and the geometry
-cyclically, (x, y, z) to (y, z, x) or (z, x, y), brings either axis to where the kernels have z;
-images stay as they are.
+wherever it passes from one level to the next, so levels should be stacked along the axis that
+rays are most nearly at right angles to. That is z for a source beside the object, and x or y
+for one well above or below it, or for a detector of a single row. Turning the volume and the
+geometry cyclically, (x, y, z) to (y, z, x) or (z, x, y), brings either axis to where the
+kernels have z; images stay as they are.
 
 The derivatives are exact for a volume of voxels, almost everywhere: a line integral is a smooth
 function of the ray as long as the ray meets the same voxels in the same order. They are what
@@ -117,9 +117,13 @@ def level_axes(
     rows, cols = shape
     source, first, u, v = (rays[:, i : i + 3] for i in (0, 3, 6, 9))
     r, c = np.meshgrid([0, (rows - 1) / 2, rows - 1], [0, (cols - 1) / 2, cols - 1])
-    towards = first[:, None] + r.reshape(-1, 1) * v[:, None] + c.reshape(-1, 1) * u[:, None]
+    towards = (
+        first[:, None] + r.reshape(-1, 1) * v[:, None] + c.reshape(-1, 1) * u[:, None]
+    )
     middle = towards[:, 4]
-    size = np.abs(towards) / np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
+    size = np.abs(towards) / np.maximum(
+        np.linalg.norm(towards, axis=2, keepdims=True), 1e-9
+    )
     every = rows * cols * size.mean(axis=1)
     through = (np.array(counts[::-1]) / np.maximum(size[:, 4], 1e-9)).min(axis=1)
     times = np.empty((len(rays), 4))
@@ -127,15 +131,24 @@ def level_axes(
     for i, (a, b, w) in enumerate(ORDERS):
 
         def across(step: FloatArray, a: int = a, b: int = b) -> FloatArray:
-            return np.asarray(np.abs(step[:, a] * middle[:, b] - step[:, b] * middle[:, a]))
+            return np.asarray(
+                np.abs(step[:, a] * middle[:, b] - step[:, b] * middle[:, a])
+            )
 
-        # Fans follow the images of planes along w: columns, or rows where those lie closer to them.
+        # Fans follow the images of planes along w: columns, or rows where those lie closer to
+        # them.
         lying = across(v) > across(u)
         steps, columns = np.where(lying, rows, cols), np.where(lying[:, None], v, u)
         along, length = np.where(lying[:, None], u, v), np.where(lying, cols, rows)
         flat = np.abs(along[:, [a, b]]).max(axis=1) * length < fan_plan.LEVEL
-        far = np.hypot(source[:, a], source[:, b]) + 0.5 * math.hypot(counts[2 - a], counts[2 - b])
-        wide = across(columns) * far / np.maximum(np.hypot(middle[:, a], middle[:, b]), 1e-9) ** 2
+        far = np.hypot(source[:, a], source[:, b]) + 0.5 * math.hypot(
+            counts[2 - a], counts[2 - b]
+        )
+        wide = (
+            across(columns)
+            * far
+            / np.maximum(np.hypot(middle[:, a], middle[:, b]), 1e-9) ** 2
+        )
         fans = steps * np.where(flat, 1.0, np.maximum(wide / SPREAD, 1.0 / WIDEST))
         levels = np.minimum(counts[2 - w], np.abs(along[:, w]) * length)
         slab = FAN_SLAB_NS + np.where(flat, *FAN_LEVEL_NS) * levels
@@ -184,7 +197,9 @@ def forward(
     shape = geometry.of_shape(shape)
     if isinstance(volume, DeviceVolume):
         if out is not None:
-            raise GeometryError("out is of the host; allowed: None for a volume on a device", {})
+            raise GeometryError(
+                "out is of the host; allowed: None for a volume on a device", {}
+            )
         geometry = run_through(geometry, corners_of(volume))
         there, rays = volume.layout, voxel_rays(geometry, volume.layout, shape)
         # Arrays on a device have no type of their own.
@@ -207,7 +222,9 @@ def forward(
     return result
 
 
-def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Array) -> bool:
+def _on_device(
+    volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Array
+) -> bool:
     """Try to fill `out` on a CUDA device and return whether that succeeded."""
     if not gpu.availability().present or len(geometry) == 0 or volume.layout.empty:
         return False
@@ -270,7 +287,9 @@ def back(
     geometry = run_through(geometry, corners_of(like))
     if gpu.is_there(values):
         if out is not None:
-            raise GeometryError("out is of the host; allowed: None for images on a device", {})
+            raise GeometryError(
+                "out is of the host; allowed: None for images on a device", {}
+            )
         target = DeviceVolume.blank(like)
         there, rays = target.layout, voxel_rays(geometry, target.layout, shape)
         gpu.demand(
@@ -313,7 +332,9 @@ def _spread(
     if clean:
         layout_kernels.touch(layout.flat)
     rooms: dict[Order, Float32Array] = {}
-    for some, order, fans in by_level_axis(like, geometry, (values.shape[1], values.shape[2])):
+    for some, order, fans in by_level_axis(
+        like, geometry, (values.shape[1], values.shape[2])
+    ):
         turned, target = like.in_order(order), layout
         if order != ORDERS[0]:
             if order not in rooms:
@@ -384,7 +405,9 @@ def require_line_integrals(projections: Any) -> None:
     if kind is not None and kind.kind == "u":
         said = f"projections are {kind}, as a detector's counts are"
         wanted = "line integrals, as `line_integrals()` of a data set gives them"
-        raise GeometryError.instead(said, str(kind), f"{wanted}, or floating-point numbers")
+        raise GeometryError.instead(
+            said, str(kind), f"{wanted}, or floating-point numbers"
+        )
 
 
 def require_finite(values: Any) -> None:
@@ -425,7 +448,11 @@ def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
     Raises:
         GeometryError: a row does not; it is named.
     """
-    given = cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(as_numbers("cone_vec", cone_vec))
+    given = (
+        cone_vec
+        if isinstance(cone_vec, ConeVec)
+        else ConeVec(as_numbers("cone_vec", cone_vec))
+    )
     return check_spread(given)
 
 
@@ -544,7 +571,9 @@ def geometry_change(
     moved = np.asarray(change, dtype=np.float64)
     if moved.shape not in ((12,), (len(geometry), 12)):
         wanted = (len(geometry), 12)
-        raise GeometryError.of_shape("the geometry's change", moved.shape, wanted, " or (12,)")
+        raise GeometryError.of_shape(
+            "the geometry's change", moved.shape, wanted, " or (12,)"
+        )
     shape = geometry.of_shape(shape)
     result = np.zeros((len(geometry), *shape), np.float32)
     times = stretches(geometry, corners_of(volume))

@@ -53,7 +53,9 @@ def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def turn_portions(turns: IntArray, unit_ns: FloatArray, threads: int) -> Iterator[IntArray]:
+def turn_portions(
+    turns: IntArray, unit_ns: FloatArray, threads: int
+) -> Iterator[IntArray]:
     """Yield the rows of `fan_plan.Turns.turns` in portions, each (k, 2).
 
     Args:

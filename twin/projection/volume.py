@@ -1,5 +1,5 @@
-"""A voxel volume as a frozen value, the memory layout that the kernels read, and how far the values
-of a reconstructed one may be off, in short.
+"""A voxel volume as a frozen value, the memory layout that the kernels read, and how far the
+values of a reconstructed one may be off, in short.
 
 Voxels are stored data[z, y, x], float32. The kernels want z contiguous, know which voxels are
 empty, and never look outside the occupied box; that layout is derived once per volume, on first
@@ -37,11 +37,13 @@ CAUSES: Final = {
     "drift": "an open beam beside the object that is not the flat field's",
 }
 GRANTED: Final = (
-    "taken for granted: the geometry, as far as images do not contradict it, and line integrals "
+    "taken for granted: the geometry, as far as images do not contradict it, and line "
+    "integrals "
     "without beam hardening and scatter"
 )
 NOT_BOUNDED: Final = (
-    "accuracy: not bounded, because the object extends beyond the panel's sides: a denser shell "
+    "accuracy: not bounded, because the object extends beyond the panel's sides: a "
+    "denser shell "
     "out there makes every value too low, and no image shows it"
 )
 Vector3 = tuple[float, float, float]
@@ -73,9 +75,12 @@ class Accuracy:
     def __str__(self) -> str:
         if self.cut_off:
             return f"{NOT_BOUNDED}; {GRANTED}"
-        half, most = (f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most))
+        half, most = (
+            f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most)
+        )
         return (
-            f"accuracy: within {most} in nine of ten uniform regions and {half} in half of them "
+            f"accuracy: within {most} in nine of ten uniform regions and {half} in half "
+            "of them "
             f"(noise not included); largest cause: {CAUSES[self.cause]}; {GRANTED}"
         )
 
@@ -98,8 +103,8 @@ class Layout:
         counts: (nx, ny, nz) voxels of the box; any may be 0 when the volume is empty.
         low_mm: object-frame position of the outer corner of voxel (0, 0, 0) of the box [mm].
         voxel_mm: voxel size (x, y, z) [mm].
-        spans: int32 (ny * nx * 2): occupied voxels of column (ix, iy) are first <= iz < last, at
-            2 * (iy * nx + ix) and after.
+        spans: int32 (ny * nx * 2): occupied voxels of column (ix, iy) are first <= iz < last,
+            at 2 * (iy * nx + ix) and after.
     """
 
     flat: Float32Array
@@ -200,8 +205,8 @@ def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
 class Volume:
     """A frozen volume of voxels.
 
-    The array is kept as a read-only view, not copied when it is float32 already. Whoever goes on
-    writing into the original array after a projection gets projections of the old content.
+    The array is kept as a read-only view, not copied when it is float32 already. Whoever goes
+    on writing into the original array after a projection gets projections of the old content.
 
     Attributes:
         data: float32 (nz, ny, nx), linear attenuation [1/mm]; index grows with +z, +y, +x.
@@ -228,7 +233,9 @@ class Volume:
         data = as_numbers("volume data", self.data, np.float32)
         if data.ndim != 3 or 0 in data.shape:
             wanted = ("nz", "ny", "nx")
-            raise GeometryError.of_shape("volume data", data.shape, wanted, ", all positive")
+            raise GeometryError.of_shape(
+                "volume data", data.shape, wanted, ", all positive"
+            )
         view = data.view()
         view.setflags(write=False)
         object.__setattr__(self, "data", view)
@@ -242,7 +249,11 @@ class Volume:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """Return the values, (nz, ny, nx)."""
-        return np.array(self.data, dtype=dtype) if copy else np.asarray(self.data, dtype=dtype)
+        return (
+            np.array(self.data, dtype=dtype)
+            if copy
+            else np.asarray(self.data, dtype=dtype)
+        )
 
     def __dlpack__(self, **options: Any) -> Any:
         """Export the values to another library, such as `torch.from_dlpack(volume)`,
@@ -266,8 +277,10 @@ class Volume:
         size = " x ".join(f"{side:g}" for side in self.size_mm)
         least, most = float(self.data.min()), float(self.data.max())
         return (
-            f"<table><caption>{escape(repr(self)[1:-1])}</caption><tr><th>size (x, y, z)</th><td>"
-            f"{size} mm</td></tr><tr><th>values</th><td>{least:.4g} to {most:.4g} / mm</td></tr>"
+            f"<table><caption>{escape(repr(self)[1:-1])}</caption><tr><th>size (x, y, "
+            "z)</th><td>"
+            f"{size} mm</td></tr><tr><th>values</th><td>{least:.4g} to {most:.4g} / "
+            "mm</td></tr>"
             "</table>"
         )
 
@@ -291,7 +304,8 @@ class Volume:
         if device != "cuda" or not found.present:
             why = f": {found.reason}" if device == "cuda" else ""
             raise NotBuiltError(
-                f"no volumes on device {device!r}{why}; allowed: 'cpu', and 'cuda' where there is "
+                f"no volumes on device {device!r}{why}; allowed: 'cpu', and 'cuda' where "
+                "there is "
                 "a CUDA device. Projections use it by themselves, too",
                 {"asked": device, "allowed": ["cpu", "cuda"]},
             )
@@ -322,8 +336,8 @@ class Volume:
     def show(self, window: Sequence[float] | None = None) -> Any:
         """Show three slices in a notebook, with a slider for each.
 
-        With ipywidgets (the extra `notebook`) every layer and any window can be chosen; without it
-        it is a page of HTML with some layers, which `.save("volume.html")` writes.
+        With ipywidgets (the extra `notebook`) every layer and any window can be chosen; without
+        it it is a page of HTML with some layers, which `.save("volume.html")` writes.
 
         Args:
             window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
@@ -354,7 +368,8 @@ class Volume:
         return backend("xarray").volume_to_xarray(self)
 
     def save(self, file: File) -> None:
-        """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5, .zarr.
+        """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5,
+        .zarr.
 
         Raises:
             TwinError: another ending, or the package that writes it is not installed.
@@ -463,7 +478,9 @@ class Volume:
         nz, ny, nx = self.shape
         x, y, z = (
             np.asarray(c + (np.arange(n) - (n - 1) / 2) * size, dtype=np.float64)
-            for c, n, size in zip(self.center_mm, (nx, ny, nz), self.voxel_xyz, strict=True)
+            for c, n, size in zip(
+                self.center_mm, (nx, ny, nz), self.voxel_xyz, strict=True
+            )
         )
         return x, y, z
 
@@ -476,7 +493,9 @@ class Volume:
             96.0
         """
         if data.shape != self.data.shape:
-            raise GeometryError.of_shape("values", data.shape, self.shape, ", the volume's")
+            raise GeometryError.of_shape(
+                "values", data.shape, self.shape, ", the volume's"
+            )
         return replace(self, data=np.asarray(data, dtype=np.float32))
 
     def in_order(self, order: tuple[int, int, int]) -> Volume:
@@ -527,7 +546,9 @@ class Volume:
         filled = last > first
         if not filled.any():
             none, origin = np.zeros(0, np.int32), (0.0, 0.0, 0.0)
-            return Layout(flat, 0, stride_x, stride_y, (0, 0, 0), origin, self.voxel_xyz, none)
+            return Layout(
+                flat, 0, stride_x, stride_y, (0, 0, 0), origin, self.voxel_xyz, none
+            )
         # Only offsets and counts change.
         ys, xs = (np.flatnonzero(filled.any(axis=axis)) for axis in (1, 0))
         x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
@@ -551,8 +572,8 @@ class Volume:
 class DeviceVolume:
     """A volume whose voxels are on the CUDA device, and stay there.
 
-    `forward` of one gives images on the device, `back` of images on the device gives one; `to` and
-    the arrays' `copy_to_host` move them to the host. Libraries that take
+    `forward` of one gives images on the device, `back` of images on the device gives one; `to`
+    and the arrays' `copy_to_host` move them to the host. Libraries that take
     `__cuda_array_interface__` (cupy, PyTorch, numba) share the memory.
 
     Attributes:
@@ -582,7 +603,9 @@ class DeviceVolume:
 
         Voxel (z, y, x) is at flat[y * strides[0] + x * strides[1] + z].
         """
-        layout = replace(blank_layout(like), flat=flat, stride_y=strides[0], stride_x=strides[1])
+        layout = replace(
+            blank_layout(like), flat=flat, stride_y=strides[0], stride_x=strides[1]
+        )
         return cls(layout, like.shape, like.voxel_mm, like.center_mm)
 
     @property
@@ -610,7 +633,9 @@ class DeviceVolume:
         if device == "cuda":
             return self
         if device != "cpu":
-            raise NotBuiltError(f"no volumes on device {device!r}; allowed: 'cpu', 'cuda'", {})
+            raise NotBuiltError(
+                f"no volumes on device {device!r}; allowed: 'cpu', 'cuda'", {}
+            )
         from flexdt.twin.projection import gpu
 
         flat = gpu.demand(lambda: self.layout.flat.copy_to_host())  # type: ignore[attr-defined]
@@ -638,7 +663,9 @@ class Grid:
     center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
+        if min(self.shape) < 1 or not (
+            math.isfinite(self.voxel_mm) and self.voxel_mm > 0
+        ):
             said = f"grid of {self.shape} voxels of {self.voxel_mm} mm"
             wanted = "three whole numbers above 0, and one edge above 0"
             raise GeometryError.instead(said, repr((self.shape, self.voxel_mm)), wanted)
@@ -706,14 +733,21 @@ def aligned_zeros(count: int) -> Float32Array:
 
 
 def bring_over(
-    data: Float32Array, flat: Float32Array, stride_x: int, stride_y: int, *, adding: bool = False
+    data: Float32Array,
+    flat: Float32Array,
+    stride_x: int,
+    stride_y: int,
+    *,
+    adding: bool = False,
 ) -> None:
     """Copy or add data[z, y, x] to flat[y * stride_y + x * stride_x + z]."""
     from flexdt.twin.projection.kernels import layout_kernels
 
     data = data.view()
     data.flags.writeable = False  # a kernel is compiled for each type of its arguments
-    if data.strides[1] < data.strides[2]:  # blocks are of z and of what is contiguous in data
+    if (
+        data.strides[1] < data.strides[2]
+    ):  # blocks are of z and of what is contiguous in data
         data, stride_x, stride_y = data.transpose(0, 2, 1), stride_y, stride_x
     nz, ny, nx = data.shape
     for y0, y1 in equal_portions(ny, PASS_NS * nz * nx, 1):

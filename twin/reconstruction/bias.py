@@ -2,12 +2,12 @@
 
 A coarse volume of the object is projected and reconstructed on a ladder of scans: from
     one without
-a flaw (parallel rays from everywhere, a panel that sees all) to the one at hand, one flaw a rung.
-The difference of two rungs is the effect of that flaw on such an object. Two flaws show in
-the images alone, and get a reconstruction each: what lies beyond the panel's edges,
+a flaw (parallel rays from everywhere, a panel that sees all) to the one at hand, one flaw a
+rung. The difference of two rungs is the effect of that flaw on such an object. Two flaws show
+in the images alone, and get a reconstruction each: what lies beyond the panel's edges,
     continued in
-another way, and the drift of the flat, which is seen beside the object. A voxel's bound is what all
-of them come to about it.
+another way, and the drift of the flat, which is seen beside the object. A voxel's bound is what
+all of them come to about it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
-from flexdt.twin.reconstruction.consistency.agreement import Contradiction, contradiction_of
+from flexdt.twin.reconstruction.consistency.agreement import (
+    Contradiction,
+    contradiction_of,
+)
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 SAFETY_FACTOR: Final = 3.0
@@ -39,8 +42,13 @@ images."""
 FDK_ERROR_SHARE: Final = 0.003
 """Error of FDK without flaws, relative to the attenuation about a voxel."""
 USUAL_SHARE: Final = {
-    "angles": 0.3, "aside": 0.1, "cone": 0.7, "rows": 1.0, "beyond": 1.0, "drift": 1.3,
-}  # fmt: skip
+    "angles": 0.3,
+    "aside": 0.1,
+    "cone": 0.7,
+    "rows": 1.0,
+    "beyond": 1.0,
+    "drift": 1.3,
+}
 """Cause -> share of its bound that half of a scan's uniform regions stay below. Causes
 that reach their bound in narrow places have small ones
 (`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
@@ -106,7 +114,9 @@ class Bias:
         size = np.array(grid.shape[::-1]) * grid.voxel_mm + self.found.voxel_xyz
         near = [
             np.abs(places - middle) <= 0.5 * side
-            for places, middle, side in zip(self.found.centers(), grid.center_mm, size, strict=True)
+            for places, middle, side in zip(
+                self.found.centers(), grid.center_mm, size, strict=True
+            )
         ]
         inside = near[2][:, None, None] & near[1][:, None] & near[0] & self.inside
         value = np.abs(self.found.data)
@@ -116,7 +126,9 @@ class Bias:
             return None
         off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
         most = float(np.percentile(self.total[inside] / value[inside], 90.0))
-        usual = USUAL_FLOOR + sum(USUAL_SHARE[cause] * part for cause, part in off.items())
+        usual = USUAL_FLOOR + sum(
+            USUAL_SHARE[cause] * part for cause, part in off.items()
+        )
         half = min(float(np.median(usual)), most)
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
         return Accuracy(half, most, worst, "beyond" in off)
@@ -180,7 +192,9 @@ def _bias_of(scan: CoarseScan) -> Bias:
     if scan.sparse:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
-        best, ours = (scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles))
+        best, ours = (
+            scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles)
+        )
         add("angles", SAFETY_FACTOR, np.abs(ours - best))
     rungs = [(rung.flaw, scan.seen(found, rung)) for rung in scan.ladder()]
     for (_, before), (flaw, after) in pairwise(rungs):
@@ -188,8 +202,13 @@ def _bias_of(scan: CoarseScan) -> Bias:
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
         ways = [(truncation.otherwise, SAFETY_FACTOR)]
-        if truncation.explained:  # but the prisms' residual at the edges is as unknown as ever
-            ways = [(truncation.otherwise, PRISM_ERROR_SHARE), (truncation.later, SAFETY_FACTOR)]
+        if (
+            truncation.explained
+        ):  # but the prisms' residual at the edges is as unknown as ever
+            ways = [
+                (truncation.otherwise, PRISM_ERROR_SHARE),
+                (truncation.later, SAFETY_FACTOR),
+            ]
         for way, share in ways:
             other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
             add("beyond", share, other - data)
@@ -225,7 +244,9 @@ def _evenness(values: Float32Array, most: float) -> FloatArray:
     from scipy.ndimage import gaussian_gradient_magnitude
 
     steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")
-    return np.asarray(np.exp(-np.square(steep / max(most, float(np.finfo(np.float32).tiny)))))
+    return np.asarray(
+        np.exp(-np.square(steep / max(most, float(np.finfo(np.float32).tiny))))
+    )
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
@@ -236,4 +257,6 @@ def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
         total = gaussian_filter(weights * what, 1.0, mode="nearest")
         return np.asarray(total / gaussian_filter(weights, 1.0, mode="nearest"))
 
-    return np.asarray(np.sqrt(np.maximum(mean(np.square(mean(values.astype(np.float64)))), 0.0)))
+    return np.asarray(
+        np.sqrt(np.maximum(mean(np.square(mean(values.astype(np.float64)))), 0.0))
+    )

@@ -52,17 +52,17 @@ def fdk(
         errors: find `sigma`, `bias_bound` and `accuracy` of the volume, and warn.
 
     Returns:
-        Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few views
-        see, above or below the panel, are NaN.
+        Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few
+        views see, above or below the panel, are NaN.
 
     Raises:
-        GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes that
-            do not fit.
+        GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes
+            that do not fit.
         UnknownNameError: no such window.
 
     Warns:
-        UserWarning: even places may be off by more than some per cent, and why; layers of the grid
-            lie above or below what the panel sees.
+        UserWarning: even places may be off by more than some per cent, and why; layers of the
+            grid lie above or below what the panel sees.
 
     Examples:
         A cube of 0.02 / mm, projected and reconstructed:
@@ -98,7 +98,14 @@ def fdk(
     sentences = settled(found, GeometryError)
     with long_work.during("reconstructing by FDK", progress) as advance:
         volume, doubts = checked_fdk(
-            values.__getitem__, parts, geometry, shape, like, window, advance, errors=errors
+            values.__getitem__,
+            parts,
+            geometry,
+            shape,
+            like,
+            window,
+            advance,
+            errors=errors,
         )
     for sentence in sentences:
         warnings.warn(sentence, PlausibilityWarning, stacklevel=3)
@@ -132,7 +139,9 @@ def checked_fdk(
         the volume and the texts of warnings.
     """
     truncation = truncation_of(image, cone_vec, shape)
-    volume = fdk_parts(parts, cone_vec, shape, like, window, progress, truncation, errors=errors)
+    volume = fdk_parts(
+        parts, cone_vec, shape, like, window, progress, truncation, errors=errors
+    )
     said = layer_warnings(lost_layers(volume.data), len(volume.data))
     if not errors:
         return volume, said
@@ -158,7 +167,8 @@ def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
     if bias.too_coarse(grid):
         edge = float(np.max(grid.voxel_mm))
         return [
-            f"accuracy is not known: voxels of {edge:g} mm are too large to hold a uniform region; "
+            f"accuracy is not known: voxels of {edge:g} mm are too large to hold a "
+            "uniform region; "
             f"choose at most {max(bias.found.voxel_xyz):.2g} mm"
         ]
     accuracy = bias.accuracy(grid)

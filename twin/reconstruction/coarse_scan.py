@@ -117,10 +117,14 @@ class CoarseScan:
             first = 1.0 if circle.rise else 0.0
             rows_of_bands = (truncation.rows + 0.5) / down - 0.5 + first
             truncation = replace(truncation, rows=rows_of_bands)
-        scan = ConeVec.from_vectors(part.source, part.detector, part.u * across, part.v * down)
+        scan = ConeVec.from_vectors(
+            part.source, part.detector, part.u * across, part.v * down
+        )
         numbers = at[chosen]
         binned = (down, across)
-        return cls(images, scan, circle, circle.angle[numbers], truncation, numbers, binned)
+        return cls(
+            images, scan, circle, circle.angle[numbers], truncation, numbers, binned
+        )
 
     def thinned(self, *, all_views: bool = False) -> CoarseScan:
         """Take fewer views and rows of a circle: enough to compare images with the
@@ -141,7 +145,9 @@ class CoarseScan:
             truncation = replace(truncation, rows=(truncation.rows + 0.5) / down - 0.5)
         return replace(
             self,
-            images=np.ascontiguousarray(binned_mean(self.images[chosen, :rows], (down, 1))),
+            images=np.ascontiguousarray(
+                binned_mean(self.images[chosen, :rows], (down, 1))
+            ),
             cone_vec=views,
             angles=self.angles[chosen],
             truncation=truncation,
@@ -159,32 +165,41 @@ class CoarseScan:
         """Distances from the axis that the panel sees on its two sides [mm]."""
         fan = fan_angles(circle_of(self.cone_vec), self.level, self.images.shape[2])
         low, high = reach(fan)
-        return float(self.circle.radius * np.sin(low)), float(self.circle.radius * np.sin(high))
+        return float(self.circle.radius * np.sin(low)), float(
+            self.circle.radius * np.sin(high)
+        )
 
     @cached_property
     def grid(self) -> Volume:
         """Grid of the field of view without values, in layers as high as rows."""
         x, y = self.circle.centre.tolist()
         scan, away = self.cone_vec, np.array([x, y, 0.0])
-        scan = ConeVec.from_vectors(scan.source - away, scan.detector - away, scan.u, scan.v)
+        scan = ConeVec.from_vectors(
+            scan.source - away, scan.detector - away, scan.u, scan.v
+        )
         view = field_of_view(scan, self.images.shape[1:])
         pitches = np.linalg.norm([self.cone_vec.u[0], self.cone_vec.v[0]], axis=1)
         tall = view.voxel_mm * float(pitches[1] / pitches[0])
         layers, height = self.images.shape[1], view.shape[0] * view.voxel_mm
-        if self.circle.rise:  # far more than a panel's height, in layers as few as its rows
+        if (
+            self.circle.rise
+        ):  # far more than a panel's height, in layers as few as its rows
             layers = min(max(layers, round(height / tall)), NODES)
             tall = height / layers
         wide = 2.0 * max(self.ends)
         across = round(wide / max(view.voxel_mm, wide / NODES))
         blank = np.zeros((layers, across, across), np.float32)
-        return Volume(blank, (wide / across, wide / across, tall), (x, y, view.center_mm[2]))
+        return Volume(
+            blank, (wide / across, wide / across, tall), (x, y, view.center_mm[2])
+        )
 
     @cached_property
     def rim(self) -> npt.NDArray[np.bool_]:
         """Voxel columns outside some views, (ny, nx) bool."""
         x, y, _ = self.grid.centers()
         away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
-        # A voxel and a half. Nodes are at just that distance; rounding shall not decide on them.
+        # A voxel and a half. Nodes are at just that distance; rounding shall not decide on
+        # them.
         return np.asarray(away > max(self.ends) - 1.49 * self.grid.voxel_xyz[0])
 
     @cached_property
@@ -206,14 +221,22 @@ class CoarseScan:
         return not self.circle.rise and (apart or few or not self.circle.full)
 
     def fdk(
-        self, images: Float32Array, cone_vec: ConeVec, truncation: Truncation | None = None
+        self,
+        images: Float32Array,
+        cone_vec: ConeVec,
+        truncation: Truncation | None = None,
     ) -> Float32Array:
         """Reconstruct the grid from some images, NaN where no data cover it."""
         shape = (images.shape[1], images.shape[2])
         volume = fdk_parts(
-            lambda: [images.copy()], cone_vec, shape, self.grid, truncation=truncation,
-            target=OnProcessor(self.grid), outside=True,
-        )  # fmt: skip
+            lambda: [images.copy()],
+            cone_vec,
+            shape,
+            self.grid,
+            truncation=truncation,
+            target=OnProcessor(self.grid),
+            outside=True,
+        )
         return volume.data
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
@@ -225,7 +248,12 @@ class CoarseScan:
         return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
 
     def projected(
-        self, thing: Float32Array, views: ConeVec, shape: tuple[int, int], *, fine: bool = True
+        self,
+        thing: Float32Array,
+        views: ConeVec,
+        shape: tuple[int, int],
+        *,
+        fine: bool = True,
     ) -> Float32Array:
         """Project values on the grid, (nz, ny, nx), as some views see them, (n, rows, cols).
 
@@ -277,7 +305,8 @@ class CoarseScan:
         low, high = self.ends
         turn = None if self.circle.rise else self.angles
         rungs = [self.parallel("", (max(low, high),) * 2, turn)]
-        # Rays that climb less than a row across the object are a fan, whose flaw are its angles.
+        # Rays that climb less than a row across the object are a fan, whose flaw are its
+        # angles.
         climb = 0.5 * self.grid.size_mm[2] / self.circle.radius * 2.0 * max(low, high)
         fan = self.sparse and climb < self.grid.voxel_xyz[2]
         cone = "angles" if fan else "cone"

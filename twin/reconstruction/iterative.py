@@ -115,7 +115,9 @@ def sirt(
     with long_work.during("solving by SIRT", progress) as advance:
         return solved(
             problem,
-            lambda p: _subset_steps(p, [ALL], 1.0, iterations, start, nonnegative, watch, advance),
+            lambda p: _subset_steps(
+                p, [ALL], 1.0, iterations, start, nonnegative, watch, advance
+            ),
         )
 
 
@@ -159,7 +161,9 @@ def sart(
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
         said = f"{subsets} subsets, relaxation {relaxation:g}"
-        raise LimitError.instead(said, [subsets, relaxation], "at least 1, and between 0 and 2")
+        raise LimitError.instead(
+            said, [subsets, relaxation], "at least 1, and between 0 and 2"
+        )
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
     with long_work.during("solving by SART", progress) as advance:
         return solved(
@@ -195,7 +199,9 @@ def _subset_steps(
             if nonnegative:
                 np.maximum(x, 0.0, out=x)
         if watch is not None:
-            watch(Step(i + 1, iterations, float(np.sqrt(squares / problem.measured.size))))
+            watch(
+                Step(i + 1, iterations, float(np.sqrt(squares / problem.measured.size)))
+            )
         advance((i + 1) / iterations)
         if weighted and noise <= problem.measured.size:
             break
@@ -230,7 +236,9 @@ def cgls(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations, surroundings=surroundings)
+    problem = LinearSystem.of(
+        projections, cone_vec, like, iterations, surroundings=surroundings
+    )
     with long_work.during("solving by CGLS", progress) as advance:
         return solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
 

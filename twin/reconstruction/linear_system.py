@@ -1,9 +1,9 @@
 """The problem of every iterative method: data, geometry, grid, and the pair of operators.
 
 A `LinearSystem` works on plain arrays. A `RegionSystem` is one of two grids, a fine region and
-coarse surroundings, whose voxels are one array. Where a CUDA device has room for all that a method
-holds, the same method runs on a `DeviceProblem`, whose arrays are there from the first iteration to
-the last.
+coarse surroundings, whose voxels are one array. Where a CUDA device has room for all that a
+method holds, the same method runs on a `DeviceProblem`, whose arrays are there from the first
+iteration to the last.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ class LinearSystem:
             raise LimitError.instead(said, repr(iterations), "a whole number from 1")
         geometry = as_cone_vec(cone_vec)
         if not len(geometry):
-            raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
+            raise GeometryError(
+                "no views; allowed: one or more", {"asked": 0, "allowed": 1}
+            )
         require_line_integrals(projections)
         values = check_projections(projections, len(geometry))
         on_host = not gpu.is_there(values)
@@ -119,7 +121,10 @@ class LinearSystem:
         weights = None
         if variances is not None:
             spread = np.asarray(variances, dtype=np.float32)
-            if spread.shape != values.shape or not (np.isfinite(spread) & (spread > 0.0)).all():
+            if (
+                spread.shape != values.shape
+                or not (np.isfinite(spread) & (spread > 0.0)).all()
+            ):
                 said = f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}"
                 wanted = f"one above 0 for each line integral, {values.shape}"
                 raise GeometryError.instead(said, list(spread.shape), wanted)
@@ -131,7 +136,9 @@ class LinearSystem:
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
             said = "images on a device, with hardening or surroundings"
             raise GeometryError.instead(said, "device", "images of the host")
-        return system if surroundings is None else RegionSystem.within(system, surroundings)
+        return (
+            system if surroundings is None else RegionSystem.within(system, surroundings)
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -145,7 +152,10 @@ class LinearSystem:
         if start.shape != self.like.shape or not np.allclose(
             [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
         ):
-            said, wanted = f"the first guess is {start!r}", f"on the grid of {self.like!r}"
+            said, wanted = (
+                f"the first guess is {start!r}",
+                f"on the grid of {self.like!r}",
+            )
             raise GeometryError.instead(said, list(start.shape), wanted)
         return np.array(start.data, dtype=np.float32)
 
@@ -158,8 +168,8 @@ class LinearSystem:
         return back(y, self.geometry[views], self.like, self.room).data
 
     def misfit(self, x: Any, views: Some) -> tuple[Any, Any]:
-        """Measured less expected line integrals of some views, and how many times as much a step
-        must add to straight ones: straight over expected, 1 without `hardening`.
+        """Measured less expected line integrals of some views, and how many times as much a
+        step must add to straight ones: straight over expected, 1 without `hardening`.
         """
         measured = self.measured[views]
         if self.hardening is None:
@@ -274,11 +284,15 @@ class RegionSystem(LinearSystem):
         below, above = np.ceil(np.maximum(beyond - 1e-6, 0.0))
         if not (below.any() or above.any()):
             said = f"surroundings {wanted!r} within the region {inner.like!r}"
-            raise GeometryError.instead(said, list(wanted.shape), "a grid that reaches beyond it")
+            raise GeometryError.instead(
+                said, list(wanted.shape), "a grid that reaches beyond it"
+            )
         counts = below + parts + above
         most = MAX_VOXEL_RATIO * (math.prod(wanted.shape) + math.prod(inner.like.shape))
         if counts.prod() > most:
-            said = f"{counts.prod():.3g} voxels, none larger than the region {inner.like!r}"
+            said = (
+                f"{counts.prod():.3g} voxels, none larger than the region {inner.like!r}"
+            )
             less = f"{most}, by a larger region or nearer surroundings"
             raise GeometryError.instead(said, counts.tolist(), less)
         nx, ny, nz = (int(n) for n in counts)
@@ -369,7 +383,9 @@ def inverse(values: Float32Array) -> Float32Array:
 @singledispatch
 def ratio(a: Any, b: Any) -> Any:
     """Compute a / b, zero where b is (nearly) zero."""
-    return np.divide(a, b, out=np.zeros_like(b), where=b > MIN_WEIGHT_SHARE * float(b.max()))
+    return np.divide(
+        a, b, out=np.zeros_like(b), where=b > MIN_WEIGHT_SHARE * float(b.max())
+    )
 
 
 @ratio.register

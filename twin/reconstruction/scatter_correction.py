@@ -1,8 +1,9 @@
 """Corrections of a scan's line integrals before reconstruction: hardening, scatter.
 
 Beam hardening comes from low energies being absorbed first; its correction is for objects of a
-single material, and iterative methods take the hardening in several into account (`Polychromatic`).
-Flat field and logarithm are in `flexdt.twin.dataset`, rings in `consistency/ring_pattern.py`.
+single material, and iterative methods take the hardening in several into account
+(`Polychromatic`). Flat field and logarithm are in `flexdt.twin.dataset`, rings in
+`consistency/ring_pattern.py`.
 
 Scatter is computed from the scan itself: FDK gives the object's attenuation, the names of
 its materials its scattering. That scatter is simulated (`flexdt.twin.physics.scatter`)
@@ -32,7 +33,11 @@ from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.scatter import Beam, Object, ScatterSettings, scan_scatter
 from flexdt.twin.physics.tube import TubeModel
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
+from flexdt.twin.projection.operators import (
+    as_cone_vec,
+    check_projections,
+    require_finite,
+)
 from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
 from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
@@ -67,7 +72,9 @@ class Hardening:
         x = np.asarray(line_integrals)
         out = np.interp(x, self.measured, self.straight)
         first = self.straight[1] / self.measured[1]
-        last = (self.straight[-1] - self.straight[-2]) / (self.measured[-1] - self.measured[-2])
+        last = (self.straight[-1] - self.straight[-2]) / (
+            self.measured[-1] - self.measured[-2]
+        )
         out = np.where(x < 0.0, x * first, out)
         over = x - self.measured[-1]
         out = np.where(over > 0.0, self.straight[-1] + over * last, out)
@@ -93,7 +100,9 @@ def hardening(
     Raises:
         LimitError: there is no spectrum for `kV`.
     """
-    chain = Chain(Detector() if panel is None else panel, TubeModel() if tube is None else tube)
+    chain = Chain(
+        Detector() if panel is None else panel, TubeModel() if tube is None else tube
+    )
     signal, _ = weights_of(chain, kV)
     mu = material.attenuation()
     energies = tables().energy_keV
@@ -154,7 +163,9 @@ class Polychromatic:
         """
         ends = tables().energy_keV[[0, -1]]
         require_within("energy_keV", energy_keV, float(ends[0]), float(ends[1]), "keV")
-        chain = Chain(Detector() if panel is None else panel, TubeModel() if tube is None else tube)
+        chain = Chain(
+            Detector() if panel is None else panel, TubeModel() if tube is None else tube
+        )
         signal, noise = weights_of(chain, kV)
         mu = np.array([one.attenuation_at(energy_keV) for one in materials])
         require_apart(materials, mu)
@@ -167,7 +178,9 @@ class Polychromatic:
         Densities are relative to the named material's.
         """
         order = np.argsort(self.mu)
-        of = order[np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)]
+        of = order[
+            np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)
+        ]
         for m, mu in enumerate(self.mu.astype(np.float32)):
             yield np.where(of == m, values / mu, np.float32(0))
 
@@ -185,7 +198,9 @@ class Polychromatic:
         least = np.maximum(paths_mm, np.float32(0))
         thin, straight = np.tensordot(np.array([mean, self.mu], np.float32), least, 1)
         seen, _ = self.beam.transmit(least)
-        dark = np.maximum(seen / np.float32(self.beam.signal.sum()), np.float32(np.exp(-BLACK)))
+        dark = np.maximum(
+            seen / np.float32(self.beam.signal.sum()), np.float32(np.exp(-BLACK))
+        )
         found = np.where(thin > THIN, -np.log(dark), thin)
         none, light = thin < THIN * THIN, int(np.argmin(self.mu))
         limit = np.float32(self.mu[light] / mean[light])
@@ -201,7 +216,9 @@ def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
         LimitError: it does not.
     """
     if not len(materials):
-        raise LimitError("no material; allowed: one or more", {"asked": 0, "allowed": "> 0"})
+        raise LimitError(
+            "no material; allowed: one or more", {"asked": 0, "allowed": "> 0"}
+        )
     for one, other in pairwise(np.argsort(mu)):
         if mu[other] - mu[one] < APART * mu[other]:
             names = [materials[i].name for i in (one, other)]
@@ -287,7 +304,9 @@ def without_scatter(
     stack = np.asarray(line_integrals, dtype=np.float32)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, cone.rows, shape_of(stack), beam, settings)
-    return np.stack([subtracted(image, scatter.signal(i)) for i, image in enumerate(stack)])
+    return np.stack(
+        [subtracted(image, scatter.signal(i)) for i, image in enumerate(stack)]
+    )
 
 
 def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Array:
@@ -314,8 +333,8 @@ def scatterer_of(
     subtraction.
 
     A voxel that attenuates as much as one of the materials is taken for it; one between two of
-    them, or between one and air, for a mixture. Line integrals are straightened (beam hardening)
-    as those of the material named first.
+    them, or between one and air, for a mixture. Line integrals are straightened (beam
+    hardening) as those of the material named first.
 
     Args:
         line_integrals: float32 (n, rows, cols); coarse ones are enough.
@@ -336,9 +355,11 @@ def scatterer_of(
     grid = field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
     (mu, straighten), beam = attenuations(chain, kV), Beam.of(chain, kV)
     in_rounds = replace(
-        wanted, step_deg=max(wanted.step_deg, ROUND_DEG), nodes=min(wanted.nodes, ROUND_NODES),
+        wanted,
+        step_deg=max(wanted.step_deg, ROUND_DEG),
+        nodes=min(wanted.nodes, ROUND_NODES),
         error=max(wanted.error, ROUND_ERROR),
-    )  # fmt: skip
+    )
     direct, before, changes = stack, np.zeros(()), list[float]()
     while True:
         volume = volume_of(straighten(direct), cone_vec, grid)
@@ -354,7 +375,9 @@ def scatterer_of(
     dark = float(np.mean(np.asarray(images) * np.exp(stack) > MOST))
     doubts = doubts_about(dark, volume, chain, mu)
     if changes[-1] >= SETTLED:
-        doubts.append(f"scatter still changes by {100 * changes[-1]:.1f} % after {ROUNDS} rounds")
+        doubts.append(
+            f"scatter still changes by {100 * changes[-1]:.1f} % after {ROUNDS} rounds"
+        )
     return Scatterer(thing, tuple(changes), tuple(doubts))
 
 
@@ -365,7 +388,9 @@ def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     volume = fdk_parts(
         lambda: [stack], cone_vec, shape, grid, "hann", None, truncation, outside=True
     )
-    return replace(volume, data=np.nan_to_num(volume.data))  # voxels without a view scatter nothing
+    return replace(
+        volume, data=np.nan_to_num(volume.data)
+    )  # voxels without a view scatter nothing
 
 
 def shape_of(stack: Float32Array) -> tuple[int, int]:
@@ -433,7 +458,8 @@ def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> l
     if abs(ratio - 1.0) > UNLIKE:
         name, voxel = chain.substances[int(np.argmax(mu))].name, volume.voxel_xyz[0]
         out.append(
-            f"the densest part attenuates {ratio:.2g} times as much as {name}: either it is not "
+            f"the densest part attenuates {ratio:.2g} times as much as {name}: either it "
+            "is not "
             f"{name}, or it is smaller than {voxel:.2g} mm voxels"
         )
     return out

@@ -4,11 +4,11 @@ The volume minimises
 
     cost(x) = 1/2 sum((A x - b)^2) + strength * TV(x),    x >= 0,    x = 0 outside a mask,
 
-by a monotone accelerated proximal gradient method (MFISTA: Beck and Teboulle 2009) with restarts;
-total variation and constraints are handled together by the accelerated dual method of the same
-authors, which begins where it ended in the iteration before. Passes through ordered subsets of the
-views may go first; one that gains little is undone and the number of subsets halved, so that the
-end is the minimum whatever the subsets were.
+by a monotone accelerated proximal gradient method (MFISTA: Beck and Teboulle 2009) with
+restarts; total variation and constraints are handled together by the accelerated dual method of
+the same authors, which begins where it ended in the iteration before. Passes through ordered
+subsets of the views may go first; one that gains little is undone and the number of subsets
+halved, so that the end is the minimum whatever the subsets were.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ class Minimised:
     def __repr__(self) -> str:
         end = "converged" if self.converged else "stopped"
         return (
-            f"<Minimised: {end} after {self.iterations} iterations, cost {self.costs[0]:.6g} to "
+            f"<Minimised: {end} after {self.iterations} iterations, cost "
+            f"{self.costs[0]:.6g} to "
             f"{self.costs[-1]:.6g}>"
         )
 
@@ -137,8 +138,10 @@ def minimise_tv(
     """
     problem = LinearSystem.of(projections, cone_vec, like, iterations)
     for name, value, least in (
-        ("weight", weight, 0.0), ("tolerance", tolerance, 0.0), ("subsets", subsets, 1),
-    ):  # fmt: skip
+        ("weight", weight, 0.0),
+        ("tolerance", tolerance, 0.0),
+        ("subsets", subsets, 1),
+    ):
         if not least <= value < math.inf:
             raise LimitError.instead(f"{name} {value:g}", value, f"{least:g} or more")
     regular = Regular.of(problem.like, nonnegative, mask)
@@ -149,7 +152,15 @@ def minimise_tv(
             there = isinstance(problem, DeviceProblem)
             kept = DeviceRegular.of_host(regular, problem.like) if there else regular
             return _minimised(
-                problem, kept, iterations, weight, tolerance, subsets, start, watch, advance
+                problem,
+                kept,
+                iterations,
+                weight,
+                tolerance,
+                subsets,
+                start,
+                watch,
+                advance,
             )
 
         return solved(problem, minimised)
@@ -189,7 +200,9 @@ def _minimised(
     objective = _Objective(problem, strength, regular)
     at = objective.at(objective.regular.allow(problem.first(start)))
     costs = [at.cost]
-    norm = norm_of(problem.project, problem.spread, ones(problem.first(None)), NORM_TOLERANCE)
+    norm = norm_of(
+        problem.project, problem.spread, ones(problem.first(None)), NORM_TOLERANCE
+    )
     if norm == 0.0:
         return Minimised(problem.volume(at.x), tuple(costs), True, strength)
     step = 1.0 / (1.02 * norm) ** 2  # the estimate of the norm is from below
@@ -248,7 +261,8 @@ class _At:
             return self
         factor = np.float32(part)
         return _At(
-            self.x + factor * (self.x - last.x), self.rest + factor * (self.rest - last.rest)
+            self.x + factor * (self.x - last.x),
+            self.rest + factor * (self.rest - last.rest),
         )
 
 
@@ -300,7 +314,9 @@ class Regular:
         else:
             allowed = np.ascontiguousarray(np.asarray(mask) != 0, dtype=np.uint8)
             if allowed.shape != like.shape:
-                raise GeometryError.of_shape("the mask", allowed.shape, like.shape, ", the grid's")
+                raise GeometryError.of_shape(
+                    "the mask", allowed.shape, like.shape, ", the grid's"
+                )
         edges = np.array(like.voxel_xyz[::-1])
         return cls(
             (edges.min() / edges).astype(np.float32),
@@ -311,7 +327,9 @@ class Regular:
 
     def allow(self, x: Any) -> Any:
         """Find the nearest allowed values to x."""
-        return np.ascontiguousarray(np.maximum(x, self.lowest) * self.allowed, dtype=np.float32)
+        return np.ascontiguousarray(
+            np.maximum(x, self.lowest) * self.allowed, dtype=np.float32
+        )
 
     def variation(self, x: Any) -> float:
         """Compute the total variation of x."""
@@ -348,12 +366,16 @@ class Regular:
                 z, dual, theta, self.scale, self.lowest, self.allowed, x, first, last
             )
 
-    def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
+    def dual_step(
+        self, x: Any, ahead: Any, rate: np.float32, further: np.float32
+    ) -> None:
         """Update `dual` and `ahead`; see `tv_kernels.dual_step`."""
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
-            tv_kernels.dual_step(x, ahead, self.dual, rate, further, self.scale, first, last)
+            tv_kernels.dual_step(
+                x, ahead, self.dual, rate, further, self.scale, first, last
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,9 +405,13 @@ class DeviceRegular(Regular):
         last = (self.lowest, self.allowed.flat, x.flat)
         self._run("primal_step", z.flat, dual.flat, theta, *self._form, *last)
 
-    def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
+    def dual_step(
+        self, x: Any, ahead: Any, rate: np.float32, further: np.float32
+    ) -> None:
         """Update `dual` and `ahead`; see `Regular`."""
-        self._run("dual_step", x.flat, ahead.flat, self.dual.flat, rate, further, *self._form)
+        self._run(
+            "dual_step", x.flat, ahead.flat, self.dual.flat, rate, further, *self._form
+        )
 
     @property
     def _form(self) -> tuple[Any, ...]:
@@ -394,7 +420,9 @@ class DeviceRegular(Regular):
 
     def _run(self, name: str, *arguments: Any) -> None:
         def launch() -> None:
-            from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+            from flexdt.twin.reconstruction.kernels import (
+                gpu_reconstruction_kernels as kernels,
+            )
 
             blocks = -(-self.allowed.flat.size // gpu.LINEAR)
             getattr(kernels, name)[blocks, gpu.LINEAR](*arguments)

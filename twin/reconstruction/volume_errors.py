@@ -60,8 +60,8 @@ def with_errors(
 def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
     """Interpolate values on a coarse grid, linearly, at the voxels of another, (nz, ny, nx).
 
-    Voxels beyond the outermost nodes have the value of the nearest. Axes are interpolated one after
-    the other, so that a voxel costs two multiplications.
+    Voxels beyond the outermost nodes have the value of the nearest. Axes are interpolated one
+    after the other, so that a voxel costs two multiplications.
     """
     z, y, x = (
         _neighbours(places, known)

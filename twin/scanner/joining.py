@@ -125,7 +125,9 @@ class StopMotion:
     ) -> StopMotion:
         """Make the value from trajectories that begin at `now` or earlier."""
         distances = {
-            n: abs(t.target - t.position(now)) for n, t in trajectories.items() if t.moving(now)
+            n: abs(t.target - t.position(now))
+            for n, t in trajectories.items()
+            if t.moving(now)
         }
         seconds = max((t.end - now for t in trajectories.values()), default=0.0)
         return cls(trajectories, path, max(0.0, seconds), distances, would_hit)
@@ -157,7 +159,9 @@ class Lookahead:
         """Return the programmes of the motors that have not come to their last rest."""
         return {n: d.ahead(self.now) for n, d in self.drives.items() if d.end > self.now}
 
-    def contact(self, trajectories: Trajectories, since: float | None = None) -> Contact | None:
+    def contact(
+        self, trajectories: Trajectories, since: float | None = None
+    ) -> Contact | None:
         """Find the first contact if some motors follow `trajectories`, the
         others their programme.
 
@@ -168,7 +172,9 @@ class Lookahead:
         if self.guard is None:
             return None
         start = self.now if since is None else since
-        others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in trajectories}
+        others = {
+            n: d.ahead(self.now) for n, d in self.drives.items() if n not in trajectories
+        }
         return self.guard({**others, **trajectories}, start)
 
     def touching(
@@ -180,7 +186,9 @@ class Lookahead:
             deep: measure overlaps.
             standing: of parts at their present places, as `Guard.standing` has them.
         """
-        here = {name: d.at(self.now).position(self.now) for name, d in self.drives.items()}
+        here = {
+            name: d.at(self.now).position(self.now) for name, d in self.drives.items()
+        }
         if self.guard is None:
             return {}
         guard = self.guard.standing(here) if standing else self.guard
@@ -207,7 +215,9 @@ class Lookahead:
             return Joined({}, contact)
         others = any(name not in new for name in self.ahead())
         halted = (self._alone(new, contact) if not others else None) or (
-            self._new_halt_swept(new, contact) if others else self._halt_along(new, contact)
+            self._new_halt_swept(new, contact)
+            if others
+            else self._halt_along(new, contact)
         )
         if halted is None and others and any(name in new for name in self.ahead()):
             halted = self._halt_along({**self.ahead(), **new}, contact)
@@ -236,20 +246,26 @@ class Lookahead:
             return halted
         return None
 
-    def _halt_along(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
+    def _halt_along(
+        self, new: Trajectories, contact: Contact
+    ) -> dict[str, Trajectory] | None:
         """Slow `new` along its path as late as possible; the path is free up to the contact."""
         moving = {name: self.drives[name].following(t) for name, t in new.items()}
 
         def rests_in_time(at: float) -> bool:
             """Return whether a stop begun at `at` ends before the contact."""
-            return programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
+            return (
+                programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
+            )
 
         at = self._latest(rests_in_time, contact, HALVINGS)
         if at is None:
             return None
         return _trajectories(braked_at(self.drives, at, new, self.hardest), new)
 
-    def _new_halt_swept(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
+    def _new_halt_swept(
+        self, new: Trajectories, contact: Contact
+    ) -> dict[str, Trajectory] | None:
         """Slow `new` by itself as late as possible while the others carry on."""
 
         new_drives = {name: self.drives[name] for name in new}
@@ -329,16 +345,22 @@ class Lookahead:
         duration = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
-            name: greatest(name, d.at(self.now), self.now, most) for name, d in self.drives.items()
+            name: greatest(name, d.at(self.now), self.now, most)
+            for name, d in self.drives.items()
         }
         slowed = {name: self.drives[name].following(t) for name, t in along.items()}
         for share in QUICKER_STOP_SHARES:
             at = self.now + share * duration
             drives = slowed if share else self.drives
             stops = braked_apart(self.machine, drives, at, strongest)
-            if max((t.end for t in stops.values()), default=at) > self.now + duration - MIN_GAIN_S:
+            if (
+                max((t.end for t in stops.values()), default=at)
+                > self.now + duration - MIN_GAIN_S
+            ):
                 return None
-            trajectories = {n: motion.rejoined(along[n], at, rest) for n, rest in stops.items()}
+            trajectories = {
+                n: motion.rejoined(along[n], at, rest) for n, rest in stops.items()
+            }
             # The one motor that has anything to do brakes on the path that it was swept
             # on. Where another is to set off later, it may rely on the room that one
             # would make.
@@ -362,7 +384,10 @@ class Lookahead:
 
     def halted_at_once(self, contact: Contact) -> Trajectories | None:
         """Slow what is under way along its path from now on, if it rests before a contact."""
-        if programme_time_at_rest(self.drives, self.now, self.hardest) > contact.last_free_time:
+        if (
+            programme_time_at_rest(self.drives, self.now, self.hardest)
+            > contact.last_free_time
+        ):
             return None
         return braked_along(self.drives, self.now, self.hardest)
 
@@ -391,12 +416,16 @@ class Lookahead:
         """
         axes = self.machine.axes
         return all(
-            axes[name].lower - POSITION_ROUNDING <= t.target <= axes[name].upper + POSITION_ROUNDING
+            axes[name].lower - POSITION_ROUNDING
+            <= t.target
+            <= axes[name].upper + POSITION_ROUNDING
             for name, t in trajectories.items()
         )
 
 
-def _trajectories(drives: Mapping[str, Drive], names: Trajectories) -> dict[str, Trajectory]:
+def _trajectories(
+    drives: Mapping[str, Drive], names: Trajectories
+) -> dict[str, Trajectory]:
     """Return the first trajectory of each named motor."""
     return {name: drives[name].trajectories[0] for name in names}
 
@@ -431,7 +460,11 @@ class UnsweptProgramme:
         """Motor -> trajectories, the wait for a first one that begins later included."""
         out = {}
         for name, legs in self.programme.items():
-            wait = [motion.at_rest(self.start[name], 0.0)] if legs and legs[0].start > 0.0 else []
+            wait = (
+                [motion.at_rest(self.start[name], 0.0)]
+                if legs and legs[0].start > 0.0
+                else []
+            )
             out[name] = (*wait, *legs)
         return {name: legs for name, legs in out.items() if legs}
 

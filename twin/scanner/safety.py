@@ -82,7 +82,9 @@ class Contact:
 class Guard(Protocol):
     """Finds contacts on one stage; it changes nothing."""
 
-    def __call__(self, trajectories: Mapping[str, Trajectory], now: float, /) -> Contact | None:
+    def __call__(
+        self, trajectories: Mapping[str, Trajectory], now: float, /
+    ) -> Contact | None:
         """Find the first contact from `now` on, given the trajectory of every
         motor; None if none."""
 
@@ -104,10 +106,17 @@ def require_ready(safety: Safety, what: str) -> None:
     Raises:
         SafetyError: E-stop in force, or blocked; the message includes the way out.
     """
-    if safety.state == "estopped" or (safety.state == "blocked" and safety.contact is None):
+    if safety.state == "estopped" or (
+        safety.state == "blocked" and safety.contact is None
+    ):
         raise SafetyError(
             f"{what} is refused: {safety.reason}; a reset is needed",
-            {"asked": what, "state": safety.state, "reason": safety.reason, "allowed": "reset"},
+            {
+                "asked": what,
+                "state": safety.state,
+                "reason": safety.reason,
+                "allowed": "reset",
+            },
         )
 
 
@@ -123,7 +132,11 @@ def after_contact(safety: Safety, contact: Contact) -> Safety:
         return replace(safety, blocked_attempts=attempts)
     reason = f"motion was blocked {attempts} times in a row, last by {first} and {second}"
     return replace(
-        safety, state="blocked", blocked_attempts=attempts, reason=reason, stop=safety.stop + 1
+        safety,
+        state="blocked",
+        blocked_attempts=attempts,
+        reason=reason,
+        stop=safety.stop + 1,
     )
 
 
@@ -137,7 +150,9 @@ def after_free_motion(safety: Safety) -> Safety:
 def estopped(safety: Safety, by: str) -> Safety:
     """Record a press of the E-stop, perhaps a repeated one: the next stop."""
     reason = "the E-stop is in force"
-    return replace(safety, state="estopped", reason=reason, stop=safety.stop + 1, stopped_by=by)
+    return replace(
+        safety, state="estopped", reason=reason, stop=safety.stop + 1, stopped_by=by
+    )
 
 
 def released(safety: Safety, stop: int | None) -> Safety:
@@ -158,7 +173,12 @@ def released(safety: Safety, stop: int | None) -> Safety:
         why = safety.reason or "it has been released"
         raise SafetyError(
             f"the reset is for another stop than the latest{by} ({why}); nothing is released",
-            {"asked": stop, "allowed": safety.stop, "state": safety.state, "reason": safety.reason},
+            {
+                "asked": stop,
+                "allowed": safety.stop,
+                "state": safety.state,
+                "reason": safety.reason,
+            },
         )
     ready = replace(safety, state="ready", blocked_attempts=0, reason="", stopped_by="")
     if safety.contact is None:
@@ -244,5 +264,12 @@ def would_touch(
         data: further members of the error's data.
     """
     how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else near
-    told = {"asked": what, "pair": list(pair), "time_s": ahead, "last_free": dict(last_free)}
-    return CollisionError(f"{what}: {' and '.join(pair)} {how}; {outcome}", {**told, **data})
+    told = {
+        "asked": what,
+        "pair": list(pair),
+        "time_s": ahead,
+        "last_free": dict(last_free),
+    }
+    return CollisionError(
+        f"{what}: {' and '.join(pair)} {how}; {outcome}", {**told, **data}
+    )

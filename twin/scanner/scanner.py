@@ -90,7 +90,9 @@ class ScannerTwin:
         self.camera = machine.detector.camera
         self.sample = Sample()
         self.correction: NamedCorrection | None = None
-        self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts, stop=last_stop)
+        self.safety = Safety(
+            max_blocked_attempts=machine.max_blocked_attempts, stop=last_stop
+        )
         self._drives: dict[str, Drive] = plan.home(machine, now)
         self._coasts_until = -math.inf
         self._stage = self._stops = self._programmes = 0
@@ -168,7 +170,9 @@ class ScannerTwin:
         """Compute the nominal poses, n = 1."""
         return self.poses_at(self.positions(now), self.camera)
 
-    def poses_at(self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings) -> Poses:
+    def poses_at(
+        self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings
+    ) -> Poses:
         """Compute nominal poses for positions [mm, deg], scalars or (n,), and
         any camera settings."""
         return motor_poses(self.machine, self.profile, camera, positions)
@@ -225,7 +229,10 @@ class ScannerTwin:
         if self._derived[0] != made_of:
             poses = self.poses_at(positions, self.camera)
             sensor = self.machine.detector.pixels
-            self._derived = (made_of, readout(poses, self.camera, sensor, self.parameters))
+            self._derived = (
+                made_of,
+                readout(poses, self.camera, sensor, self.parameters),
+            )
         return self._derived[1]
 
     # Motion
@@ -264,7 +271,9 @@ class ScannerTwin:
         )
         joined = self._lookahead(now).joined(new)
         if joined.contact is not None:
-            what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
+            what = "move " + ", ".join(
+                f"{name}={value:g}" for name, value in targets.items()
+            )
             raise self._blocked(joined, now, what)
         self.safety = rules.after_free_motion(self.safety)
         self._take(joined.trajectories)
@@ -339,7 +348,8 @@ class ScannerTwin:
         if joined.contact is not None and not joined.trajectories:
             raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
         goes = any(
-            abs(t.target - t.position(now)) >= MIN_STEP for t in joined.trajectories.values()
+            abs(t.target - t.position(now)) >= MIN_STEP
+            for t in joined.trajectories.values()
         )
         if joined.contact is None and goes:
             self.safety = rules.after_free_motion(self.safety)
@@ -369,7 +379,9 @@ class ScannerTwin:
         if now < self._coasts_until:
             return self.stop(now)
         if self.machine.estop.category == 0:
-            trajectories = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
+            trajectories = coasting(
+                self.machine, self._drives, now, self.machine.estop.coasting
+            )
             hit = ahead.contact(trajectories) if trajectories else None
             self._coasts_until = max((t.end for t in trajectories.values()), default=now)
             return self._stopped(StopMotion.of(trajectories, "coasting", now, hit))
@@ -453,10 +465,14 @@ class ScannerTwin:
         self._require_ready("a programme", now)
         prepared = certificate.prepared
         if certificate.contact is not None and self.holds(certificate):
-            raise self._blocked(Joined({}, certificate.contact), now, "the programme", now)
+            raise self._blocked(
+                Joined({}, certificate.contact), now, "the programme", now
+            )
         if not self.may_follow(certificate, now):
             what = "the programme was checked for another stage or another start; nothing moves"
-            raise SafetyError(what, {"asked": "a programme", "allowed": "checking it again"})
+            raise SafetyError(
+                what, {"asked": "a programme", "allowed": "checking it again"}
+            )
         self._programmes += 1
         for name, legs in prepared.legs.items():
             self._drives[name] = self._drives[name].following(*legs, origin=now)
@@ -493,7 +509,9 @@ class ScannerTwin:
         self.require_applicable(correction)
         self._require_power("a change of the stage", now)
         bound = self.targets(now)
-        targets = {n: x for n, x in (targets or {}).items() if n not in bound or x != bound[n]}
+        targets = {
+            n: x for n, x in (targets or {}).items() if n not in bound or x != bound[n]
+        }
         if targets:
             self._require_ready("motion", now)
         version = (self._stage, self._stops, self._programmes)
@@ -503,7 +521,14 @@ class ScannerTwin:
             drives = plan.with_settings(self.machine, drives, name, speed, acceleration)
         moves = plan.plan_move(self.machine, drives, targets, now) if targets else {}
         return StageChange(
-            sample, correction, guard, ahead, version, moves, dict(targets or {}), dict(paces or {})
+            sample,
+            correction,
+            guard,
+            ahead,
+            version,
+            moves,
+            dict(targets or {}),
+            dict(paces or {}),
         )
 
     def take_stage(self, change: StageChange, now: float) -> CollisionError | None:
@@ -529,11 +554,13 @@ class ScannerTwin:
         """
         if change.version[0] != self._stage:
             raise SafetyError(
-                "the stage was changed meanwhile; nothing changes", {"allowed": "asking again"}
+                "the stage was changed meanwhile; nothing changes",
+                {"allowed": "asking again"},
             )
         if change.targets and change.version[1] != self._stops:
             raise SafetyError(
-                "motion was stopped meanwhile; nothing changes", {"allowed": "asking again"}
+                "motion was stopped meanwhile; nothing changes",
+                {"allowed": "asking again"},
             )
         anew = self.stage_change(
             change.sample,
@@ -545,7 +572,9 @@ class ScannerTwin:
         )
         verdict = anew.renewed(change)
         for name, (speed, acceleration) in change.paces.items():
-            self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
+            self._drives = plan.with_settings(
+                self.machine, self._drives, name, speed, acceleration
+            )
         self._set_stage(change.sample, change.correction, change.guard)
         if anew.moves:
             self._take(anew.moves)
@@ -562,7 +591,11 @@ class ScannerTwin:
         return collision_error(contact, now, self.safety, "the motion under way", stops)
 
     def initialise_stage(
-        self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None, now: float
+        self,
+        sample: Sample,
+        correction: NamedCorrection | None,
+        guard: Guard | None,
+        now: float,
     ) -> list[str]:
         """Begin with this stage, whatever it touches, as after a restart.
 
@@ -605,7 +638,9 @@ class ScannerTwin:
         Raises:
             UnknownNameError, LimitError.
         """
-        self._drives = plan.with_settings(self.machine, self._drives, axis, speed, acceleration)
+        self._drives = plan.with_settings(
+            self.machine, self._drives, axis, speed, acceleration
+        )
 
     def set_tube(
         self,
@@ -682,7 +717,11 @@ class ScannerTwin:
             left = self._coasts_until - now
             raise SafetyError(
                 f"{what} is refused: motors coast for another {left:.3g} s",
-                {"asked": what, "state": self.safety.state, "allowed": "asking again at rest"},
+                {
+                    "asked": what,
+                    "state": self.safety.state,
+                    "allowed": "asking again at rest",
+                },
             )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
@@ -693,7 +732,10 @@ class ScannerTwin:
             least = self.machine.safety_margin_mm - 2.0 * rules.ROUNDING_MM
             near = {} if self.guard is None else self.guard.touching(positions)
             found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
-            self._judged = (made_of, min(found, key=lambda pair: found[pair], default=None))
+            self._judged = (
+                made_of,
+                min(found, key=lambda pair: found[pair], default=None),
+            )
         return self._judged[1]
 
     def _safety_at(self, now: float) -> Safety:
@@ -705,7 +747,9 @@ class ScannerTwin:
         self.safety = self._safety_at(now)
         rules.require_ready(self.safety, what)
 
-    def _blocked(self, joined: Joined, now: float, what: str, zero: float = 0.0) -> CollisionError:
+    def _blocked(
+        self, joined: Joined, now: float, what: str, zero: float = 0.0
+    ) -> CollisionError:
         """Halt before the contact, or stop everything when attempts were blocked too often.
 
         Args:

@@ -22,7 +22,12 @@ import numpy as np
 
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
-from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
+from flexdt.twin.geometry.conventions import (
+    FloatArray,
+    rotation_x,
+    rotation_y,
+    rotation_z,
+)
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets, require_plausible
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
@@ -96,7 +101,9 @@ class StagePlacement:
         for f in fields(self):
             if not math.isfinite(getattr(self, f.name)):
                 what = f"sample offset {f.name} is {getattr(self, f.name)}; it must be finite"
-                raise LimitError(what, {"asked": str(getattr(self, f.name)), "setting": f.name})
+                raise LimitError(
+                    what, {"asked": str(getattr(self, f.name)), "setting": f.name}
+                )
 
     @property
     def rotation(self) -> FloatArray:
@@ -243,7 +250,10 @@ def readout(
 
 
 def readout_of(
-    cone: ConeVec, shape: tuple[int, int], pixels_mm: tuple[float, float], axis: FloatArray
+    cone: ConeVec,
+    shape: tuple[int, int],
+    pixels_mm: tuple[float, float],
+    axis: FloatArray,
 ) -> Readout | None:
     """Compute derived quantities of the first view of a geometry, or None as for `readout`.
 
@@ -352,15 +362,22 @@ def changed_camera(
     return new
 
 
-def _require_within(device: str, name: str, value: float, lower: float, upper: float) -> None:
+def _require_within(
+    device: str, name: str, value: float, lower: float, upper: float
+) -> None:
     """Raise LimitError unless a setting is within its range."""
     if not lower <= value <= upper:
         what = f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]"
-        raise LimitError(what, {"setting": name, "asked": value, "allowed": [lower, upper]})
+        raise LimitError(
+            what, {"setting": name, "asked": value, "allowed": [lower, upper]}
+        )
 
 
 def require_applicable(
-    machine: Machine, profile: Profile, camera: CameraSettings, correction: NamedCorrection | None
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    correction: NamedCorrection | None,
 ) -> None:
     """Check that a correction leaves a geometry that a scanner can have, anywhere
     in the travel.

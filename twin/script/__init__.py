@@ -7,7 +7,12 @@ from flexdt.twin.script.dry_run_report import html_report
 from flexdt.twin.script.parse import parse_script, read_script
 from flexdt.twin.script.planning.check_findings import Clearance, Collision
 from flexdt.twin.script.planning.plan import CheckReport, ScanPlan
-from flexdt.twin.script.planning.plan_values import Exposure, PlanStep, SampleSize, StartState
+from flexdt.twin.script.planning.plan_values import (
+    Exposure,
+    PlanStep,
+    SampleSize,
+    StartState,
+)
 from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.planning.pose_plan import plan_poses
 from flexdt.twin.script.problems import ScriptError, ScriptProblem

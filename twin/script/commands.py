@@ -22,7 +22,9 @@ from flexdt.twin.values import adapter_of
 
 Binary = Annotated[
     bytes,
-    BeforeValidator(lambda value: base64.b64decode(value) if isinstance(value, str) else value),
+    BeforeValidator(
+        lambda value: base64.b64decode(value) if isinstance(value, str) else value
+    ),
     PlainSerializer(lambda value: base64.b64encode(value).decode(), when_used="json"),
 ]
 """Bytes; base64 in JSON."""
@@ -65,7 +67,9 @@ class Command:
     def arguments(self) -> dict[str, Any]:
         """Fields of the command's own type, by name; those that all commands have
         are left out."""
-        return {f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]}
+        return {
+            f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]
+        }
 
 
 class Pause(Command):

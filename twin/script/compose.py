@@ -26,7 +26,12 @@ from flexdt.twin.geometry.conventions import (
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Axis, Machine, Profile
 from flexdt.twin.machine.travel import check_target
-from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
+from flexdt.twin.scanner.state import (
+    CameraChange,
+    TubeSettings,
+    changed_camera,
+    changed_tube,
+)
 from flexdt.twin.script.motor_targets import QUANTITIES, MotorTargets, beside_beam
 from flexdt.twin.script.planning.planned_images import MARGIN_IMAGES, run_up
 from flexdt.twin.script.scan_request import ScanPosition, ScanRequest
@@ -59,12 +64,18 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     panel = machine.detector
     tube = machine.tube
     exposure = panel.exposure_ms if request.exposure_ms is None else request.exposure_ms
-    change: CameraChange = {"mode": request.mode, "roi": request.roi, "exposure_ms": exposure}
+    change: CameraChange = {
+        "mode": request.mode,
+        "roi": request.roi,
+        "exposure_ms": exposure,
+    }
     changed_camera(panel, panel.camera, change)
     changed_tube(tube, TubeSettings(tube.kV, tube.power_W), request.kV, request.power_W)
     attempts = list(_usual(request, MotorTargets(machine, profile)))
     for sod, sdd, height in attempts:
-        placed = (ScanPosition(sod),) if request.placements is None else request.placements
+        placed = (
+            (ScanPosition(sod),) if request.placements is None else request.placements
+        )
         full = _Request(
             **{
                 **vars(request),
@@ -89,12 +100,16 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
             with suppress(LimitError):
                 writer.station(second)
                 both = dict.fromkeys((*writer.request.placements, ScanPosition(second)))
-                writer = replace(writer, request=replace(writer.request, placements=tuple(both)))
+                writer = replace(
+                    writer, request=replace(writer.request, placements=tuple(both))
+                )
                 break
     return "".join(f"{row}\r\n" for row in writer.rows())
 
 
-def _usual(request: ScanRequest, places: MotorTargets) -> Iterator[tuple[float, float, float]]:
+def _usual(
+    request: ScanRequest, places: MotorTargets
+) -> Iterator[tuple[float, float, float]]:
     """Yield SOD, SDD and height to try: as requested, else the usual ones, else
     those at home [mm]."""
 
@@ -154,7 +169,9 @@ class _Writer(MotorTargets):
         m = self.machine
         camera = self.camera
         yield _row("tube", "set kV", _f(m.tube.kV if w.kV is None else w.kV))
-        yield _row("tube", "set power", _f(m.tube.power_W if w.power_W is None else w.power_W))
+        yield _row(
+            "tube", "set power", _f(m.tube.power_W if w.power_W is None else w.power_W)
+        )
         yield _row("camera", "set mode", camera.mode)
         yield _row("camera", "set exposure", _f(w.exposure_ms))
         yield _row("camera", "set ROI", str(camera.roi))
@@ -230,7 +247,8 @@ class _Writer(MotorTargets):
             moved = ("object_z",)
         if not self.has(*moved):
             what = (
-                "has no motors that raise source and detector together, and none that lowers the "
+                "has no motors that raise source and detector together, and none that "
+                "lowers the "
                 "sample, which a helical scan needs"
             )
             missing = ["source_z", "detector_z", "object_z"]
@@ -244,7 +262,9 @@ class _Writer(MotorTargets):
             if list(m.geometry[quantity]) != [motor] or moves != [quantity]:
                 what = "raises or lowers with motors that move something else too, so flexdt writes"
                 axes = list(m.geometry[quantity])
-                raise self.lacking(f"{what} no helical scan for it", asked="helical", axes=axes)
+                raise self.lacking(
+                    f"{what} no helical scan for it", asked="helical", axes=axes
+                )
             at = station[motor]
             factor = m.geometry[quantity][motor]
             axis = m.axis(motor)
@@ -257,7 +277,9 @@ class _Writer(MotorTargets):
                     {"asked": pace, "allowed": axis.max_speed, "axis": motor},
                 )
             ramp = 0.5 * pace**2 / axis.acceleration
-            below = (w.rise_mm / 2 / abs(factor) + pace * lead_s - ramp) * math.copysign(1, factor)
+            below = (w.rise_mm / 2 / abs(factor) + pace * lead_s - ramp) * math.copysign(
+                1, factor
+            )
             below = -below if quantity == "object_z" else below
             low, high = (check_target(m, motor, x) for x in (at - below, at + below))
             targets[motor] = (low, high, pace)
@@ -297,7 +319,10 @@ class _Writer(MotorTargets):
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
         yield _row(name, "move absolute", _f(end), "0.000000", "POS")
         yield _row(
-            "camera", "take and save image sequence", f"{self.request.folder}\\scan_", str(first)
+            "camera",
+            "take and save image sequence",
+            f"{self.request.folder}\\scan_",
+            str(first),
         )
 
     def turn_speed(self, total: float, frames: int) -> float:
@@ -311,7 +336,8 @@ class _Writer(MotorTargets):
         if speed > rotation.max_speed:
             raise LimitError(
                 f"{frames} frames of {self.image_s * 1000:g} ms over {total:g} deg need "
-                f"{speed:.4g} deg/s, but {name} turns at most {rotation.max_speed:g} deg/s; raise "
+                f"{speed:.4g} deg/s, but {name} turns at most {rotation.max_speed:g} "
+                "deg/s; raise "
                 "frames, exposure or averages",
                 {"asked": speed, "allowed": rotation.max_speed, "axis": name},
             )
@@ -377,16 +403,21 @@ class _Writer(MotorTargets):
             slack = _ROUNDED_MM
             if not self.has(quantity) and quantity not in ("object_y", "detector_y"):
                 size = rows * row_pixel if quantity.endswith("_z") else cols * pixel
-                slack = BESIDE * size * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
+                slack = (
+                    BESIDE * size * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
+                )
             if abs(asked - only) <= slack:
                 continue
             self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
             what = (
-                f"has no motor of its own for {QUANTITIES[quantity]}: {asked:g} mm were asked for"
+                f"has no motor of its own for {QUANTITIES[quantity]}: {asked:g} mm were "
+                "asked for"
             )
             it_is = f"{what}, it is {only:g} mm"
             raise self.lacking(it_is, asked=asked, allowed=only, missing=quantity)
-        return {name: check_target(self.machine, name, value) for name, value in found.items()}
+        return {
+            name: check_target(self.machine, name, value) for name, value in found.items()
+        }
 
     def out_of_beam(self) -> dict[str, float]:
         """Compute the stage's targets for the flat image: beside the beam, to
@@ -429,7 +460,11 @@ class _Writer(MotorTargets):
         frame (3,) [mm]."""
         across, down = self.camera.roi_shift_mm(self.machine.detector.pixels)
         u, v = turn_detector(
-            COLUMN_DIRECTION, ROW_DIRECTION, 0.0, 0.0, math.radians(self.profile.det_roll_deg)
+            COLUMN_DIRECTION,
+            ROW_DIRECTION,
+            0.0,
+            0.0,
+            math.radians(self.profile.det_roll_deg),
         )
         return across * u + down * v
 
@@ -477,17 +512,25 @@ def _check_counts(request: _Request) -> None:
         ("height_mm", request.height_mm, -1e6, 1e6),
         ("sdd_mm", request.sdd_mm, 1e-3, 1e6),
         ("sod_mm", request.sod_mm, 1e-3, request.sdd_mm),
-        *(("placements", x, -1e6, 1e6) for p in request.placements for x in vars(p).values()),
+        *(
+            ("placements", x, -1e6, 1e6)
+            for p in request.placements
+            for x in vars(p).values()
+        ),
     )
     for name, value, low, high in rules:
         if not (math.isfinite(value) and low <= value <= high):
             what = f"{name} is {value:g}; allowed: {low:g} to {high:g}"
             if name == "sod_mm" and value > high:
                 what += ", the sdd_mm: are the two swapped?"
-            raise LimitError(what, {"setting": name, "asked": value, "allowed": [low, high]})
+            raise LimitError(
+                what, {"setting": name, "asked": value, "allowed": [low, high]}
+            )
 
 
-def _row(component: str, command: str, first: str = "", second: str = "", wait: str = "ACK") -> str:
+def _row(
+    component: str, command: str, first: str = "", second: str = "", wait: str = "ACK"
+) -> str:
     """Format one row of seven TAB separated columns."""
     return "\t".join((component, command, first, second, wait, "", ""))
 

@@ -94,7 +94,9 @@ def check_plan(
     seen = [v for v in views(plan) if v.kind == "projection"]
     optics = tuple(_optics(v) for v in seen)
     clearance = (
-        None if collision is None else collision(plan, plan.machine, plan.profile, plan.sample)
+        None
+        if collision is None
+        else collision(plan, plan.machine, plan.profile, plan.sample)
     )
     found = [*problems, *plan.problems, *_truncation_problems(seen)]
     found += open_beam_problems(plan, physics)
@@ -104,7 +106,9 @@ def check_plan(
         for x in clearance.collisions:
             what = f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s"
             found.append(ScriptProblem("error", "collision", x.line, 1, what))
-    return CheckReport(plan, in_order(found), clearance, optics, _dose(plan), text, start_known)
+    return CheckReport(
+        plan, in_order(found), clearance, optics, _dose(plan), text, start_known
+    )
 
 
 def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
@@ -123,7 +127,8 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
     moved = {
         motor
         for step in plan.steps[: first.step]
-        if isinstance(step.command, c.MoveAbsolute) and plan.machine.has(step.command.component)
+        if isinstance(step.command, c.MoveAbsolute)
+        and plan.machine.has(step.command.component)
         for motor in plan.machine.moves(step.command.component)
     }
     left = {m: x for m, x in plan.start.positions.items() if m not in moved}
@@ -182,7 +187,9 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
             continue
         names = ("left", "right", "top", "bottom")
         cuts = (view.cut_columns, view.cut_rows)
-        least = [px for cut in cuts for px in np.min(cut, axis=0).tolist()]  # NaN: height unknown
+        least = [
+            px for cut in cuts for px in np.min(cut, axis=0).tolist()
+        ]  # NaN: height unknown
         if parts := cut_off(dict(zip(names, least, strict=True))):
             what = f"the sample is cut off over the rotation: {parts}"
             found.append(ScriptProblem("warning", "truncated", min(view.lines), 1, what))
@@ -198,5 +205,7 @@ def _dose(plan: ScanPlan) -> Dose:
     )
     on = sum(b.end_s - b.start_s for b in plan.beam)
     # Below a volt there is no current to speak of, and the quotient may overflow.
-    charge = sum((b.end_s - b.start_s) * b.power_W / b.kV for b in plan.beam if b.kV > 1e-3)
+    charge = sum(
+        (b.end_s - b.start_s) * b.power_W / b.kV for b in plan.beam if b.kV > 1e-3
+    )
     return Dose(on, charge, exposing)

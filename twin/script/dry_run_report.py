@@ -36,12 +36,18 @@ def against_summary(found: LogComparison) -> Facts:
         ("executed", f"{found.total_real_s:.2f} s"),
         ("predicted", f"{found.total_predicted_s:.2f} s"),
         ("  90 % range", between(found.total_range) or "no time is measured"),
-        ("absolute errors", f"{found.sum_abs_error_s:.2f} s, summed over {len(found.rows)} lines"),
+        (
+            "absolute errors",
+            f"{found.sum_abs_error_s:.2f} s, summed over {len(found.rows)} lines",
+        ),
         (
             "in their 90 % range",
             f"{sum(ranges)} of {len(ranges)} lines" if ranges else "no time is measured",
         ),
-        ("start", f"{HOME_ASSUMED}: where an axis stood before its first move, a log does not say"),
+        (
+            "start",
+            f"{HOME_ASSUMED}: where an axis stood before its first move, a log does not say",
+        ),
     ]
 
 
@@ -80,17 +86,23 @@ def _optics_facts(o: Optics) -> Facts:
     Args:
         o: of one camera setting.
     """
-    where = f"line {o.lines[0]}" if o.lines[0] == o.lines[1] else f"lines {o.lines[0]}-{o.lines[1]}"
+    where = (
+        f"line {o.lines[0]}"
+        if o.lines[0] == o.lines[1]
+        else f"lines {o.lines[0]}-{o.lines[1]}"
+    )
     facts = [
         (
             f"projections, {where}",
-            f"{o.shape[1]} x {o.shape[0]} pixels of {o.pixel_mm:g} mm, SOD {_span(o.sod_mm)} mm, "
+            f"{o.shape[1]} x {o.shape[0]} pixels of {o.pixel_mm:g} mm, SOD "
+            f"{_span(o.sod_mm)} mm, "
             f"SDD {_span(o.sdd_mm)} mm",
         ),
         ("  magnification", f"{_span(o.magnification)}, voxel {_span(o.voxel_um)} um"),
         (
             "  field of view",
-            f"{o.field_mm[0]:.2f} x {o.field_mm[1]:.2f} mm at the axis; whole over a full turn: "
+            f"{o.field_mm[0]:.2f} x {o.field_mm[1]:.2f} mm at the axis; whole over a "
+            "full turn: "
             f"{o.turn_field_mm:.2f} mm across",
         ),
     ]
@@ -108,7 +120,9 @@ def _collisions(report: CheckReport) -> str:
     nearest = ""
     if c.min_clearance_mm is not None and not c.collisions:
         pair = f" ({' and '.join(c.min_clearance_pair)})" if c.min_clearance_pair else ""
-        nearest = f"; parts in relative motion stay {c.min_clearance_mm:.2f} mm apart{pair}"
+        nearest = (
+            f"; parts in relative motion stay {c.min_clearance_mm:.2f} mm apart{pair}"
+        )
     return f"{len(c.collisions) or 'none'}{nearest}"
 
 

@@ -125,7 +125,9 @@ def _line(
     tail = [] if wait is None else record[wait.end() + 1 :].split(b"\t", 3)
     if wait is None or len(tail) < 3:
         found = record.count(b"\t") + 2
-        raise ArgumentError(f"{found} columns, or no wait (ACK, no wait, POS, RCV); {COLUMNS}")
+        raise ArgumentError(
+            f"{found} columns, or no wait (ACK, no wait, POS, RCV); {COLUMNS}"
+        )
     script = record[: wait.end()] + b"\t" + b"\t".join(tail[:2])
     row = next(rows(script), None)
     if row is None:
@@ -133,12 +135,19 @@ def _line(
     command = read_row(replace(row, line=number), problems)
     if command is None:
         raise ArgumentError("the command does not hold")
-    own = grammar.not_negative(tail[2].decode("latin-1").strip(), "own time [ms] (column 8)") / 1e3
+    own = (
+        grammar.not_negative(
+            tail[2].decode("latin-1").strip(), "own time [ms] (column 8)"
+        )
+        / 1e3
+    )
     if own > MAX_OWN_S:
         raise ArgumentError(f"own time (column 8) is {own:g} s; at most {MAX_OWN_S:g} s")
     hour, minute, second = (float(x) for x in stamp.groups())
     if not (hour < 24 and minute < 60 and second < 60):
-        raise ArgumentError(f"moment {stamp[0].strip().decode()} (column 10) is no time of day")
+        raise ArgumentError(
+            f"moment {stamp[0].strip().decode()} (column 10) is no time of day"
+        )
     reply = tail[3] if len(tail) > 3 else b""
     motor = None
     if isinstance(command, c.MoveAbsolute) and command.wait is c.Wait.ACK:
@@ -146,8 +155,10 @@ def _line(
         if motor is None or not _arrived(motor, command.target):
             motor = None
             what = (
-                f"the reply of {shorten(command.component)} ({len(reply)} bytes) is left out: it "
-                f"must begin with {_REPLY_DOUBLES} big-endian doubles (position near the target, "
+                f"the reply of {shorten(command.component)} ({len(reply)} bytes) is left "
+                "out: it "
+                f"must begin with {_REPLY_DOUBLES} big-endian doubles (position near the "
+                "target, "
                 "limits twice)"
             )
             problems.append(ScriptProblem("warning", "reply", number, 1, what))
@@ -158,10 +169,15 @@ def _arrived(motor: MotorReply, target: float) -> bool:
     """Return whether a reply is about a move to `target`, or to the limit before it."""
     allowed = min(max(target, motor.lower), motor.upper)
     near = 1e-3 * (1.0 + abs(allowed))
-    return abs(motor.target - allowed) <= near and abs(motor.position - motor.target) <= 1.0 + near
+    return (
+        abs(motor.target - allowed) <= near
+        and abs(motor.position - motor.target) <= 1.0 + near
+    )
 
 
-def log_line(words: tuple[str, ...], wait: str, own_s: float, reply: bytes, stamp: str) -> bytes:
+def log_line(
+    words: tuple[str, ...], wait: str, own_s: float, reply: bytes, stamp: str
+) -> bytes:
     """Format one line of a log, as `read_log` reads it.
 
     Args:
@@ -241,7 +257,10 @@ def motor_reply(reply: bytes) -> MotorReply | None:
     found = MotorReply(v[0], v[1], v[2], v[4], v[6], v[5], v[8], v[10])
     copy = struct.unpack_from(">2d", reply, _LIMITS_COPY_BYTE)
     sound = all(abs(x) <= 1e9 for x in vars(found).values())
-    rates = 0 < found.speed <= found.max_speed and 0 < found.acceleration <= found.max_acceleration
+    rates = (
+        0 < found.speed <= found.max_speed
+        and 0 < found.acceleration <= found.max_acceleration
+    )
     if not sound or not rates or found.max_speed > 1e6 or found.max_acceleration > 1e6:
         return None
     if copy != (found.upper, found.lower) or not found.lower < found.upper:

@@ -28,7 +28,9 @@ MAX_NUMBER: Final = 1e9
 """Greatest absolute value of an argument; it keeps arithmetic from overflowing."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_RESERVED = re.compile(r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL)
+_RESERVED = re.compile(
+    r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL
+)
 
 WAITS: Final[Mapping[str, c.Wait]] = {w.value.lower(): w for w in c.Wait}
 Read = Callable[[str, str], dict[str, object]]
@@ -94,7 +96,9 @@ def number(text: str, what: str, index: int = 0) -> float:
         problem = f"{shorten(text)!r} is not a number" if text else "it is missing"
         raise ArgumentError(f"{what} must be a number: {problem}{hint}", index=index)
     if abs(value) > MAX_NUMBER:
-        raise ArgumentError(f"{what} {shorten(text)} is beyond {MAX_NUMBER:g}", index=index)
+        raise ArgumentError(
+            f"{what} {shorten(text)} is beyond {MAX_NUMBER:g}", index=index
+        )
     return value
 
 
@@ -106,7 +110,9 @@ def positive(text: str, what: str) -> float:
     """
     value = number(text, what)
     if value < MIN_RATE:
-        raise ArgumentError(f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}")
+        raise ArgumentError(
+            f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}"
+        )
     return value
 
 
@@ -196,7 +202,8 @@ def _roi(a: str, _b: str) -> dict[str, object]:
     parts = a.replace(",", " ").replace(";", " ").split()
     if len(parts) != 4:
         raise ArgumentError(
-            f"ROI {shorten(a)!r} has {len(parts)} numbers; allowed: left top right bottom", "roi"
+            f"ROI {shorten(a)!r} has {len(parts)} numbers; allowed: left top right bottom",
+            "roi",
         )
     try:
         return {"roi": Roi(*(whole(p, "ROI edge", 0, 1_000_000) for p in parts))}
@@ -219,9 +226,13 @@ def _move(a: str, b: str) -> dict[str, object]:
 _path = _text("path", "a path")
 
 _SCANNER: Final[Mapping[str, Spec]] = {
-    "pause": Spec(c.Pause, lambda a, _: {"duration_ms": not_negative(a, "pause [ms]")}, 1),
+    "pause": Spec(
+        c.Pause, lambda a, _: {"duration_ms": not_negative(a, "pause [ms]")}, 1
+    ),
     "set output path": Spec(c.SetOutputPath, _path, 1, free=True),
-    "set sample info": Spec(c.SetSampleInfo, lambda a, _: {"data": encode(a)}, 1, free=True),
+    "set sample info": Spec(
+        c.SetSampleInfo, lambda a, _: {"data": encode(a)}, 1, free=True
+    ),
     "keep xrayon": Spec(c.KeepXrayOn, _keep, 1),
     "write settings file": Spec(c.WriteSettingsFile, _nothing, 0),
 }
@@ -229,7 +240,9 @@ _TUBE: Final[Mapping[str, Spec]] = {
     "xrayon": Spec(c.XrayOn, _nothing, 0),
     "xrayoff": Spec(c.XrayOff, _nothing, 0),
     "set kV": Spec(c.SetVoltage, lambda a, _: {"kV": not_negative(a, "kV")}, 1),
-    "set power": Spec(c.SetPower, lambda a, _: {"power_W": not_negative(a, "power [W]")}, 1),
+    "set power": Spec(
+        c.SetPower, lambda a, _: {"power_W": not_negative(a, "power [W]")}, 1
+    ),
     "REPEAT UNTIL TRUE status_XReady_get": Spec(c.WaitXrayReady, _nothing, 0),
 }
 _CAMERA: Final[Mapping[str, Spec]] = {
@@ -238,10 +251,14 @@ _CAMERA: Final[Mapping[str, Spec]] = {
         c.SetExposure, lambda a, _: {"exposure_ms": positive(a, "exposure [ms]")}, 1
     ),
     "set number of frames": Spec(
-        c.SetFrames, lambda a, _: {"frames": whole(a, "number of frames", 1, MAX_FRAMES)}, 1
+        c.SetFrames,
+        lambda a, _: {"frames": whole(a, "number of frames", 1, MAX_FRAMES)},
+        1,
     ),
     "set number of averages": Spec(
-        c.SetAverages, lambda a, _: {"averages": whole(a, "number of averages", 1, MAX_AVERAGES)}, 1
+        c.SetAverages,
+        lambda a, _: {"averages": whole(a, "number of averages", 1, MAX_AVERAGES)},
+        1,
     ),
     "set ROI": Spec(c.SetRoi, _roi, 1, free=True),
     "take image": Spec(c.TakeImage, _nothing, 0),
@@ -334,13 +351,19 @@ def kind_of(name: str) -> ImageKind:
 
 def _move_line(k: c.MoveAbsolute) -> str:
     """Describe a move."""
-    until = f", goes on at {k.trigger:g}" if k.wait is c.Wait.POS and k.trigger is not None else ""
+    until = (
+        f", goes on at {k.trigger:g}"
+        if k.wait is c.Wait.POS and k.trigger is not None
+        else ""
+    )
     return f"{k.component} to {k.target:.10g}{until}"
 
 
 _LINES: Final[Mapping[type[c.Command], Callable[[Any], str]]] = {
     c.Pause: lambda k: f"pause {k.duration_ms / 1000:g} s",
-    c.SetOutputPath: lambda k: f"output path {shorten(k.path)} (the twin chooses the folder)",
+    c.SetOutputPath: lambda k: (
+        f"output path {shorten(k.path)} (the twin chooses the folder)"
+    ),
     c.SetSampleInfo: lambda k: "sample info",
     c.KeepXrayOn: lambda k: f"keep X-rays on: {'yes' if k.keep else 'no'}",
     c.WriteSettingsFile: lambda k: "write settings file",

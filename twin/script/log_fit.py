@@ -93,7 +93,13 @@ class Fit:
             "axes": {
                 name: {
                     **self.machine.axes[name].model_dump(
-                        include={"lower", "upper", "max_speed", "max_acceleration", "source"}
+                        include={
+                            "lower",
+                            "upper",
+                            "max_speed",
+                            "max_acceleration",
+                            "source",
+                        }
                     ),
                     "position": replies[-1].position,
                     "n": len(replies),
@@ -250,7 +256,9 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
         The machine, and how it agrees with the logs.
     """
     if not any(logs):
-        raise MachineFileError("no line of the logs can be read, so there is nothing to fit", {})
+        raise MachineFileError(
+            "no line of the logs can be read, so there is nothing to fit", {}
+        )
     replies = _replies(logs, base)
     commands = [x.command for log in logs for x in log]
     axes = dict(base.axes)
@@ -260,7 +268,9 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     start = base.timing.model_copy(update={"spread": {}, "sequence_overhead_s": None})
     machine = base.model_copy(update={"axes": axes, "timing": start})
     samples: dict[str, tuple[float, ...]] = {}
-    for _ in range(2):  # with better times, motion without a wait ends before the right line
+    for _ in range(
+        2
+    ):  # with better times, motion without a wait ends before the right line
         samples = _samples(logs, machine)
         timing = _timing(samples, machine.timing, source, len(logs))
         machine = machine.model_copy(update={"timing": timing})
@@ -281,7 +291,9 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):
         low, high = step_range(step, machine.timing) or (None, None)
-        rows.append(LogRow(x.line, step.what, x.own_s, step.holds_s, low, high, step.kind))
+        rows.append(
+            LogRow(x.line, step.what, x.own_s, step.holds_s, low, high, step.kind)
+        )
     return rows
 
 
@@ -305,11 +317,14 @@ def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
             what = f"machine {machine.name} has no axis {name!r}; it has: {', '.join(machine.axes)}"
         elif axis and own and (own.lower, own.upper) != (axis.lower, axis.upper):
             what = (
-                f"{name} goes from {own.lower:g} to {own.upper:g} in the log, from {axis.lower:g} "
+                f"{name} goes from {own.lower:g} to {own.upper:g} in the log, from "
+                f"{axis.lower:g} "
                 f"to {axis.upper:g} on machine {machine.name}"
             )
         if what:
-            found.setdefault(name, ScriptProblem("warning", "other_machine", x.line, 1, what))
+            found.setdefault(
+                name, ScriptProblem("warning", "other_machine", x.line, 1, what)
+            )
     return tuple(found.values())
 
 
@@ -363,7 +378,11 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
         own: the commands to this axis.
     """
     common = mode((r.lower, r.upper, r.max_speed, r.max_acceleration) for r in replies)
-    agree = [r for r in replies if (r.lower, r.upper, r.max_speed, r.max_acceleration) == common]
+    agree = [
+        r
+        for r in replies
+        if (r.lower, r.upper, r.max_speed, r.max_acceleration) == common
+    ]
     lower, upper, max_speed, max_acceleration = common
     last = agree[-1]
     of = "" if len(agree) == len(replies) else f" of {len(replies)}"
@@ -378,7 +397,9 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
             "speed": min(axis.speed, max_speed) if set_speed else last.speed,
             "max_speed": max_speed,
             "acceleration": (
-                min(axis.acceleration, max_acceleration) if set_acceleration else last.acceleration
+                min(axis.acceleration, max_acceleration)
+                if set_acceleration
+                else last.acceleration
             ),
             "max_acceleration": max_acceleration,
             "source": f"measured, log, n = {len(agree)}{of}",
@@ -419,7 +440,9 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
     return {kind: tuple(times) for kind, times in found.items()}
 
 
-def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int) -> Timing:
+def _timing(
+    samples: Mapping[str, Times], before: Timing, source: str, logs: int
+) -> Timing:
     """Fit the times of commands: medians, 90 % ranges and the common drift.
 
     Args:
@@ -441,9 +464,12 @@ def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int
         kind: sum(abs(_log(x) - _log(medians[kind])) for x in times) / (len(times) - 0.5)
         for kind, times in samples.items()
     }
-    common = fmean([off[kind] for kind, times in samples.items() if len(times) > 1] or [1.0])
+    common = fmean(
+        [off[kind] for kind, times in samples.items() if len(times) > 1] or [1.0]
+    )
     spread = {
-        kind: _spread(times, off[kind], common, sure * shift) for kind, times in samples.items()
+        kind: _spread(times, off[kind], common, sure * shift)
+        for kind, times in samples.items()
     }
     update = {f"{kind}_s": round(x, _TIME_DECIMALS) for kind, x in medians.items()}
     told = {
@@ -479,16 +505,24 @@ def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
     """
     n = len(times)
     scale = (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)
-    beyond = scale * max(0.0, -math.log(_TAIL_PROBABILITY * (n + 1))) * math.sqrt(1.0 + 1.0 / n**2)
+    beyond = (
+        scale
+        * max(0.0, -math.log(_TAIL_PROBABILITY * (n + 1)))
+        * math.sqrt(1.0 + 1.0 / n**2)
+    )
     low, high = np.quantile(
-        [_log(x) for x in times], (_TAIL_PROBABILITY, 1.0 - _TAIL_PROBABILITY), method="weibull"
+        [_log(x) for x in times],
+        (_TAIL_PROBABILITY, 1.0 - _TAIL_PROBABILITY),
+        method="weibull",
     )
     low = low - beyond + min(0.0, shift)
     high = high + beyond + max(0.0, shift)
     place = 10.0**_TIME_DECIMALS
     return Spread(
         p5_s=math.floor(max(0.0, math.exp(low) - _LOG_OFFSET_S) * place) / place,
-        p95_s=min(math.ceil((math.exp(high) - _LOG_OFFSET_S) * place) / place, MAX_TIME_S),
+        p95_s=min(
+            math.ceil((math.exp(high) - _LOG_OFFSET_S) * place) / place, MAX_TIME_S
+        ),
         n=n,
     )
 

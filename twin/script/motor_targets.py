@@ -66,7 +66,9 @@ class MotorTargets:
     def value(self, quantity: str, positions: Mapping[str, float]) -> float:
         """Compute a quantity with motors at `positions`, the others at home [mm]."""
         factors = self.machine.geometry.get(quantity, {})
-        moved = (f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items())
+        moved = (
+            f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items()
+        )
         return self.constant(quantity) + sum(moved)
 
     @cached_property
@@ -172,6 +174,8 @@ def beside_beam(
     away = (abs(share) * size / 2 + BESIDE_BEAM_MM + radius_mm) / abs(factor)
     least = math.ceil(axis.lower * 1e6) / 1e6
     most = math.floor(axis.upper * 1e6) / 1e6
-    upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
+    upper, lower = (
+        {name: round(min(max(middle + way, least), most), 6)} for way in (away, -away)
+    )
     freer = middle - axis.lower > axis.upper - middle
     return (lower, upper) if freer else (upper, lower)

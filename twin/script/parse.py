@@ -35,8 +35,12 @@ LOG_STAMP: Final = re.compile(rb"\t(\d\d):(\d\d):(\d\d\.\d{3})[ \t]*(?:\r\n|\n|\
 """The end of a line of an executed script: the moment at which its command was sent."""
 
 _END = re.compile(r"\r\n|\n|\r")
-_BLOB = re.compile(r"[ \t]*scanner[ \t]+set[ \t]+sample[ \t]+info(?=[ \t]|$)", re.IGNORECASE)
-_BLOB_WAIT = re.compile(r"\t(?:ACK|no\s+wait|POS|RCV)(?:\t[^\t]*){0,2}\s*$", re.IGNORECASE)
+_BLOB = re.compile(
+    r"[ \t]*scanner[ \t]+set[ \t]+sample[ \t]+info(?=[ \t]|$)", re.IGNORECASE
+)
+_BLOB_WAIT = re.compile(
+    r"\t(?:ACK|no\s+wait|POS|RCV)(?:\t[^\t]*){0,2}\s*$", re.IGNORECASE
+)
 _COMMENT = re.compile(r"\s*(?:#|//|;)")
 _TAIL_COMMENT = re.compile(r"(?<!\S)(?:#|//|;).*$", re.DOTALL)
 """A comment that starts a word: `# ...`, `// ...` or `; ...`."""
@@ -86,7 +90,11 @@ def decode(data: str | bytes) -> str:
 
 def is_utf16(data: str | bytes) -> bool:
     """Return whether the text was saved in two bytes a character, which no scanner does."""
-    head = data[:40] if isinstance(data, bytes) else data[:40].encode("utf-8", "surrogatepass")
+    head = (
+        data[:40]
+        if isinstance(data, bytes)
+        else data[:40].encode("utf-8", "surrogatepass")
+    )
     return head[:2] in (b"\xff\xfe", b"\xfe\xff") or (
         len(head) >= 4 and not (any(head[0::2]) and any(head[1::2]))
     )
@@ -101,7 +109,10 @@ def is_log(text: str | bytes) -> bool:
         >>> is_log("tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")
         True
     """
-    return LOG_STAMP.search(grammar.encode(text) if isinstance(text, str) else text) is not None
+    return (
+        LOG_STAMP.search(grammar.encode(text) if isinstance(text, str) else text)
+        is not None
+    )
 
 
 def rows(data: str | bytes) -> Iterator[CodeLine]:
@@ -154,7 +165,9 @@ def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
     joined = ""
     for i in range(first, min(first + _MAX_BLOB_LINES, len(parts))):
         joined += parts[i]
-        if _BLOB_WAIT.search(joined) and (not crlf or i >= len(ends) or ends[i] == "\r\n"):
+        if _BLOB_WAIT.search(joined) and (
+            not crlf or i >= len(ends) or ends[i] == "\r\n"
+        ):
             return i
         if i >= len(ends) or (crlf and ends[i] == "\r\n"):
             return i if crlf else first
@@ -188,7 +201,12 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
     """
     pieces = text.split("\t")
     tail = next(
-        (k for k in range(len(pieces) - 1, 3, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])), None
+        (
+            k
+            for k in range(len(pieces) - 1, 3, -1)
+            if _BLOB_WAIT.fullmatch("\t" + pieces[k])
+        ),
+        None,
     )
     if tail is None:
         return _columns(text)
@@ -258,8 +276,10 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     problems: list[ScriptProblem] = []
     if is_log(text):
         what = (
-            "this is an executed script, a log: `flexdt machine fit` learns the machine from it, "
-            "and `flexdt check SCRIPT --against` it compares; to run, a script has seven columns"
+            "this is an executed script, a log: `flexdt machine fit` learns the machine "
+            "from it, "
+            "and `flexdt check SCRIPT --against` it compares; to run, a script has seven "
+            "columns"
         )
         return c.Script((), (), 0), (ScriptProblem("error", "executed_log", 0, 1, what),)
     commands: list[c.Command] = []
@@ -268,7 +288,9 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
         if command is not None:
             commands.append(command)
     if not commands and not problems:
-        problems.append(ScriptProblem("error", "syntax", 0, 1, "the script holds no command"))
+        problems.append(
+            ScriptProblem("error", "syntax", 0, 1, "the script holds no command")
+        )
     ordered = in_order(problems)
     warnings = tuple(p for p in ordered if p.severity == "warning")
     return c.Script(tuple(commands), warnings, line_count(text)), ordered
@@ -324,14 +346,20 @@ class _Line:
 
     def warn(self, code: str, column: int, message: str) -> None:
         """Add a warning about this line."""
-        self.problems.append(ScriptProblem("warning", code, self.row.line, column, message))
+        self.problems.append(
+            ScriptProblem("warning", code, self.row.line, column, message)
+        )
 
     def command(self) -> c.Command | None:
         """Read the command; add an error and return None if it cannot be read."""
         try:
             if not self.component.text:
                 raise _Refused("syntax", 1, "the component (first column) is missing")
-            parts = self._padded() if self.row.columns is None else self._tabbed(self.row.columns)
+            parts = (
+                self._padded()
+                if self.row.columns is None
+                else self._tabbed(self.row.columns)
+            )
             if parts is None:
                 return self._unknown()
             return self._build(parts)
@@ -379,7 +407,9 @@ class _Line:
                 width = 0
         wait = self.end
         if width:
-            wait = Field(" ".join(w.text for w in words[at : at + width]), words[at].column)
+            wait = Field(
+                " ".join(w.text for w in words[at : at + width]), words[at].column
+            )
         tail = _until_comment(words[at + width : at + width + 3])[:2]
         # One number after the wait is in the place of the TAB form's expected duration.
         timeout, expected = tail if len(tail) == 2 else (self.end, *tail, self.end)[:2]
@@ -409,9 +439,13 @@ class _Line:
             return self._span(body), none
         if len(body) > spec.arguments:
             extra = body[spec.arguments]
-            allowed = ("no argument", "one argument", "at most two arguments")[spec.arguments]
+            allowed = ("no argument", "one argument", "at most two arguments")[
+                spec.arguments
+            ]
             what = f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}"
-            raise _Refused("syntax", extra.column, f"{what}, then ACK, no wait, POS or RCV")
+            raise _Refused(
+                "syntax", extra.column, f"{what}, then ACK, no wait, POS or RCV"
+            )
         return body[0], body[1] if len(body) > 1 else none
 
     def _span(self, body: Sequence[Field]) -> Field:
@@ -432,17 +466,28 @@ class _Line:
             allowed = grammar.vocabulary(name)
             knows = f"; it knows: {', '.join(allowed)}"
             if not fields:
-                raise _Refused("syntax", self.end.column, f"{name} without a command{knows}")
-            asked = fields[0].text if self.row.columns else " ".join(f.text for f in fields[:3])
-            what = f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}{knows}"
+                raise _Refused(
+                    "syntax", self.end.column, f"{name} without a command{knows}"
+                )
+            asked = (
+                fields[0].text
+                if self.row.columns
+                else " ".join(f.text for f in fields[:3])
+            )
+            what = (
+                f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}{knows}"
+            )
             raise _Refused("unknown_command", fields[0].column, what)
         if not self._custom_form(fields):
             what = (
                 f"{shorten(name)!r} is not a component of the scanner"
-                f"{_meant(name, (*grammar.FIXED,))}; a custom component needs a name, a command "
+                f"{_meant(name, (*grammar.FIXED,))}; a custom component needs a name, a "
+                "command "
                 "and a wait"
             )
-            raise _Refused("unknown_component" if fields else "syntax", self.component.column, what)
+            raise _Refused(
+                "unknown_component" if fields else "syntax", self.component.column, what
+            )
         what = f"{shorten(name)!r} is a custom component: allowed, without effect here"
         self.warn("custom_component", self.component.column, what)
         words = tuple(f.text for f in fields)
@@ -462,7 +507,9 @@ class _Line:
         words = [word.text for field in fields[:5] for word in _split(field)]
         if nearest is not None and grammar.match(nearest, words) is not None:
             return False
-        return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(_find_wait(fields, 0)[1])
+        return any(_find_wait(_split(f), 0)[1] for f in fields) or bool(
+            _find_wait(fields, 0)[1]
+        )
 
     def _build(self, parts: _Parts) -> c.Command | None:
         """Read arguments, wait and times into a command; None if an error was added.
@@ -471,7 +518,10 @@ class _Line:
             parts: columns of a known command.
         """
         before = len(self.problems)
-        fields: dict[str, object] = {"line": self.row.line, "column": self.component.column}
+        fields: dict[str, object] = {
+            "line": self.row.line,
+            "column": self.component.column,
+        }
         if issubclass(parts.spec.type, c.MotorCommand):
             fields["component"] = self.component.text
         for i, argument in enumerate((parts.first, parts.second)):
@@ -485,9 +535,14 @@ class _Line:
             column = (parts.first, parts.second)[error.index].column
             self.error(error.code, column, str(error))
         fields["wait"] = self._wait(parts)
-        for key, field in (("timeout_ms", parts.timeout), ("expected_ms", parts.expected)):
+        for key, field in (
+            ("timeout_ms", parts.timeout),
+            ("expected_ms", parts.expected),
+        ):
             try:
-                fields[key] = grammar.not_negative(field.text, key) if field.text else None
+                fields[key] = (
+                    grammar.not_negative(field.text, key) if field.text else None
+                )
             except ArgumentError as error:
                 self.error("value", field.column, str(error))
         if any(p.severity == "error" for p in self.problems[before:]):
@@ -520,7 +575,9 @@ class _Line:
             what = "POS needs the trigger position as argument 2 of the move"
             self.error("trigger", trigger.column, what)
         elif is_move and trigger.text and wait is not c.Wait.POS:
-            what = f"the trigger position is used with POS only; the wait is {wait.value!r}"
+            what = (
+                f"the trigger position is used with POS only; the wait is {wait.value!r}"
+            )
             self.warn("trigger_unused", trigger.column, what)
         return wait
 

@@ -1,8 +1,8 @@
 """`flexdt calibrate`, `align` and `compare`: geometry from scans with and without a
 bead phantom, and a check of it.
 
-The work is in `flexdt.library.calibration`; these commands pass options to it, print the result and
-choose the exit code.
+The work is in `flexdt.library.calibration`; these commands pass options to it, print the result
+and choose the exit code.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ def calibrate(
 ) -> Answer:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
 
-    A data set may be a folder of TIFFs with the two settings texts alone; --frames and --geometry
-    are for those of any other scanner, --markers for what was marked by hand. Exit code 5 when the
-    data cannot determine what was asked for; then nothing is pushed.
+    A data set may be a folder of TIFFs with the two settings texts alone; --frames and
+    --geometry are for those of any other scanner, --markers for what was marked by hand. Exit
+    code 5 when the data cannot determine what was asked for; then nothing is pushed.
 
     Args:
         phantom: Use this phantom's beads; unknown: markers anywhere.
@@ -103,13 +103,17 @@ def calibrate(
     }
     target = _named(phantom)
     if per_scan and len(datasets or ()) > 1 and push:
-        raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
+        raise typer.BadParameter(
+            "--push: with --per-scan there is no one geometry to push"
+        )
     if push:
         _require_answer(twin)
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
     request_of(target, options)  # what cannot be asked for is said before images are read
-    given = _given(datasets or [], frames, markers, geometry or [], said(None, shape, pixel))
+    given = _given(
+        datasets or [], frames, markers, geometry or [], said(None, shape, pixel)
+    )
     outcome = calibrate_with(given, target, options)
     document: dict[str, Any] = outcome.document
     if report is not None:
@@ -123,7 +127,9 @@ def calibrate(
     for problem in document["problems"]:
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
     if not document["identifiable"]:
-        codes = ", ".join(p["code"] for p in document["problems"] if p["severity"] == "error")
+        codes = ", ".join(
+            p["code"] for p in document["problems"] if p["severity"] == "error"
+        )
         raise CommandError(f"not to be used{codes and ': '}{codes}", NOT_IDENTIFIABLE)
     if push:
         _push(twin, outcome.correction, outcome.sources, document)
@@ -131,7 +137,9 @@ def calibrate(
 
 def _assigned(given: list[str] | None) -> dict[str, float]:
     """Read P=VALUE,... of an option that may be given several times."""
-    return option_values.assignments(word for one in given or () for word in one.split(","))
+    return option_values.assignments(
+        word for one in given or () for word in one.split(",")
+    )
 
 
 def _named(phantom: str | None) -> str:
@@ -146,9 +154,12 @@ def _named(phantom: str | None) -> str:
 
 
 def _given(
-    folders: list[Path], frames: Path | None, markers: Path | None, geometries: list[Path],
+    folders: list[Path],
+    frames: Path | None,
+    markers: Path | None,
+    geometries: list[Path],
     known: Given,
-) -> list[DataSet]:  # fmt: skip
+) -> list[DataSet]:
     """Load the data sets, any scanner's frames, or the geometry of markers without
     images.
 
@@ -170,8 +181,10 @@ def _given(
             raise typer.BadParameter("--frames and a data set; give one")
         return _opened(folders, geometries)
     if len(geometries) != 1 or (frames is None and markers is None):
-        raise typer.BadParameter("no data set; allowed: --frames DIR or --markers FILE, and one "
-                                 "--geometry FILE")  # fmt: skip
+        raise typer.BadParameter(
+            "no data set; allowed: --frames DIR or --markers FILE, and one "
+            "--geometry FILE"
+        )
     from flexdt.twin.geometry.cone_vec import ConeVec
 
     cone = ConeVec.load(geometries[0], shape=known.shape, pixel=known.pitch_mm)
@@ -194,8 +207,12 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
     if not geometries:
         return data
     if len(geometries) != len(folders):
-        raise typer.BadParameter(f"{len(geometries)} geometries for {len(folders)} data sets")
-    return [with_geometry(d, load_geometry(f)) for d, f in zip(data, geometries, strict=True)]
+        raise typer.BadParameter(
+            f"{len(geometries)} geometries for {len(folders)} data sets"
+        )
+    return [
+        with_geometry(d, load_geometry(f)) for d, f in zip(data, geometries, strict=True)
+    ]
 
 
 def align(
@@ -255,8 +272,8 @@ def compare(
 ) -> Answer:
     """Lay virtual projections beside a data set's radiographs.
 
-    The twin is posed from the data set's texts; residuals and difference images are given before
-    and after the correction that calibration finds. Exit code 1 above the tolerance.
+    The twin is posed from the data set's texts; residuals and difference images are given
+    before and after the correction that calibration finds. Exit code 1 above the tolerance.
 
     Args:
         phantom: Compare with this phantom, the one that was scanned.
@@ -273,11 +290,15 @@ def compare(
         write_comparison(found, out)
     document: dict[str, Any] = found.document
     yield document
-    rows = [(name, *(_number(n, 4) for n in figures)) for name, *figures in rows_of(document)]
+    rows = [
+        (name, *(_number(n, 4) for n in figures)) for name, *figures in rows_of(document)
+    ]
     yield table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms"))
     if not found.within:
         rms = _number(document["after"]["rms_px"], 4)
-        raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
+        raise CommandError(
+            f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px"
+        )
 
 
 def _require_answer(twin: Twin) -> None:
@@ -302,8 +323,12 @@ def push_correction(client: TwinClient, correction: NamedCorrection, source: str
     from flexdt.twin.geometry.offsets import NOMINAL
 
     nominal = NOMINAL.to_edge()
-    parameters = {n: v for n, v in correction.parameters.to_edge().items() if v != nominal[n]}
-    client.apply_calibration(parameters, correction.name, comment=correction.note, source=source)
+    parameters = {
+        n: v for n, v in correction.parameters.to_edge().items() if v != nominal[n]
+    }
+    client.apply_calibration(
+        parameters, correction.name, comment=correction.note, source=source
+    )
 
 
 def show(document: Mapping[str, Any]) -> Iterator[str]:
@@ -320,7 +345,11 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     for line in document.get("next", ()):
         yield f"next: {line}"
     rows = [
-        (f"{name}, scan {k}" if k else name, *_rounded(q, "value", "sigma"), _unit(q["unit"]))
+        (
+            f"{name}, scan {k}" if k else name,
+            *_rounded(q, "value", "sigma"),
+            _unit(q["unit"]),
+        )
         for k, place in enumerate(document.get("image_space", ()))
         for name, q in place.items()
     ]
@@ -351,7 +380,11 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
             for m in document["markers"]
         ]
         yield table(rows, ("marker", "x, y, z [mm]", "frames", "rms [px]"))
-        free = "; give the distance of two: --scale A-B=MM" if document["scale"] == "free" else ""
+        free = (
+            "; give the distance of two: --scale A-B=MM"
+            if document["scale"] == "free"
+            else ""
+        )
         yield f"scale: {document['scale']}{free}"
     for text in document["weak"]:
         yield f"weak: {text}"
@@ -367,7 +400,8 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
             values = told["values"]
             sigma = sum(told["sigmas"]) / len(values)
             yield (
-                f"{name} moves by {max(values) - min(values):.3g} {told['unit']} during the scan, "
+                f"{name} moves by {max(values) - min(values):.3g} {told['unit']} during "
+                "the scan, "
                 f"each frame known to {sigma:.2g}"
             )
 

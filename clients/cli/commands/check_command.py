@@ -10,7 +10,12 @@ import typer
 
 from flexdt.clients.cli import options, value_completion
 from flexdt.clients.cli.boundary import INVALID
-from flexdt.clients.cli.commands.script_files import ScriptFile, exit_code, read_log_file, tell
+from flexdt.clients.cli.commands.script_files import (
+    ScriptFile,
+    exit_code,
+    read_log_file,
+    tell,
+)
 from flexdt.clients.cli.console import table
 from flexdt.clients.cli.options import Answer, option
 from flexdt.library import machines
@@ -82,7 +87,8 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
         Document and lines of the answer.
 
     Raises:
-        CommandError: the log is not of this script; the message names the first line that differs.
+        CommandError: the log is not of this script; the message names the first line that
+            differs.
     """
     from flexdt.library.dry_run_page import against_html
     from flexdt.twin.script import parse_script
@@ -96,7 +102,9 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
     if not is_log(data):
         different = first_difference(parse_script(data).commands, lines)
         if different is not None:
-            raise CommandError(f"{script}: {different}; {log} is not a log of it", INVALID)
+            raise CommandError(
+                f"{script}: {different}; {log} is not a log of it", INVALID
+            )
     found = LogComparison.of(lines, known)
     tell(found.problems, str(log))
     if html is not None:
@@ -118,10 +126,16 @@ def show(report: CheckReport, file: str) -> Answer:
 
     timing = report.plan.machine.timing
     steps = [
-        (s.line, f"{s.start_s:.2f}", f"{s.duration_s:.2f}", between(step_range(s, timing)),
-         f"{s.assumed_s:.2f}" if s.assumed_s else "", s.what)
+        (
+            s.line,
+            f"{s.start_s:.2f}",
+            f"{s.duration_s:.2f}",
+            between(step_range(s, timing)),
+            f"{s.assumed_s:.2f}" if s.assumed_s else "",
+            s.what,
+        )
         for s in report.plan.steps
-    ]  # fmt: skip
+    ]
     if steps:
         head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
         yield table(steps, head) + "\n"

@@ -1,4 +1,5 @@
-"""`flexdt reconstruct`, `export` and `import`: volumes from data sets, geometry in other formats.
+"""`flexdt reconstruct`, `export` and `import`: volumes from data sets, geometry in other
+formats.
 
 The work is in `flexdt.library.reconstruction` and `flexdt.library.datasets.exchange`.
 """
@@ -58,7 +59,8 @@ def reconstruct(
 ) -> Answer:
     """Reconstruct a volume from a data set.
 
-    Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
+    Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in
+    1/mm.
 
     Args:
         out: Write the volume: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.
@@ -80,29 +82,56 @@ def reconstruct(
         slurm: Submit workers to SLURM as this file says.
     """
     own = {
-        "algorithm": None if algorithm == DEFAULT else algorithm, "voxel": voxel, "shape": shape,
-        "binning": binning, "every": every, "iterations": iterations, "weight": weight,
-        "center": center, "rings": rings or None, "material": material,
-        "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
-    }  # fmt: skip
+        "algorithm": None if algorithm == DEFAULT else algorithm,
+        "voxel": voxel,
+        "shape": shape,
+        "binning": binning,
+        "every": every,
+        "iterations": iterations,
+        "weight": weight,
+        "center": center,
+        "rings": rings or None,
+        "material": material,
+        "scatter-correction": scatter_correction,
+        "scheduler": scheduler,
+        "slurm": slurm,
+    }
     other = {"kv": kv, "correction": correction, "geometry": geometry}
     given = {name: value for name, value in (own | other).items() if value is not None}
-    _check_together(given, out, [name for name in own if name in given] if preview else [])
-    from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+    _check_together(
+        given, out, [name for name in own if name in given] if preview else []
+    )
+    from flexdt.library.reconstruction.reconstruct import (
+        VolumeRequest,
+        reconstruct_dataset,
+    )
     from flexdt.library.reconstruction.reconstruct import preview as quick_look
     from flexdt.twin.projection.volume import Accuracy
 
     voxels = None if shape is None else _shape(shape)
-    scattering = None if scatter_correction is None else option_values.names(scatter_correction)
+    scattering = (
+        None if scatter_correction is None else option_values.names(scatter_correction)
+    )
     made_of = None if material is None else option_values.names(material)
     middle = "X,Y,Z, e.g. 0,0,-5.5"
     request = VolumeRequest(
-        algorithm=algorithm or DEFAULT, voxel_mm=voxel, shape=voxels, binning=binning or 1,
-        every=every or 1, iterations=iterations, weight=weight,
+        algorithm=algorithm or DEFAULT,
+        voxel_mm=voxel,
+        shape=voxels,
+        binning=binning or 1,
+        every=every or 1,
+        iterations=iterations,
+        weight=weight,
         window=chosen(ReconstructSettings).window,
-        center_mm=None if center is None else option_values.triple(center, "center", middle),
-        rings=rings, material=made_of, kV=kv, scatter_correction=scattering, png=png,
-    )  # fmt: skip
+        center_mm=None
+        if center is None
+        else option_values.triple(center, "center", middle),
+        rings=rings,
+        material=made_of,
+        kV=kv,
+        scatter_correction=scattering,
+        png=png,
+    )
     option_values.require_folder(out)
     parameters, report = _correction(correction, twin)
     # Workers have working directories of their own.
@@ -110,7 +139,9 @@ def reconstruct(
     data = scan_of(dataset.resolve() if shared else dataset, texts, report, geometry)
     warn(data.warnings, dataset)
     if data.missing:
-        note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
+        note(
+            f"{dataset}: warning: {len(data.missing)} frames are missing and are left out"
+        )
     workers = _workers(scheduler, slurm)
     direct = ALGORITHMS[request.algorithm].direct
     unit = "iterations" if not direct else "images" if workers is None else "slabs"
@@ -119,14 +150,20 @@ def reconstruct(
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
         else:
             document = reconstruct_dataset(
-                data, out, request, parameters=parameters, progress=bar.update, workers=workers,
+                data,
+                out,
+                request,
+                parameters=parameters,
+                progress=bar.update,
+                workers=workers,
                 memory=chosen(ReconstructSettings).memory,
-            )  # fmt: skip
+            )
     warn(document["warnings"], dataset)
     yield document
     z, y, x = document["shape"]
     yield (
-        f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
+        f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from "
+        f"{document['frames']} "
         f"frames, {size(bytes_of(out))}, {duration(document['seconds'])}"
     )
     if document["accuracy"] is not None:
@@ -134,7 +171,9 @@ def reconstruct(
     yield from (f"  {file}" for file in document["slices"])
 
 
-def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
+def _check_together(
+    given: Mapping[str, object], out: Path, kept_out: Iterable[str]
+) -> None:
     """Check that options go together.
 
     Args:
@@ -152,18 +191,40 @@ def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[s
     corrects = {"material", "scatter-correction"} & given.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
-        (ending(out) not in endings(), "out",
-         f"{out}: the ending must be one of {', '.join(endings())}"),
-        ("kv" in given and not corrects, "kv", "it is for --material and --scatter-correction"),
-        *((name in given and name not in has, name, f"{algorithm} has none")
-          for name in ("iterations", "weight")),
-        ({"scheduler", "slurm"} <= given.keys(), "slurm", "not together with --scheduler"),
-        *((not ALGORITHMS[algorithm].direct, name,
-           f"{algorithm} is not done by workers; allowed: {DEFAULT}")
-          for name in ("scheduler", "slurm") if name in given),
-        ({"correction", "geometry"} <= given.keys(), "correction",
-         "no correction is added to a geometry from a file"),
-    ):  # fmt: skip
+        (
+            ending(out) not in endings(),
+            "out",
+            f"{out}: the ending must be one of {', '.join(endings())}",
+        ),
+        (
+            "kv" in given and not corrects,
+            "kv",
+            "it is for --material and --scatter-correction",
+        ),
+        *(
+            (name in given and name not in has, name, f"{algorithm} has none")
+            for name in ("iterations", "weight")
+        ),
+        (
+            {"scheduler", "slurm"} <= given.keys(),
+            "slurm",
+            "not together with --scheduler",
+        ),
+        *(
+            (
+                not ALGORITHMS[algorithm].direct,
+                name,
+                f"{algorithm} is not done by workers; allowed: {DEFAULT}",
+            )
+            for name in ("scheduler", "slurm")
+            if name in given
+        ),
+        (
+            {"correction", "geometry"} <= given.keys(),
+            "correction",
+            "no correction is added to a geometry from a file",
+        ),
+    ):
         if wrong:
             raise typer.BadParameter(f"--{name}: {why}")
 
@@ -188,7 +249,9 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
         case "twin":
             with twin() as client:
                 in_force = client.calibration()
-            return NOMINAL if in_force is None else Offsets.from_edge(in_force.parameters), None
+            return NOMINAL if in_force is None else Offsets.from_edge(
+                in_force.parameters
+            ), None
     report = read_report(Path(named))
     return report.parameters, report
 
@@ -219,11 +282,15 @@ def scan_of(
         from flexdt.twin.scanner.state import NamedCorrection
 
         found = Panel.from_json(panel)
-        data = data.with_correction(NamedCorrection("report", "", report.parameters, panel=found))
+        data = data.with_correction(
+            NamedCorrection("report", "", report.parameters, panel=found)
+        )
     return moved(data, report)
 
 
-def _workers(scheduler: str | None, slurm: Path | None) -> AbstractContextManager[Executor] | None:
+def _workers(
+    scheduler: str | None, slurm: Path | None
+) -> AbstractContextManager[Executor] | None:
     from flexdt.library.extras import extension
 
     if scheduler is None and slurm is None:
@@ -271,7 +338,9 @@ def read_report(path: Path) -> Report:
         raise CommandError(f"{path}: not JSON: {error}") from None
     content = document.get("correction", document) if isinstance(document, dict) else None
     if not isinstance(content, dict) or not content:
-        raise CommandError(f"{path}: holds no correction (was the calibration identifiable?)")
+        raise CommandError(
+            f"{path}: holds no correction (was the calibration identifiable?)"
+        )
     for name, value in content.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise CommandError(f"{path}: {name} = {value!r} is not a number")
@@ -306,7 +375,8 @@ def moved(data: DataSet, report: Report) -> DataSet:
     here = [m for m, folder in pairs if own and Path(str(folder)).resolve() == own]
     if moving and len(here) != 1:
         note(
-            f"{path}: warning: the motion in it is that of {', '.join(map(str, folders))} and is "
+            f"{path}: warning: the motion in it is that of "
+            f"{', '.join(map(str, folders))} and is "
             f"left out for {data.where}"
         )
     if not moving or len(here) != 1:
@@ -363,9 +433,13 @@ def export(
     )
     height, width = written.shape or (0, 0)
     yield {
-        "format": format, "file": str(out), "views": len(written), "shape": [height, width],
-        "corrected": corrected, "rows": FORMATS[format].rows or rows,
-    }  # fmt: skip
+        "format": format,
+        "file": str(out),
+        "views": len(written),
+        "shape": [height, width],
+        "corrected": corrected,
+        "rows": FORMATS[format].rows or rows,
+    }
     what = "corrected" if corrected else "nominal"
     yield f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}"
 
@@ -407,10 +481,14 @@ def import_(
     for text in geometry.notes:
         note(f"{file}: {text}")
     yield {
-        "format": format, "file": str(file), "out": str(out), "views": len(geometry),
+        "format": format,
+        "file": str(file),
+        "out": str(out),
+        "views": len(geometry),
         "shape": None if geometry.shape is None else list(geometry.shape),
-        "pixel_mm": list(geometry.pitch_mm), "notes": list(geometry.notes),
-    }  # fmt: skip
+        "pixel_mm": list(geometry.pitch_mm),
+        "notes": list(geometry.notes),
+    }
     height, width = geometry.shape or (None, None)
     size = "unknown size" if width is None else f"{width} x {height} pixels"
     u, v = geometry.pitch_mm

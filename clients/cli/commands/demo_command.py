@@ -1,8 +1,8 @@
 """`flexdt demo`: the main job from end to end, with servers of its own.
 
-Each stage does its real work through the public client and the files, as a user would, and stops
-the demonstration with a readable error when something is wrong. A stage that did not run is absent
-from the document.
+Each stage does its real work through the public client and the files, as a user would, and
+stops the demonstration with a readable error when something is wrong. A stage that did not run
+is absent from the document.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def demo(
     """Do the main job: script, scan, data set, calibration.
 
     Starts the servers on free ports, scans the LEGO bead phantom with the example script,
-    accelerated, calibrates from the data set, and says what was done, where the files are and how
-    the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
+    accelerated, calibrates from the data set, and says what was done, where the files are and
+    how the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
 
     Args:
         out: Write everything to this folder.
@@ -82,7 +82,10 @@ def demo(
 
 
 def run_demo(
-    out: Path, truth_file: Path | None, tell: Tell, stay: Callable[[str], None] | None = None
+    out: Path,
+    truth_file: Path | None,
+    tell: Tell,
+    stay: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Run all stages.
 
@@ -107,12 +110,16 @@ def run_demo(
     with contextlib.ExitStack() as running:
         path = truth_file or running.enter_context(_drawn_truth())
         truth = hidden.read(path)
-        tell("starting the servers; the very first start compiles the projector's kernels")
+        tell(
+            "starting the servers; the very first start compiles the projector's kernels"
+        )
         # Kernels of calibration and reconstruction compile during the servers' start and the
         # scan.
         compiling = running.enter_context(compile_ahead.start(compile_ahead.ANALYSIS))
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
-        servers = running.enter_context(_started(options, out, tell, viewer=stay is not None))
+        servers = running.enter_context(
+            _started(options, out, tell, viewer=stay is not None)
+        )
         with TwinClient(*servers.address) as client:
             document = _main_job(client, compiling.wait, truth, out, tell)
         write_json(out / "demo.json", document)
@@ -253,9 +260,12 @@ def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     document = outcome.document
     if not document["identifiable"]:
         problems = [str(f.text) for f in outcome.calibration.findings]
-        raise CommandError(["the calibration is not identifiable", *problems], NOT_IDENTIFIABLE)
+        raise CommandError(
+            ["the calibration is not identifiable", *problems], NOT_IDENTIFIABLE
+        )
     tell(
-        f"calibrated in {duration(time.monotonic() - begun)}: {document['detections']} beads seen, "
+        f"calibrated in {duration(time.monotonic() - begun)}: {document['detections']} "
+        "beads seen, "
         f"rms {document['rms_px']:.4f} px"
     )
     return outcome
@@ -310,11 +320,14 @@ def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
     dataset = shlex.quote(document["dataset"])
     folder = shlex.quote(str(out))
     tell(f"verdict: {document['calibration']['verdict']}")
-    tell(f"picture: {document['picture']} (the first radiograph, and a layer of the volume)")
+    tell(
+        f"picture: {document['picture']} (the first radiograph, and a layer of the volume)"
+    )
     tell(f"summary: {out / 'demo.json'}")
     tell("next:")
     tell(
-        f"  {program} reconstruct {dataset} --correction {folder}/{CALIBRATION} --binning 4 --png "
+        f"  {program} reconstruct {dataset} --correction {folder}/{CALIBRATION} "
+        "--binning 4 --png "
         f"--out {folder}/volume.nrrd"
     )
     tell(f"  {program} up --data {folder}/data   # the lab in the browser, until Ctrl-C")

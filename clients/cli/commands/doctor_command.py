@@ -23,7 +23,11 @@ def doctor() -> Answer:
     from flexdt.clients.launch.doctor import examine
 
     up = chosen(UpSettings)
-    ports = (("twin", up.port), ("projector", up.projector_port), ("viewer", up.viewer_port))
+    ports = (
+        ("twin", up.port),
+        ("projector", up.projector_port),
+        ("viewer", up.viewer_port),
+    )
     findings = []
     for finding in examine(up.data or TwinSettings.data, ports):
         findings.append(finding)

@@ -20,8 +20,12 @@ SHOWN_SETTINGS: Final = 5
 
 def expose(
     dataset: Path | None = argument(None, "[DATASET]"),
-    sample: str = option("lego", metavar="NAME or FILE", proposes=value_completion.sample_names),
-    material: str | None = option(None, metavar="M", proposes=value_completion.material_names),
+    sample: str = option(
+        "lego", metavar="NAME or FILE", proposes=value_completion.sample_names
+    ),
+    material: str | None = option(
+        None, metavar="M", proposes=value_completion.material_names
+    ),
     kV: list[float] | None = option(None, "--kV", "--kv"),
     power: float | None = option(None, metavar="W"),
     filter: str = option("", metavar="MATERIAL:MM"),
@@ -86,9 +90,15 @@ def expose(
 
 def _seen(found: Forecast | Measured) -> Answer:
     seen: Transmission = found.transmission
-    yield (f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "
-           f"5 % below {seen.p5:.3g}, half below {seen.median:.3g}")  # fmt: skip
-    full = "unknown" if found.saturated is None else f"{100 * found.saturated:.3g} % of the pixels"
+    yield (
+        f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "
+        f"5 % below {seen.p5:.3g}, half below {seen.median:.3g}"
+    )
+    full = (
+        "unknown"
+        if found.saturated is None
+        else f"{100 * found.saturated:.3g} % of the pixels"
+    )
     yield f"saturated {full}, starved {100 * found.starved:.3g} %"
 
 
@@ -104,12 +114,19 @@ def _told(forecast: Forecast) -> Answer:
     if asked.cnr is not None:
         seen = f"contrast {asked.cnr:.3g} times the noise"
     yield f"{forecast.detail} on the darkest ray: {seen}"
-    yield (f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
-           f"{duration(forecast.seconds)}, {size(forecast.bytes)}")  # fmt: skip
+    yield (
+        f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
+        f"{duration(forecast.seconds)}, {size(forecast.bytes)}"
+    )
     rows = [
-        (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}",
-         "-" if s.cnr is None else f"{s.cnr:.3g}", f"{s.kerma_mGy:.3g}")
+        (
+            f"{s.kV:g}",
+            s.filter or "-",
+            f"{s.averages} x {s.exposure_ms:.4g}",
+            "-" if s.cnr is None else f"{s.cnr:.3g}",
+            f"{s.kerma_mGy:.3g}",
+        )
         for s in forecast.best[:SHOWN_SETTINGS]
-    ]  # fmt: skip
+    ]
     yield f"best of {len(forecast.best)} settings of the same power and time:"
     yield table(rows, ("kV", "filter", "ms", "contrast/noise", "mGy"))

@@ -41,8 +41,8 @@ def follow(
 ) -> Answer:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
 
-    Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
-    no connection.
+    Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there
+    was no connection.
 
     Args:
         address: tcp://HOST[:PORT] of its outgoing events.
@@ -75,7 +75,9 @@ def follow(
         from flexdt.phantoms.samples import as_phantom
 
         if sample is None or not frames.is_dir():
-            raise CommandError("--frames needs --sample, and a folder that is there", USAGE)
+            raise CommandError(
+                "--frames needs --sample, and a folder that is there", USAGE
+            )
         beside = (frames, FramesBeside(follower, as_phantom(sample), out))
     from flexdt.library.extras import package
 
@@ -87,8 +89,12 @@ def follow(
     except ValueError as error:
         raise CommandError(str(error), USAGE) from None
     with ExitStack() as files:
-        session.record = None if record is None else files.enter_context(record.open("ab"))
-        note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
+        session.record = (
+            None if record is None else files.enter_context(record.open("ab"))
+        )
+        note(
+            f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it"
+        )
         try:
             with suppress(KeyboardInterrupt):
                 asyncio.run(_run(session, at, seconds, beside))

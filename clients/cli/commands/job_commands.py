@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 ALL: Final = "all"
 """Word for every job that has ended."""
 Job = Annotated[
-    str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
+    str | None,
+    typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out."),
 ]
 
 
@@ -98,7 +99,8 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     Args:
         client: connected to the twin.
         job: which one.
-        own: no other client steers the job, so Ctrl-C and a pause because of an error end the wait.
+        own: no other client steers the job, so Ctrl-C and a pause because of an error end the
+            wait.
 
     Raises:
         CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
@@ -133,8 +135,10 @@ def list_jobs(twin: Twin) -> Answer:
     with twin() as client:
         found = client.jobs()
     yield found
-    rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
-            for j in found.jobs]  # fmt: skip
+    rows = [
+        (j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
+        for j in found.jobs
+    ]
     yield table(rows, ("job", "state", "frames", "data set")) if rows else "no jobs yet"
 
 
@@ -159,7 +163,9 @@ def _on_job(does: str, method: str) -> Callable[..., Answer]:
 
 def forget(
     twin: Twin,
-    job: str = typer.Argument(metavar="JOB", help="As in `job list`; `all` that have ended."),
+    job: str = typer.Argument(
+        metavar="JOB", help="As in `job list`; `all` that have ended."
+    ),
 ) -> Answer:
     """Forget an ended job; its data set stays."""
     with twin() as client:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 COMMENTS: Final = "as the file's comments say"
 """Source of a value whose source is no value of the file."""
-NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
+NameOrFile = Annotated[
+    str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")
+]
 
 
 def list_machines() -> Answer:
@@ -37,10 +39,14 @@ def show(name: NameOrFile) -> Answer:
     yield _axes({n: (a, a.source or COMMENTS) for n, a in found.axes.items()})
     yield "\n" + _places(found)
     panel, tube = found.detector, found.tube
-    yield (f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
-           f"{panel.bits} bits, mode {panel.mode}")  # fmt: skip
-    yield (f"tube: {tube.min_kV:g} to {tube.max_kV:g} kV, at most {tube.max_W:g} W; at start "
-           f"{tube.kV:g} kV, {tube.power_W:g} W\n")  # fmt: skip
+    yield (
+        f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
+        f"{panel.bits} bits, mode {panel.mode}"
+    )
+    yield (
+        f"tube: {tube.min_kV:g} to {tube.max_kV:g} kV, at most {tube.max_W:g} W; at start "
+        f"{tube.kV:g} kV, {tube.power_W:g} W\n"
+    )
     yield _bodies(found)
     yield "\n" + _times(found)
 
@@ -75,7 +81,11 @@ def fit(
     from flexdt.twin.script.log_fit import fit_machine, unlike
 
     machine = machines.machine(base)
-    text = Path(base).read_text("utf-8") if machines.is_file(base) else builtin_machine_text(base)
+    text = (
+        Path(base).read_text("utf-8")
+        if machines.is_file(base)
+        else builtin_machine_text(base)
+    )
     commands = [read_log_file(log, machine) for log in logs]
     names = ", ".join(log.name for log in logs).encode("utf-8", "replace").decode()
     source = f"measured: {names} ({sum(map(len, commands))} lines)"
@@ -87,43 +97,58 @@ def fit(
     )
     out.write_text(made, encoding="utf-8")
     yield found.to_dict()
-    yield _axes({n: (found.machine.axes[n], found.machine.axes[n].source) for n in found.axes})
+    yield _axes(
+        {n: (found.machine.axes[n], found.machine.axes[n].source) for n in found.axes}
+    )
     yield "\n" + _times(found.machine)
     lines = found.lines
     yield (
         f"\n{len(lines.rows)} lines, {lines.total_real_s:.2f} s; absolute errors sum to "
-        f"{lines.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time predicted "
+        f"{lines.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time "
+        "predicted "
         "from the others of its kind"
     )
     if len(logs) == 1:
-        yield ("one log does not show how a scan differs from the next: ranges may be too narrow")
+        yield (
+            "one log does not show how a scan differs from the next: ranges may be too narrow"
+        )
     yield (f"{out}: written, everything else as in {base}")
 
 
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
     rows = [
-        (name, *(f"{v:g}" for v in (a.lower, a.upper, a.max_speed, a.max_acceleration)), a.unit,
-         source)
+        (
+            name,
+            *(f"{v:g}" for v in (a.lower, a.upper, a.max_speed, a.max_acceleration)),
+            a.unit,
+            source,
+        )
         for name, (a, source) in axes.items()
-    ]  # fmt: skip
+    ]
     return table(rows, ("axis", "lower", "upper", "max /s", "max /s2", "unit", "source"))
 
 
 def _places(machine: Machine) -> str:
     from flexdt.twin.machine.kinematics import places
 
-    rows = [(p.name, p.total, f"{p.least:g}", f"{p.most:g}", f"{p.home:g}")
-            for p in places(machine)]  # fmt: skip
+    rows = [
+        (p.name, p.total, f"{p.least:g}", f"{p.most:g}", f"{p.home:g}")
+        for p in places(machine)
+    ]
     return table(rows, ("without zero offsets", "is", "from", "to", "at home"))
 
 
 def _bodies(machine: Machine) -> str:
     rows = [
-        (c.name, c.role, " + ".join(reversed(machine.chain(c))) or "nothing",
-         " x ".join(f"{side:g}" for side in c.size_mm),
-         "; ".join(filter(None, (c.mesh and f"mesh {c.mesh}", c.source))) or COMMENTS)
+        (
+            c.name,
+            c.role,
+            " + ".join(reversed(machine.chain(c))) or "nothing",
+            " x ".join(f"{side:g}" for side in c.size_mm),
+            "; ".join(filter(None, (c.mesh and f"mesh {c.mesh}", c.source))) or COMMENTS,
+        )
         for c in machine.components
-    ]  # fmt: skip
+    ]
     return table(rows, ("body", "role", "moved by", "size [mm]", "source"))
 
 
@@ -134,8 +159,16 @@ def _times(machine: Machine) -> str:
         found = timing.spread.get(kind)
         spread = ("", "", "assumed")
         if found is not None:
-            spread = (f"{found.p5_s:.3f}", f"{found.p95_s:.3f}", f"measured, log, n = {found.n}")
+            spread = (
+                f"{found.p5_s:.3f}",
+                f"{found.p95_s:.3f}",
+                f"measured, log, n = {found.n}",
+            )
         rows.append((kind, f"{timing.seconds(kind):.3f}", *spread))
     if timing.spread:
-        rows.append(("all together", "", "", f"+-{100 * timing.drift:.0f} %", "log; for totals"))
-    return table(rows, ("time of a", "median [s]", "5 %", "95 %", f"source ({timing.source})"))
+        rows.append(
+            ("all together", "", "", f"+-{100 * timing.drift:.0f} %", "log; for totals")
+        )
+    return table(
+        rows, ("time of a", "median [s]", "5 %", "95 %", f"source ({timing.source})")
+    )

@@ -21,7 +21,9 @@ USUAL_BASE: Final = "xyzr_cabinet"
 def new(
     name: str = argument(..., "NAME"),
     out: Path = option(..., metavar="FILE", written=True),
-    base: str | None = option(None, metavar="NAME", proposes=value_completion.machine_names),
+    base: str | None = option(
+        None, metavar="NAME", proposes=value_completion.machine_names
+    ),
     detector: str | None = option(None, metavar="COLUMNSxROWS"),
     pitch: str | None = option(None, metavar="MM[xMM]"),
     bits: int | None = option(None),
@@ -30,7 +32,9 @@ def new(
     kv: str | None = option(None, metavar="KV or KV:KV"),
     power: float | None = option(None, metavar="W"),
     limit: list[str] | None = option(None, metavar="AXIS=LOWER:UPPER"),
-    without: list[str] | None = option(None, metavar="AXIS", proposes=value_completion.axis_names),
+    without: list[str] | None = option(
+        None, metavar="AXIS", proposes=value_completion.axis_names
+    ),
 ) -> Answer:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal.
 
@@ -49,7 +53,11 @@ def new(
         without: Leave out this axis.
     """
     from flexdt.twin.collision.home_check import check_home
-    from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
+    from flexdt.twin.machine.description import (
+        builtin_machine,
+        builtin_machines,
+        parse_machine,
+    )
     from flexdt.twin.machine.kinematics import place
     from flexdt.twin.machine.new_machine import Answers, new_machine_text
 
@@ -66,7 +74,9 @@ def new(
     sod = _asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
     sdd = _asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
     kv = _asked(
-        "Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}"
+        "Tube, kV: at most, or least:most",
+        kv,
+        f"{like.tube.min_kV:g}:{like.tube.max_kV:g}",
     )
     volts = None if kv is None else option_values.span(kv, "--kv")
     pixels = None if size is None else _pair(size, "--detector", whole=True)
@@ -84,7 +94,9 @@ def new(
         min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
         max_kV=None if volts is None else volts[1],
         max_W=None if power is None else option_values.number(f"{power}", "--power"),
-        limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
+        limits={
+            axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines
+        },
         without=tuple(without or ()),
     )
     text = new_machine_text(answers)

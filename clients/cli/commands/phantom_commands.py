@@ -37,7 +37,9 @@ def list_phantoms() -> Answer:
 
 def make(
     file: Path = argument(..., "FILE.json"),
-    like: str | None = option(None, metavar="NAME", proposes=value_completion.sample_names),
+    like: str | None = option(
+        None, metavar="NAME", proposes=value_completion.sample_names
+    ),
     size: str | None = option(None, metavar="W,B,H"),
     beads: int = option(5, metavar="K"),
     radius: float = option(2.0, metavar="MM"),

@@ -28,7 +28,9 @@ MODULES: Final = {
 """Process -> module of its program."""
 Only = Annotated[
     Literal["twin", "projector", "viewer", "gateway"] | None,
-    typer.Option("--only", help="Run this process alone; its options: flexdt PROCESS --help."),
+    typer.Option(
+        "--only", help="Run this process alone; its options: flexdt PROCESS --help."
+    ),
 ]
 
 
@@ -36,8 +38,8 @@ def up(context: typer.Context, only: str | None, **given: object) -> None:
     """Start projector, twin and viewer; Ctrl-C stops all.
 
     They run as processes under one supervisor, which restarts a dead one. Prints one
-    JSON `ready` line with the addresses once everything listens. `flexdt twin --help` and its like
-    list further options, which `up` takes, too.
+    JSON `ready` line with the addresses once everything listens. `flexdt twin --help` and its
+    like list further options, which `up` takes, too.
     """
     start(only or "up", [*words(given), *context.args])
 
@@ -50,11 +52,18 @@ def _public() -> list[inspect.Parameter]:
     return [p if p.default is False else p.replace(default=None) for p in own]
 
 
-has_parameters(up, [
-    inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context),
-    inspect.Parameter("only", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Only),
-    *_public(),
-])  # fmt: skip
+has_parameters(
+    up,
+    [
+        inspect.Parameter(
+            "context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context
+        ),
+        inspect.Parameter(
+            "only", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Only
+        ),
+        *_public(),
+    ],
+)
 
 
 def alone(name: str, about: str) -> Callable[[typer.Context], None]:
@@ -104,7 +113,9 @@ def _check(given: Mapping[str, Any]) -> None:
         machine(given["machine"])
 
 
-def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> NoReturn:
+def become(
+    module: str, given: Mapping[str, object], more: Sequence[str] = ()
+) -> NoReturn:
     """Run `python -m module` in this process, with the options `given` and `more` words.
 
     A new interpreter would not react to Ctrl-C before it had loaded the module.

@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 
     from flexdt.clients.client.client import TwinClient
     from flexdt.protocol.methods.scanner_messages import LengthUnit
-    from flexdt.protocol.state_model import AxisState, ImageFlags, State, Stopped, TubeState
+    from flexdt.protocol.state_model import (
+        AxisState,
+        ImageFlags,
+        State,
+        Stopped,
+        TubeState,
+    )
 
 
 def state(twin: Twin) -> Answer:
@@ -35,8 +41,10 @@ def state(twin: Twin) -> Answer:
     with twin() as client:
         current = client.state()
     yield current
-    yield table([_axis(n, a) for n, a in current.axes.items()],
-                ("axis", "position", "target", "velocity", "limits", "unit", ""))  # fmt: skip
+    yield table(
+        [_axis(n, a) for n, a in current.axes.items()],
+        ("axis", "position", "target", "velocity", "limits", "unit", ""),
+    )
     yield ""
     for name, text in _facts(current):
         yield f"{name:12} {text}"
@@ -46,9 +54,14 @@ def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
     lower, upper = axis.limits
     doing = "moving" if axis.moving else "virtual" if axis.virtual else ""
     return (
-        name, f"{axis.position:.4f}", f"{axis.target:.4f}", f"{axis.velocity:.3f}",
-        f"[{lower:g}, {upper:g}]", axis.unit, doing,
-    )  # fmt: skip
+        name,
+        f"{axis.position:.4f}",
+        f"{axis.target:.4f}",
+        f"{axis.velocity:.3f}",
+        f"[{lower:g}, {upper:g}]",
+        axis.unit,
+        doing,
+    )
 
 
 def _facts(state: State) -> list[tuple[str, str]]:
@@ -57,25 +70,38 @@ def _facts(state: State) -> list[tuple[str, str]]:
     g, c, t, s = state.geometry, state.camera, state.tube, state.sample
     rows, cols = c.shape
     facts = [
-        ("geometry", f"SOD {g.SOD_mm:.4f} mm, SDD {g.SDD_mm:.4f} mm, magnification "
-                     f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um"),
-        ("view", f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
-                 f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}"),
+        (
+            "geometry",
+            f"SOD {g.SOD_mm:.4f} mm, SDD {g.SDD_mm:.4f} mm, magnification "
+            f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um",
+        ),
+        (
+            "view",
+            f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
+            f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}",
+        ),
         ("tube", f"{xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"),
-        ("camera", f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms"),
+        (
+            "camera",
+            f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms",
+        ),
         ("sample", s.name or "none"),
         ("safety", " ".join(w for w in (state.safety.state, state.safety.message) if w)),
         ("clock", f"{state.clock.time_s:.2f} s, speed-up {state.clock.speed_up}"),
         ("correction", state.correction.name if state.correction else "none"),
         ("controller", state.controller or "nobody"),
-    ]  # fmt: skip
+    ]
     if state.image is not None:
         i = state.image
         cut = f", sample cut off at: {', '.join(i.truncated)}" if i.truncated else ""
-        facts.append(("image", f"{i.saturated:.1%} saturated, {i.starved:.1%} starved{cut}"))
+        facts.append(
+            ("image", f"{i.saturated:.1%} saturated, {i.starved:.1%} starved{cut}")
+        )
     if state.job is not None:
         j = state.job
-        facts.append(("job", f"{j.job} {j.state}, {j.frames_done} of {j.frames_total} frames"))
+        facts.append(
+            ("job", f"{j.job} {j.state}, {j.frames_done} of {j.frames_total} frames")
+        )
     return facts
 
 
@@ -126,11 +152,15 @@ def camera(
         if exposure_ms is None and mode is None and roi is None and averages is None:
             c = client.state().camera
         else:
-            c = client.set_camera(exposure_ms=exposure_ms, mode=mode, roi=roi, averages=averages)
+            c = client.set_camera(
+                exposure_ms=exposure_ms, mode=mode, roi=roi, averages=averages
+            )
     yield c
     rows, cols = c.shape
-    yield (f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
-           f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
+    yield (
+        f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
+        f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}"
+    )
 
 
 def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
@@ -153,7 +183,9 @@ JOG_POLL_S = 0.002
 
 def move(
     twin: Twin,
-    targets: list[str] = argument(..., "AXIS=VALUE...", proposes=value_completion.axis_values),
+    targets: list[str] = argument(
+        ..., "AXIS=VALUE...", proposes=value_completion.axis_values
+    ),
     relative: bool = option(False, "--relative"),
     plan: bool = option(False, "--plan"),
     shortest: bool = option(False, "--shortest"),
@@ -180,7 +212,9 @@ def move(
     warn(done.warnings)
     yield done
     if done.arrived is False:
-        raise CommandError("the move did not end at its target; see `flexdt state`", REFUSED)
+        raise CommandError(
+            "the move did not end at its target; see `flexdt state`", REFUSED
+        )
     verb = "moving, arrives in" if no_wait else "arrived after"
     yield f"{verb} {duration(done.duration_s)} of the twin's clock"
 
@@ -279,15 +313,23 @@ def _rest(state: Stopped) -> str:
     stopping = state.stopping
     if stopping is None or not stopping.distances:
         return "nothing moves"
-    ways = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
-    hit = f"; {' and '.join(stopping.would_hit)} would collide" if stopping.would_hit else ""
+    ways = [
+        f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()
+    ]
+    hit = (
+        f"; {' and '.join(stopping.would_hit)} would collide"
+        if stopping.would_hit
+        else ""
+    )
     return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
 
 
 def reset(twin: Twin) -> Answer:
     """Leave the emergency stop."""
     with twin() as client:
-        seen = client.state().safety  # the stop to release; an older twin has no number for it
+        seen = (
+            client.state().safety
+        )  # the stop to release; an older twin has no number for it
         current = client.reset(seen.stop or None)
     why = f": {current.safety.message}" if current.safety.message else ""
     yield current
@@ -296,7 +338,9 @@ def reset(twin: Twin) -> Answer:
 
 def sample(
     twin: Twin,
-    name: str | None = argument(None, "NAME or FILE", proposes=value_completion.sample_names),
+    name: str | None = argument(
+        None, "NAME or FILE", proposes=value_completion.sample_names
+    ),
     unit: str | None = option(None, among=lambda: UNITS_MM),
     material: str | None = option(None, proposes=value_completion.material_names),
 ) -> Answer:
@@ -313,7 +357,9 @@ def sample(
     kind = "" if file is None else file.suffix.lower().lstrip(".")
     if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
         file = None
-    if (file is None or kind not in MESH_FORMATS) and (unit is not None or material is not None):
+    if (file is None or kind not in MESH_FORMATS) and (
+        unit is not None or material is not None
+    ):
         raise typer.BadParameter("--unit and --material are for a mesh file")
     with twin() as client:
         if name is None:
@@ -369,8 +415,9 @@ def snap(
     """Take a projection at the current pose.
 
     A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
-    dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
-    what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
+    dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in
+    colour what would be wrong with the exposure: saturated red, starved blue, cut-off edges
+    yellow.
 
     Args:
         kind: Write this kind; default: counts in a TIFF, integrals in a PNG.
@@ -389,15 +436,24 @@ def snap(
     save(file, image, dark_is_dense=wanted == "line_integral", marks=taken.marks)
     if dark and not tube.on:
         note(
-            "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
+            "warning: X-rays are off, so this is a dark image; `flexdt tube --on` "
+            "switches them on"
         )
     elif dark:
-        note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
+        note(
+            f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image"
+        )
     elif taken.flags is not None:
         warn_of_exposure(taken.flags)
     flags = None if dark or taken.flags is None else taken.flags.model_dump()
-    yield {"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
-           "cone_vec": taken.cone_vec, "kind": wanted, "flags": flags}  # fmt: skip
+    yield {
+        "file": str(file),
+        "dtype": str(image.dtype),
+        "shape": image.shape,
+        "cone_vec": taken.cone_vec,
+        "kind": wanted,
+        "flags": flags,
+    }
     rows, cols = image.shape
     yield f"{file}: {cols} x {rows} {image.dtype}"
     if taken.marks is not None:

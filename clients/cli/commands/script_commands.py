@@ -92,8 +92,13 @@ def new(
         )
     if file is not None:
         file.write_bytes(text.encode("utf-8"))
-    yield {"file": file, "text": text, "frames": plan.frames, "bytes": plan.bytes,
-           "duration_s": plan.duration_s}  # fmt: skip
+    yield {
+        "file": file,
+        "text": text,
+        "frames": plan.frames,
+        "bytes": plan.bytes,
+        "duration_s": plan.duration_s,
+    }
     if file is None:
         yield text.removesuffix("\n")
     else:
@@ -113,7 +118,12 @@ def _own(kind: Kind, **given: Any) -> dict[str, Any]:
     Raises:
         typer.BadParameter: an option of another kind was given.
     """
-    kinds = {"position": "calibration", "tiles": "tiled", "turns": "helical", "rise": "helical"}
+    kinds = {
+        "position": "calibration",
+        "tiles": "tiled",
+        "turns": "helical",
+        "rise": "helical",
+    }
     own = {name: value for name, value in given.items() if value not in (None, [])}
     for name in own:
         if kinds[name] != kind:

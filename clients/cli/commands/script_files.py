@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from flexdt.twin.script import CheckReport, ScriptProblem
     from flexdt.twin.script.executed_log import Executed
 
-ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
+ScriptFile = Annotated[
+    Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")
+]
 
 
 def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
@@ -45,7 +47,9 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
 
         data = executed_script(data, machine)
     if not is_log(data):
-        raise CommandError(f"{log}: no line of an executed script in it; {COLUMNS}", INVALID)
+        raise CommandError(
+            f"{log}: no line of an executed script in it; {COLUMNS}", INVALID
+        )
     lines, problems = read_log(data)
     tell(problems, str(log))
     if any(p.severity == "error" for p in problems):

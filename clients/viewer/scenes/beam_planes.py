@@ -46,7 +46,9 @@ class BeamPlane:
     axes: FloatArray
 
 
-def fans(world: World, lines: npt.NDArray[np.generic], radius_mm: float) -> list[BeamPlane]:
+def fans(
+    world: World, lines: npt.NDArray[np.generic], radius_mm: float
+) -> list[BeamPlane]:
     """Planes of the middle column before and behind the sample, and of the middle row.
 
     Args:
@@ -86,10 +88,15 @@ def _fan(
     ahead = ahead / length
     # In the plane: (distance from the focal spot, along the line of pixels).
     cut = float((world.sample.shift - world.source) @ ahead) + side * radius
-    near, far = (0.0, max(cut, 1.0)) if side < 0.0 else (min(max(cut, 0.0), length - 1.0), length)
+    near, far = (
+        (0.0, max(cut, 1.0)) if side < 0.0 else (min(max(cut, 0.0), length - 1.0), length)
+    )
     half = 0.5 * float(np.linalg.norm(across))
     first, last = middle @ along - half, middle @ along + half
-    low, high = min(first * near, first * far) / length, max(last * near, last * far) / length
+    low, high = (
+        min(first * near, first * far) / length,
+        max(last * near, last * far) / length,
+    )
     rows, cols = SHAPE
     a = near + (np.arange(cols) + 0.5) * (far - near) / cols
     b = low + (np.arange(rows)[:, None] + 0.5) * (high - low) / rows
@@ -97,7 +104,9 @@ def _fan(
     pixel = np.clip(part * len(through), 0, len(through) - 1).astype(int)
     rgba = np.empty((*SHAPE, 4), dtype=np.uint8)
     rgba[..., :3] = LIGHT
-    rgba[..., 3] = np.where((part >= 0.0) & (part < 1.0), MOST * through[pixel], 0.0).clip(0, 255)
+    rgba[..., 3] = np.where(
+        (part >= 0.0) & (part < 1.0), MOST * through[pixel], 0.0
+    ).clip(0, 255)
     center = world.source + 0.5 * (near + far) * ahead + 0.5 * (low + high) * along
     axes = np.stack([ahead, along, np.cross(ahead, along)], axis=1)
     return BeamPlane(rgba, (far - near, float(high - low)), center, axes)
@@ -110,14 +119,20 @@ class BeamShade:
         plain: Any = {"visible": False, "cast_shadow": False, "receive_shadow": False}
         self._planes: list[Any] = [
             scene.add_image(
-                f"/beam/shade{name}", np.zeros((2, 2, 4), dtype=np.uint8), 0.01, 0.01, **plain
+                f"/beam/shade{name}",
+                np.zeros((2, 2, 4), dtype=np.uint8),
+                0.01,
+                0.01,
+                **plain,
             )
             for name in range(4)
         ]
         self._newest: tuple[World, npt.NDArray[np.generic], float] | None = None
         self._lit = False
 
-    def show(self, world: World, lines: npt.NDArray[np.generic], radius_mm: float) -> None:
+    def show(
+        self, world: World, lines: npt.NDArray[np.generic], radius_mm: float
+    ) -> None:
         """Take the newest image (see `fans`)."""
         self._newest = world, lines, max(radius_mm, 1.0)
         self._draw()

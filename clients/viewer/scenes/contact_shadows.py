@@ -50,7 +50,9 @@ def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str
     found: dict[str, float] = {}
     for part in parts:
         for other in parts:
-            over = (low[part.name] < high[other.name])[:2] & (low[other.name] < high[part.name])[:2]
+            over = (low[part.name] < high[other.name])[:2] & (
+                low[other.name] < high[part.name]
+            )[:2]
             gap = low[part.name][2] - high[other.name][2]
             rises = bodies[part.name].slides[:, 2] - bodies[other.name].slides[:, 2]
             if over.all() and abs(gap) <= TOUCHING_MM and not rises.any():
@@ -68,15 +70,23 @@ def shadow(part: Component, top_mm: float) -> bytes:
     """
     width, depth, _ = (1.0 + 2.0 * SPREAD_SHARE) * np.asarray(part.size_mm)
     x, y, _ = part.center_mm
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2] + [x, y]
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2] + [
+        x,
+        y,
+    ]
     place = np.column_stack([corners, np.full(4, top_mm + ABOVE_MM)]) * MM
     mesh = trimesh.Trimesh(place, [[0, 1, 2], [0, 2, 3]], process=False)
     make: Any = PBRMaterial
     material = make(
-        baseColorTexture=_soft(), alphaMode="BLEND", metallicFactor=0.0, roughnessFactor=1.0
+        baseColorTexture=_soft(),
+        alphaMode="BLEND",
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
     )
     visuals: Any = trimesh.visual.TextureVisuals
-    mesh.visual = visuals(uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), material=material)
+    mesh.visual = visuals(
+        uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), material=material
+    )
     out = io.BytesIO()
     export: Any = trimesh.Scene(mesh).export
     export(out, file_type="glb", include_normals=True)

@@ -1,7 +1,8 @@
 """Handles that drag stages along the directions in which their motors move.
 
-A drag becomes motor targets, clamped to their limits. The twin plans and sweeps them as usual, and
-the stage follows at its own speed. A drag counts as a command of the page whose frame it is in.
+A drag becomes motor targets, clamped to their limits. The twin plans and sweeps them as usual,
+and the stage follows at its own speed. A drag counts as a command of the page whose frame it is
+in.
 """
 
 from __future__ import annotations
@@ -79,10 +80,14 @@ class Gizmos:
         active = [bool(self._machine.geometry.get(f"{stage}_{c}")) for c in COORDINATES]
         turns = stage == "object" and bool(self._machine.geometry.get("angle"))
         control = server.scene.add_transform_controls(
-            f"/gizmos/{stage}", scale=SIZE_M, active_axes=(active[0], active[1], active[2]),
-            disable_sliders=True, disable_rotations=not turns, depth_test=False,
+            f"/gizmos/{stage}",
+            scale=SIZE_M,
+            active_axes=(active[0], active[1], active[2]),
+            disable_sliders=True,
+            disable_rotations=not turns,
+            depth_test=False,
             line_width=3.0,
-        )  # fmt: skip
+        )
         handle = _Handle(stage, control)
 
         # Plain functions would run in threads, in any order.
@@ -113,7 +118,8 @@ class Gizmos:
             handle: being dragged.
             event: of viser, with its client.
         """
-        # The last update of a drag may come after its end, and counts from where the drag began.
+        # The last update of a drag may come after its end, and counts from where the drag
+        # began.
         if not handle.start:
             return
         shift = (np.array(handle.control.position, dtype=float) - handle.begun) / MM

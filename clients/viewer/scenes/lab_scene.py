@@ -30,7 +30,14 @@ from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.name_tags import Name, names_of_image, names_of_parts
 from flexdt.clients.viewer.scenes.plan_drawing import HOME, SCREEN, PlanDrawing
 from flexdt.clients.viewer.scenes.sample_looks import SampleLook
-from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
+from flexdt.clients.viewer.scenes.still import (
+    Shape,
+    cone,
+    cut,
+    image_on,
+    placed,
+    shape_of,
+)
 from flexdt.clients.viewer.scenes.world import MM, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
@@ -116,11 +123,19 @@ class LabScene:
         scene.world_axes.visible = False
         room = room_of(self.machine)
         scene.add_grid(
-            "/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0,
-            cell_color=FLOOR, section_color=FLOOR, cell_thickness=0.5,
-            section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
+            "/floor",
+            width=8.0,
+            height=8.0,
+            cell_size=0.25,
+            section_size=1.0,
+            cell_color=FLOOR,
+            section_color=FLOOR,
+            cell_thickness=0.5,
+            section_thickness=0.9,
+            fade_distance=5.0,
+            fade_strength=2.0,
             position=(0.0, 0.55, room.floor_mm * MM),
-        )  # fmt: skip
+        )
         ground = ground_of(self.machine)
         standing = contact_shadows.standing(self.machine.components, self._bodies)
         for part in self.machine.components:
@@ -130,16 +145,20 @@ class LabScene:
             pieces = pieces_of(part)
             self._solids[part.name] = cut(pieces)
             scene.add_glb(
-                f"/machine/{part.name}/look", own or glb(pieces),
-                position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
+                f"/machine/{part.name}/look",
+                own or glb(pieces),
+                position=tuple(
+                    np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM
+                ),
                 receive_shadow=part is ground,  # a part's shadow on itself has stripes
-            )  # fmt: skip
+            )
             if part.name in standing:
                 scene.add_glb(
                     f"/machine/{part.name}/look/shadow",
                     contact_shadows.shadow(part, standing[part.name]),
-                    cast_shadow=False, receive_shadow=False,
-                )  # fmt: skip
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
         pieces, lamp = cabinet(room)
         self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), WORLD_POSE
         still: Any = {"cast_shadow": False, "receive_shadow": False}
@@ -158,15 +177,29 @@ class LabScene:
         scene.add_frame("/beam", show_axes=False)
         blank = np.zeros((8, 8, 3), dtype=np.uint8)
         self._image = scene.add_image(
-            "/panel", blank, 0.1, 0.1, format="jpeg", jpeg_quality=80,
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            "/panel",
+            blank,
+            0.1,
+            0.1,
+            format="jpeg",
+            jpeg_quality=80,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
         self._shade = BeamShade(scene)
         self._edges = scene.add_line_segments(
-            "/beam/edges", np.zeros((8, 2, 3), np.float32), BEAM_OFF, thickness=1.6, **SCREEN
+            "/beam/edges",
+            np.zeros((8, 2, 3), np.float32),
+            BEAM_OFF,
+            thickness=1.6,
+            **SCREEN,
         )
         self._spot = scene.add_icosphere(
-            "/beam/spot", radius=0.004, color=LIGHT, cast_shadow=False, receive_shadow=False
+            "/beam/spot",
+            radius=0.004,
+            color=LIGHT,
+            cast_shadow=False,
+            receive_shadow=False,
         )
         self._axis = scene.add_line_segments(
             "/axis", _axis_points(), (40, 160, 235), thickness=2.0, **SCREEN
@@ -175,9 +208,12 @@ class LabScene:
             "/piercing", _cross_points(), (60, 220, 120), thickness=2.5, **SCREEN
         )
         self._ranges = scene.add_line_segments(
-            "/ranges", np.zeros((1, 2, 3), dtype=np.float32), RANGE,
-            thickness=2.5, **SCREEN,
-        )  # fmt: skip
+            "/ranges",
+            np.zeros((1, 2, 3), dtype=np.float32),
+            RANGE,
+            thickness=2.5,
+            **SCREEN,
+        )
 
     def _build_bodies(self) -> None:
         margin = self.machine.safety_margin_mm
@@ -186,7 +222,9 @@ class LabScene:
             self._hulls[name] = self._hull(f"/machine/{name}/body", hull, RED, 0.35)
             if margin > 0.0:
                 shell = grown(hull, margin)
-                self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
+                self._margins[name] = self._hull(
+                    f"/machine/{name}/margin", shell, AMBER, 0.25
+                )
 
     def _build_labels(self) -> None:
         """Build the world's axes and a scale on the floor."""
@@ -194,27 +232,39 @@ class LabScene:
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
         scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN)
         scene.add_frame(
-            "/axes", axes_length=AXES_MM * MM, axes_radius=4 * MM,
+            "/axes",
+            axes_length=AXES_MM * MM,
+            axes_radius=4 * MM,
             position=tuple((np.array([x, y - 2 * AXES_MM, z]) * MM).tolist()),
-        )  # fmt: skip
+        )
 
     def named(self, world: World, shown: Shown) -> list[Name]:
         """List the names shown now, and their places."""
         if "labels" not in shown:
             return names_of_image(world) if "names" in shown else []
         first = _scale_mm(self.machine)
-        out: list[Name] = [(f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM)]
+        out: list[Name] = [
+            (f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM)
+        ]
         for k, words in enumerate(("x traversal", "y source to detector", "z up")):
             end = first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]
             out.append((words, end * MM))
         return out + names_of_parts(self.machine, dict(self._sent))
 
-    def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
+    def _hull(
+        self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float
+    ) -> Any:
         vertices, faces = plain(mesh)
         return self._server.scene.add_mesh_simple(
-            node, vertices, faces, color=color, opacity=opacity,
-            side="double", cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            node,
+            vertices,
+            faces,
+            color=color,
+            opacity=opacity,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
 
     # -- moving ------------------------------------------------------------------------------
 
@@ -291,7 +341,10 @@ class LabScene:
             near: leave out shapes that do not turn with the sample.
         """
         poses = dict(self._sent)
-        turning = {"object", *(part.name for part in self.machine.components if part.role in NEAR)}
+        turning = {
+            "object",
+            *(part.name for part in self.machine.components if part.role in NEAR),
+        }
         drawn = [n for n in self._solids if (n if n == "cabinet" else "machine") in shown]
         if near:
             drawn = [n for n in drawn if n in turning]
@@ -314,7 +367,9 @@ class LabScene:
         """Draw an image (rows, cols, 3) on the panel, and its line integrals in the air."""
         self._image.image = rgb
         with self._server.atomic():
-            self._shade.show(world, lines, 0.0 if self._look is None else self._look.radius_mm)
+            self._shade.show(
+                world, lines, 0.0 if self._look is None else self._look.radius_mm
+            )
 
     def show_surface(
         self, vertices_mm: FloatArray | None, faces: npt.NDArray[np.int32] | None = None
@@ -340,9 +395,14 @@ class LabScene:
                 self._surface.vertices, self._surface.faces = vertices, triangles
                 return
             self._surface = self._server.scene.add_mesh_simple(
-                "/object/surface", vertices, triangles, color=SURFACE, side="double",
-                cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+                "/object/surface",
+                vertices,
+                triangles,
+                color=SURFACE,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
 
     def wear(self, look: SampleLook) -> None:
         """Put a sample on the stage.
@@ -358,12 +418,17 @@ class LabScene:
                 handle.remove()
             self._skins = [
                 self._server.scene.add_mesh_simple(
-                    f"/sample/{skin.name}", skin.vertices, skin.faces, color=skin.color,
+                    f"/sample/{skin.name}",
+                    skin.vertices,
+                    skin.faces,
+                    color=skin.color,
                     **_clear(Shown().opacity, skin.dense),
-                    wireframe=not look.exact, cast_shadow=look.exact, receive_shadow=False,
+                    wireframe=not look.exact,
+                    cast_shadow=look.exact,
+                    receive_shadow=False,
                 )
                 for skin in look.skins
-            ]  # fmt: skip
+            ]
             self._stand(look)
         self.plain = self.nodes(Shown(), faded=False)
 
@@ -374,7 +439,9 @@ class LabScene:
             look: the sample; without meshes there is no rod.
         """
         name = f"{STAND_NODE}/rod"
-        mount = next((p for p in self.machine.components if p.role == "sample_mount"), None)
+        mount = next(
+            (p for p in self.machine.components if p.role == "sample_mount"), None
+        )
         known = self._server.scene.get_handle_by_name(name)
         if known is not None:
             known.remove()
@@ -388,18 +455,24 @@ class LabScene:
             self._solids["object"] = cut([rod])
             self._server.scene.add_glb(name, glb([rod]), receive_shadow=False)
 
-    def nodes(self, shown: Shown, near: Collection[str] = (), faded: bool = True) -> Nodes:
+    def nodes(
+        self, shown: Shown, near: Collection[str] = (), faded: bool = True
+    ) -> Nodes:
         """Collect the nodes of all layers, for frames of a page that shows `shown`.
 
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
             faded: whether the sample fades where its volume is drawn within it.
         """
-        out = {n: {"visible": visible} for n, visible in self._visible(shown, near).items()}
+        out = {
+            n: {"visible": visible} for n, visible in self._visible(shown, near).items()
+        }
         skins = () if self._look is None else self._look.skins
         within = faded and self._surface is not None
         opacity = min(shown.opacity, FADED_OPACITY) if within else shown.opacity
-        clear = {f"/sample/{s.name}": _clear(opacity, s.dense and not within) for s in skins}
+        clear = {
+            f"/sample/{s.name}": _clear(opacity, s.dense and not within) for s in skins
+        }
         return {**out, **clear}
 
     def _visible(self, shown: Shown, near: Collection[str] = ()) -> dict[str, bool]:
@@ -423,7 +496,9 @@ class LabScene:
                 continue
             k = self._collision.axes.index(part.axis)
             at = body.origin + q @ body.slides + np.asarray(part.center_mm)
-            ends = [at + body.slides[k] * (limit - q[k]) for limit in (axis.lower, axis.upper)]
+            ends = [
+                at + body.slides[k] * (limit - q[k]) for limit in (axis.lower, axis.upper)
+            ]
             lines.append(ends)
             side = np.cross(body.slides[k], [0.3, 0.2, 0.9])
             side *= 25.0 / np.linalg.norm(side)

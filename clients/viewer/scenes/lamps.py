@@ -1,4 +1,5 @@
-"""Lamps of the lab: plain ones for every browser, and finer ones where a graphics processor draws.
+"""Lamps of the lab: plain ones for every browser, and finer ones where a graphics processor
+draws.
 
 Without one, shadows and an environment take ten times as long as all the rest of a picture.
 """
@@ -20,7 +21,9 @@ FILL_AT: Final = (-2.6, 1.4, 1.2)
 def light_plainly(scene: viser.SceneApi) -> None:
     """Set lamps without shadows, for all clients."""
     scene.configure_environment_map(None)
-    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.35)
+    scene.add_light_hemisphere(
+        SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.35
+    )
     scene.add_light_directional(KEY, intensity=2.5, position=KEY_AT)
     scene.add_light_directional("/lights/fill", intensity=0.8, position=FILL_AT)
 
@@ -33,5 +36,7 @@ def light_finely(scene: viser.SceneApi) -> None:
         scene: of one client; its lamps replace those of all clients.
     """
     scene.configure_environment_map("studio", environment_intensity=0.1)
-    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1)
+    scene.add_light_hemisphere(
+        SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1
+    )
     scene.add_light_directional(KEY, intensity=1.9, position=KEY_AT, cast_shadow=True)

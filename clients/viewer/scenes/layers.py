@@ -58,7 +58,10 @@ LAYERS: Final[tuple[Layer, ...]] = (
     Layer("cabinet", "cabinet", False, ("/cabinet/walls", "/cabinet/lamp")),
     Layer("orbit", "planned trajectory", True, ("/object/plan",)),
     Layer(
-        "gizmos", "handles to drag", False, ("/gizmos/source", "/gizmos/object", "/gizmos/detector")
+        "gizmos",
+        "handles to drag",
+        False,
+        ("/gizmos/source", "/gizmos/object", "/gizmos/detector"),
     ),
     Layer("names", "names of source, sample, detector", True),
     Layer("labels", "all names, axes, scale", False, ("/scale", "/axes")),
@@ -100,7 +103,9 @@ class Shown:
             "opacity": self.opacity,
         }
 
-    def visible(self, parts: Collection[str], near: Collection[str] = ()) -> dict[str, bool]:
+    def visible(
+        self, parts: Collection[str], near: Collection[str] = ()
+    ) -> dict[str, bool]:
         """Say whether each node of all layers is visible.
 
         Args:

@@ -34,7 +34,9 @@ Name = tuple[str, FloatArray]
 """Words, and the point (3,) that they name [m, world]."""
 
 
-def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) -> FloatArray:
+def laid_out(
+    anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]
+) -> FloatArray:
     """Place the names' boxes.
 
     Args:
@@ -49,18 +51,31 @@ def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) 
     ways = np.stack([np.cos(turns), -np.sin(turns)], axis=1)
     rings = np.repeat(np.arange(len(RINGS_PX)), WAYS)
     preference = rings + 0.5 * (1.0 + np.tile(ways[:, 1], len(RINGS_PX)))
-    size = sizes.max(axis=0, initial=0.0)  # of every place, so that any name has room in it
+    size = sizes.max(
+        axis=0, initial=0.0
+    )  # of every place, so that any name has room in it
     places, named = np.zeros((0, 2)), np.zeros(0, dtype=int)
     for k in np.argsort(anchors[:, 1]):
         if not ((anchors[k] >= 0.0) & (anchors[k] <= area)).all():
             continue
         middles = np.concatenate([anchors[k] + (r + 0.5 * size) * ways for r in RINGS_PX])
-        inside = (np.abs(middles - 0.5 * np.array(area)) <= 0.5 * (area - size) - GAP_PX).all(1)
-        apart = (np.abs(middles[:, None] - places) >= size + GAP_PX).any(axis=2).all(axis=1)
-        covered = (np.abs(middles[:, None] - anchors) < 0.5 * size + GAP_PX).all(axis=2).sum(axis=1)
+        inside = (
+            np.abs(middles - 0.5 * np.array(area)) <= 0.5 * (area - size) - GAP_PX
+        ).all(1)
+        apart = (
+            (np.abs(middles[:, None] - places) >= size + GAP_PX).any(axis=2).all(axis=1)
+        )
+        covered = (
+            (np.abs(middles[:, None] - anchors) < 0.5 * size + GAP_PX)
+            .all(axis=2)
+            .sum(axis=1)
+        )
         cost = np.where(inside & apart, preference + 4.0 * covered, np.inf)
         if np.isfinite(cost).any():
-            places, named = np.vstack([places, middles[np.argmin(cost)]]), np.append(named, k)
+            places, named = (
+                np.vstack([places, middles[np.argmin(cost)]]),
+                np.append(named, k),
+            )
     # Where two leaders crossed, their names could change places and both would be shorter.
     lengths = np.linalg.norm(places[:, None] - anchors[named], axis=2)
     place, name = linear_sum_assignment(lengths)
@@ -77,16 +92,24 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
 def names_of_image(world: World) -> list[Name]:
     """Name source, sample and detector."""
     image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
-    named = ("X-ray source", world.source), ("sample", world.sample.shift), ("detector", image)
+    named = (
+        ("X-ray source", world.source),
+        ("sample", world.sample.shift),
+        ("detector", image),
+    )
     return [(words, at * MM) for words, at in named]
 
 
-def names_of_parts(machine: Machine, poses: Mapping[str, tuple[float, ...]]) -> list[Name]:
+def names_of_parts(
+    machine: Machine, poses: Mapping[str, tuple[float, ...]]
+) -> list[Name]:
     """List parts that move or have a role, at a corner, from their poses (w, x, y, z,
     place [m])."""
     out = []
     for part in machine.components:
-        if (pose := poses.get(part.name)) is not None and (part.axis is not None or part.role):
+        if (pose := poses.get(part.name)) is not None and (
+            part.axis is not None or part.role
+        ):
             (x, _, z), middle = part.size_mm, np.array(part.center_mm)
             turn = Rotation.from_quat(pose[:4], scalar_first=True)
             at = turn.apply((middle + [x / 2, 0.0, z / 2]) * MM) + pose[4:]
@@ -116,7 +139,13 @@ class NameTags:
         right = np.cross(ahead, camera.up_direction)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(ahead, right), ahead])
-        key = [area, camera.fov, eye.round(4), axes.round(4), [(w, p.round(4)) for w, p in names]]
+        key = [
+            area,
+            camera.fov,
+            eye.round(4),
+            axes.round(4),
+            [(w, p.round(4)) for w, p in names],
+        ]
         if self._drawn.get(client.client_id) == (seen := str(key)):
             return
         self._drawn[client.client_id] = seen
@@ -126,7 +155,9 @@ class NameTags:
         scale = 0.5 * area[1] / math.tan(0.5 * camera.fov)
         middle = 0.5 * np.array(area)
         anchors = middle + scale * np.stack([x, y], axis=1) / depth[:, None]
-        sizes = np.array([[PAD_PX + LETTER_PX * len(words), LINE_PX] for words, _ in names])
+        sizes = np.array(
+            [[PAD_PX + LETTER_PX * len(words), LINE_PX] for words, _ in names]
+        )
         sizes = sizes.reshape(-1, 2)
         corners = laid_out(anchors, sizes, area)
         there = np.flatnonzero(~np.isnan(corners[:, 0]))
@@ -150,6 +181,9 @@ class NameTags:
                     f"/names/{n}", names[k][0], position=place, anchor="center-center"
                 )
             client.scene.add_line_segments(
-                "/names/leaders", np.array(lines or np.zeros((1, 2, 3)), np.float32), LEADER,
-                thickness=2.0, thickness_units="screen",
-            )  # fmt: skip
+                "/names/leaders",
+                np.array(lines or np.zeros((1, 2, 3)), np.float32),
+                LEADER,
+                thickness=2.0,
+                thickness_units="screen",
+            )

@@ -1,4 +1,5 @@
-"""A scrubbed plan: a blue ghost of the machine and the focal spot's path; and the ray of a pixel.
+"""A scrubbed plan: a blue ghost of the machine and the focal spot's path; and the ray of a
+pixel.
 
 They are drawn for the viser clients of one page alone.
 """
@@ -41,7 +42,9 @@ class PlanDrawing:
         moving = {part.name for part in machine.components if machine.chain(part)}
         self._moving = [body for body in collision.bodies if body.name in moving]
 
-    def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
+    def ghost(
+        self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]
+    ) -> None:
         """Show some clients the moving parts at other motor positions.
 
         Args:
@@ -61,10 +64,17 @@ class PlanDrawing:
                     if handle is None:
                         vertices, faces = plain(bare(body.solid))
                         client.scene.add_mesh_simple(
-                            name, vertices, faces, color=GHOST, opacity=0.28,
-                            side="double", cast_shadow=False, receive_shadow=False,
-                            wxyz=turn, position=at,
-                        )  # fmt: skip
+                            name,
+                            vertices,
+                            faces,
+                            color=GHOST,
+                            opacity=0.28,
+                            side="double",
+                            cast_shadow=False,
+                            receive_shadow=False,
+                            wxyz=turn,
+                            position=at,
+                        )
                     else:
                         handle.wxyz, handle.position = turn, at
 
@@ -72,7 +82,9 @@ class PlanDrawing:
         """Show them no longer."""
         _remove(clients, "/ghost")
 
-    def orbit(self, clients: Sequence[viser.ClientHandle], points: FloatArray | None) -> None:
+    def orbit(
+        self, clients: Sequence[viser.ClientHandle], points: FloatArray | None
+    ) -> None:
         """Show some clients the focal spot's path as the sample sees it; None: no longer.
 
         Args:
@@ -88,15 +100,20 @@ class PlanDrawing:
 
 
 def _draw_lines(
-    clients: Sequence[viser.ClientHandle], name: str, lines: FloatArray | None,
-    color: tuple[int, int, int], px: float,
-) -> None:  # fmt: skip
+    clients: Sequence[viser.ClientHandle],
+    name: str,
+    lines: FloatArray | None,
+    color: tuple[int, int, int],
+    px: float,
+) -> None:
     """Replace the lines (n, 2, 3) [mm] that clients had under this name; None removes
     them."""
     _remove(clients, name)
     if lines is not None and len(lines):
         for client in clients:
-            client.scene.add_line_segments(name, lines * MM, color, thickness=px, **SCREEN)
+            client.scene.add_line_segments(
+                name, lines * MM, color, thickness=px, **SCREEN
+            )
 
 
 def _remove(clients: Iterable[viser.ClientHandle], name: str) -> None:

@@ -148,7 +148,9 @@ def _skins(phantom: Phantom) -> SampleLook:
         vertices, faces = plain(mesh)
         name = "".join(c if c.isalnum() else "_" for c in material)
         dense = material == "steel" and len(groups) > 1
-        skins.append(Skin(name, vertices, faces, COLORS.get(material, OTHER_COLOR), dense))
+        skins.append(
+            Skin(name, vertices, faces, COLORS.get(material, OTHER_COLOR), dense)
+        )
     return SampleLook(tuple(skins), np.asarray(phantom.beads))
 
 

@@ -1,7 +1,8 @@
 """A picture of the scene that the viewer computes itself, for pages that cannot draw one yet.
 
-Triangles are shaded flat and compete for pixels by their depth, in whole arrays: triangles of about
-one size are filled together. The live scene replaces it, so shadows and smooth surfaces can wait.
+Triangles are shaded flat and compete for pixels by their depth, in whole arrays: triangles of
+about one size are filled together. The live scene replaces it, so shadows and smooth surfaces
+can wait.
 """
 
 from __future__ import annotations
@@ -88,7 +89,9 @@ def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
     y, x = (part[..., None] for part in np.mgrid[: rows + 1, : cols + 1])
     grid = (first + (right - first) * x / cols + (down - first) * y / rows) * MM
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
-    halves = [np.stack(three, axis=2).reshape(-1, 3, 3) for three in ((a, d, c), (a, c, b))]
+    halves = [
+        np.stack(three, axis=2).reshape(-1, 3, 3) for three in ((a, d, c), (a, c, b))
+    ]
     return Shape(np.concatenate(halves), np.concatenate([colors, colors]), lit=False)
 
 
@@ -116,7 +119,11 @@ def drawn(
     width, height = (fine * side for side in size)
     above, below = (np.array(color, dtype=np.float32) for color in GROUND[dark])
     down = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
-    out = np.broadcast_to(above + down * (below - above), (height, width, 3)).reshape(-1, 3).copy()
+    out = (
+        np.broadcast_to(above + down * (below - above), (height, width, 3))
+        .reshape(-1, 3)
+        .copy()
+    )
     nearest = np.zeros(width * height, dtype=np.float32)
     solid = [shape for shape in shapes if shape.opacity >= 1.0]
     for group in (solid, *([shape] for shape in shapes if shape.opacity < 1.0)):
@@ -138,7 +145,9 @@ def drawn(
 def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
     """Encode as good a JPEG as fits into `most` bytes (or the worst)."""
     for quality in (85, 75, 60, 40):
-        coded = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        coded = cv2.imencode(
+            ".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
+        )[1]
         if coded.size <= most:
             break
     return coded.tobytes()
@@ -151,11 +160,15 @@ def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
     a, b, c = np.moveaxis(shape.corners, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    facing = np.clip(normal @ KEY, 0.0, 1.0) * (1.05 - SKY) + SKY * (0.8 + 0.2 * normal[:, 2])
+    facing = np.clip(normal @ KEY, 0.0, 1.0) * (1.05 - SKY) + SKY * (
+        0.8 + 0.2 * normal[:, 2]
+    )
     return np.asarray(color * facing[:, None], dtype=np.float32)
 
 
-def _projected(corners: FloatArray, camera: Standpoint, width: int, height: int) -> FloatArray:
+def _projected(
+    corners: FloatArray, camera: Standpoint, width: int, height: int
+) -> FloatArray:
     """Project corners (n, 3, 3) to column, row [px] and inverse depth [1/m]; NaN too
     near the eye."""
     eye, up = np.asarray(camera.position), np.asarray(camera.up)
@@ -188,30 +201,39 @@ def _filled(
     high = np.minimum(np.ceil(corners[:, :, :2].max(axis=1)), [width, height])
     low = np.maximum(low, 0)
     x, y, inverse = np.moveaxis(corners, 2, 0)
-    # An edge, and the inverse depth, is a plane over the screen: of each its slopes and its height
-    # at the middle of the triangle's first pixel.
+    # An edge, and the inverse depth, is a plane over the screen: of each its slopes and its
+    # height at the middle of the triangle's first pixel.
     to_x, to_y = np.roll(x, -1, axis=1) - x, np.roll(y, -1, axis=1) - y
     area = to_x[:, 0] * to_y[:, 1] - to_y[:, 0] * to_x[:, 1]
     edges = np.stack([-to_y, to_x], axis=2)
     at = to_x * (low[:, 1:] + 0.5 - y) - to_y * (low[:, :1] + 0.5 - x)
     part = np.roll(inverse, 1, axis=1) / area[:, None]
-    planes = np.concatenate([edges, (part[:, :, None] * edges).sum(axis=1)[:, None]], axis=1)
+    planes = np.concatenate(
+        [edges, (part[:, :, None] * edges).sum(axis=1)[:, None]], axis=1
+    )
     planes = planes.astype(np.float32)
     at = np.concatenate([at, (part * at).sum(axis=1)[:, None]], axis=1).astype(np.float32)
     # Rows go downwards, so a triangle that is counter-clockwise from the front has a negative
     # area.
-    whole = np.isfinite(corners).all(axis=(1, 2)) & (high > low).all(axis=1) & (area < 0.0)
+    whole = (
+        np.isfinite(corners).all(axis=(1, 2)) & (high > low).all(axis=1) & (area < 0.0)
+    )
     depth = np.zeros(width * height, dtype=np.float32)
     which = np.full(width * height, -1, dtype=np.int64)
     sides = np.where(whole[:, None], np.maximum(high - low, 1.0), 1.0)
     power = np.ceil(np.log2(sides)).astype(int)
     for across, down in np.unique(power[whole], axis=0).tolist():
         of_class = np.flatnonzero(whole & (power == (across, down)).all(axis=1))
-        columns, rows = np.arange(2**across)[None, None], np.arange(2**down)[None, :, None]
+        columns, rows = (
+            np.arange(2**across)[None, None],
+            np.arange(2**down)[None, :, None],
+        )
         pieces = 1 + (len(of_class) << (across + down)) // PLACES_AT_ONCE
         for some in np.array_split(of_class, pieces):
             first, last = low[some].astype(int), high[some].astype(int)
-            inside = (columns < (last - first)[:, :1, None]) & (rows < (last - first)[:, 1:, None])
+            inside = (columns < (last - first)[:, :1, None]) & (
+                rows < (last - first)[:, 1:, None]
+            )
             for k in range(4):
                 a, b = (planes[some, k, n, None, None] for n in (0, 1))
                 value = (at[some, k, None, None] + b * rows.astype(np.float32)) + (

@@ -40,8 +40,12 @@ TUBE_MM = (110.0, 110.0, 100.0)
 [mm]."""
 RIM_CORNERS: Final = 12
 """Number of corners of the polygon around the cylinder in which a sample turns."""
-FOV_RAD: Final = {"iso": math.radians(30.0), "side": math.radians(24.0),
-                  "free": math.radians(34.0), "sample": math.radians(30.0)}  # fmt: skip
+FOV_RAD: Final = {
+    "iso": math.radians(30.0),
+    "side": math.radians(24.0),
+    "free": math.radians(34.0),
+    "sample": math.radians(30.0),
+}
 """View -> vertical opening of its camera [rad]."""
 
 
@@ -75,7 +79,9 @@ class Standpoint:
     fov: float
 
 
-FREE = Standpoint((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
+FREE = Standpoint(
+    (-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0)
+)
 """Camera of exported scenes for which no person has chosen one."""
 
 
@@ -102,8 +108,12 @@ class Fitted:
         Args:
             aspect: the pane's width over its height.
         """
-        cameras = [fitted(self.points, way, self.fov, self.around, aspect) for way in self.ways]
-        return min(cameras, key=lambda one: float(np.linalg.norm(self.around - one.position)))
+        cameras = [
+            fitted(self.points, way, self.fov, self.around, aspect) for way in self.ways
+        ]
+        return min(
+            cameras, key=lambda one: float(np.linalg.norm(self.around - one.position))
+        )
 
     def fits(self, camera: Standpoint, aspect: float) -> bool:
         """Check that a camera holds all points and wastes no room.
@@ -120,7 +130,8 @@ class Fitted:
             return False
         slope = depth * math.tan(0.5 * camera.fov)
         reach = max(
-            float(np.abs(x / slope).max()) / bounded(aspect), float(np.abs(y / slope).max())
+            float(np.abs(x / slope).max()) / bounded(aspect),
+            float(np.abs(y / slope).max()),
         )
         return LEAST_REACH < reach < 1.0
 
@@ -134,7 +145,9 @@ def bounded(aspect: float) -> float:
     return min(MAX_ASPECT, max(MIN_ASPECT, aspect))
 
 
-def presets(world: World, radius_mm: float, rim_mm: FloatArray | None = None) -> dict[str, Fitted]:
+def presets(
+    world: World, radius_mm: float, rim_mm: FloatArray | None = None
+) -> dict[str, Fitted]:
     """View -> the camera that it opens with, for all but the beam's eye.
 
     Args:
@@ -169,7 +182,12 @@ def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArr
     """
     if not any(len(some) for some in vertices_m):
         return None
-    ends = np.array([[some.min(axis=0), some.max(axis=0)] for some in vertices_m if len(some)]) / MM
+    ends = (
+        np.array(
+            [[some.min(axis=0), some.max(axis=0)] for some in vertices_m if len(some)]
+        )
+        / MM
+    )
     low, high = ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
     pick = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)])
     corners = world.sample @ np.where(pick, high, low)
@@ -208,7 +226,8 @@ def fitted(
     eye, back = np.zeros(3), []
     for k, share in ((0, bounded(aspect)), (1, 1.0)):
         slope = ROOM * share * math.tan(0.5 * fov)
-        # On the left each point wants x - eye >= -slope * (depth - eye's depth); right likewise.
+        # On the left each point wants x - eye >= -slope * (depth - eye's depth); right
+        # likewise.
         left = (seen[:, k] + slope * seen[:, 2]).min()
         right_of = (seen[:, k] - slope * seen[:, 2]).max()
         back.append((left - right_of) / (2.0 * slope))
@@ -240,7 +259,9 @@ def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
     width, height = cols * pu, rows * pv
     left, top = (column + 0.5) * pu, (row + 0.5) * pv
     half_w, half_h = max(left, width - left), max(top, height - top)
-    exact = 2.0 * half_w <= MAX_SIZE_RATIO * width and 2.0 * half_h <= MAX_SIZE_RATIO * height
+    exact = (
+        2.0 * half_w <= MAX_SIZE_RATIO * width and 2.0 * half_h <= MAX_SIZE_RATIO * height
+    )
     if exact:
         target, far = world.foot, world.distance
     else:

@@ -1,8 +1,8 @@
 """From the twin's state to positions in the world frame; in mm.
 
-Positions come from motors and calibration profile as in `kinematics`, and the correction in force
-is added as in `poses`, so the drawing shows the public geometry that `geometry.get` states. The
-hidden misalignment is unknown here.
+Positions come from motors and calibration profile as in `kinematics`, and the correction in
+force is added as in `poses`, so the drawing shows the public geometry that `geometry.get`
+states. The hidden misalignment is unknown here.
 """
 
 from __future__ import annotations
@@ -105,9 +105,13 @@ class World:
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
     """Convert the wire's camera settings to the twin's."""
     return CameraSettings(
-        camera.mode, Roi(*camera.roi), camera.exposure_ms, camera.averages, camera.frames,
+        camera.mode,
+        Roi(*camera.roi),
+        camera.exposure_ms,
+        camera.averages,
+        camera.frames,
         machine.detector.camera.modes,
-    )  # fmt: skip
+    )
 
 
 def parameters_of(state: State) -> Offsets:

@@ -74,7 +74,9 @@ def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Face
     """
     dense = data > level
     corners = [
-        dense[tuple(slice(k, n - 1 + k) for k, n in zip(corner, dense.shape, strict=True))]
+        dense[
+            tuple(slice(k, n - 1 + k) for k, n in zip(corner, dense.shape, strict=True))
+        ]
         for corner in product((0, 1), repeat=3)
     ]
     mixed = np.any(corners, axis=0) & ~np.all(corners, axis=0)
@@ -97,7 +99,9 @@ def _quads(dense: npt.NDArray[np.bool_], number: npt.NDArray[np.int32]) -> Faces
     for axis in range(3):
         u, v = (np.eye(3, dtype=int)[(axis + k) % 3] for k in (1, 2))
         lower = dense[tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))]
-        upper = dense[tuple(slice(1, None) if k == axis else slice(None) for k in range(3))]
+        upper = dense[
+            tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
+        ]
         at = np.argwhere(lower != upper)
         a, b, c, d = (number[tuple((at - back).T)] for back in (u + v, v, 0 * u, u))
         leaving = lower[tuple(at.T)]

@@ -87,8 +87,8 @@ def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], b
         most: voxels at most; a larger volume becomes means over cubes.
 
     Returns:
-        The head: shape (z, y, x) of the codes, `factor` voxels a side of a cube, the values `low`
-        and `high` of codes 1 and TOP + 1, and the `window` to begin with. And the codes,
+        The head: shape (z, y, x) of the codes, `factor` voxels a side of a cube, the values
+        `low` and `high` of codes 1 and TOP + 1, and the `window` to begin with. And the codes,
         little-endian.
     """
     factor = 1
@@ -111,7 +111,13 @@ def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], b
         (float(v) for v in np.percentile(some, (1.0, 99.8))) if some.size else (low, high)
     )
     window = [max(dark, -LOW_SHARE * abs(bright)), max(bright, dark + 1e-9)]
-    head = {"shape": [nz, ny, nx], "factor": factor, "low": low, "high": high, "window": window}
+    head = {
+        "shape": [nz, ny, nx],
+        "factor": factor,
+        "low": low,
+        "high": high,
+        "window": window,
+    }
     return head, codes.tobytes()
 
 
@@ -153,10 +159,15 @@ class Held:
     def hold(self, data: Float32Array, grid: Volume) -> None:
         """Store a volume for requests."""
         self.grid, self.volumes = grid, {"volume": data}
-        self.about |= {"size": list(data.shape[::-1]), "voxel_mm": float(np.max(grid.voxel_mm))}
+        self.about |= {
+            "size": list(data.shape[::-1]),
+            "voxel_mm": float(np.max(grid.voxel_mm)),
+        }
 
 
-def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda: True) -> None:
+def grow(
+    held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda: True
+) -> None:
     """Reconstruct a data set while it is taken.
 
     Args:
@@ -220,12 +231,19 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         TwinError: as `reconstruct_volume`.
     """
     data = load_dataset(folder)
-    held.dataset, held.request = data, VolumeRequest(binning=max(1, round(data.shape[1] / side)))
+    held.dataset, held.request = (
+        data,
+        VolumeRequest(binning=max(1, round(data.shape[1] / side))),
+    )
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
-        volume = reconstruct_volume(data, held.request, progress=_share(held, "done"), errors=True)
+        volume = reconstruct_volume(
+            data, held.request, progress=_share(held, "done"), errors=True
+        )
     said, accuracy = [str(doubt.message) for doubt in doubts], volume.accuracy
-    if accuracy is not None and not accuracy.warnings:  # the accuracy has the same warnings
+    if (
+        accuracy is not None and not accuracy.warnings
+    ):  # the accuracy has the same warnings
         said.append(str(accuracy))
     held.hold(volume.data, volume)
     held.keep(
@@ -282,15 +300,25 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
     """
     data, grid, request = held.dataset, held.grid, held.request
     if data is None or grid is None or request is None:
-        raise TwinError("only the finished volume of a past scan is compared with its truth", {})
+        raise TwinError(
+            "only the finished volume of a past scan is compared with its truth", {}
+        )
     voxel_mm = float(np.max(grid.voxel_mm))
     held.say(comparing=0.0)
     truth = held.volumes.setdefault("truth", truth_of(data, grid))
     held.volumes["difference"] = held.volumes["volume"] - truth
     rows = {_named(data.correction): figures(held.volumes["volume"], truth, voxel_mm)}
-    other = NOMINAL if data.correction is not None else None if now is None else now.parameters
+    other = (
+        NOMINAL
+        if data.correction is not None
+        else None
+        if now is None
+        else now.parameters
+    )
     if other is not None:
-        same = replace(request, voxel_mm=voxel_mm, shape=grid.shape, center_mm=grid.center_mm)
+        same = replace(
+            request, voxel_mm=voxel_mm, shape=grid.shape, center_mm=grid.center_mm
+        )
         progress = _share(held, "comparing")
         made = reconstruct_volume(data, same, parameters=other, progress=progress)
         held.volumes["other"] = made.data
@@ -358,9 +386,13 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
     try:
         work()
-    except Exception as error:  # of any kind: the page shows it instead of waiting for ever
+    except (
+        Exception
+    ) as error:  # of any kind: the page shows it instead of waiting for ever
         known = isinstance(error, (TwinError, OSError, ValueError))
-        held.keep(**{problem: str(error) if known else f"{type(error).__name__}: {error}"})
+        held.keep(
+            **{problem: str(error) if known else f"{type(error).__name__}: {error}"}
+        )
 
 
 def main() -> None:

@@ -18,7 +18,9 @@ from flexdt.runtime.workers import ENVIRONMENT
 
 PROGRAM: Final = "flexdt.clients.viewer.volumes.live_volume"
 LINE_BYTES: Final = 4 << 20
-SINGLE: Final = {name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")}
+SINGLE: Final = {
+    name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")
+}
 """Environment of the process, which sets the number of threads of its kernels itself."""
 Answer = tuple[dict[str, Any], bytes]
 Wish = tuple[str, ...]
@@ -143,7 +145,13 @@ class LiveReconstruction:
 
 async def _started() -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
-        sys.executable, "-P", "-m", PROGRAM,
-        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.DEVNULL, env={**os.environ, **SINGLE}, limit=LINE_BYTES,
-    )  # fmt: skip
+        sys.executable,
+        "-P",
+        "-m",
+        PROGRAM,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+        env={**os.environ, **SINGLE},
+        limit=LINE_BYTES,
+    )

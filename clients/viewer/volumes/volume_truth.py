@@ -52,7 +52,8 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     name = "" if document is None else document.sample.name
     if not is_shipped(name):
         raise TwinError(
-            f"{dataset.where}: what the sample {name!r} is made of is not known here; known: the "
+            f"{dataset.where}: what the sample {name!r} is made of is not known here; "
+            "known: the "
             "phantoms of flexdt, in scans of the twin",
             {"asked": name, "allowed": "a phantom that ships with flexdt"},
         )
@@ -70,15 +71,21 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     nz, ny, nx = like.shape
     axes = [
         (np.arange(n) - (n - 1) / 2) * step + center
-        for n, step, center in zip((nx, ny, nz), like.voxel_xyz, like.center_mm, strict=True)
+        for n, step, center in zip(
+            (nx, ny, nz), like.voxel_xyz, like.center_mm, strict=True
+        )
     ]
     y, x = np.meshgrid(axes[1], axes[0], indexing="ij")
     out = np.zeros(like.shape, np.float32)
     ends = (np.array(whole.shape[::-1]) - 1) / 2
-    for k, z in enumerate(axes[2]):  # a layer at a time: places take six times as much as voxels
+    for k, z in enumerate(
+        axes[2]
+    ):  # a layer at a time: places take six times as much as voxels
         seen = np.stack([x - shift[0], y - shift[1], np.full_like(x, z - shift[2])])
         inside = np.tensordot(back, seen, axes=1) - np.reshape(whole.center_mm, (3, 1, 1))
-        at = inside / np.reshape(whole.voxel_xyz, (3, 1, 1)) + ends.reshape(3, 1, 1) + half
+        at = (
+            inside / np.reshape(whole.voxel_xyz, (3, 1, 1)) + ends.reshape(3, 1, 1) + half
+        )
         out[k] = ndimage.map_coordinates(data, at[::-1], order=1, mode="constant")
     return np.maximum(out, 0.0, out=out)  # a hole leaves a rounding error
 
@@ -123,11 +130,18 @@ def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[
     box = ndimage.find_objects(solid.astype(np.int8))
     around = tuple(slice(max(0, s.start - 3), s.stop + 3) for s in box[0]) if box else ...
     apart = (values[around] - truth[around])[known[around]]
-    rms = float(np.sqrt(np.mean(np.square(apart, dtype=np.float64)))) if apart.size else math.nan
+    rms = (
+        float(np.sqrt(np.mean(np.square(apart, dtype=np.float64))))
+        if apart.size
+        else math.nan
+    )
     filled = np.where(known, values, 0.0)
     pairs = {
         "attenuation": (seen_mu, mu),
-        "void": (1 - (seen & enclosed).sum() / whole, 1 - (solid & enclosed).sum() / whole),
+        "void": (
+            1 - (seen & enclosed).sum() / whole,
+            1 - (solid & enclosed).sum() / whole,
+        ),
         **{
             f"{name}_mm": tuple(
                 voxel_mm * extent(data, truth, axis, level, mu)
@@ -162,7 +176,9 @@ def main_level(truth: Float32Array) -> float:
     return float(np.exp(np.median(there[alike])))
 
 
-def extent(values: Float32Array, truth: Float32Array, axis: int, seen: float, mu: float) -> float:
+def extent(
+    values: Float32Array, truth: Float32Array, axis: int, seen: float, mu: float
+) -> float:
     """Measure the extent from one face to the other along an axis, where the truth is
     widest [voxels].
 
@@ -181,7 +197,10 @@ def extent(values: Float32Array, truth: Float32Array, axis: int, seen: float, mu
     there = solid.any(axis=-1)
     if not there.any():
         return math.nan
-    first, last = solid.argmax(axis=-1), solid.shape[-1] - 1 - solid[..., ::-1].argmax(axis=-1)
+    first, last = (
+        solid.argmax(axis=-1),
+        solid.shape[-1] - 1 - solid[..., ::-1].argmax(axis=-1),
+    )
     widest = there & (last - first >= (last - first)[there].max() - 1)
     profile = np.pad(np.median(np.moveaxis(values, axis, -1)[widest], axis=0), 1)
     above = np.flatnonzero(profile > seen / 2)

@@ -31,18 +31,22 @@ PROGRESS_S = 2.0
 
 def batch(
     plan: Path = argument(..., "PLAN.toml"),
-    out: Path | None = option(None, "Write results here; default: the plan's name.", metavar="DIR"),
+    out: Path | None = option(
+        None, "Write results here; default: the plan's name.", metavar="DIR"
+    ),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
-    slurm: Path | None = option(None, "Submit workers to SLURM as this file says.", metavar="FILE"),
+    slurm: Path | None = option(
+        None, "Submit workers to SLURM as this file says.", metavar="FILE"
+    ),
     slurm_script: bool = option(
         False, "Print the script of --slurm's jobs and leave.", "--slurm-script"
     ),
 ) -> Answer:
     """Make a batch of scans or calibrations; run again to take up an interrupted one.
 
-    Results are Zarr arrays and a manifest with every item's seed, parameters and checksums; they
-    are the same bytes whatever the number of processes.
+    Results are Zarr arrays and a manifest with every item's seed, parameters and checksums;
+    they are the same bytes whatever the number of processes.
     """
     from flexdt_extensions.batch.batch_plan import read_plan
     from flexdt_extensions.batch.batch_run import run_batch
@@ -95,7 +99,12 @@ def batch(
     if found:
         yield f"{found['identifiable']} of {found['judged']} calibrations are identifiable"
         rows = [
-            (name, f"{f['mae']:.4g}", f"{f['rms_pull']:.3g}", f"{100 * f['within_95']:.1f} %")
+            (
+                name,
+                f"{f['mae']:.4g}",
+                f"{f['rms_pull']:.3g}",
+                f"{100 * f['within_95']:.1f} %",
+            )
             for name, f in found["parameters"].items()
         ]
         yield table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma"))

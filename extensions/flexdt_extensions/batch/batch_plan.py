@@ -1,10 +1,11 @@
 """The plan of a batch: a TOML file as validated, frozen values; errors name key path and value.
 
-The manifest holds the plan with every default written out, so no result depends on a hidden one.
+The manifest holds the plan with every default written out, so no result depends on a hidden
+one.
 
-A plan fixes or draws values: `600.0`, `{ uniform = [500, 800] }`, `{ choice = [...] }`. Each is a
-frozen value with `sample(rng)`; the caller owns the generator. Validation errors name the allowed
-values.
+A plan fixes or draws values: `600.0`, `{ uniform = [500, 800] }`, `{ choice = [...] }`. Each is
+a frozen value with `sample(rng)`; the caller owns the generator. Validation errors name the
+allowed values.
 """
 
 from __future__ import annotations
@@ -80,7 +81,9 @@ class Draw:
 _SAMPLERS: Final[Mapping[str, Callable[[Any, Generator], Any]]] = {
     "fixed": lambda v, rng: v[0],
     "uniform": lambda v, rng: float(rng.uniform(v[0], v[1])),
-    "loguniform": lambda v, rng: float(math.exp(rng.uniform(math.log(v[0]), math.log(v[1])))),
+    "loguniform": lambda v, rng: float(
+        math.exp(rng.uniform(math.log(v[0]), math.log(v[1])))
+    ),
     "normal": lambda v, rng: float(rng.normal(v[0], v[1])),
     "integers": lambda v, rng: int(rng.integers(v[0], v[1], endpoint=True)),
     "choice": lambda v, rng: v[int(rng.integers(len(v)))],
@@ -89,7 +92,11 @@ KINDS: Final = tuple(k for k in _SAMPLERS if k != "fixed")
 
 
 def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+    )
 
 
 def parse(value: object) -> Draw:
@@ -105,20 +112,30 @@ def parse(value: object) -> Draw:
         return value
     if isinstance(value, str) or _number(value):
         return Draw("fixed", (value,))  # type: ignore[arg-type]
-    if not isinstance(value, Mapping) or len(value) != 1 or next(iter(value)) not in KINDS:
-        raise ValueError(f"got {value!r}; allowed: a value, or a table with one of {list(KINDS)}")
+    if (
+        not isinstance(value, Mapping)
+        or len(value) != 1
+        or next(iter(value)) not in KINDS
+    ):
+        raise ValueError(
+            f"got {value!r}; allowed: a value, or a table with one of {list(KINDS)}"
+        )
     ((kind, given),) = value.items()
     if not isinstance(given, list) or not given:
         raise ValueError(f"{kind} takes a list, got {given!r}")
     if kind == "choice":
         if not (all(isinstance(v, str) for v in given) or all(_number(v) for v in given)):
-            raise ValueError(f"choice takes texts or numbers, not both or others: {given!r}")
+            raise ValueError(
+                f"choice takes texts or numbers, not both or others: {given!r}"
+            )
         return Draw(kind, tuple(given))
     if len(given) != 2 or not all(_number(v) for v in given):
         raise ValueError(f"{kind} takes two numbers, got {given!r}")
     low, high = given
     if kind == "normal" and high < 0:
-        raise ValueError(f"normal takes a mean and a standard deviation >= 0, got {given!r}")
+        raise ValueError(
+            f"normal takes a mean and a standard deviation >= 0, got {given!r}"
+        )
     if kind == "loguniform" and low <= 0:
         raise ValueError(f"loguniform takes numbers above 0, got {given!r}")
     if kind == "integers" and not all(isinstance(v, int) for v in given):
@@ -155,7 +172,9 @@ def _counts(value: object) -> Draw:
 def _names(value: object) -> Draw:
     draw = parse(value)
     if not all(isinstance(v, str) for v in draw.values):
-        raise ValueError(f"a name or a choice of names is needed, got {draw.to_plain()!r}")
+        raise ValueError(
+            f"a name or a choice of names is needed, got {draw.to_plain()!r}"
+        )
     return draw
 
 
@@ -169,8 +188,13 @@ Name: TypeAlias = Annotated[Draw, BeforeValidator(_names), _plain, _schema]
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False,
-                              arbitrary_types_allowed=True)  # fmt: skip
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+    )
 
 
 def _fixed(value: float | str) -> Draw:
@@ -184,7 +208,9 @@ class Batch(_Table):
     kind: Literal["projections", "calibrations"]
     items: Annotated[int, Ge(1), Le(10_000_000)]
     seed: Annotated[int, Ge(0)] = Field(description="of everything that is drawn")
-    shard: Annotated[int, Ge(1), Le(100_000)] = Field(default=1, description="items a file")
+    shard: Annotated[int, Ge(1), Le(100_000)] = Field(
+        default=1, description="items a file"
+    )
 
 
 class Cuboid(_Table):
@@ -212,7 +238,9 @@ class Spheres(_Table):
 class PhantomTable(_Table):
     """The scanned phantom: one of three forms."""
 
-    name: Name | None = Field(default=None, description="as `flexdt phantom list` has them")
+    name: Name | None = Field(
+        default=None, description="as `flexdt phantom list` has them"
+    )
     cuboid: Cuboid | None = None
     spheres: Spheres | None = None
 
@@ -229,8 +257,12 @@ class Geometry(_Table):
 
     sod_mm: Positive = _fixed(600.0)
     sdd_mm: Positive = _fixed(1059.0)
-    height_mm: Number = Field(default=_fixed(0.0), description="of the sample above the beam")
-    lateral_mm: Number = Field(default=_fixed(0.0), description="of the axis from the beam")
+    height_mm: Number = Field(
+        default=_fixed(0.0), description="of the sample above the beam"
+    )
+    lateral_mm: Number = Field(
+        default=_fixed(0.0), description="of the axis from the beam"
+    )
     frames: Annotated[int, Ge(1), Le(100_000)] = 36
     turn_deg: Annotated[float, Gt(0)] = 360.0
     start_deg: Number = _fixed(0.0)
@@ -293,7 +325,9 @@ class Calibrate(_Table):
     """How each calibration is done."""
 
     fidelity: Literal["points", "images"] = "points"
-    free: Annotated[list[str], Len(1, len(NAMES))] = Field(default_factory=lambda: list(SIX))
+    free: Annotated[list[str], Len(1, len(NAMES))] = Field(
+        default_factory=lambda: list(SIX)
+    )
     priors: dict[str, Annotated[float, Ge(0)]] | Literal["none"] | None = Field(
         default=None,
         description="what is known of other parameters [mm, deg, 1], in place of what is assumed; "
@@ -309,7 +343,9 @@ class Calibrate(_Table):
     def _known(self) -> Calibrate:
         wrong = [n for n in self.free if n not in NAMES]
         if wrong:
-            raise ValueError(f"free: unknown parameters {wrong}; allowed: {', '.join(NAMES)}")
+            raise ValueError(
+                f"free: unknown parameters {wrong}; allowed: {', '.join(NAMES)}"
+            )
         try:
             CalibrationRequest(free=tuple(self.free), priors=self.stated_priors)
         except TwinError as error:
@@ -330,7 +366,8 @@ class Plan(_Table):
     geometry: Geometry = Field(default_factory=Geometry)
     camera: Camera = Field(default_factory=Camera)
     errors: dict[str, Number] = Field(
-        default_factory=dict, description="hidden misalignment, true minus nominal [mm, deg]"
+        default_factory=dict,
+        description="hidden misalignment, true minus nominal [mm, deg]",
     )
     images: Images = Field(default_factory=Images)
     reconstruct: Reconstruct | None = None
@@ -346,12 +383,16 @@ class Plan(_Table):
         """
         wrong = [n for n in self.errors if n not in NAMES]
         if wrong:
-            raise ValueError(f"errors: unknown parameters {wrong}; allowed: {', '.join(NAMES)}")
+            raise ValueError(
+                f"errors: unknown parameters {wrong}; allowed: {', '.join(NAMES)}"
+            )
         calibrations = self.batch.kind == "calibrations"
         if calibrations and self.reconstruct is not None:
             raise ValueError("reconstruct belongs to kind projections")
         if calibrations and self.phantom.spheres is not None:
-            raise ValueError("calibrations need beads: give phantom.name or phantom.cuboid")
+            raise ValueError(
+                "calibrations need beads: give phantom.name or phantom.cuboid"
+            )
         if self.images.physics != "ideal" and self.camera.shape is not None:
             raise ValueError(
                 f"images.physics {self.images.physics} models the machine's panel: give "
@@ -364,7 +405,9 @@ class Plan(_Table):
     @property
     def text(self) -> str:
         """The plan with all defaults as canonical JSON: equal plans have equal texts."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return json.dumps(
+            self.model_dump(mode="json"), sort_keys=True, separators=(",", ":")
+        )
 
     @property
     def sha256(self) -> str:

@@ -2,8 +2,8 @@
 
 `work` computes an item; `executors` provides the workers.
 
-The folder of a batch (`Store`) has arrays as Zarr, a log that survives a crash, and the manifest
-made of both.
+The folder of a batch (`Store`) has arrays as Zarr, a log that survives a crash, and the
+manifest made of both.
 
     OUT/data.zarr       Zarr 3: one array for each kind of result; the first axis counts items
     OUT/items.jsonl     finished items, one line each, written after the arrays; sorted at the end
@@ -58,7 +58,11 @@ class Store:
         self.folder, self.plan = folder, plan
         self._log_path = folder / "items.jsonl"
         self.records: dict[int, dict[str, Any]] = {}
-        self._head = {"format": FORMAT, "flexdt": version("flexdt"), "plan_sha256": plan.sha256}
+        self._head = {
+            "format": FORMAT,
+            "flexdt": version("flexdt"),
+            "plan_sha256": plan.sha256,
+        }
         self._waiting: dict[int, ItemOutcome] = {}
         folder.mkdir(parents=True, exist_ok=True)
         known = self._read()
@@ -104,7 +108,9 @@ class Store:
         """
         items = [self.records[i] for i in range(self.plan.batch.items)]
         self._tables(items)
-        arrays = {n: {"shape": list(s), "dtype": d} for n, (s, d) in layout(self.plan).items()}
+        arrays = {
+            n: {"shape": list(s), "dtype": d} for n, (s, d) in layout(self.plan).items()
+        }
         manifest = {
             **self._head,
             "plan": self.plan.model_dump(mode="json"),
@@ -145,7 +151,8 @@ class Store:
         if not self._log_path.exists():
             if any(self.folder.iterdir()):
                 raise CommandError(
-                    f"{self.folder}: holds files that are no batch of flexdt; choose another folder"
+                    f"{self.folder}: holds files that are no batch of flexdt; choose "
+                    "another folder"
                 )
             return False
         whole = self._log_path.read_bytes()
@@ -191,16 +198,21 @@ class Store:
             if all(name in root for name in wanted):
                 return {name: root[name] for name in wanted}
         attributes = {"format": FORMAT, "plan_sha256": self.plan.sha256}
-        root = zarr.create_group(where, overwrite=True, zarr_format=3, attributes=attributes)
+        root = zarr.create_group(
+            where, overwrite=True, zarr_format=3, attributes=attributes
+        )
         return {
             name: root.create_array(
-                name, shape=(self.plan.batch.items, *shape), chunks=(1, *shape), dtype=dtype,
+                name,
+                shape=(self.plan.batch.items, *shape),
+                chunks=(1, *shape),
+                dtype=dtype,
                 shards=(size, *shape) if (size := self.plan.batch.shard) > 1 else None,
                 fill_value=0 if dtype == "<u2" else float("nan"),
                 dimension_names=("item", *_AXES[name]),
             )
             for name, (shape, dtype) in wanted.items()
-        }  # fmt: skip
+        }
 
     def _tables(self, items: list[dict[str, Any]]) -> None:
         """Write figures as arrays too, so that readers need not parse the manifest.
@@ -213,13 +225,17 @@ class Store:
         tables: dict[str, np.ndarray[Any, Any]] = {"done": done}
         names = sorted(self.plan.errors)
         attributes: dict[str, dict[str, Any]] = {"truth": {"parameters": names}}
-        tables["truth"] = _table([i.get("parameters", {}).get("errors", {}) for i in items], names)
+        tables["truth"] = _table(
+            [i.get("parameters", {}).get("errors", {}) for i in items], names
+        )
         if self.plan.batch.kind == "calibrations":
             free = list(self.plan.calibrate.free)
             for name in ("values", "errors", "sigmas"):
                 tables[name] = _table([i.get(name, {}) for i in items], free)
                 attributes[name] = {"parameters": free}
-            tables["identifiable"] = np.array([bool(i.get("identifiable")) for i in items])
+            tables["identifiable"] = np.array(
+                [bool(i.get("identifiable")) for i in items]
+            )
         for name, values in tables.items():
             if values.size:
                 made = root.create_array(name, data=values, overwrite=True)
@@ -240,8 +256,9 @@ def figures(items: list[dict[str, Any]]) -> dict[str, Any]:
     """Sum up the identifiable calibrations; empty for images.
 
     Returns:
-        Counts, and for each parameter the mean absolute error, the root mean square of error over
-        stated sigma, and the share within 1.96 sigma (0.95 if errors are Gaussian and sigmas true).
+        Counts, and for each parameter the mean absolute error, the root mean square of error
+        over stated sigma, and the share within 1.96 sigma (0.95 if errors are Gaussian and
+        sigmas true).
     """
     judged = [i for i in items if "identifiable" in i]
     used = [i for i in judged if i["identifiable"]]
@@ -292,7 +309,11 @@ Tell = Callable[[int, int, float], None]
 
 
 def run_batch(
-    plan: Plan, out: Path, workers: AbstractContextManager[Executor], *, tell: Tell | None = None
+    plan: Plan,
+    out: Path,
+    workers: AbstractContextManager[Executor],
+    *,
+    tell: Tell | None = None,
 ) -> dict[str, Any]:
     """Compute the missing items of a batch.
 
@@ -356,7 +377,8 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
     try:
         while True:
             flying |= {
-                pool.submit(run_item, text, i) for i in islice(todo, in_flight - len(flying))
+                pool.submit(run_item, text, i)
+                for i in islice(todo, in_flight - len(flying))
             }
             if not flying:
                 return
@@ -369,7 +391,8 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
                     tell(count, store.plan.batch.items, rate)
     except BrokenProcessPool as error:
         raise CommandError(
-            f"a worker died ({error}); {len(store.records)} items are done: run the command again "
+            f"a worker died ({error}); {len(store.records)} items are done: run the "
+            "command again "
             "to go on"
         ) from None
     finally:

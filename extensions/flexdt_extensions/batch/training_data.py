@@ -1,4 +1,5 @@
-"""A batch's items for training: `TrainingData` by index, `stream` shard by shard, each with seeds.
+"""A batch's items for training: `TrainingData` by index, `stream` shard by shard, each with
+seeds.
 
 Both give dictionaries of arrays, which PyTorch's `DataLoader` collates: `TrainingData` is a
 map-style data set as it is, `stream` needs PyTorch.
@@ -97,19 +98,26 @@ class TrainingData:
         (24, 48, 64)
     """
 
-    def __init__(self, folder: Path | str, augment: Augment | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, folder: Path | str, augment: Augment | None = None, seed: int = 0
+    ) -> None:
         """Read the manifest and check that `augment` fits the images; see the class."""
         self.folder, self.augment, self.seed, self.epoch = Path(folder), augment, seed, 0
         file = self.folder / "manifest.json"
         if not file.is_file():
-            raise CommandError(f"{self.folder}: no finished batch; run `flexdt batch` to its end")
+            raise CommandError(
+                f"{self.folder}: no finished batch; run `flexdt batch` to its end"
+            )
         manifest = json.loads(file.read_text(encoding="utf-8"))
         plan = manifest["plan"]
         if augment is not None and plan["images"]["values"] != "line_integrals":
-            raise CommandError(f"{self.folder}: holds counts; augment needs line integrals")
+            raise CommandError(
+                f"{self.folder}: holds counts; augment needs line integrals"
+            )
         if augment is not None and augment.photons and plan["images"]["noise"]:
             raise CommandError(
-                f"{self.folder}: its images have noise; photons would add to it. Make the batch "
+                f"{self.folder}: its images have noise; photons would add to it. Make "
+                "the batch "
                 "with noise = false, or give Augment(photons=None)"
             )
         self.names = tuple(manifest["arrays"])
@@ -131,7 +139,9 @@ class TrainingData:
     def __getitem__(self, number: int) -> Sample:
         """Return an item: its arrays by name, and `index`, its number in the batch."""
         index = int(self.indices[number])
-        return self._finish(index, {name: self._arrays[name][index] for name in self.names})
+        return self._finish(
+            index, {name: self._arrays[name][index] for name in self.names}
+        )
 
     def order(self, rank: int = 0, ranks: int = 1) -> npt.NDArray[np.int64]:
         """Return this epoch's order of the shards that one process of several reads;
@@ -145,11 +155,16 @@ class TrainingData:
         shuffled inside."""
         for shard in self.order(rank, ranks).tolist():
             first = shard * self.shard
-            part = {name: self._arrays[name][first : first + self.shard] for name in self.names}
+            part = {
+                name: self._arrays[name][first : first + self.shard]
+                for name in self.names
+            }
             here = self.indices[self.indices // self.shard == shard]
             rng = np.random.default_rng((self.seed, self.epoch, shard))
             for index in rng.permutation(here).tolist():
-                yield self._finish(index, {n: values[index - first] for n, values in part.items()})
+                yield self._finish(
+                    index, {n: values[index - first] for n, values in part.items()}
+                )
 
     def _finish(self, index: int, sample: Sample) -> Sample:
         if self.augment is not None:

@@ -3,8 +3,8 @@
 An item that fails becomes an outcome that states the reason. No files are read or written.
 
 The plan's draws take their values from the item's own seed: item i draws from
-`SeedSequence(seed).spawn(items)[i]`, which any process can make by itself, so items come out the
-same in any order and with any number of processes.
+`SeedSequence(seed).spawn(items)[i]`, which any process can make by itself, so items come out
+the same in any order and with any number of processes.
 """
 
 from __future__ import annotations
@@ -108,8 +108,13 @@ def draw_item(plan: Plan, index: int) -> Item:
         name: getattr(g, name).sample(rng)
         for name in ("sod_mm", "sdd_mm", "height_mm", "lateral_mm", "start_deg")
     }
-    drawn |= {name: getattr(images, name).sample(rng) for name in ("kV", "power_W", "exposure_ms")}
-    drawn |= {name: getattr(calibrate, name).sample(rng) for name in ("noise_px", "counts")}
+    drawn |= {
+        name: getattr(images, name).sample(rng)
+        for name in ("kV", "power_W", "exposure_ms")
+    }
+    drawn |= {
+        name: getattr(calibrate, name).sample(rng) for name in ("noise_px", "counts")
+    }
     errors = {name: float(plan.errors[name].sample(rng)) for name in sorted(plan.errors)}
     phantom, described = _phantom(plan, index, rng)
     machine = builtin_machine(plan.camera.machine)
@@ -133,9 +138,18 @@ def draw_item(plan: Plan, index: int) -> Item:
         if camera is not None:
             check_distances(machine, camera, exposure, drawn["sod_mm"], drawn["sdd_mm"])
     return Item(
-        index, phantom, poses, Offsets.from_edge(errors), shape, machine, camera, exposure,
-        float(drawn["noise_px"]), float(drawn["counts"]), parameters,
-    )  # fmt: skip
+        index,
+        phantom,
+        poses,
+        Offsets.from_edge(errors),
+        shape,
+        machine,
+        camera,
+        exposure,
+        float(drawn["noise_px"]),
+        float(drawn["counts"]),
+        parameters,
+    )
 
 
 def detector_shape(plan: Plan) -> tuple[int, int]:
@@ -170,20 +184,29 @@ def _camera(
     standard, sensor = machine.detector.camera, machine.detector.pixels
     roi = standard.roi if wanted.roi is None else Roi(*wanted.roi)
     camera = replace(
-        standard, mode=wanted.mode or standard.mode, roi=roi, averages=plan.images.averages
+        standard,
+        mode=wanted.mode or standard.mode,
+        roi=roi,
+        averages=plan.images.averages,
     )
     if not (
-        0 <= roi.left <= roi.right < sensor.columns and 0 <= roi.top <= roi.bottom < sensor.rows
+        0 <= roi.left <= roi.right < sensor.columns
+        and 0 <= roi.top <= roi.bottom < sensor.rows
     ):
         raise TwinError(
             f"camera.roi {list(roi.edges)} does not lie on the sensor of {sensor.columns} x "
             f"{sensor.rows} pixels",
-            {"asked": list(roi.edges), "allowed": [0, 0, sensor.columns - 1, sensor.rows - 1]},
+            {
+                "asked": list(roi.edges),
+                "allowed": [0, 0, sensor.columns - 1, sensor.rows - 1],
+            },
         )
     return camera, camera.shape, camera.pixel_mm(sensor), camera.roi_shift_mm(sensor)
 
 
-def _phantom(plan: Plan, index: int, rng: np.random.Generator) -> tuple[Phantom, dict[str, Any]]:
+def _phantom(
+    plan: Plan, index: int, rng: np.random.Generator
+) -> tuple[Phantom, dict[str, Any]]:
     table = plan.phantom
     if table.name is not None:
         name = table.name.sample(rng)
@@ -199,9 +222,12 @@ def _cuboid(table: Cuboid, rng: np.random.Generator) -> tuple[Phantom, dict[str,
     values = {name: getattr(table, name).sample(rng) for name in type(table).model_fields}
     size = tuple(float(values[f"{side}_mm"]) for side in ("width", "breadth", "height"))
     made = bead_phantom(
-        size, int(values["beads"]), bead_radius_mm=float(values["bead_radius_mm"]),
-        body_material=values["body_material"], bead_material=values["bead_material"],
-    )  # fmt: skip
+        size,
+        int(values["beads"]),
+        bead_radius_mm=float(values["bead_radius_mm"]),
+        body_material=values["body_material"],
+        bead_material=values["bead_material"],
+    )
     return made, {"name": made.name, **values}
 
 
@@ -235,9 +261,13 @@ def _spheres(
                 {"asked": radius, "allowed": [wide, high]},
             )
         solids.append(Solid(Sphere(center, radius), made_of.name, made_of.mu_per_mm))
-        listed.append({"center_mm": list(center), "radius_mm": radius, "material": made_of.name})
+        listed.append(
+            {"center_mm": list(center), "radius_mm": radius, "material": made_of.name}
+        )
     size = (2.0 * wide, 2.0 * wide, 2.0 * high)
-    phantom = Phantom(f"spheres-{len(solids)}", "random spheres", Scene(tuple(solids)), size)
+    phantom = Phantom(
+        f"spheres-{len(solids)}", "random spheres", Scene(tuple(solids)), size
+    )
     return phantom, {"name": phantom.name, "spheres": listed}
 
 
@@ -249,8 +279,11 @@ def _place(
     for _ in range(MAX_TRIES):
         distance = (wide - radius) * math.sqrt(rng.uniform())
         turn = rng.uniform(0.0, 2.0 * math.pi)
-        at = (distance * math.cos(turn), distance * math.sin(turn),
-              rng.uniform(-(high - radius), high - radius))  # fmt: skip
+        at = (
+            distance * math.cos(turn),
+            distance * math.sin(turn),
+            rng.uniform(-(high - radius), high - radius),
+        )
         if all(math.dist(at, o.center) >= radius + o.radius for o in others):
             return at
     return None
@@ -299,7 +332,8 @@ def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
 def item_bytes(plan: Plan) -> int:
     """Compute the size of one item's arrays before compression [bytes]."""
     return sum(
-        math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout(plan).values()
+        math.prod(shape) * np.dtype(dtype).itemsize
+        for shape, dtype in layout(plan).values()
     )
 
 
@@ -333,12 +367,19 @@ def run_item(text: str, index: int) -> ItemOutcome:
         **arrays,
     }
     wanted = layout(plan)
-    kept = {name: np.ascontiguousarray(kept[name], dtype=wanted[name][1]) for name in wanted}
-    sums = {name: hashlib.sha256(values.tobytes()).hexdigest() for name, values in kept.items()}
+    kept = {
+        name: np.ascontiguousarray(kept[name], dtype=wanted[name][1]) for name in wanted
+    }
+    sums = {
+        name: hashlib.sha256(values.tobytes()).hexdigest()
+        for name, values in kept.items()
+    }
     if doubts:
         figures = {**figures, "warnings": doubts}
     status = "failed" if "error" in figures else "done"
-    return ItemOutcome(index, {**record, "status": status, **figures, "sha256": sums}, kept)
+    return ItemOutcome(
+        index, {**record, "status": status, **figures, "sha256": sums}, kept
+    )
 
 
 def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
@@ -347,7 +388,9 @@ def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
     if plan.batch.kind != "projections" or item.camera is None or not counted:
         return []
     view = item.poses.cone_vec(item.truth).rows[0]
-    return open_beam_doubts(item.machine, item.camera, item.exposure, view, plan.images.physics)
+    return open_beam_doubts(
+        item.machine, item.camera, item.exposure, view, plan.images.physics
+    )
 
 
 # -- projections -----------------------------------------------------------------------------------
@@ -374,7 +417,9 @@ def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, An
         z, y, x = want.shape
         like = Volume(np.zeros((z, y, x), np.float32), want.voxel_mm)
         geometry = cone if want.geometry == "true" else item.poses.cone_vec()
-        arrays["volumes"] = fdk(images, geometry, like, window=want.window, errors=False).data
+        arrays["volumes"] = fdk(
+            images, geometry, like, window=want.window, errors=False
+        ).data
     return arrays, {}
 
 
@@ -390,15 +435,20 @@ def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
         return lines
     model = ideal_response(item.machine)
     counts = [
-        expose(model, image, item.exposure, _rng(plan, item, i)) for i, image in enumerate(lines)
+        expose(model, image, item.exposure, _rng(plan, item, i))
+        for i, image in enumerate(lines)
     ]
     if plan.images.values == "counts":
         return np.stack(counts)
     bright = np.float32(open_beam(model, item.exposure))
-    return np.stack([_logarithm(c, np.float32(model.dark_counts), bright) for c in counts])
+    return np.stack(
+        [_logarithm(c, np.float32(model.dark_counts), bright) for c in counts]
+    )
 
 
-def _logarithm(counts: Counts, dark: np.float32, bright: np.float32 | Float32Array) -> Float32Array:
+def _logarithm(
+    counts: Counts, dark: np.float32, bright: np.float32 | Float32Array
+) -> Float32Array:
     """Compute -ln((counts - dark) / open beam); no count above dark is taken as half a
     one."""
     above = np.maximum(counts.astype(np.float32) - dark, np.float32(0.5))
@@ -428,7 +478,9 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     images: list[Array] = []
     for i, row in enumerate(cone.rows):
         expected = expected_signal(chain, paths[:, i], row, item.exposure)
-        counts = read_out(panel, expected, item.camera, item.exposure, _rng(plan, item, i))
+        counts = read_out(
+            panel, expected, item.camera, item.exposure, _rng(plan, item, i)
+        )
         if plan.images.values == "counts":
             images.append(counts)
             continue
@@ -460,25 +512,38 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         rng = np.random.default_rng(seed_of(plan, item.index, NOISE))
         noisy = tracks + item.noise_px * rng.normal(size=tracks.shape)
         fit = estimate_geometry(
-            noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px,
+            noisy,
+            model,
+            item.poses,
+            free,
+            shape=item.shape,
+            noise_px=item.noise_px,
             priors=known(free, plan.calibrate.priors),
             strain=known_strain(model, given=plan.calibrate.priors, free=free),
-        )  # fmt: skip
+        )
         return {}, _judged(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
     from flexdt_extensions.studies.rendered_runs import Rendering, render
 
     camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
     key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
-    frames = render(item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape)
+    frames = render(
+        item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape
+    )
     request = CalibrationRequest(free=free, priors=plan.calibrate.stated_priors)
-    result = calibrate([Scan(frames, item.poses)], model, request, scene=item.phantom.scene)
+    result = calibrate(
+        [Scan(frames, item.poses)], model, request, scene=item.phantom.scene
+    )
     note = "; ".join(f.text for f in result.errors)
     return {}, _judged(result.fit, item, free, result.identifiable, note)
 
 
 def _judged(
-    fit: FitResult | None, item: Item, free: tuple[str, ...], identifiable: bool, note: str
+    fit: FitResult | None,
+    item: Item,
+    free: tuple[str, ...],
+    identifiable: bool,
+    note: str,
 ) -> dict[str, Any]:
     """Compare a fit with the truth, in edge units, for the parameters that the data
     determine.

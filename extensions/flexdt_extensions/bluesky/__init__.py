@@ -1,7 +1,8 @@
-"""The twin as ophyd-async devices for Bluesky: axes, tube, camera, and a flyer for smooth scans.
+"""The twin as ophyd-async devices for Bluesky: axes, tube, camera, and a flyer for smooth
+scans.
 
-Needs the extra `lab` (ophyd-async and bluesky); names are looked up on first use, so that importing
-this package never imports them.
+Needs the extra `lab` (ophyd-async and bluesky); names are looked up on first use, so that
+importing this package never imports them.
 """
 
 from __future__ import annotations

@@ -45,7 +45,11 @@ from ophyd_async.core import (
 )
 
 from flexdt.extending import tiff_bytes, write_whole
-from flexdt_extensions.bluesky.lab_connection import LabConnection, ReadBeforeDescribed, settable
+from flexdt_extensions.bluesky.lab_connection import (
+    LabConnection,
+    ReadBeforeDescribed,
+    settable,
+)
 
 MIMETYPE: Final = "multipart/related;type=image/tiff"
 
@@ -77,14 +81,20 @@ class Announcements(StreamResourceDataProvider):
     ) -> AsyncIterator[StreamAsset]:
         """Yield the documents of the images since the last call."""
         self.count()
-        async for asset in super().make_stream_docs(collections_written, collections_per_event):
+        async for asset in super().make_stream_docs(
+            collections_written, collections_per_event
+        ):
             if asset[0] == "stream_datum":
                 self._last = asset[1]
             yield asset
 
 
 def tiff_stream(
-    data_key: str, folder: PurePath, template: str, shape: tuple[int, int], written: SignalR[int]
+    data_key: str,
+    folder: PurePath,
+    template: str,
+    shape: tuple[int, int],
+    written: SignalR[int],
 ) -> Announcements:
     """Make the provider that announces files as they appear.
 
@@ -137,7 +147,9 @@ class Roll:
         if self.folder is None:
             raise RuntimeError("the camera was triggered before it was prepared")
         file = self.folder / self.template.format(self.count)
-        await asyncio.to_thread(write_whole, file, tiff_bytes(np.asarray(image, dtype=np.uint16)))
+        await asyncio.to_thread(
+            write_whole, file, tiff_bytes(np.asarray(image, dtype=np.uint16))
+        )
         self.count += 1
         self._set_mean(float(image.mean(dtype=np.float64)))
         self._set_written(self.count)
@@ -192,7 +204,11 @@ class _Files(DetectorDataLogic):
         self.roll.load(info.directory_path, info.filename)
         shape = (await self.link.fresh()).camera.shape
         self.announcements = tiff_stream(
-            datakey_name, info.directory_path, self.roll.template, shape, self.roll.written
+            datakey_name,
+            info.directory_path,
+            self.roll.template,
+            shape,
+            self.roll.written,
         )
         return self.announcements
 
@@ -237,23 +253,35 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
         """
         client = link.client
         self.exposure_ms = settable(
-            link, "camera.exposure_ms", float, lambda v: client.set_camera(exposure_ms=v), "ms"
+            link,
+            "camera.exposure_ms",
+            float,
+            lambda v: client.set_camera(exposure_ms=v),
+            "ms",
         )
         self.averages = settable(
             link, "camera.averages", int, lambda v: client.set_camera(averages=v)
         )
-        self.mode = settable(link, "camera.mode", str, lambda v: client.set_camera(mode=v))
+        self.mode = settable(
+            link, "camera.mode", str, lambda v: client.set_camera(mode=v)
+        )
         self.roi = settable(
-            link, "camera.roi", str, lambda v: client.set_camera(roi=_edges(v)),
+            link,
+            "camera.roi",
+            str,
+            lambda v: client.set_camera(roi=_edges(v)),
             get=lambda state: " ".join(map(str, state.camera.roi)),
-        )  # fmt: skip
+        )
         super().__init__(name=name)
         self._roll = roll = Roll()
         self._triggering = _Triggering(self.exposure_ms)
         self._files = _Files(link, where, roll)
         self._staging: AsyncStatus[None] | None = None
         self.add_detector_logics(
-            self._triggering, _Acquiring(link, self._triggering, roll), self._files, _Mean(roll)
+            self._triggering,
+            _Acquiring(link, self._triggering, roll),
+            self._files,
+            _Mean(roll),
         )
         self.add_config_signals(self.averages, self.mode, self.roi)
 
@@ -266,10 +294,14 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
     async def trigger(self) -> None:  # type: ignore[override]
         """Take an image, in place of one that no document names."""
         if self._staging is not None:
-            await self._staging  # the RunEngine does not wait for it again after an interruption
+            await (
+                self._staging
+            )  # the RunEngine does not wait for it again after an interruption
         async with self._roll.turn:
             if self._files.announcements is not None:
-                self._roll.rewind(self._files.announcements.count() * self._triggering.images)
+                self._roll.rewind(
+                    self._files.announcements.count() * self._triggering.images
+                )
             await super().trigger()
 
 

@@ -92,9 +92,13 @@ class AxisLogic(MovableLogic[float]):
             raise LimitsExceeded(
                 f"{self.axis} target {new_position:g} {axis.unit}: {' and '.join(first.pair)} "
                 "would touch on the way",
-                {"axis": self.axis, "asked": new_position, "pair": list(first.pair),
-                 "last_free": dict(first.last_free)},
-            )  # fmt: skip
+                {
+                    "axis": self.axis,
+                    "asked": new_position,
+                    "pair": list(first.pair),
+                    "last_free": dict(first.last_free),
+                },
+            )
 
     async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
         """Move there.
@@ -151,19 +155,28 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
 
         with self.add_children_as_readables(StandardReadableFormat.HINTED_SIGNAL):
             position = TwinBackend(
-                link, f"axes.{axis}.position", float, units=unit,
+                link,
+                f"axes.{axis}.position",
+                float,
+                units=unit,
                 limits=lambda state: state.axes[axis].limits,
-            )  # fmt: skip
+            )
             self.readback = SignalR(position)
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
-            self.speed = member("speed", lambda v: client.set_axis(axis, speed=v), f"{unit}/s")
+            self.speed = member(
+                "speed", lambda v: client.set_axis(axis, speed=v), f"{unit}/s"
+            )
             self.acceleration = member(
-                "acceleration", lambda v: client.set_axis(axis, acceleration=v), f"{unit}/s^2"
+                "acceleration",
+                lambda v: client.set_axis(axis, acceleration=v),
+                f"{unit}/s^2",
             )
         self.setpoint = member("target", lambda v: client.move({axis: v}), unit)
         super().__init__(name=name)
 
-    def set(self, new_position: float, *more: Any, **options: Any) -> WatchableAsyncStatus[float]:
+    def set(
+        self, new_position: float, *more: Any, **options: Any
+    ) -> WatchableAsyncStatus[float]:
         """Move there, unless `stop` comes first."""
         self.movable_logic.stopped = False
         return super().set(new_position, *more, **options)
@@ -182,9 +195,12 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
     def movable_logic(self) -> AxisLogic:
         """How this axis moves."""
         return AxisLogic(
-            setpoint=self.setpoint, readback=self.readback, link=self._link, axis=self._axis,
+            setpoint=self.setpoint,
+            readback=self.readback,
+            link=self._link,
+            axis=self._axis,
             collisions=self._collisions,
-        )  # fmt: skip
+        )
 
 
 class TwinTube(ReadBeforeDescribed, StandardReadable):
@@ -208,12 +224,16 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
             await client.set_tube(on=on)
             async for state in link.states():
                 if state.tube.on != on:
-                    raise RuntimeError(f"somebody else switched X-rays {'off' if on else 'on'}")
+                    raise RuntimeError(
+                        f"somebody else switched X-rays {'off' if on else 'on'}"
+                    )
                 if state.tube.ready or not on:
                     return
 
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
-            self.kV = settable(link, "tube.kV", float, lambda v: client.set_tube(kV=v), "kV")
+            self.kV = settable(
+                link, "tube.kV", float, lambda v: client.set_tube(kV=v), "kV"
+            )
             self.power_W = settable(
                 link, "tube.power_W", float, lambda v: client.set_tube(power_W=v), "W"
             )
@@ -259,7 +279,9 @@ class TwinLab(Device, AsyncStageable):
             setattr(self, axis, TwinAxis(self.link, axis, unit, collisions=collisions))
         self.tube = TwinTube(self.link)
         self.camera = TwinCamera(self.link, where)
-        self.scan = TwinFlyer(self.link, machine=None if isinstance(machine, str) else machine)
+        self.scan = TwinFlyer(
+            self.link, machine=None if isinstance(machine, str) else machine
+        )
         super().__init__(name=name)
 
     def axis(self, name: str) -> TwinAxis:

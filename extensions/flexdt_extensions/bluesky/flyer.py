@@ -1,8 +1,8 @@
 """A flyer for smooth scans: the twin runs a script as a job and writes the data set itself.
 
-`prepare` composes or takes the script and has all of it checked before anything moves; `kickoff`
-submits it; `complete` follows the job; each finished TIFF is announced as a stream datum. The
-script's images must form one series numbered from 0.
+`prepare` composes or takes the script and has all of it checked before anything moves;
+`kickoff` submits it; `complete` follows the job; each finished TIFF is announced as a stream
+datum. The script's images must form one series numbered from 0.
 
 The plans for Bluesky's RunEngine that belong to this scanner touch no device themselves.
 """
@@ -199,12 +199,17 @@ class TwinFlyer(
         client, scan = self._link.client, ready.scan
         async with self._submitting:
             submitted = await client.submit_script(
-                ready.text, scan.name, scan.speed_up, seed=scan.seed,
+                ready.text,
+                scan.name,
+                scan.speed_up,
+                seed=scan.seed,
                 motion_samples=scan.motion_samples,
-            )  # fmt: skip
+            )
             self.job = await client.job_status(submitted.job)
         folder = PurePosixPath(self.job.dataset or submitted.dataset or "/")
-        self._images = tiff_stream(self.name, folder, ready.template, ready.shape, self._written)
+        self._images = tiff_stream(
+            self.name, folder, ready.template, ready.shape, self._written
+        )
         self._set_written(self.job.frames_done)
 
     @WatchableAsyncStatus.wrap
@@ -224,10 +229,15 @@ class TwinFlyer(
             self.job = status = await self._link.client.job_status(job)
             self._set_written(status.frames_done)
             yield WatcherUpdate(
-                name=self.name, current=status.frames_done, initial=0,
-                target=status.frames_total, unit="frames", precision=0,
-                time_elapsed=time.monotonic() - start, time_remaining=status.remaining_s,
-            )  # fmt: skip
+                name=self.name,
+                current=status.frames_done,
+                initial=0,
+                target=status.frames_total,
+                unit="frames",
+                precision=0,
+                time_elapsed=time.monotonic() - start,
+                time_remaining=status.remaining_s,
+            )
             if status.state in FINAL_STATES:
                 break
         if self.job.state != "done":
@@ -275,9 +285,12 @@ class TwinFlyer(
         return {
             self.name: DataKey(
                 source=self.source("script.submit"),
-                shape=[1, *ready.shape], dtype="array", dtype_numpy="<u2", external="STREAM:",
+                shape=[1, *ready.shape],
+                dtype="array",
+                dtype_numpy="<u2",
+                external="STREAM:",
             )
-        }  # fmt: skip
+        }
 
     def source(self, method: str) -> str:
         """Return the address of values of a method of the twin."""
@@ -295,7 +308,9 @@ class TwinFlyer(
         written: int = await self._written.get_value()
         return written
 
-    async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[StreamAsset]:
+    async def collect_asset_docs(
+        self, index: int | None = None
+    ) -> AsyncIterator[StreamAsset]:
         """Yield the documents of the files up to `index`."""
         if self._images is None:
             return
@@ -309,7 +324,9 @@ class TwinFlyer(
         for name, (value, dtype, numpy, units) in self._settings().items():
             shape: list[int | None] = [len(value)] if isinstance(value, list) else []
             key = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=numpy)
-            keys[f"{self.name}-{name}"] = key if units is None else {**key, "units": units}
+            keys[f"{self.name}-{name}"] = (
+                key if units is None else {**key, "units": units}
+            )
         return keys
 
     async def read_configuration(self) -> dict[str, Reading[Any]]:
@@ -329,7 +346,12 @@ class TwinFlyer(
             "exposure_ms": (ready.exposure_ms, "number", "<f8", "ms"),
             "duration_s": (ready.report.duration_s, "number", "<f8", "s"),
             "angles_deg": (list(ready.angles_deg), "array", "<f8", "deg"),
-            "script_sha256": (hashlib.sha256(ready.text).hexdigest(), "string", "|S64", None),
+            "script_sha256": (
+                hashlib.sha256(ready.text).hexdigest(),
+                "string",
+                "|S64",
+                None,
+            ),
         }
 
     # -- helpers -------------------------------------------------------------------------------
@@ -348,7 +370,9 @@ class TwinFlyer(
 
     def _scanner(self) -> tuple[Machine, Profile]:
         server = self._link.client.server
-        machine = builtin_machine(server.machine) if self._machine is None else self._machine
+        machine = (
+            builtin_machine(server.machine) if self._machine is None else self._machine
+        )
         return machine, self._profile or profile_of(machine, server.profile)
 
 
@@ -375,7 +399,9 @@ def _planned(
     names = [e.file for e in images]
     numbered = re.fullmatch(r"(.*?)(0+)(\.tiff?)", names[0] or "") if names else None
     if numbered is None:
-        raise TwinError(f"a fly scan has images numbered from 0; this one has {names[:2]}")
+        raise TwinError(
+            f"a fly scan has images numbered from 0; this one has {names[:2]}"
+        )
     template = f"{numbered[1]}{{:0{len(numbered[2])}d}}{numbered[3]}"
     wrong = [n for i, n in enumerate(names) if n != template.format(i)]
     if wrong:
@@ -385,9 +411,13 @@ def _planned(
         )
     shape = images[0].camera.shape
     turning = machine.geometry["angle"]
-    angles = tuple(sum(f * float(e.positions[n]) for n, f in turning.items()) for e in images)
+    angles = tuple(
+        sum(f * float(e.positions[n]) for n, f in turning.items()) for e in images
+    )
     times = tuple(float(e.start_s) for e in images)
-    return _Prepared(scan, text, report, shape, template, angles, times, images[0].exposure_ms)
+    return _Prepared(
+        scan, text, report, shape, template, angles, times, images[0].exposure_ms
+    )
 
 
 def _refused(report: CheckResult) -> LimitsExceeded:
@@ -396,9 +426,11 @@ def _refused(report: CheckResult) -> LimitsExceeded:
     more = f" (and {len(errors) - 5} more)" if len(errors) > 5 else ""
     return LimitsExceeded(
         "the scan was refused: " + "; ".join(lines) + more,
-        {"problems": [p.model_dump() for p in errors],
-         "collisions": [c.model_dump() for c in report.collisions]},
-    )  # fmt: skip
+        {
+            "problems": [p.model_dump() for p in errors],
+            "collisions": [c.model_dump() for c in report.collisions],
+        },
+    )
 
 
 STREAM = "primary"
@@ -407,7 +439,11 @@ FRAMES = "frames"
 
 
 def fly_scan(
-    flyer: TwinFlyer, scan: FlyScan, *, md: Mapping[str, Any] | None = None, flush_s: float = 0.5
+    flyer: TwinFlyer,
+    scan: FlyScan,
+    *,
+    md: Mapping[str, Any] | None = None,
+    flush_s: float = 0.5,
 ) -> MsgGenerator[str]:
     """Run one smooth scan; its images are announced while it goes on.
 
@@ -427,8 +463,9 @@ def fly_scan(
 
     def inner() -> MsgGenerator[None]:
         prepared = yield from bps.prepare(flyer, scan, wait=True)
-        # A replay would begin the scan again, and number images as those before. Without one, the
-        # message that was interrupted is lost: what follows asks again where it may have been.
+        # A replay would begin the scan again, and number images as those before. Without one,
+        # the message that was interrupted is lost: what follows asks again where it may have
+        # been.
         yield from bpp.rewindable_wrapper(flight(prepared is not None), False)  # type: ignore[no-untyped-call]
 
     def flight(live: bool) -> MsgGenerator[None]:

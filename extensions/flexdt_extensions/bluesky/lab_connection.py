@@ -2,8 +2,9 @@
 
 Requests go through an `AsyncTwinClient`; one subscription serves all watchers.
 
-The devices' signals are members of the twin's state: a backend reads by asking the twin, receives
-changes from the connection's subscription, and puts through a coroutine. Values are not cached.
+The devices' signals are members of the twin's state: a backend reads by asking the twin,
+receives changes from the connection's subscription, and puts through a coroutine. Values are
+not cached.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ class LabConnection:
 
     Args:
         host, port, token, ssl: of the twin server.
-        transport: replaces TCP, such as that of a twin in process; host, port and ssl are not used
-            then.
+        transport: replaces TCP, such as that of a twin in process; host, port and ssl are not
+            used then.
 
     Attributes:
         client: for all methods of the twin.
@@ -285,10 +286,14 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """Subscribe a callback to changes."""
         if self._end is not None:
             self._end()
-        self._end = None if callback is None else self._link.watch(_changes(self._get, callback))
+        self._end = (
+            None if callback is None else self._link.watch(_changes(self._get, callback))
+        )
 
 
-def _changes(get: Get[_T], callback: Callable[[Reading[_T]], None]) -> Callable[[State], None]:
+def _changes(
+    get: Get[_T], callback: Callable[[Reading[_T]], None]
+) -> Callable[[State], None]:
     last: list[_T] = []
 
     def notify(state: State) -> None:

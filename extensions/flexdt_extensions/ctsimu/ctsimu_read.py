@@ -1,8 +1,9 @@
 """A CTSimU scenario (file formats 1.0 to 1.2) to the geometry of its frames.
 
-Centres, orientations, deviations about any axis and pivot and drifts of all amounts are evaluated
-frame by frame, once as reconstruction knows them and once as they really are. The object's frame is
-the stage's (u, v, w). Parallel beams, drifting axes and files older than 1.0 are errors.
+Centres, orientations, deviations about any axis and pivot and drifts of all amounts are
+evaluated frame by frame, once as reconstruction knows them and once as they really are. The
+object's frame is the stage's (u, v, w). Parallel beams, drifting axes and files older than 1.0
+are errors.
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ class PlacedPart:
     on_stage: bool = False
 
 
-def read_ctsimu(text: str, file: str = "<scenario>", beside: Beside | None = None) -> ScanGeometry:
+def read_ctsimu(
+    text: str, file: str = "<scenario>", beside: Beside | None = None
+) -> ScanGeometry:
     """Read the geometry of a scenario: `cone_vec` as reconstruction knows it, `real`
     where it differs.
 
@@ -122,7 +125,9 @@ class ScenarioReader:
         angle = self._angles()
         binned = (pitch[0] * bins[0], pitch[1] * bins[1])
         rows_of = [
-            np.array([seen_from(p, *p[4:]) for p in self._poses(parts, angle, binned, real)])
+            np.array(
+                [seen_from(p, *p[4:]) for p in self._poses(parts, angle, binned, real)]
+            )
             for real in (False, True)
         ]
         known, real = (cone_vec_of(r, self._file) for r in rows_of)
@@ -133,7 +138,9 @@ class ScenarioReader:
             (rows // bins[1], cols // bins[0]),
             None if same else real,
             name if isinstance(name, str) else "",
-            notes=() if same else ("some deviations or drifts are unknown to reconstruction",),
+            notes=()
+            if same
+            else ("some deviations or drifts are unknown to reconstruction",),
         )
 
     def _bins(self, rows: int, cols: int) -> tuple[int, int]:
@@ -147,12 +154,22 @@ class ScenarioReader:
             return 1, 1
         found = [binning.get(a, 1) if isinstance(binning, dict) else None for a in "uv"]
         u, v = (1 if b is None and isinstance(binning, dict) else b for b in found)
-        if type(u) is not int or type(v) is not int or not (1 <= u <= cols and 1 <= v <= rows):
-            raise self._error(where, "u and v, whole numbers from 1 to the detector's size")
+        if (
+            type(u) is not int
+            or type(v) is not int
+            or not (1 <= u <= cols and 1 <= v <= rows)
+        ):
+            raise self._error(
+                where, "u and v, whole numbers from 1 to the detector's size"
+            )
         return u, v
 
     def _poses(
-        self, parts: Mapping[str, PlacedPart], angle: FloatArray, pitch: Sequence[float], real: bool
+        self,
+        parts: Mapping[str, PlacedPart],
+        angle: FloatArray,
+        pitch: Sequence[float],
+        real: bool,
     ) -> list[Pose]:
         still = np.zeros(self._count)
         out: list[Pose] = []
@@ -181,7 +198,9 @@ class ScenarioReader:
     def _part(self, name: str) -> PlacedPart:
         return self._placed(self._at("geometry", name), f"geometry.{name}", (WORLD,))
 
-    def _placed(self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]) -> PlacedPart:
+    def _placed(
+        self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]
+    ) -> PlacedPart:
         """Read source, detector, stage (u, w) or sample (r, t), in one of the `allowed`
         references.
 
@@ -197,19 +216,27 @@ class ScenarioReader:
             ExchangeError: names file, key and the allowed values.
         """
         if part.get("deviation") or part.get("centre"):
-            raise self._error(where, "the form of file format 1.0 and later (center, deviations)")
+            raise self._error(
+                where, "the form of file format 1.0 and later (center, deviations)"
+            )
         center = part.get("center")
-        names = [r for r in allowed if isinstance(center, dict) and set(r) <= center.keys()]
+        names = [
+            r for r in allowed if isinstance(center, dict) and set(r) <= center.keys()
+        ]
         if not isinstance(center, dict) or not names:
             raise self._error(f"{where}.center", " or ".join(map(", ".join, allowed)))
         reference = names[0]
         moves = [self._frames(center[a], f"{where}.center.{a}", MM) for a in reference]
         start = [self._value(center[a], f"{where}.center.{a}", MM) for a in reference]
         first, last = "uw" if allowed == (WORLD,) else "rt"
-        u, w = (self._vector(part.get(f"vector_{a}"), f"{where}.vector_{a}")
-                for a in (first, last))  # fmt: skip
+        u, w = (
+            self._vector(part.get(f"vector_{a}"), f"{where}.vector_{a}")
+            for a in (first, last)
+        )
         if u[0] != reference or w[0] != reference:
-            raise self._error(where, f"vector_{first} and vector_{last} in {', '.join(reference)}")
+            raise self._error(
+                where, f"vector_{first} and vector_{last} in {', '.join(reference)}"
+            )
         axes = _orthonormal(u[1], w[1])
         if axes is None:
             raise self._error(where, f"vector_{first} and vector_{last} at right angles")
@@ -218,15 +245,19 @@ class ScenarioReader:
             deviations = [deviations]
         if not isinstance(deviations, list):
             raise self._error(f"{where}.deviations", "a list")
-        rest = [PerFrame(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)]
+        rest = [
+            PerFrame(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)
+        ]
         return PlacedPart(
             np.array(start),
             axes,
             (rest[0], rest[1], rest[2]),
-            tuple(self._deviation(d, f"{where}.deviations[{i}]")
-                  for i, d in enumerate(deviations)),
+            tuple(
+                self._deviation(d, f"{where}.deviations[{i}]")
+                for i, d in enumerate(deviations)
+            ),
             reference == STAGE,
-        )  # fmt: skip
+        )
 
     def _deviation(self, value: object, where: str) -> _Deviation:
         """Read a deviation: a translation [mm] or a rotation [rad] about a pivot.
@@ -238,7 +269,10 @@ class ScenarioReader:
         Raises:
             ExchangeError: names file, key and the allowed values.
         """
-        if not isinstance(value, dict) or value.get("type") not in ("translation", "rotation"):
+        if not isinstance(value, dict) or value.get("type") not in (
+            "translation",
+            "rotation",
+        ):
             raise self._error(where, "an object with type translation or rotation")
         turn = value["type"] == "rotation"
         axis = value.get("axis")
@@ -251,13 +285,22 @@ class ScenarioReader:
         pivot_reference, pivot = _SAMPLE, np.zeros(3)
         if value.get("pivot") is not None:
             pivot_reference, pivot = self._vector(value["pivot"], f"{where}.pivot", MM)
-        amount = self._frames(value.get("amount"), f"{where}.amount", _RAD if turn else MM)
+        amount = self._frames(
+            value.get("amount"), f"{where}.amount", _RAD if turn else MM
+        )
         known = value.get("known_to_reconstruction")
         length = float(np.linalg.norm(direction))
         if length == 0.0:
             raise self._error(f"{where}.axis", "a vector of some length")
-        return _Deviation(turn, reference, direction / length, pivot_reference, pivot, amount,
-                          known is not False)  # fmt: skip
+        return _Deviation(
+            turn,
+            reference,
+            direction / length,
+            pivot_reference,
+            pivot,
+            amount,
+            known is not False,
+        )
 
     def _vector(
         self, value: object, where: str, units: Mapping[Any, float] = NUMBER
@@ -268,7 +311,9 @@ class ScenarioReader:
                     for a in reference:
                         if drifts_of(value[a]):
                             raise self._error(f"{where}.{a}", "a vector without drifts")
-                    parts = [self._value(value[a], f"{where}.{a}", units) for a in reference]
+                    parts = [
+                        self._value(value[a], f"{where}.{a}", units) for a in reference
+                    ]
                     return reference, np.array(parts)
         raise self._error(where, "three components x, y, z or u, v, w")
 
@@ -299,7 +344,9 @@ class ScenarioReader:
                 continue
             if not _numeric(values):
                 raise self._error(f"{at}.value", "a list of numbers")
-            unit = drift.get("unit") or (value.get("unit") if isinstance(value, dict) else None)
+            unit = drift.get("unit") or (
+                value.get("unit") if isinstance(value, dict) else None
+            )
             amounts = np.array(values, dtype=np.float64) * self._factor(unit, units, at)
             over = _interpolated(amounts, self._count)
             real = real + over
@@ -321,12 +368,17 @@ class ScenarioReader:
         """
         if not isinstance(name, str) or self._beside is None:
             raise self._error(where, "values in this file, as no other is read here")
-        lines = [line.replace(",", " ").split() for line in self._beside(name).splitlines()]
+        lines = [
+            line.replace(",", " ").split() for line in self._beside(name).splitlines()
+        ]
         try:
             table = np.array(
-                [[float(x) for x in words[:columns]] for words in lines
-                 if words and not words[0].startswith("#")]
-            )  # fmt: skip
+                [
+                    [float(x) for x in words[:columns]]
+                    for words in lines
+                    if words and not words[0].startswith("#")
+                ]
+            )
         except ValueError:
             table = np.zeros(0)
         if table.ndim != 2 or table.shape[1] < columns or not np.isfinite(table).all():
@@ -376,7 +428,9 @@ class ScenarioReader:
         if about.get("file_type") != "CTSimU Scenario" or not fits:
             asked = f"file_type {about.get('file_type')!r}, format {major}.{minor}"
             allowed = f"CTSimU Scenario, 1.0 to 1.{MAX_MINOR}"
-            raise ExchangeError.instead(f"{self._file}: {asked}", asked, allowed, path="file")
+            raise ExchangeError.instead(
+                f"{self._file}: {asked}", asked, allowed, path="file"
+            )
 
     def _error(self, where: str, allowed: str) -> ExchangeError:
         asked = self._asked(where)
@@ -399,7 +453,9 @@ def seen_from(pose: Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
     """Convert a pose to a cone_vec row (12,) in another frame, whose centre and axes
     are the world's."""
     source, detector, u, v = pose[:4]
-    return np.concatenate([axes.T @ x for x in (source - center, detector - center, u, v)])
+    return np.concatenate(
+        [axes.T @ x for x in (source - center, detector - center, u, v)]
+    )
 
 
 def place(
@@ -477,5 +533,6 @@ def drifts_of(value: object) -> list[Any]:
 
 def _numeric(values: object) -> bool:
     return isinstance(values, list) and all(
-        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
+        for v in values
     )

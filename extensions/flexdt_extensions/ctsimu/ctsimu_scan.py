@@ -16,7 +16,14 @@ from flexdt.twin.attenuation import Substance, mass_fractions, parse_formula, ta
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange import ExchangeError, ScanGeometry, read_json
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.physics import Filter, Spectrum, TubeModel, deposited, monochromatic, tube_spectrum
+from flexdt.twin.physics import (
+    Filter,
+    Spectrum,
+    TubeModel,
+    deposited,
+    monochromatic,
+    tube_spectrum,
+)
 from flexdt_extensions.ctsimu.ctsimu_read import (
     MM,
     MOST,
@@ -37,10 +44,31 @@ _S: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 _G_CM3: Final = {"g/cm^3": 1.0, "kg/m^3": 1e-3}
 _PER_J: Final = {"1/J": 1.0}
 _WORDS: Final = frozenset(
-    ("comment", "contact", "date_changed", "date_created", "dead_time", "description", "drifts",
-     "endian", "gain", "headersize", "id", "known_to_reconstruction", "manufacturer", "model",
-     "name", "scan_mode", "scan_speed", "temperature", "type", "uncertainty", "unit", "version")
-)  # fmt: skip
+    (
+        "comment",
+        "contact",
+        "date_changed",
+        "date_created",
+        "dead_time",
+        "description",
+        "drifts",
+        "endian",
+        "gain",
+        "headersize",
+        "id",
+        "known_to_reconstruction",
+        "manufacturer",
+        "model",
+        "name",
+        "scan_mode",
+        "scan_speed",
+        "temperature",
+        "type",
+        "uncertainty",
+        "unit",
+        "version",
+    )
+)
 """Keys that change no image here, or only in combination with one that is read."""
 _MIN_CHANGE: Final = 1e-9
 """Changes of place [mm] and direction that count as zero."""
@@ -76,8 +104,8 @@ class MeshSample:
 
 @dataclass(frozen=True)
 class Reference:
-    """Dark or flat images: how many, of how many frames each, whether without noise, and whether
-    the projections are corrected with them."""
+    """Dark or flat images: how many, of how many frames each, whether without noise, and
+    whether the projections are corrected with them."""
 
     number: int
     averages: int
@@ -196,12 +224,16 @@ class _Watched(dict[str, Any]):
             elif key in self.seen:
                 for i, one in enumerate(value if isinstance(value, list) else [value]):
                     if isinstance(one, _Watched):
-                        yield from one.unseen(f"{at}[{i}]" if isinstance(value, list) else at)
+                        yield from one.unseen(
+                            f"{at}[{i}]" if isinstance(value, list) else at
+                        )
 
 
 def _says_something(value: object) -> bool:
     if isinstance(value, dict):
-        return any(_says_something(one) for key, one in value.items() if key not in _WORDS)
+        return any(
+            _says_something(one) for key, one in value.items() if key not in _WORDS
+        )
     return value not in (None, False, "", [], 0)
 
 
@@ -219,27 +251,47 @@ class _ScanReader(ScenarioReader):
         size = [self._size("detector", name) for name in ("rows", "columns")]
         bins = self._bins(*size)[::-1]
         geometry = self.geometry()
-        self._substances = dict(self._material_of(one, f"materials[{i}]")
-                                for i, one in enumerate(self._list("materials")))  # fmt: skip
+        self._substances = dict(
+            self._material_of(one, f"materials[{i}]")
+            for i, one in enumerate(self._list("materials"))
+        )
         parts = {name: self._part(name) for name in ("source", "detector", "stage")}
-        pitch = [self._constant(MM, "detector", "pixel_pitch", axis, default=0.0) for axis in "uv"]
+        pitch = [
+            self._constant(MM, "detector", "pixel_pitch", axis, default=0.0)
+            for axis in "uv"
+        ]
         poses = self._poses(parts, self._angles(), pitch, True)
         views = np.array([seen_from(pose, *pose[4:]) for pose in poses])
-        samples = [self._sample(one, f"samples[{i}]", poses)
-                   for i, one in enumerate(self._list("samples"))]  # fmt: skip
+        samples = [
+            self._sample(one, f"samples[{i}]", poses)
+            for i, one in enumerate(self._list("samples"))
+        ]
         spectra, which = self._spectra()
         mAs = self._series(_MA, "source", "current", default=1.0)
         mAs = mAs * self._series(_S, "detector", "integration_time", default=1.0)
         rows, cols = (n // b * b for n, b in zip(size, bins, strict=True))
         response, grey = self._response(), self._grey()
         scan = ScenarioScan(
-            geometry, views, (rows, cols), bins, tuple(s for s in samples if s is not None),
-            self._material(self._given("environment", "material_id"), "environment.material_id"),
-            spectra, which, mAs, self._spot(), response, grey,
+            geometry,
+            views,
+            (rows, cols),
+            bins,
+            tuple(s for s in samples if s is not None),
+            self._material(
+                self._given("environment", "material_id"), "environment.material_id"
+            ),
+            spectra,
+            which,
+            mAs,
+            self._spot(),
+            response,
+            grey,
             self._natural("acquisition", "frame_average"),
-            self._reference("dark_field"), self._reference("flat_field"),
-            self._flag("acquisition", "scattering"), (),
-        )  # fmt: skip
+            self._reference("dark_field"),
+            self._reference("flat_field"),
+            self._flag("acquisition", "scattering"),
+            (),
+        )
         self._check(scan)
         left = [f"{place} is ignored" for place in self._document.unseen()]  # type: ignore[attr-defined]
         return replace(scan, notes=(*geometry.notes, *self._notes, *left))
@@ -249,7 +301,8 @@ class _ScanReader(ScenarioReader):
         if scan.scattering and (varies or any(s.on_stage is None for s in scan.samples)):
             raise self._error(
                 "acquisition.scattering",
-                "false, where the spectrum or a sample's place on the stage changes in the scan",
+                "false, where the spectrum or a sample's place on the stage changes in "
+                "the scan",
             )
 
     # Geometry
@@ -269,16 +322,22 @@ class _ScanReader(ScenarioReader):
             ExchangeError: names file, key and the allowed values.
         """
         if not isinstance(given, dict) or not isinstance(given.get("position"), dict):
-            raise self._error(where, "an object with file, unit, material_id and position")
+            raise self._error(
+                where, "an object with file, unit, material_id and position"
+            )
         name = self._text(given.get("file"), f"{where}.file")
         if name is None:
-            raise self._error(f"{where}.file", "the name of a surface mesh, such as part.stl")
+            raise self._error(
+                f"{where}.file", "the name of a surface mesh, such as part.stl"
+            )
         unit = self._factor(given.get("unit"), MM, where)
         factors = given.get("scaling_factor") or {}
         if not isinstance(factors, dict):
             raise self._error(f"{where}.scaling_factor", "r, s and t")
-        scale = [self._plain(factors.get(a), NUMBER, f"{where}.scaling_factor.{a}", 1.0)
-                 for a in "rst"]  # fmt: skip
+        scale = [
+            self._plain(factors.get(a), NUMBER, f"{where}.scaling_factor.{a}", 1.0)
+            for a in "rst"
+        ]
         if min(scale) <= 0.0:
             raise self._error(f"{where}.scaling_factor", "above 0")
         substance = self._material(given.get("material_id"), f"{where}.material_id")
@@ -294,15 +353,22 @@ class _ScanReader(ScenarioReader):
             else:
                 there.append((turn.T @ (center - stage), turn.T @ axes))
             views[i] = seen_from(pose, center, axes)
-        moves = max(float(np.abs(a - b).max()) for one in there
-                    for a, b in zip(one, there[0], strict=True))  # fmt: skip
+        moves = max(
+            float(np.abs(a - b).max())
+            for one in there
+            for a, b in zip(one, there[0], strict=True)
+        )
         if substance is None:
             self._notes.append(f"{where} is of vacuum and left out")
             return None
         return MeshSample(
-            where, name, unit * np.array(scale), substance, views,
+            where,
+            name,
+            unit * np.array(scale),
+            substance,
+            views,
             there[0] if moves < _MIN_CHANGE else None,
-        )  # fmt: skip
+        )
 
     # Materials
 
@@ -329,9 +395,13 @@ class _ScanReader(ScenarioReader):
             if not isinstance(part, dict):
                 raise self._error(at, "an object with formula and mass_fraction")
             formula = self._text(part.get("formula"), f"{at}.formula") or ""
-            whole = self._plain(part.get("mass_fraction"), NUMBER, f"{at}.mass_fraction", 1.0)
+            whole = self._plain(
+                part.get("mass_fraction"), NUMBER, f"{at}.mass_fraction", 1.0
+            )
             if formula.strip() and whole > 0.0:
-                for symbol, x in self._tried(at, _fractions, "".join(formula.split())).items():
+                for symbol, x in self._tried(
+                    at, _fractions, "".join(formula.split())
+                ).items():
                     amounts[symbol] = amounts.get(symbol, 0.0) + whole * x
         total = sum(amounts.values())
         if density <= 0.0 or not total > 0.0:
@@ -344,12 +414,16 @@ class _ScanReader(ScenarioReader):
         if name is None:
             return None
         if not isinstance(name, str) or name not in self._substances:
-            raise self._error(where, f"the id of a material: {', '.join(self._substances)}")
+            raise self._error(
+                where, f"the id of a material: {', '.join(self._substances)}"
+            )
         return self._substances[name]
 
     def _layers(self, *path: str) -> tuple[Filter, ...]:
         where = ".".join(path)
-        found = [self._layer(one, f"{where}[{i}]") for i, one in enumerate(self._list(*path))]
+        found = [
+            self._layer(one, f"{where}[{i}]") for i, one in enumerate(self._list(*path))
+        ]
         return tuple(layer for layer in found if layer is not None)
 
     def _layer(self, given: object, where: str) -> Filter | None:
@@ -380,8 +454,14 @@ class _ScanReader(ScenarioReader):
         behind = self._layers("source", "filters")
         if any(files):
             keys: list[Any] = [self._text(name, f"{at}.file") for name in files]
-            made = {name: self._tabulated(name, f"{at}.file") for name in dict.fromkeys(keys)}
-            for name in ("voltage", "target", "window"):  # tube settings of the file's spectrum
+            made = {
+                name: self._tabulated(name, f"{at}.file") for name in dict.fromkeys(keys)
+            }
+            for name in (
+                "voltage",
+                "target",
+                "window",
+            ):  # tube settings of the file's spectrum
                 self._at("source").get(name)
         else:
             keys = self._series(_KV, "source", "voltage").tolist()
@@ -389,7 +469,9 @@ class _ScanReader(ScenarioReader):
             if not single:
                 self._check_target()
             make = _line if single else _unfiltered
-            made = {kV: self._tried("source.voltage", make, kV) for kV in dict.fromkeys(keys)}
+            made = {
+                kV: self._tried("source.voltage", make, kV) for kV in dict.fromkeys(keys)
+            }
         fluence = tuple(one.behind(*behind).fluence for one in made.values())
         if not min(one.sum() for one in fluence) > 0.0:
             raise self._error("source.filters", "filters that let some radiation through")
@@ -401,11 +483,14 @@ class _ScanReader(ScenarioReader):
             self._given("source", "target", "material_id"), "source.target.material_id"
         )
         if made_of is not None and made_of.fractions != (("W", 1.0),):
-            raise self._error("source.target.material_id", "tungsten, or a spectrum from a file")
+            raise self._error(
+                "source.target.material_id", "tungsten, or a spectrum from a file"
+            )
         for name in ("angle", "thickness"):
             self._given("source", "target", name)
         self._notes.append(
-            "source.target: the spectrum is that of tungsten reflecting at 12 degrees, whatever "
+            "source.target: the spectrum is that of tungsten reflecting at 12 degrees, "
+            "whatever "
             "type and angles are; source.spectrum.file states another"
         )
 
@@ -423,7 +508,9 @@ class _ScanReader(ScenarioReader):
         if len(energy) < 2 or np.diff(energy).min() <= 0.0 or photons.min() < 0.0:
             raise self._error(where, "two or more growing energies, photons of 0 or more")
         middle = (energy[1:] + energy[:-1]) / 2.0
-        edges = np.concatenate([[2 * energy[0] - middle[0]], middle, [2 * energy[-1] - middle[-1]]])
+        edges = np.concatenate(
+            [[2 * energy[0] - middle[0]], middle, [2 * energy[-1] - middle[-1]]]
+        )
         bins = tables().energy_keV
         step = float(bins[1] - bins[0])
         ours = np.append(bins - step / 2, bins[-1] + step / 2)
@@ -445,14 +532,20 @@ class _ScanReader(ScenarioReader):
         self._nothing(*where, "intensity_map", "file")
         found = []
         for axis in "uv":
-            size, sigma = (self._constant(MM, *where, name, axis, default=0.0)
-                           for name in ("size", "sigma"))  # fmt: skip
+            size, sigma = (
+                self._constant(MM, *where, name, axis, default=0.0)
+                for name in ("size", "sigma")
+            )
             if min(size, sigma) < 0.0:
                 raise self._error("source.spot", "0 or more")
             if size > 0.0 and (sigma == 0.0 or size < 6.0 * sigma):
-                self._notes.append(f"source.spot: a Gaussian of the same width along {axis}")
+                self._notes.append(
+                    f"source.spot: a Gaussian of the same width along {axis}"
+                )
                 x = np.linspace(-size / 2.0, size / 2.0, 1001)
-                weights = np.exp(-0.5 * (x / sigma) ** 2) if sigma > 0.0 else np.ones(1001)
+                weights = (
+                    np.exp(-0.5 * (x / sigma) ** 2) if sigma > 0.0 else np.ones(1001)
+                )
                 sigma = float(np.sqrt((weights * x**2).sum() / weights.sum()))
             found.append(sigma)
         return found[0], found[1]
@@ -481,7 +574,9 @@ class _ScanReader(ScenarioReader):
             at = ("detector", "scintillator")
             screen = self._layer(self._given(*at) or {}, ".".join(at))
             if screen is None:
-                self._notes.append("detector.scintillator is not given: all energy is absorbed")
+                self._notes.append(
+                    "detector.scintillator is not given: all energy is absorbed"
+                )
             else:
                 part = deposited(screen).mean
         return part * energy * Spectrum(np.ones_like(energy)).behind(*layers).fluence
@@ -498,7 +593,9 @@ class _ScanReader(ScenarioReader):
         at = ("detector", "gray_value")
         single = self._flag("source", "spectrum", "monochromatic")
         table = self._table(2, *at, "intensity_characteristics_file")
-        imin, imax = (self._constant(NUMBER, *at, name, default=None) for name in ("imin", "imax"))
+        imin, imax = (
+            self._constant(NUMBER, *at, name, default=None) for name in ("imin", "imax")
+        )
         factor = self._constant(_PER_J, *at, "factor", default=None)
         offset = self._constant(NUMBER, *at, "offset", default=0.0)
         if table is not None or factor is not None:
@@ -509,7 +606,9 @@ class _ScanReader(ScenarioReader):
                 )
             imax = None
         elif imax is None or imax <= (imin or 0.0):
-            raise self._error("detector.gray_value", "imax above imin, or factor, or a file")
+            raise self._error(
+                "detector.gray_value", "imax above imin, or factor, or a file"
+            )
         snr = self._constant(NUMBER, "detector", "noise", "snr_at_imax", default=None)
         blur = self._constant(
             MM, "detector", self._sharp(), "basic_spatial_resolution", default=0.0
@@ -520,17 +619,26 @@ class _ScanReader(ScenarioReader):
         if snr is not None and snr <= 0.0:
             raise self._error("detector.noise.snr_at_imax", "above 0")
         if not 0.0 <= blur <= 100.0:
-            raise self._error("detector.unsharpness.basic_spatial_resolution", "0 to 100 mm")
+            raise self._error(
+                "detector.unsharpness.basic_spatial_resolution", "0 to 100 mm"
+            )
         if not 0.0 <= lag < 1.0:
             raise self._error("detector.image_lag", "0 or more, below 1")
         if bits not in range(1, 17):
             raise self._error("detector.bit_depth", "1 to 16")
         return GreyValues(
-            imin or 0.0, imax, factor, offset, table, snr,
+            imin or 0.0,
+            imax,
+            factor,
+            offset,
+            table,
+            snr,
             self._table(2, "detector", "noise", "noise_characteristics_file"),
-            blur * DUPLEX_WIRE, self._table(2, "detector", self._sharp(), "mtf"),
-            lag, int(bits),
-        )  # fmt: skip
+            blur * DUPLEX_WIRE,
+            self._table(2, "detector", self._sharp(), "mtf"),
+            lag,
+            int(bits),
+        )
 
     def _sharp(self) -> str:
         return "sharpness" if "sharpness" in self._at("detector") else "unsharpness"
@@ -540,7 +648,10 @@ class _ScanReader(ScenarioReader):
         correction = self._flag(*at, "correction")
         number = self._natural(*at, "number", default=0, least=int(correction))
         return Reference(
-            number, self._natural(*at, "frame_average"), self._flag(*at, "ideal"), correction
+            number,
+            self._natural(*at, "frame_average"),
+            self._flag(*at, "ideal"),
+            correction,
         )
 
     # Values
@@ -596,11 +707,18 @@ class _ScanReader(ScenarioReader):
         names = last.get("value")
         if isinstance(last.get("file"), str):
             names = (self._beside or str)(last["file"]).split()
-        if not isinstance(names, list) or not all(isinstance(one, str) for one in names[:1]):
-            raise self._error(f"{where}.drifts", "a list of texts, or a file with one in each line")
+        if not isinstance(names, list) or not all(
+            isinstance(one, str) for one in names[:1]
+        ):
+            raise self._error(
+                f"{where}.drifts", "a list of texts, or a file with one in each line"
+            )
         given.get("value")  # type: ignore[attr-defined]
         steps = max(1, self._count - 1)
-        return [self._text(names[i * (len(names) - 1) // steps], where) for i in range(self._count)]
+        return [
+            self._text(names[i * (len(names) - 1) // steps], where)
+            for i in range(self._count)
+        ]
 
     def _table(self, columns: int, *path: str) -> FloatArray | None:
         """Read the numbers of the file named at a place, by growing first column."""

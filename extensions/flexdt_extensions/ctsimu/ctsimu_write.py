@@ -1,10 +1,10 @@
 """A scan as a CTSimU scenario (file format 1.2): nominal geometry, deviations, drifts.
 
-The scenario's world is (x, y, z) = our (y, -x, z) with the first nominal source at the origin, as
-CTSimU's own examples have it. Nominal motion is the stage's rotation and, where motors move
+The scenario's world is (x, y, z) = our (y, -x, z) with the first nominal source at the origin,
+as CTSimU's own examples have it. Nominal motion is the stage's rotation and, where motors move
 otherwise, drifts of centres. Each offset of the correction is a deviation that reconstruction
-knows; any further misalignment is a deviation that reconstruction does not know. The orientation of
-the panel must be the same in all frames.
+knows; any further misalignment is a deviation that reconstruction does not know. The
+orientation of the panel must be the same in all frames.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ def scenario_of(
         The scenario's JSON object.
     """
     if parameters is None:
-        parameters = NOMINAL if dataset.correction is None else dataset.correction.parameters
+        parameters = (
+            NOMINAL if dataset.correction is None else dataset.correction.parameters
+        )
     doc, machine = dataset.document, dataset.machine
     geometry_of(dataset, NOMINAL)  # raises for frames of several shapes
     scan = Scenario(
@@ -124,7 +126,8 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
         if turned.max() * max(scan.shape) > SAME_MM:
             view = int(np.argmax(turned))
             raise ExchangeError(
-                f"CTSimU: the panel's {what} in frame {view} is not that of frame 0; only panels "
+                f"CTSimU: the panel's {what} in frame {view} is not that of frame 0; "
+                "only panels "
                 "that keep their orientation are written",
                 {"row": view},
             )
@@ -179,7 +182,9 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
             "manufacturer": None,
             "voltage": {"value": scan.kV, "unit": "kV"},
             "current": {
-                "value": None if not scan.kV or scan.power_W is None else scan.power_W / scan.kV,
+                "value": None
+                if not scan.kV or scan.power_W is None
+                else scan.power_W / scan.kV,
                 "unit": "mA",
             },
         },
@@ -203,7 +208,9 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
     }
 
 
-def _stage_motion(angles_deg: FloatArray) -> tuple[float, float, str, list[dict[str, Any]]]:
+def _stage_motion(
+    angles_deg: FloatArray,
+) -> tuple[float, float, str, list[dict[str, Any]]]:
     """Determine the stage's start and stop angle [deg], direction and drifts.
 
     Deviations from equal steps become a drift of a turn about the stage's own axis.
@@ -217,7 +224,12 @@ def _stage_motion(angles_deg: FloatArray) -> tuple[float, float, str, list[dict[
     steps = np.arange(count) / max(1, count - 1) * (stop - start) + start
     rest = -angles_deg - sign * steps
     uneven = np.abs(rest).max() >= 1e-12
-    return start, stop, direction, [_drifting_turn(rest, True, "motors")] if uneven else []
+    return (
+        start,
+        stop,
+        direction,
+        [_drifting_turn(rest, True, "motors")] if uneven else [],
+    )
 
 
 _SOURCE: Final = "-y dS_x, z dS_y"
@@ -235,16 +247,23 @@ class _Deviations:
     def __init__(self, known: Offsets, real: Offsets) -> None:
         self._known, self._real = known.to_edge(), real.to_edge()
 
-    def stage(self, motion: list[dict[str, Any]], angles_deg: FloatArray) -> list[dict[str, Any]]:
-        scale = [_drifting_turn(-amount * angles_deg, known, "angle_scale")
-                 for known, amount in self._amounts("angle_scale", 1.0)]  # fmt: skip
+    def stage(
+        self, motion: list[dict[str, Any]], angles_deg: FloatArray
+    ) -> list[dict[str, Any]]:
+        scale = [
+            _drifting_turn(-amount * angles_deg, known, "angle_scale")
+            for known, amount in self._amounts("angle_scale", 1.0)
+        ]
         moved, turned = (self.of(part) for part in _STAGE)
         return [*moved, *motion, *turned, *scale, *self.of(_OBJECT)]
 
     def _amounts(self, name: str, nominal: float = 0.0) -> list[tuple[bool, float]]:
         known = self._known[name] - nominal
-        return [(k, a) for k, a in ((True, known), (False, self._real[name] - self._known[name]))
-                if a != 0.0]  # fmt: skip
+        return [
+            (k, a)
+            for k, a in ((True, known), (False, self._real[name] - self._known[name]))
+            if a != 0.0
+        ]
 
     def of(self, parameters: str) -> list[dict[str, Any]]:
         """List the deviations of a table of axes and parameters."""
@@ -305,7 +324,9 @@ def _part(
 
 
 def _direction(vector: FloatArray) -> dict[str, Any]:
-    return {axis: {"value": float(x) + 0.0} for axis, x in zip("xyz", vector, strict=True)}
+    return {
+        axis: {"value": float(x) + 0.0} for axis, x in zip("xyz", vector, strict=True)
+    }
 
 
 def _mm(value: float) -> dict[str, Any]:

@@ -88,7 +88,9 @@ class ScenarioImages:
         try:
             return text_of(self.path.parent / name)
         except (OSError, ValueError) as error:
-            raise ExchangeError(f"{self.path} names {name!r}: {error}", {"path": name}) from None
+            raise ExchangeError(
+                f"{self.path} names {name!r}: {error}", {"path": name}
+            ) from None
 
     def _mesh(self, sample: MeshSample) -> TriangleMesh:
         found = read_mesh(self.path.parent / sample.file)
@@ -106,7 +108,9 @@ class ScenarioImages:
             substances.append(self.scan.environment)
             thick.append(max(float(self._distance(i).max()) for i in range(len(self))))
         signals = [spectrum * self.scan.response for spectrum in self.scan.spectra]
-        return [effective_beam(s, s * self.scan.response, substances, thick) for s in signals]
+        return [
+            effective_beam(s, s * self.scan.response, substances, thick) for s in signals
+        ]
 
     def _distance(self, frame: int) -> Float32Array:
         """Compute the distance from the source to each pixel, (rows, cols) [mm]."""
@@ -120,14 +124,20 @@ class ScenarioImages:
         shape, order = self.scan.shape, {one: i for i, one in enumerate(self._thickest)}
         air = self.scan.environment is not None
         out = np.zeros((len(order) + air, *shape), np.float32)
-        for sample, mesh in zip(self.scan.samples, self._meshes, strict=True) if samples else ():
-            rows = within_pixels(sample.views[frame : frame + 1], self._rays)[ray : ray + 1]
+        for sample, mesh in (
+            zip(self.scan.samples, self._meshes, strict=True) if samples else ()
+        ):
+            rows = within_pixels(sample.views[frame : frame + 1], self._rays)[
+                ray : ray + 1
+            ]
             out[order[sample.substance]] += project_mesh(mesh, ConeVec(rows), shape)[0]
         if air:
             out[-1] = np.maximum(self._distance(frame) - out[:-1].sum(axis=0), 0.0)
         return out
 
-    def _collected(self, frame: int, samples: bool = True) -> tuple[Float32Array, Float32Array]:
+    def _collected(
+        self, frame: int, samples: bool = True
+    ) -> tuple[Float32Array, Float32Array]:
         """Compute the energy in each pixel of one frame, and its variance, before the
         detector blurs.
 
@@ -140,10 +150,13 @@ class ScenarioImages:
         """
         scan, n = self.scan, self._rays if samples else 1
         beam = self._beams[scan.spectrum_of[frame]]
-        # In double precision: rays that meet nothing then average to the open beam's very value.
+        # In double precision: rays that meet nothing then average to the open beam's very
+        # value.
         sums: list[Any] = [np.zeros(scan.shape) for _ in range(2)]
         for k in range(n * n):
-            for total, one in zip(sums, beam.transmit(self._paths(frame, k, samples)), strict=True):
+            for total, one in zip(
+                sums, beam.transmit(self._paths(frame, k, samples)), strict=True
+            ):
                 total += one
         mean, spread = ((total / n**2).astype(np.float32) for total in sums)
         view = scan.views[frame]
@@ -197,7 +210,9 @@ class ScenarioImages:
     def _grey(self, energy: Float32Array) -> Float32Array:
         grey = self.scan.grey
         if grey.imax is not None:
-            values = grey.imin + (grey.imax - grey.imin) / float(self._open[0].max()) * energy
+            values = (
+                grey.imin + (grey.imax - grey.imin) / float(self._open[0].max()) * energy
+            )
         elif grey.table is not None:
             values = np.interp(energy * KEV_J, grey.table[:, 0], grey.table[:, 1])
         else:
@@ -217,19 +232,29 @@ class ScenarioImages:
         u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
         if grey.mtf is None:
             # The resolution of a detector is that with its pixels.
-            rest = (np.sqrt(max((grey.blur_mm / one) ** 2 - 1 / 12, 0.0)) for one in (u, v))
+            rest = (
+                np.sqrt(max((grey.blur_mm / one) ** 2 - 1 / 12, 0.0)) for one in (u, v)
+            )
             return blurred(image, *map(float, rest))
         wide = max(image.shape) // 2
         padded = np.pad(image, wide, mode="edge")
         frequency = np.hypot(
-            np.fft.fftfreq(padded.shape[0], v)[:, None], np.fft.rfftfreq(padded.shape[1], u)
+            np.fft.fftfreq(padded.shape[0], v)[:, None],
+            np.fft.rfftfreq(padded.shape[1], u),
         )
-        curve = np.interp(frequency, grey.mtf[:, 0], grey.mtf[:, 1], right=0.0) / grey.mtf[0, 1]
+        curve = (
+            np.interp(frequency, grey.mtf[:, 0], grey.mtf[:, 1], right=0.0)
+            / grey.mtf[0, 1]
+        )
         back = np.fft.irfft2(np.fft.rfft2(padded) * curve, padded.shape)
         return np.asarray(back[wide:-wide, wide:-wide], dtype=np.float32)
 
     def _read_out(
-        self, energy: Float32Array, variance: Float32Array, averages: int, noise: int | None
+        self,
+        energy: Float32Array,
+        variance: Float32Array,
+        averages: int,
+        noise: int | None,
     ) -> FloatArray:
         """Compute the grey values of the binned pixels.
 
@@ -249,15 +274,21 @@ class ScenarioImages:
                 sigma = np.sqrt(variance / brightest) * (self.brightest / grey.snr)
             else:
                 sigma = np.zeros_like(values)
-            draw = frame_rng(self._seed, noise).standard_normal(values.shape, dtype=np.float32)
+            draw = frame_rng(self._seed, noise).standard_normal(
+                values.shape, dtype=np.float32
+            )
             values = values + draw * (sigma / np.sqrt(averages)).astype(np.float32)
         top, (b, c) = 2.0**grey.bits - 1.0, self.scan.binning
         rows, cols = (n // k for n, k in zip(self.scan.shape, (b, c), strict=True))
         blocks = np.clip(values, 0.0, top).reshape(rows, b, cols, c)
         return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64))
 
-    def _references(self, asked: Reference, lit: bool, first: int) -> Iterator[FloatArray]:
-        energy, variance = self._open if lit else (np.zeros(self.scan.shape, np.float32),) * 2
+    def _references(
+        self, asked: Reference, lit: bool, first: int
+    ) -> Iterator[FloatArray]:
+        energy, variance = (
+            self._open if lit else (np.zeros(self.scan.shape, np.float32),) * 2
+        )
         for k in range(asked.number):
             number = None if asked.ideal else first + k
             yield self._read_out(energy, variance, asked.averages, number)
@@ -274,7 +305,9 @@ class ScenarioImages:
     def flats(self) -> list[Counts]:
         """Compute the flat images, uint16 (rows, cols)."""
         first = self.scan.dark.number
-        return [self._counts(one) for one in self._references(self.scan.flat, True, first)]
+        return [
+            self._counts(one) for one in self._references(self.scan.flat, True, first)
+        ]
 
     def projections(self) -> Iterator[Counts]:
         """Yield the projections in order.
@@ -301,7 +334,9 @@ class ScenarioImages:
             yield self._counts(values if gain is None else values * gain)
 
     def _counts(self, values: FloatArray) -> Counts:
-        return np.clip(np.rint(values), 0.0, 2.0**self.scan.grey.bits - 1.0).astype(np.uint16)
+        return np.clip(np.rint(values), 0.0, 2.0**self.scan.grey.bits - 1.0).astype(
+            np.uint16
+        )
 
     def dataset(self) -> DataSet:
         """Collect all images in a data set in memory, with the geometry that
@@ -323,9 +358,14 @@ class ScenarioImages:
         if flat is not None:
             flat = np.rint(np.maximum(flat, 0.0))
         made = DataSet.from_arrays(
-            counts, scan.geometry.cone_vec, dark=dark, flat=flat, name=self.path.stem,
-            warnings=scan.notes, truth=self,
-        )  # fmt: skip
+            counts,
+            scan.geometry.cone_vec,
+            dark=dark,
+            flat=flat,
+            name=self.path.stem,
+            warnings=scan.notes,
+            truth=self,
+        )
         return replace(made, full_scale=2**scan.grey.bits - 1)
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
@@ -341,7 +381,8 @@ class ScenarioImages:
         folder, stem = Path(folder).absolute(), self.path.stem
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ExchangeError(
-                f"{folder} exists; allowed: a new folder, or an empty one", {"path": str(folder)}
+                f"{folder} exists; allowed: a new folder, or an empty one",
+                {"path": str(folder)},
             )
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
@@ -349,14 +390,20 @@ class ScenarioImages:
         try:
             names = {}
             for kind, images in (("dark", self.darks()), ("flat", self.flats())):
-                pattern = f"{stem}_{kind}.tif" if len(images) == 1 else f"{stem}_{kind}_%04d.tif"
+                pattern = (
+                    f"{stem}_{kind}.tif"
+                    if len(images) == 1
+                    else f"{stem}_{kind}_%04d.tif"
+                )
                 names[kind] = pattern if images else None
                 for k, image in enumerate(images):
                     name = pattern % k if "%" in pattern[len(stem) :] else pattern
                     (part / name).write_bytes(tiff_bytes(image))
             for i, image in enumerate(self.projections()):
                 (part / f"{stem}_{i:04d}.tif").write_bytes(tiff_bytes(image))
-            about = json.dumps(self._metadata(folder, names), indent=1, ensure_ascii=False)
+            about = json.dumps(
+                self._metadata(folder, names), indent=1, ensure_ascii=False
+            )
             (part / f"{stem}_metadata.json").write_text(about + "\n", encoding="utf-8")
             if folder.exists():
                 folder.rmdir()
@@ -378,7 +425,9 @@ class ScenarioImages:
         pitch = scan.geometry.pitch_mm
 
         def size(values: tuple[float, float], unit: str) -> dict[str, Any]:
-            return {a: {"value": x, "unit": unit} for a, x in zip("xy", values, strict=True)}
+            return {
+                a: {"value": x, "unit": unit} for a, x in zip("xy", values, strict=True)
+            }
 
         def images(kind: str, asked: Reference) -> dict[str, Any]:
             return {
@@ -390,9 +439,13 @@ class ScenarioImages:
 
         return {
             "file": {
-                "name": self.path.stem, "description": scan.geometry.name, "contact": "",
-                "date_created": today, "date_changed": today,
-                "file_type": "CTSimU Metadata", "file_format_version": FORMAT,
+                "name": self.path.stem,
+                "description": scan.geometry.name,
+                "contact": "",
+                "date_created": today,
+                "date_changed": today,
+                "file_type": "CTSimU Metadata",
+                "file_format_version": FORMAT,
             },
             "output": {
                 "system": f"flexdt {version('flexdt')}",
@@ -416,15 +469,21 @@ class ScenarioImages:
             "acquisition_geometry": {"path_to_CTSimU_JSON": own},
             "reconstruction": {"software": None, "settings": {}},
             "simulation": {
-                "flexdt": {"seed": self._seed, "rays": self._rays, "notes": list(scan.notes)},
+                "flexdt": {
+                    "seed": self._seed,
+                    "rays": self._rays,
+                    "notes": list(scan.notes),
+                },
                 "ctsimu_scenario": {},
             },
-        }  # fmt: skip
+        }
 
 
 def _made_of(substance: Substance) -> Material:
     """Wrap a substance for the scatter's grid, which needs nothing else."""
-    return Material(substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions)
+    return Material(
+        substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions
+    )
 
 
 def dataset(path: str | os.PathLike[str], seed: int | None, rays: int) -> DataSet:

@@ -17,7 +17,9 @@ def simulate(
         None, "Write to this new folder; default: the scenario's name.", metavar="DIR"
     ),
     seed: int = option(0, "Draw the noise from this seed.", min=0),
-    rays: int = option(3, "Trace so many rays along each side of a pixel.", min=1, max=16),
+    rays: int = option(
+        3, "Trace so many rays along each side of a pixel.", min=1, max=16
+    ),
 ) -> Answer:
     """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.
 
@@ -38,10 +40,16 @@ def simulate(
     scan = images.scan
     rows, cols = scan.geometry.shape or (0, 0)
     yield {
-        "scenario": str(scenario), "out": str(metadata.parent), "metadata": str(metadata),
-        "projections": len(images), "darks": scan.dark.number, "flats": scan.flat.number,
-        "shape": [rows, cols], "max_intensity": images.brightest, "warnings": list(scan.notes),
-    }  # fmt: skip
+        "scenario": str(scenario),
+        "out": str(metadata.parent),
+        "metadata": str(metadata),
+        "projections": len(images),
+        "darks": scan.dark.number,
+        "flats": scan.flat.number,
+        "shape": [rows, cols],
+        "max_intensity": images.brightest,
+        "warnings": list(scan.notes),
+    }
     yield (
         f"{metadata.parent}: {len(images)} projections, {scan.dark.number} dark and "
         f"{scan.flat.number} flat images of {cols} x {rows} pixels; {metadata.name}"

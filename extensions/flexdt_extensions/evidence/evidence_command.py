@@ -29,14 +29,18 @@ def evidence(
     for name in names or ():
         if not files[name]:
             case = CASES[name]
-            raise CommandError(f"{name}: no {case.files} in {data}; the data: {case.source}")
+            raise CommandError(
+                f"{name}: no {case.files} in {data}; the data: {case.source}"
+            )
     document: list[dict[str, Any]] = []
     for name, own in files.items():
         case = CASES[name]
         yield f"{name}: {case.source}, {case.licence}"
         told = list(case.told(own)) if own else []
         figures = [one for one in told if isinstance(one, Figure)]
-        rows = [(f.what, f.published, f.ours, "yes" if f.agrees else "NO") for f in figures]
+        rows = [
+            (f.what, f.published, f.ours, "yes" if f.agrees else "NO") for f in figures
+        ]
         if not own:
             yield f"  not at hand in {data}"
         if rows:

@@ -114,7 +114,10 @@ class _Numbers(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if module.startswith("cate."):
             return SimpleNamespace
-        numbers = {"numpy": ("_reconstruct", "ndarray", "dtype", "scalar"), "_codecs": ("encode",)}
+        numbers = {
+            "numpy": ("_reconstruct", "ndarray", "dtype", "scalar"),
+            "_codecs": ("encode",),
+        }
         if name in numbers.get(module.split(".")[0], ()):
             return super().find_class(module.replace("numpy.core", "numpy._core"), name)
         raise pickle.UnpicklingError(f"{module}.{name} in a file of numbers")
@@ -128,7 +131,9 @@ def _numbers(file: Path) -> Any:
         return _Numbers(stream).load().item()
 
 
-def _calibrated(seen: Any, frames: Any, start: fx.ConeVec, *free: str) -> tuple[Any, Array]:
+def _calibrated(
+    seen: Any, frames: Any, start: fx.ConeVec, *free: str
+) -> tuple[Any, Array]:
     """Fit the geometry to CaTE's marks; returns the report and the markers' places (k,
     3) [mm]."""
     marks = [
@@ -137,13 +142,20 @@ def _calibrated(seen: Any, frames: Any, start: fx.ConeVec, *free: str) -> tuple[
         for name, (column, row) in seen[frame].items()
     ]
     priors = {"dD_x": 0, "dD_y": 20, "dD_z": 1000 if "dD_z" in free else 0, "dO_z": 0}
-    found = fx.calibrate(None, "unknown", geometry=start, markers=marks, free=free, priors=priors)
+    found = fx.calibrate(
+        None, "unknown", geometry=start, markers=marks, free=free, priors=priors
+    )
     document: Any = found.document
     places = {m["name"]: m["position_mm"] for m in document["markers"]}
     return document, np.array([places[name] for name in sorted(places)])
 
 
-VIEWS: Final[Mapping[str, int]] = {"pos_2": 3600, "pert_0": 24, "pert_2": 14, "pert_2++": 24}
+VIEWS: Final[Mapping[str, int]] = {
+    "pos_2": 3600,
+    "pert_0": 24,
+    "pert_2": 14,
+    "pert_2++": 24,
+}
 """CaTE's scans of 25 September 2020 -> views of a turn."""
 SHIFT_MM: Final = -758.0
 """Shift of the detector [mm], against the SDD of 1098 mm that CaTE starts with."""
@@ -187,7 +199,9 @@ def needles(files: list[Path]) -> Iterator[Told]:
         near = document["identifiable"] and abs(value - SHIFT_MM) <= 2 * sigma
         rms = document["rms_px"]
         yield Figure(f"{scan}: shift of the detector", "about -758 mm", ours, near)
-        yield Figure(f"{scan}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.0)
+        yield Figure(
+            f"{scan}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.0
+        )
 
     for file in files:
         yield from _guarded(partial(of_scan, file), file.name)
@@ -228,23 +242,35 @@ def delft(files: list[Path]) -> Iterator[Told]:
         SDD, residual and axis of each source; markers, turn and magnification of each
         pair.
     """
-    stored = _numbers(files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy"))
+    stored = _numbers(
+        files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy")
+    )
     found: list[tuple[Array, Any, complex, float]] = []
     for k, file in enumerate(files, 1):
         seen = _numbers(file)
         frames = sorted(f for f in seen if len(seen[f]) > 1)
         turn = [(f - frames[0]) * 360 / 773 for f in frames]  # 773 frames are one
-        start = fx.ConeVec.circular(sod=945, sdd=1215, angles=turn, shape=(1548, 550), pixel=PITCH)
+        start = fx.ConeVec.circular(
+            sod=945, sdd=1215, angles=turn, shape=(1548, 550), pixel=PITCH
+        )
         free, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
-        few, sigma = not free["identifiable"], free["parameters"]["dD_z"]["sigma"] or np.inf
+        few, sigma = (
+            not free["identifiable"],
+            free["parameters"]["dD_z"]["sigma"] or np.inf,
+        )
         ours = f"{'refused' if few else 'an answer'}, sigma {sigma:.0f} mm"
         yield Figure(f"{k}: SDD", "three views are too few", ours, few)
         held, places = _calibrated(seen, frames, start, "dO_x")
-        rms, (aside, up) = held["rms_px"], (held["parameters"][key] for key in ("dO_x", "dD_y"))
+        rms, (aside, up) = (
+            held["rms_px"],
+            (held["parameters"][key] for key in ("dO_x", "dD_y")),
+        )
         yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
-        # Theirs are cm; columns grow to the left, seen from the source, and a panel's middle is at
-        # half their number: its mirror image is stored.
-        source, panel = (10 * getattr(stored[k], name) for name in ("_source", "_detector"))
+        # Theirs are cm; columns grow to the left, seen from the source, and a panel's middle is
+        # at half their number: its mirror image is stored.
+        source, panel = (
+            10 * getattr(stored[k], name) for name in ("_source", "_detector")
+        )
         here, there = complex(source[0], -source[1]), complex(panel[0], -panel[1])
         axis = (here * there.conjugate()).imag / abs(here) + 0.5 * PITCH[0]
         above = panel[2] - source[2] + 0.5 * PITCH[1]
@@ -252,17 +278,25 @@ def delft(files: list[Path]) -> Iterator[Told]:
         x, sigma, y = np.array(values, float) * [1215 / 945, 1215 / 945, 1.0]
         ours = f"{x:.2f} (sigma {sigma:.2g}), {y:.1f} mm"
         near = abs(x - axis) <= 0.1 and abs(y - above) <= 2.0  # half a pixel; ten
-        yield Figure(f"{k}: axis aside, panel up", f"{axis:.2f}, {above:.1f} mm", ours, bool(near))
+        yield Figure(
+            f"{k}: axis aside, panel up", f"{axis:.2f}, {above:.1f} mm", ours, bool(near)
+        )
         # From above, turned so that the source, about the axis, is at -90 degrees.
         flat = (places - places.mean(axis=0)) @ [1215 + 1j * x, 1215j - x, 0]
         found.append((places, flat, here, abs(here - there) / abs(here)))
     for (k, one), (m, other) in combinations(enumerate(found, 1), 2):
         apart, larger = _apart(one[0], other[0])
-        yield Figure(f"{k} and {m}: markers", "the same", f"{apart:.3f} mm rms", apart <= 0.2)
-        turned, stands = np.angle([other[2] / one[2], np.vdot(other[1], one[1])], deg=True)
+        yield Figure(
+            f"{k} and {m}: markers", "the same", f"{apart:.3f} mm rms", apart <= 0.2
+        )
+        turned, stands = np.angle(
+            [other[2] / one[2], np.vdot(other[1], one[1])], deg=True
+        )
         more = other[3] / one[3]
         near = abs(stands - turned) <= 0.1 and abs(larger - more) <= SCALE
-        theirs, ours = (f"{a:.2f} deg, {b:.4f}" for a, b in ((turned, more), (stands, larger)))
+        theirs, ours = (
+            f"{a:.2f} deg, {b:.4f}" for a, b in ((turned, more), (stands, larger))
+        )
         yield Figure(f"{k} and {m}: turned, magnified", theirs, ours, bool(near))
 
 
@@ -273,15 +307,17 @@ def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVe
     source = -rays @ matrix[:, 3]
     rays *= pixel / np.linalg.norm(rays[:, 0])
     middle = source + rays @ [(shape[1] - 1) / 2, (shape[0] - 1) / 2, 1.0]
-    return fx.ConeVec.from_vectors(source, middle, rays[:, 0], rays[:, 1], (shape[0], shape[1]))
+    return fx.ConeVec.from_vectors(
+        source, middle, rays[:, 0], rays[:, 1], (shape[0], shape[1])
+    )
 
 
 def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
     """Compute Grangeat's derivative of the object's integrals over planes (k, 3) through
     the source.
 
-    It is that of the integrals of the image, weighted by cosines, over the planes' lines, across
-    those and over the squared cosine of the plane. Pixels are square.
+    It is that of the integrals of the image, weighted by cosines, over the planes' lines,
+    across those and over the squared cosine of the plane. Pixels are square.
     """
     from scipy.ndimage import map_coordinates
 
@@ -318,13 +354,19 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
         numbers = said["Projection Matrix"].strip("[]").replace(";", " ").split()
         matrices.append(np.array(numbers, float).reshape(3, 4))
         pixel = float(said["spacings"].split()[0])
-    points = np.append(np.random.default_rng(0).uniform(-100, 100, (3, 100)), np.ones((1, 100)), 0)
+    points = np.append(
+        np.random.default_rng(0).uniform(-100, 100, (3, 100)), np.ones((1, 100)), 0
+    )
     for lower in (0, 5):
         matrices[-1][1] += lower * matrices[-1][2]
-        views = [_by_matrix(m, i.shape, pixel) for m, i in zip(matrices, images, strict=True)]
+        views = [
+            _by_matrix(m, i.shape, pixel) for m, i in zip(matrices, images, strict=True)
+        ]
         seen = np.array([(m @ points)[:2] / (m @ points)[2] for m in matrices])
         off = np.abs([v.project_points(points[:3].T)[0].T for v in views] - seen).max()
-        yield Figure(f"points, {lower} px lower", "as by matrix", f"{off:.0e} px off", off < 1e-6)
+        yield Figure(
+            f"points, {lower} px lower", "as by matrix", f"{off:.0e} px off", off < 1e-6
+        )
         one, other = (v.source[0] for v in views)
         base = (other - one) / np.linalg.norm(other - one)
         flat = np.cross(base, one + other)
@@ -332,8 +374,12 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
         normals = np.cos(turn) * flat + np.sin(turn) * np.cross(base, flat)
         here, there = (_across(v, i, normals) for v, i in zip(views, images, strict=True))
         apart = float(np.linalg.norm(here - there) / np.linalg.norm(here))
-        ours = f"{100 * apart:.1f} % apart, correlation {np.corrcoef(here, there)[0, 1]:.6f}"
-        what, agrees = ("not the same", apart > 0.1) if lower else ("the same", apart < 0.02)
+        ours = (
+            f"{100 * apart:.1f} % apart, correlation {np.corrcoef(here, there)[0, 1]:.6f}"
+        )
+        what, agrees = (
+            ("not the same", apart > 0.1) if lower else ("the same", apart < 0.02)
+        )
         yield Figure(f"planes of both sources, {lower} px lower", what, ours, agrees)
 
 
@@ -358,7 +404,9 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
         name = file.name.removeprefix("htc2022_").removesuffix("_full.mat")
         published = file.with_name(f"{file.stem}_recon_fbp.mat")
         if not published.exists():
-            yield NotRead(file.name, f"no {published.name}, the published image, beside it")
+            yield NotRead(
+                file.name, f"no {published.name}, the published image, beside it"
+            )
             return
         scan = loadmat(file, simplify_cells=True)["CtDataFull"]
         said = scan["parameters"]
@@ -366,9 +414,13 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
         turn = np.asarray(said["angles"], float)
         once = turn < turn[0] + 360.0 - 1e-6  # the last view is the first one again
         lengths = ("distanceSourceOrigin", "distanceSourceDetector", "pixelSizePost")
-        sod, sdd, pixel, voxel = (float(said[n]) for n in (*lengths, "effectivePixelSizePost"))
+        sod, sdd, pixel, voxel = (
+            float(said[n]) for n in (*lengths, "effectivePixelSizePost")
+        )
         shape = 1, scan["sinogram"].shape[1]
-        fan = fx.ConeVec.circular(sod=sod, sdd=sdd, angles=turn[once], shape=shape, pixel=pixel)
+        fan = fx.ConeVec.circular(
+            sod=sod, sdd=sdd, angles=turn[once], shape=shape, pixel=pixel
+        )
         views = scan["sinogram"][once, None].astype(np.float32)
         ours = fx.fdk(views, fan, fx.Grid((1, *image.shape), voxel)).data[0, ::-1]
         alike = float(np.corrcoef(ours.ravel(), image.ravel())[0, 1])
@@ -383,9 +435,14 @@ def tooth(files: list[Path]) -> Iterator[Told]:
     h5py = package("h5py", "HDF5 files", "io")
     with h5py.File(files[0]) as stored:
         scan = stored["exchange"]
-        counts, white = scan["data"][:].astype(np.uint16), scan["data_white"][:].mean(axis=0)
+        counts, white = (
+            scan["data"][:].astype(np.uint16),
+            scan["data_white"][:].mean(axis=0),
+        )
         dark, turn = scan["data_dark"][:].mean(axis=0), scan["theta"][:]  # deg
-    far = fx.ConeVec.circular(sod=1e5, sdd=1.001e5, angles=turn, shape=counts.shape[1:], pixel=0.01)
+    far = fx.ConeVec.circular(
+        sod=1e5, sdd=1.001e5, angles=turn, shape=counts.shape[1:], pixel=0.01
+    )
     data = fx.DataSet.from_arrays(counts, far, dark=dark, flat=white)
     why = data.align().alignment.refused.get("axis_column_px", "")
     yield Figure("align", "to be refused", why or "an answer", bool(why))
@@ -409,15 +466,23 @@ def _said(make: Callable[[], Any]) -> str:
 
 CASES: Final[Mapping[str, Case]] = {
     "cate": Case(
-        "**/needle_25Sep2020_*_locations.npy", "github.com/adriaangraas/CaTE, examples/needles",
-        "GPL-3.0 (the repository's)", needles,
+        "**/needle_25Sep2020_*_locations.npy",
+        "github.com/adriaangraas/CaTE, examples/needles",
+        "GPL-3.0 (the repository's)",
+        needles,
     ),
-    "htc2022": Case("**/htc2022_*_full.mat", "zenodo.org/records/6984868", "CC-BY-4.0", helsinki),
+    "htc2022": Case(
+        "**/htc2022_*_full.mat", "zenodo.org/records/6984868", "CC-BY-4.0", helsinki
+    ),
     "tooth": Case("**/tooth.h5", "github.com/tomopy/tomopy", "BSD-3-Clause", tooth),
     "zeiss": Case("**/*chip*.txrm", "github.com/tomopy/tomopy", "BSD-3-Clause", zeiss),
-    "carm": Case("**/proj0?0.nrrd", "github.com/aaichert/EpipolarConsistency", "Apache-2.0", c_arm),
-    "delft": Case(
-        f"**/pre_proc_{DELFT}_cam?.npy", "github.com/adriaangraas/fluidized-bed-ct, scripts/calib",
-        "GPL-3.0 (the repository's)", delft,
+    "carm": Case(
+        "**/proj0?0.nrrd", "github.com/aaichert/EpipolarConsistency", "Apache-2.0", c_arm
     ),
-}  # fmt: skip
+    "delft": Case(
+        f"**/pre_proc_{DELFT}_cam?.npy",
+        "github.com/adriaangraas/fluidized-bed-ct, scripts/calib",
+        "GPL-3.0 (the repository's)",
+        delft,
+    ),
+}

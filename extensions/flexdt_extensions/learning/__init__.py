@@ -3,8 +3,9 @@
     import gymnasium
     env = gymnasium.make("flexdt_extensions.learning:flexdt/NextAngle-v0")
 
-Importing this package registers the environments (Gymnasium's own way; the part before the colon
-makes it import the package). The extra `learn` installs Gymnasium; agents are the user's own.
+Importing this package registers the environments (Gymnasium's own way; the part before the
+colon makes it import the package). The extra `learn` installs Gymnasium; agents are the user's
+own.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ for _name, (_entry, _options) in ENVIRONMENTS.items():
         gymnasium.register(
             id=_name,
             entry_point=_entry,
-            vector_entry_point=f"{_HERE}.vector_scanning:ScanVectorEnv" if _turns else None,
+            vector_entry_point=f"{_HERE}.vector_scanning:ScanVectorEnv"
+            if _turns
+            else None,
             kwargs=_options,
         )
 

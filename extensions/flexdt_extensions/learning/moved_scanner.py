@@ -45,7 +45,8 @@ def require_positive(*, or_zero: bool = False, **values: float) -> None:
             least = "0 or more" if or_zero else "more than 0"
             allowed = f"{least}, a whole number" if counted else least
             raise LimitError(
-                f"{name} {value:g}; allowed: {allowed}", {"asked": value, "allowed": allowed}
+                f"{name} {value:g}; allowed: {allowed}",
+                {"asked": value, "allowed": allowed},
             )
 
 
@@ -91,7 +92,9 @@ class Lab:
         exposure_s: of each frame.
     """
 
-    def __init__(self, size_mm: tuple[float, float, float], exposure_s: float = 0.5) -> None:
+    def __init__(
+        self, size_mm: tuple[float, float, float], exposure_s: float = 0.5
+    ) -> None:
         self.machine = builtin_machine()
         profile = profile_of(self.machine)
         guard = SceneGuard(build_scene(self.machine, profile, (box(size_mm),)))
@@ -143,14 +146,18 @@ class Lab:
             way = target - here
             if self.machine.axes[axis].kind == "rotation":
                 way = (way + 180.0) % 360.0 - 180.0
-            ends.append(move(here, 0.0, here + way, *self.scanner.settings(axis), self.now).end)
+            ends.append(
+                move(here, 0.0, here + way, *self.scanner.settings(axis), self.now).end
+            )
         return max(ends) - self.now + self.exposure_s
 
     def poses(self, targets: dict[str, float] | None = None) -> Poses:
         """Compute the nominal pose of the present positions, or with some motors
         elsewhere."""
         positions = self.scanner.positions(self.now)
-        return self.scanner.poses_at({**positions, **(targets or {})}, self.scanner.camera)
+        return self.scanner.poses_at(
+            {**positions, **(targets or {})}, self.scanner.camera
+        )
 
     def small(self, poses: Poses, at: Offsets) -> ConeVec:
         """Compute the coarse detector's geometry."""

@@ -1,8 +1,8 @@
 """The environment in which an agent chooses how to reconstruct a noisy scan.
 
-Each step is one attempt with an algorithm, a strength and a constraint; the reward is the gain in
-quality over the best attempt so far, less the work. Work counts projections instead of seconds, so
-that an episode is the same on every machine. Observations never contain the truth.
+Each step is one attempt with an algorithm, a strength and a constraint; the reward is the gain
+in quality over the best attempt so far, less the work. Work counts projections instead of
+seconds, so that an episode is the same on every machine. Observations never contain the truth.
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.reconstruction import cgls, fdk, sirt
 from flexdt_extensions.learning.moved_scanner import Lab, choices, require_positive
-from flexdt_extensions.learning.rewards import GRID, SIDE_MM, blank, noisy, quality, random_object
+from flexdt_extensions.learning.rewards import (
+    GRID,
+    SIDE_MM,
+    blank,
+    noisy,
+    quality,
+    random_object,
+)
 
 ALGORITHMS: Final = ("fdk", "sirt", "cgls")
 WINDOWS: Final = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
@@ -37,7 +44,8 @@ Action = npt.NDArray[np.int64]
 class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     """Choose algorithm, strength and constraint for a scan of a random object.
 
-    Actions: (algorithm, strength, nonnegative): FDK with one of five windows, SIRT with 5 to 80 or
+    Actions: (algorithm, strength, nonnegative): FDK with one of five windows, SIRT with 5 to 80
+        or
     CGLS with 2 to 13 iterations; then clipped at zero or not.
 
     Observations, (13,) in [0, 1]: views, photons, attempts left, whether there was one, its
@@ -57,8 +65,14 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     ) -> None:
         require_positive(attempts=attempts)
         require_positive(or_zero=True, work_weight=work_weight)
-        self.attempts, self.work_weight, self.render_mode = attempts, work_weight, render_mode
-        self.action_space = gymnasium.spaces.MultiDiscrete([len(ALGORITHMS), len(WINDOWS), 2])
+        self.attempts, self.work_weight, self.render_mode = (
+            attempts,
+            work_weight,
+            render_mode,
+        )
+        self.action_space = gymnasium.spaces.MultiDiscrete(
+            [len(ALGORITHMS), len(WINDOWS), 2]
+        )
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (13,), np.float32)
         self._lab = Lab((SIDE_MM, SIDE_MM, SIDE_MM))
         self._views, self._photons, self._left = VIEWS[0], PHOTONS[0], attempts
@@ -88,7 +102,10 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         low, high = (math.log(p) for p in PHOTONS)
         self._photons = math.exp(rng.uniform(low, high))
         poses = Poses.concatenate(
-            [self._lab.poses({"rot_obj": 360.0 * i / self._views}) for i in range(self._views)]
+            [
+                self._lab.poses({"rot_obj": 360.0 * i / self._views})
+                for i in range(self._views)
+            ]
         )
         self._cone = self._lab.small(poses, NOMINAL)
         clean = project_scene(thing.scene, self._cone, self._lab.small_shape)
@@ -99,7 +116,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         self._last = np.zeros(10, np.float32)
         return self._observe(), {"quality": 0.0, "best": 0.0, "work": 0.0}
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: Action
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Run one attempt.
 
         Args:
@@ -113,7 +132,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
             LimitError: no action of this environment.
             ResetNeeded: the episode has not begun, or is over.
         """
-        algorithm, strength, nonnegative = choices(action, [len(ALGORITHMS), len(WINDOWS), 2])
+        algorithm, strength, nonnegative = choices(
+            action, [len(ALGORITHMS), len(WINDOWS), 2]
+        )
         if self._cone is None or self._left <= 0:
             raise ResetNeeded("there is no episode to go on with: call reset() first")
         volume, work = self._run(algorithm, strength, bool(nonnegative))
@@ -127,11 +148,18 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         kind = np.zeros(3, np.float32)
         kind[algorithm] = 1.0
         self._last = np.array(
-            [1.0, *kind, strength / 4.0, nonnegative,
-             math.sqrt(float(np.mean(rest**2)) / max(scale, 1e-12)), _roughness(volume),
-             float(gain > 0.0), work / (work + 40.0)],
+            [
+                1.0,
+                *kind,
+                strength / 4.0,
+                nonnegative,
+                math.sqrt(float(np.mean(rest**2)) / max(scale, 1e-12)),
+                _roughness(volume),
+                float(gain > 0.0),
+                work / (work + 40.0),
+            ],
             np.float32,
-        )  # fmt: skip
+        )
         reward = 20.0 * gain - self.work_weight * work / 100.0
         info = {"quality": reached, "best": self._best, "work": work}
         return self._observe(), reward, self._left <= 0, False, info
@@ -144,7 +172,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         grey = np.clip(middle * (255.0 / 0.08), 0.0, 255.0).astype(np.uint8)
         return np.repeat(np.kron(grey, np.ones((8, 8), np.uint8))[..., None], 3, axis=2)
 
-    def _run(self, algorithm: int, strength: int, nonnegative: bool) -> tuple[Volume, float]:
+    def _run(
+        self, algorithm: int, strength: int, nonnegative: bool
+    ) -> tuple[Volume, float]:
         """Reconstruct by an algorithm.
 
         Args:
@@ -159,16 +189,23 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         images, cone, like = self._images, self._cone, blank()
         match ALGORITHMS[algorithm]:
             case "fdk":
-                volume, work = fdk(images, cone, like, window=WINDOWS[strength], errors=False), 1.0
+                volume, work = (
+                    fdk(images, cone, like, window=WINDOWS[strength], errors=False),
+                    1.0,
+                )
             case "sirt":
                 count = SIRT_ITERATIONS[strength]
-                volume = sirt(images, cone, like, iterations=count, nonnegative=nonnegative)
+                volume = sirt(
+                    images, cone, like, iterations=count, nonnegative=nonnegative
+                )
                 work = 2.0 * count
             case _:
                 count = CGLS_ITERATIONS[strength]
                 volume, work = cgls(images, cone, like, iterations=count), 2.0 * count
         if nonnegative:
-            volume = Volume(np.maximum(volume.data, 0.0), volume.voxel_mm, volume.center_mm)
+            volume = Volume(
+                np.maximum(volume.data, 0.0), volume.voxel_mm, volume.center_mm
+            )
         return volume, work
 
     def _observe(self) -> Observation:
@@ -178,7 +215,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
             (math.log(self._photons) - low) / (high - low),
             self._left / self.attempts,
         ]
-        return np.asarray(np.clip(np.concatenate([head, self._last]), 0.0, 1.0), np.float32)
+        return np.asarray(
+            np.clip(np.concatenate([head, self._last]), 0.0, 1.0), np.float32
+        )
 
 
 def _roughness(volume: Volume) -> float:

@@ -29,14 +29,23 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.projection import Box, Ellipsoid, Scene, Solid, Volume, forward, project_scene
+from flexdt.twin.projection import (
+    Box,
+    Ellipsoid,
+    Scene,
+    Solid,
+    Volume,
+    forward,
+    project_scene,
+)
 from flexdt.twin.reconstruction import sirt
 from flexdt_extensions.learning.moved_scanner import Lab
 
 Vector = tuple[float, float, float]
 NOISE_PX: Final = 0.1
 PRIOR: Final = 50.0
-"""Standard deviation of every parameter before the first frame, in tolerances (10 mm, 10 deg)."""
+"""Standard deviation of every parameter before the first frame, in tolerances (10 mm, 10
+deg)."""
 SIDE_MM: Final = 50.0
 GRID: Final = 20
 """Number of voxels along each side of a reconstruction of SIDE_MM."""
@@ -52,8 +61,8 @@ uses."""
 class InformationTask:
     """Calibrate with the LEGO phantom: worth is the Fisher information gained [nats].
 
-    Half the increase of log det (prior + information), evaluated at a hidden misalignment. Beads
-    that leave the detector or hide each other add nothing.
+    Half the increase of log det (prior + information), evaluated at a hidden misalignment.
+    Beads that leave the detector or hide each other add nothing.
     """
 
     features = len(SIX)
@@ -71,10 +80,14 @@ class InformationTask:
         tau = rng.normal(0.0, 1.0, 2)
         self._truth = Offsets.from_edge(
             {
-                "dO_x": shift[0], "dO_y": shift[1], "dO_z": shift[2],
-                "alpha": rng.normal(0.0, 5.0), "tau_x": tau[0], "tau_z": tau[1],
+                "dO_x": shift[0],
+                "dO_y": shift[1],
+                "dO_z": shift[2],
+                "alpha": rng.normal(0.0, 5.0),
+                "tau_x": tau[0],
+                "tau_z": tau[1],
             }
-        )  # fmt: skip
+        )
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
@@ -92,7 +105,9 @@ class InformationTask:
         """
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
         span = math.log10(PRIOR) + 3.0
-        return np.asarray(np.clip(2.0 * (np.log10(sigma) + 3.0) / span - 1.0, -1, 1), np.float32)
+        return np.asarray(
+            np.clip(2.0 * (np.log10(sigma) + 3.0) / span - 1.0, -1, 1), np.float32
+        )
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
         """Compute line integrals on the coarse detector without noise, (rows, cols)."""
@@ -110,7 +125,9 @@ class InformationTask:
         start = _log_det(np.eye(len(SIX)) / PRIOR**2)
         return {
             "information": 0.5 * (_log_det(self._information) - start),
-            "worst_sigma": float(np.sqrt(np.diag(np.linalg.inv(self._information)).max())),
+            "worst_sigma": float(
+                np.sqrt(np.diag(np.linalg.inv(self._information)).max())
+            ),
         }
 
     def _of(self, lab: Lab, poses: Poses, at: Offsets) -> FloatArray:
@@ -124,9 +141,14 @@ class InformationTask:
         n, k = len(poses), len(self._model)
         sizes = np.broadcast_to(np.asarray(lab.shape, dtype=np.float64), (n, 2))
         problem = build_problem(
-            np.zeros((n, k, 2)), self._model, poses, free=SIX, shape=sizes, noise_px=NOISE_PX,
+            np.zeros((n, k, 2)),
+            self._model,
+            poses,
+            free=SIX,
+            shape=sizes,
+            noise_px=NOISE_PX,
             start=at,
-        )  # fmt: skip
+        )
         names = problem.layout.names
         scale = np.array([tolerance_of(name) / edge_factor(name) for name in names])
         rows = (problem.jacobian(problem.start) * scale).reshape(n, k, 2, -1)
@@ -148,7 +170,9 @@ class QualityTask:
 
     features = 2
 
-    def __init__(self, draw: Callable[[np.random.Generator], Phantom] | None = None) -> None:
+    def __init__(
+        self, draw: Callable[[np.random.Generator], Phantom] | None = None
+    ) -> None:
         self.draw = random_object if draw is None else draw
         self.size_mm = (SIDE_MM, SIDE_MM, SIDE_MM)
         self._start(blank(), Scene(()))
@@ -184,13 +208,17 @@ class QualityTask:
         geometry = ConeVec.concatenate(self._cones)
         images = np.stack(self.images)
         x = self.volume
-        with warnings.catch_warnings():  # the first frames of every episode are a limited arc
+        with (
+            warnings.catch_warnings()
+        ):  # the first frames of every episode are a limited arc
             warnings.filterwarnings("ignore", "the views leave out")
             self.volume = sirt(
                 images, geometry, x, iterations=ITERATIONS, start=x, nonnegative=True
             )
         rest = images - forward(self.volume, geometry, lab.small_shape)
-        self._residual = float(np.sqrt(np.mean(rest**2) / max(float(np.mean(images**2)), 1e-12)))
+        self._residual = float(
+            np.sqrt(np.mean(rest**2) / max(float(np.mean(images**2)), 1e-12))
+        )
         return self.judge()
 
     def judge(self) -> float:
@@ -234,9 +262,13 @@ def random_object(rng: np.random.Generator) -> Phantom:
         x = along * math.cos(turn) - across * math.sin(turn)
         y = along * math.sin(turn) + across * math.cos(turn)
         a, b, c = rng.uniform(2.0, 4.5, 3)
-        shape = Ellipsoid((x, y, rng.uniform(-8, 8)), (a, b, c), _turned(rng.uniform(0, math.pi)))
+        shape = Ellipsoid(
+            (x, y, rng.uniform(-8, 8)), (a, b, c), _turned(rng.uniform(0, math.pi))
+        )
         solids.append(Solid(shape, "water", water * rng.choice([-0.8, 1.0, 2.0])))
-    return Phantom("random", "random ellipsoids", Scene(tuple(solids)), (SIDE_MM, SIDE_MM, SIDE_MM))
+    return Phantom(
+        "random", "random ellipsoids", Scene(tuple(solids)), (SIDE_MM, SIDE_MM, SIDE_MM)
+    )
 
 
 def random_plates(rng: np.random.Generator) -> Phantom:
@@ -251,7 +283,9 @@ def random_plates(rng: np.random.Generator) -> Phantom:
         center = (across * axes[1][0], across * axes[1][1], rng.uniform(-4.0, 4.0))
         size = (rng.uniform(20.0, 32.0), rng.uniform(4.0, 8.0), rng.uniform(15.0, 30.0))
         solids.append(Solid(Box(center, size, axes), "water", 2.0 * water))
-    return Phantom("plates", "random plates", Scene(tuple(solids)), (SIDE_MM, SIDE_MM, SIDE_MM))
+    return Phantom(
+        "plates", "random plates", Scene(tuple(solids)), (SIDE_MM, SIDE_MM, SIDE_MM)
+    )
 
 
 def noisy(image: Float32Array, photons: float, rng: np.random.Generator) -> Float32Array:

@@ -34,7 +34,8 @@ Kind = Literal["angle", "discrete", "pose"]
 SECTORS: Final = 36
 """Number of angles of a discrete action, and of sectors of the record of angles taken."""
 POSE_AXES: Final = ("mag_obj", "tra_obj", "mag_det")
-"""Motors that a pose moves besides rot_obj: sample along the beam, sideways; detector along it."""
+"""Motors that a pose moves besides rot_obj: sample along the beam, sideways; detector along
+it."""
 GAIN: Final = {"information": 1.0, "quality": 20.0, "plates": 20.0}
 """Reward for one nat, or for a quality of 1."""
 
@@ -89,12 +90,16 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             ("task", task, tuple(TASKS)),
         ):
             if value not in allowed:
-                raise UnknownNameError.among(f"no {what} {value!r}; there are", value, allowed)
+                raise UnknownNameError.among(
+                    f"no {what} {value!r}; there are", value, allowed
+                )
         require_positive(frames=frames, exposure_s=exposure_s)
         require_positive(
-            or_zero=True, time_weight=time_weight, dose_weight=dose_weight,
+            or_zero=True,
+            time_weight=time_weight,
+            dose_weight=dose_weight,
             collision_penalty=collision_penalty,
-        )  # fmt: skip
+        )
         self.kind: Kind = action
         self.frames = frames
         self.time_weight, self.dose_weight = time_weight, dose_weight
@@ -111,12 +116,16 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self.action_space = (
             gymnasium.spaces.Discrete(SECTORS)
             if action == "discrete"
-            else gymnasium.spaces.Box(-1.0, 1.0, (4 if action == "pose" else 1,), np.float32)
+            else gymnasium.spaces.Box(
+                -1.0, 1.0, (4 if action == "pose" else 1,), np.float32
+            )
         )
         self.observation_space = (
             gymnasium.spaces.Box(0, 255, (*self.lab.small_shape, 1), np.uint8)
             if self._shows
-            else gymnasium.spaces.Box(-1.0, 1.0, (7 + self.task.features + SECTORS,), np.float32)
+            else gymnasium.spaces.Box(
+                -1.0, 1.0, (7 + self.task.features + SECTORS,), np.float32
+            )
         )
 
     def reset(
@@ -131,7 +140,9 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self._taken, self._over = 0, False
         return self._observe(), self._info(0.0, 0.0)
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: Action
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move, take a frame and score it.
 
         Args:
@@ -152,9 +163,13 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         cost = self.time_weight * taken.seconds + self.dose_weight * taken.dose
         if taken.collided:
             self._over = True
-            return self._observe(), -self.collision_penalty - cost, True, False, {
-                **self._info(0.0, taken.seconds), "collision": True
-            }  # fmt: skip
+            return (
+                self._observe(),
+                -self.collision_penalty - cost,
+                True,
+                False,
+                {**self._info(0.0, taken.seconds), "collision": True},
+            )
         poses = self.lab.poses()
         worth = self.task.add(self.lab, poses, self.np_random)
         self._last = poses
@@ -233,9 +248,16 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         for axis in POSE_AXES:
             lower, upper = self.lab.range_of(axis)
             place.append(2.0 * (self.lab.position(axis) - lower) / (upper - lower) - 1.0)
-        head = [math.sin(angle), math.cos(angle), *place, 1.0 - self._taken / self.frames,
-                self.lab.now / (self.lab.now + 60.0)]  # fmt: skip
-        vector = np.concatenate([head, self.task.state(), self._sectors]).astype(np.float32)
+        head = [
+            math.sin(angle),
+            math.cos(angle),
+            *place,
+            1.0 - self._taken / self.frames,
+            self.lab.now / (self.lab.now + 60.0),
+        ]
+        vector = np.concatenate([head, self.task.state(), self._sectors]).astype(
+            np.float32
+        )
         return np.clip(vector, -1.0, 1.0)
 
     def _grey(self) -> npt.NDArray[np.uint8]:

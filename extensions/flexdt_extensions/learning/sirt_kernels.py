@@ -12,7 +12,17 @@ from flexdt.measuring import parallel
 
 @parallel
 def solve(
-    first, voxel, length, rows, columns, taken, counts, images, volumes, iterations, smallest
+    first,
+    voxel,
+    length,
+    rows,
+    columns,
+    taken,
+    counts,
+    images,
+    volumes,
+    iterations,
+    smallest,
 ):
     """Improve volumes by SIRT, in place, all objects at once.
 

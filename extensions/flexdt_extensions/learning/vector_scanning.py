@@ -85,11 +85,16 @@ def turntable(size_mm: tuple[float, float, float], exposure_s: float) -> Turntab
 
 
 class TurnedLab(Lab):
-    """A `Lab` on a common turntable: same times, poses and doses, looked up; only rot_obj moves."""
+    """A `Lab` on a common turntable: same times, poses and doses, looked up; only rot_obj
+    moves."""
 
     def __init__(self, table: Turntable) -> None:
         still = table.still
-        self.machine, self.scanner, self.exposure_s = still.machine, still.scanner, still.exposure_s
+        self.machine, self.scanner, self.exposure_s = (
+            still.machine,
+            still.scanner,
+            still.exposure_s,
+        )
         self.table, self.angle = table, still.position("rot_obj")
         self.now = self.dose = 0.0
 
@@ -132,12 +137,17 @@ class Rays:
         rays = len(views[0][0])
         counts = np.concatenate([(length > 0.0).sum(axis=1) for _, length in views])
         ends = np.cumsum([0, *counts])
-        self.first = np.stack([ends[i * rays : (i + 1) * rays + 1] for i in range(SECTORS)])
+        self.first = np.stack(
+            [ends[i * rays : (i + 1) * rays + 1] for i in range(SECTORS)]
+        )
         self.voxel = np.concatenate([voxel[length > 0.0] for voxel, length in views])
         self.length = np.concatenate([length[length > 0.0] for _, length in views])
         self.rows = np.stack([length.sum(axis=1) for _, length in views])
         self.columns = np.stack(
-            [np.bincount(v.ravel(), n.ravel(), GRID**3).astype(np.float32) for v, n in views]
+            [
+                np.bincount(v.ravel(), n.ravel(), GRID**3).astype(np.float32)
+                for v, n in views
+            ]
         )
 
     def solve(self, tasks: Sequence[SharedQuality]) -> None:
@@ -157,9 +167,18 @@ class Rays:
             images[k, : counts[k]] = np.reshape(task.images, (counts[k], -1))
         volumes = np.stack([task.volume.data.ravel() for task in tasks])
         squares = sirt_kernels.solve(
-            self.first, self.voxel, self.length, self.rows, self.columns, taken, counts, images,
-            volumes, ITERATIONS, np.float32(MIN_SUM_SHARE),
-        )  # fmt: skip
+            self.first,
+            self.voxel,
+            self.length,
+            self.rows,
+            self.columns,
+            taken,
+            counts,
+            images,
+            volumes,
+            ITERATIONS,
+            np.float32(MIN_SUM_SHARE),
+        )
         sizes = np.einsum("kir,kir->k", images, images, dtype=np.float64)
         for k, task in enumerate(tasks):
             pixels = counts[k] * images.shape[2]
@@ -169,7 +188,9 @@ class Rays:
 class SharedQuality(QualityTask):
     """A `QualityTask` that is solved together with others."""
 
-    def __init__(self, table: Turntable, draw: Callable[[np.random.Generator], Phantom]) -> None:
+    def __init__(
+        self, table: Turntable, draw: Callable[[np.random.Generator], Phantom]
+    ) -> None:
         self.table = table
         super().__init__(draw)
 
@@ -219,8 +240,11 @@ class _TurnEnv(ScanEnv):
         return TurnedLab(turntable(self.task.size_mm, self._exposure_s))
 
     def measure(self, action: Action) -> SharedQuality | None:
-        """Take the frame of an action that is to come; the task, if that can be solved ahead."""
-        if not isinstance(self.task, SharedQuality) or not isinstance(self.lab, TurnedLab):
+        """Take the frame of an action that is to come; the task, if that can be solved
+        ahead."""
+        if not isinstance(self.task, SharedQuality) or not isinstance(
+            self.lab, TurnedLab
+        ):
             return None
         taken, end = self.lab.table.way(self.lab.angle, self.targets(action)["rot_obj"])
         if taken.collided:
@@ -230,10 +254,11 @@ class _TurnEnv(ScanEnv):
 
 
 class ScanVectorEnv(SyncVectorEnv):
-    """Many `ScanEnv` with discrete actions: equal to as many single ones, at many times the speed.
+    """Many `ScanEnv` with discrete actions: equal to as many single ones, at many times the
+    speed.
 
-    Spaces, seeds (`reset(seed=s)` seeds them with s, s + 1, ...), infos and autoreset are those of
-    Gymnasium's `SyncVectorEnv`.
+    Spaces, seeds (`reset(seed=s)` seeds them with s, s + 1, ...), infos and autoreset are those
+    of Gymnasium's `SyncVectorEnv`.
 
     Args:
         num_envs: how many.
@@ -261,11 +286,14 @@ class ScanVectorEnv(SyncVectorEnv):
     ) -> None:
         action = words.get("action", "angle")
         if action != "discrete":
-            what = f"environments that share a turntable have no action {action!r}; there is"
+            what = (
+                f"environments that share a turntable have no action {action!r}; there is"
+            )
             more = "; for others: vectorization_mode='sync'"
             raise UnknownNameError.among(what, action, ["discrete"], more)
         super().__init__(
-            [lambda: _TurnEnv(**words) for _ in range(num_envs)], autoreset_mode=autoreset_mode
+            [lambda: _TurnEnv(**words) for _ in range(num_envs)],
+            autoreset_mode=autoreset_mode,
         )
         self._turned = cast("list[_TurnEnv]", self.envs)
 
@@ -289,12 +317,16 @@ class ScanVectorEnv(SyncVectorEnv):
         """
         chosen = np.asarray(actions)
         if chosen.shape != (self.num_envs,):
-            raise ValueError(f"actions have shape {chosen.shape}; allowed: ({self.num_envs},)")
+            raise ValueError(
+                f"actions have shape {chosen.shape}; allowed: ({self.num_envs},)"
+            )
         choices(chosen, [SECTORS] * self.num_envs)
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         steps = [
             env.measure(action)
-            for env, action, over in zip(self._turned, chosen, self._autoreset_envs, strict=True)
+            for env, action, over in zip(
+                self._turned, chosen, self._autoreset_envs, strict=True
+            )
             if same_step or not over
         ]
         tasks = [task for task in steps if task is not None]
@@ -319,10 +351,14 @@ def _lengths(cone: ConeVec, shape: tuple[int, int]) -> tuple[VoxelArray, Float32
         shape: detector (rows, cols).
     """
     rows, cols = ((np.arange(n) - (n - 1) / 2.0) for n in shape)
-    ends = cone.detector + (rows[:, None, None] * cone.v + cols[:, None] * cone.u).reshape(-1, 3)
+    ends = cone.detector + (
+        rows[:, None, None] * cone.v + cols[:, None] * cone.u
+    ).reshape(-1, 3)
     way, edge = ends - cone.source, SIDE_MM / GRID
     planes = np.arange(GRID + 1) * edge - SIDE_MM / 2.0
-    with np.errstate(divide="ignore", invalid="ignore"):  # a ray along the planes of an axis
+    with np.errstate(
+        divide="ignore", invalid="ignore"
+    ):  # a ray along the planes of an axis
         cuts = (planes - cone.source[:, :, None]) / way[:, :, None]
     cuts = np.sort(np.nan_to_num(np.clip(cuts, 0.0, 1.0)).reshape(len(way), -1))
     middle = (cuts[:, 1:] + cuts[:, :-1]) / 2.0
@@ -330,5 +366,7 @@ def _lengths(cone: ConeVec, shape: tuple[int, int]) -> tuple[VoxelArray, Float32
     cell = np.floor((points + SIDE_MM / 2.0) / edge).astype(np.int64)
     inside = ((cell >= 0) & (cell < GRID)).all(axis=2)
     length = np.where(inside, np.diff(cuts) * np.linalg.norm(way, axis=1)[:, None], 0.0)
-    voxel = np.where(inside, (cell[..., 2] * GRID + cell[..., 1]) * GRID + cell[..., 0], 0)
+    voxel = np.where(
+        inside, (cell[..., 2] * GRID + cell[..., 1]) * GRID + cell[..., 0], 0
+    )
     return voxel.astype(np.uint32), length.astype(np.float32)

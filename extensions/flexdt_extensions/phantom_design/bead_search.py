@@ -2,11 +2,11 @@
 
 Beads are exchanged between seats one at a time, from several random starts, until no exchange
 helps. A set that looks like itself turned, or whose spots fit at a second start angle, is
-discarded. Seats are plain points (see `seats` for those of a LEGO stack), and `information_table`
-scores a set of them.
+discarded. Seats are plain points (see `seats` for those of a LEGO stack), and
+`information_table` scores a set of them.
 
-Simulated scans then check the predictions: can the beads be identified, and how far do real fits
-scatter? These figures use nothing of the information matrix.
+Simulated scans then check the predictions: can the beads be identified, and how far do real
+fits scatter? These figures use nothing of the information matrix.
 """
 
 from __future__ import annotations
@@ -46,7 +46,12 @@ _TRIAL_SHIFT_MM: Final = 2.0
 
 
 def share_identified(
-    model: BeadModel, planned: PlannedScans, *, trials: int = 3, seed: int = 1, frames: int = 24
+    model: BeadModel,
+    planned: PlannedScans,
+    *,
+    trials: int = 3,
+    seed: int = 1,
+    frames: int = 24,
 ) -> float:
     """Compute the share of simulated scans, each from its own start angle, whose beads
     are told apart.
@@ -71,7 +76,10 @@ def share_identified(
         except TwinError:
             continue
         given = np.concatenate(
-            [_named(index, owner) for index, owner in zip(found.index, owners, strict=True)]
+            [
+                _named(index, owner)
+                for index, owner in zip(found.index, owners, strict=True)
+            ]
         )
         good += not found.ambiguous and not (given == 0).any() and bool((given > 0).any())
     return good / trials
@@ -107,11 +115,19 @@ def measured_spread(
         tracks = _tracks(BeadModel(beads, model.bead_radius_mm), planned, truth)
         tracks = tracks + rng.normal(0.0, planned.noise_px, tracks.shape)
         fit = estimate_geometry(
-            tracks, model, planned.poses, planned.free, shape=planned.sizes(),
-            noise_px=planned.noise_px, free_beads=free_beads,
-            bead_tolerance_mm=tolerance if free_beads else None, priors=widths,
-        )  # fmt: skip
-        off = {n: fit.values[n] - hidden.get(n, 0.0) for n in planned.free if n in fit.values}
+            tracks,
+            model,
+            planned.poses,
+            planned.free,
+            shape=planned.sizes(),
+            noise_px=planned.noise_px,
+            free_beads=free_beads,
+            bead_tolerance_mm=tolerance if free_beads else None,
+            priors=widths,
+        )
+        off = {
+            n: fit.values[n] - hidden.get(n, 0.0) for n in planned.free if n in fit.values
+        }
         seen, true = (
             axis_in_image(planned.poses[:1], at, fit.problem.origin[0])
             for at in (fit.parameters, truth)
@@ -140,12 +156,18 @@ def _shadows(
     for frame, points in enumerate(tracks):
         seen = rng.permutation(np.flatnonzero(np.isfinite(points[:, 0])))
         noisy = points[seen] + rng.normal(0.0, planned.noise_px, (len(seen), 2))
-        out.append(Detections.of_points(noisy, planned.noise_px, radii[frame, seen], planned.shape))
+        out.append(
+            Detections.of_points(
+                noisy, planned.noise_px, radii[frame, seen], planned.shape
+            )
+        )
         owners.append(seen)
     return out, owners
 
 
-def _named(index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
+def _named(
+    index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]
+) -> npt.NDArray[np.int64]:
     """Compare each bead's spot with its owner: 1 for its own, 0 for another's, -1
     without a spot."""
     out = np.full(len(index), -1, dtype=np.int64)
@@ -203,7 +225,9 @@ class Design:
     discarded: int
 
 
-def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a") -> BeadForecast:
+def forecast(
+    model: BeadModel, planned: PlannedScans, criterion: Criterion = "a"
+) -> BeadForecast:
     """Compute the predicted uncertainties, touching spots left out.
 
     Args:
@@ -219,7 +243,9 @@ def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a"
     felt = seats.felt(information)
     return BeadForecast(
         dict(zip(seats.names[: seats.asked], sigma.tolist(), strict=False)),
-        dict(zip(IN_IMAGES, (np.sqrt(np.diag(felt)) / seats.edge_px).tolist(), strict=True)),
+        dict(
+            zip(IN_IMAGES, (np.sqrt(np.diag(felt)) / seats.edge_px).tolist(), strict=True)
+        ),
         float(score_of(felt[None], criterion)[0]),
         float(masks.mean()),
     )
@@ -275,7 +301,11 @@ def design(
             {"asked": count, "allowed": [2, len(places)]},
         )
     some, weight = planned.thinned(DESIGN_FRAMES)
-    slot = np.zeros(len(places), np.int64) if slots is None else np.asarray(slots, dtype=np.int64)
+    slot = (
+        np.zeros(len(places), np.int64)
+        if slots is None
+        else np.asarray(slots, dtype=np.int64)
+    )
     most = count if per_slot is None else per_slot
     table = SeatTable.of(places, radius_mm, some, weight)
     rules = _Rules(slot, most, 2.0 * radius_mm + gap_mm, unlike_mm)
@@ -293,7 +323,15 @@ def design(
         if bounds_mm is not None:
             bounds = np.asarray(bounds_mm, dtype=np.float64)
             beads, index = _polished(
-                beads, index, radius_mm, some, weight, criterion, rules, bounds, resolution_mm
+                beads,
+                index,
+                radius_mm,
+                some,
+                weight,
+                criterion,
+                rules,
+                bounds,
+                resolution_mm,
             )
         order = np.lexsort((beads[:, 1], beads[:, 0], beads[:, 2]))
         beads, index = beads[order], index[order]
@@ -302,7 +340,8 @@ def design(
             return Design(beads, index, forecast(model, planned, criterion), discarded)
         discarded += 1
     raise TwinError(
-        f"all {discarded} bead sets found are ambiguous: their shadows fit at another start angle "
+        f"all {discarded} bead sets found are ambiguous: their shadows fit at another "
+        "start angle "
         "as well; use another number of beads, more bricks or fewer beads in one brick",
         {"asked": count, "discarded": discarded},
     )
@@ -312,8 +351,9 @@ def turned_likeness(beads: FloatArray) -> float:
     """Measure the distance of beads from a turned and shifted copy, at the best turn
     [mm].
 
-    Root mean square distance between each bead and the one it would be taken for, over turns about
-    the vertical of 10 to 350 deg in steps of 5; 0 for a set that looks the same after such a turn.
+    Root mean square distance between each bead and the one it would be taken for, over turns
+    about the vertical of 10 to 350 deg in steps of 5; 0 for a set that looks the same after
+    such a turn.
 
     Args:
         beads: (k, 3) [mm].
@@ -352,7 +392,9 @@ def _allowed(
 ) -> npt.NDArray[np.bool_]:
     """Find the seats that a further bead may take, given `others`: (m,)."""
     gaps = np.linalg.norm(table.places[:, None] - table.places[others][None], axis=2)
-    full = np.bincount(rules.slot[others], minlength=int(rules.slot.max()) + 1) >= rules.most
+    full = (
+        np.bincount(rules.slot[others], minlength=int(rules.slot.max()) + 1) >= rules.most
+    )
     seen = table.visible.any(axis=1)
     return np.asarray((gaps >= rules.apart - 1e-9).all(axis=1) & ~full[rules.slot] & seen)
 
@@ -365,7 +407,8 @@ def _random_set(
         free = np.flatnonzero(_allowed(table, rules, chosen))
         if len(free) == 0:
             raise TwinError(
-                f"{count} beads do not fit: after {len(chosen)} no seat is left that is in view, "
+                f"{count} beads do not fit: after {len(chosen)} no seat is left that is "
+                "in view, "
                 "far enough from the others and in a brick that may hold more",
                 {"asked": count, "allowed": len(chosen)},
             )
@@ -389,7 +432,9 @@ def _exchanged(
     """
     masks = table.alone(chosen)
     summed = np.einsum("kn,knf->kf", masks.astype(np.float64), table.blocks[chosen])
-    best = float(score_of(table.felt(table.marginal(summed).sum(axis=0))[None], criterion)[0])
+    best = float(
+        score_of(table.felt(table.marginal(summed).sum(axis=0))[None], criterion)[0]
+    )
     improved = True
     if turned_likeness(table.places[chosen]) < rules.unlike:
         best = math.inf
@@ -452,7 +497,10 @@ def _polished(
         Beads and seats after the moves.
     """
     beads, index = beads.copy(), index.copy()
-    steps = np.array([s for s in np.ndindex(3, 3, 3) if s != (1, 1, 1)], dtype=np.float64) - 1.0
+    steps = (
+        np.array([s for s in np.ndindex(3, 3, 3) if s != (1, 1, 1)], dtype=np.float64)
+        - 1.0
+    )
     size = float(bounds.max()) / 8.0
     while size >= resolution:
         moved = False
@@ -469,7 +517,10 @@ def _polished(
             best = int(np.argmin(scores))
             trial = beads.copy()
             trial[k] = near[best]
-            if scores[best] < scores[0] * (1.0 - 1e-6) and turned_likeness(trial) >= rules.unlike:
+            if (
+                scores[best] < scores[0] * (1.0 - 1e-6)
+                and turned_likeness(trial) >= rules.unlike
+            ):
                 beads[k], moved = near[best], True
                 index[k] = -1
         if not moved:

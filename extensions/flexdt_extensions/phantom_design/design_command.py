@@ -32,13 +32,19 @@ def design(
     radius: float = option(1.0, "Bead radius.", metavar="MM"),
     body: str = option("abs", "free: block.", metavar="MATERIAL"),
     bead: str = option("steel", metavar="MATERIAL"),
-    position: list[str] | None = option(None, "One for each scan [mm].", metavar="SOD[:LATERAL]"),
+    position: list[str] | None = option(
+        None, "One for each scan [mm].", metavar="SOD[:LATERAL]"
+    ),
     sdd: float = option(1059.0, metavar="MM"),
     frames: int = option(360, "Simulate so many frames of each scan.", min=1),
-    plan: Path | None = option(None, "A scan script instead of positions.", metavar="SCRIPT"),
+    plan: Path | None = option(
+        None, "A scan script instead of positions.", metavar="SCRIPT"
+    ),
     free: Free = None,
     noise: float = option(0.1, "Measure positions with this noise.", metavar="PX"),
-    tolerance: float = option(0.0, "How well beads will sit.", "--bead-tolerance", metavar="MM"),
+    tolerance: float = option(
+        0.0, "How well beads will sit.", "--bead-tolerance", metavar="MM"
+    ),
     criterion: Literal["a", "d", "worst"] = option("a", "What is minimised."),
     trials: int = option(60, "Fits that check it.", min=0),
     seed: int = option(1, "Same seed, same design."),
@@ -65,7 +71,9 @@ def design(
         places = [place(word) for word in position] if position else [(600.0, 0.0)]
         poses, shape = work.circle_poses(scanner, places, sdd, frames)
     if not (noise > 0 and tolerance >= 0 and radius > 0):
-        raise typer.BadParameter("--noise and --radius must be positive, --bead-tolerance >= 0")
+        raise typer.BadParameter(
+            "--noise and --radius must be positive, --bead-tolerance >= 0"
+        )
     asked = names(free) if free else SIX
     priors = known(asked, scanners=[prior_widths(scanner, offsets)])
     scans = PlannedScans(poses, shape, noise, asked, tolerance, priors)
@@ -83,4 +91,6 @@ def design(
     yield table(work.table_rows(document), work.HEADER)
     yield f"\n{work.verdict(document)}"
     if out is not None:
-        yield (f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
+        yield (
+            f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}"
+        )

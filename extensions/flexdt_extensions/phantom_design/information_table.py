@@ -78,7 +78,9 @@ class PlannedScans:
 
     def sizes(self) -> FloatArray:
         """Return (n, 2) detector (rows, cols) of each frame."""
-        return np.broadcast_to(np.asarray(self.shape, dtype=np.float64), (len(self.poses), 2))
+        return np.broadcast_to(
+            np.asarray(self.shape, dtype=np.float64), (len(self.poses), 2)
+        )
 
     def thinned(self, frames: int) -> tuple[PlannedScans, float]:
         """Select at most `frames` of the frames; returns the weight of each as well."""
@@ -128,7 +130,10 @@ class SeatTable:
             weight: of each frame.
         """
         problems = [
-            _problem(BeadModel(places[first : first + SEATS_AT_ONCE], np.array(radius)), planned)
+            _problem(
+                BeadModel(places[first : first + SEATS_AT_ONCE], np.array(radius)),
+                planned,
+            )
             for first in range(0, len(places), SEATS_AT_ONCE)
         ]
         rows = np.concatenate([_rows(problem) for problem in problems])  # (m, n, 2, q)
@@ -140,7 +145,9 @@ class SeatTable:
         blocks = weight * np.einsum("mnip,mniq->mnpq", rows, rows)
         model = BeadModel(places, np.array(radius))
         seen, slopes = image_slopes(problems[0], problems[0].start, 0)
-        widths = problems[0].prior_sigma[:p] * np.array([edge_factor(name) for name in names])
+        widths = problems[0].prior_sigma[:p] * np.array(
+            [edge_factor(name) for name in names]
+        )
         return cls(
             places,
             names,
@@ -156,7 +163,9 @@ class SeatTable:
             planned.bead_tolerance_mm,
         )
 
-    def touching(self, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    def touching(
+        self, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.bool_]:
         """Compare the spots of two seats, (a, b, n): True if they touch, by
         `identify.overlapping`."""
         first, second = self.pixels[a], self.pixels[b]
@@ -213,16 +222,26 @@ def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
     """Build the problem of the planned scans of some beads, every spot of them seen."""
     n, k = len(planned.poses), len(model)
     return build_problem(
-        np.zeros((n, k, 2)), model, planned.poses, free=planned.free, shape=planned.sizes(),
-        noise_px=planned.noise_px, free_beads=planned.bead_tolerance_mm > 0, priors=planned.widths,
-    )  # fmt: skip
+        np.zeros((n, k, 2)),
+        model,
+        planned.poses,
+        free=planned.free,
+        shape=planned.sizes(),
+        noise_px=planned.noise_px,
+        free_beads=planned.bead_tolerance_mm > 0,
+        priors=planned.widths,
+    )
 
 
 def _rows(problem: FitProblem) -> FloatArray:
     """Compute the whitened Jacobian rows of each bead, (k, n, 2, q) edge units."""
     n, k = problem.seen.shape
     factor = np.array([edge_factor(name) for name in problem.layout.names])
-    rows = (problem.jacobian(problem.start) / factor).reshape(n, k, 2, -1).transpose(1, 0, 2, 3)
+    rows = (
+        (problem.jacobian(problem.start) / factor)
+        .reshape(n, k, 2, -1)
+        .transpose(1, 0, 2, 3)
+    )
     p = problem.layout.parameter_count
     if problem.layout.bead_column < 0:
         return np.array(rows[..., :p])
@@ -252,6 +271,8 @@ def score_of(covariance: FloatArray, criterion: Criterion) -> FloatArray:
             return np.asarray(np.sqrt(variances.mean(axis=-1)))
         case "d":
             values = np.linalg.eigvalsh(covariance)
-            return np.asarray(np.exp(0.5 * np.log(np.maximum(values, RIDGE**2)).mean(axis=-1)))
+            return np.asarray(
+                np.exp(0.5 * np.log(np.maximum(values, RIDGE**2)).mean(axis=-1))
+            )
         case _:
             return np.asarray(np.sqrt(variances.max(axis=-1)))

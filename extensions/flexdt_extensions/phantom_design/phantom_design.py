@@ -37,8 +37,17 @@ from flexdt_extensions.phantom_design.bead_search import (
     measured_spread,
     share_identified,
 )
-from flexdt_extensions.phantom_design.information_table import CRITERIA, Criterion, PlannedScans
-from flexdt_extensions.phantom_design.seats import grid_seats, seats_of, stack_phantom, tubes_at
+from flexdt_extensions.phantom_design.information_table import (
+    CRITERIA,
+    Criterion,
+    PlannedScans,
+)
+from flexdt_extensions.phantom_design.seats import (
+    grid_seats,
+    seats_of,
+    stack_phantom,
+    tubes_at,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -82,7 +91,10 @@ class DesignRequest:
 
 
 def circle_poses(
-    machine: Machine, placements: Sequence[tuple[float, float]], sdd_mm: float, frames: int
+    machine: Machine,
+    placements: Sequence[tuple[float, float]],
+    sdd_mm: float,
+    frames: int,
 ) -> tuple[Poses, tuple[int, int]]:
     """Compute one turn per placement (SOD, lateral), beam through the phantom's middle.
 
@@ -101,7 +113,8 @@ def circle_poses(
     for sod, lateral in placements:
         if not (0.0 < sod < sdd_mm < math.inf and math.isfinite(lateral)):
             raise CommandError(
-                f"SOD {sod:g} mm, lateral {lateral:g} mm and SDD {sdd_mm:g} mm; allowed: finite, "
+                f"SOD {sod:g} mm, lateral {lateral:g} mm and SDD {sdd_mm:g} mm; allowed: "
+                "finite, "
                 "0 < SOD < SDD"
             )
     camera = machine.detector.camera
@@ -114,7 +127,9 @@ def circle_poses(
     return Poses.concatenate(parts), camera.shape
 
 
-def script_poses(text: str, machine: Machine, profile: Profile) -> tuple[Poses, tuple[int, int]]:
+def script_poses(
+    text: str, machine: Machine, profile: Profile
+) -> tuple[Poses, tuple[int, int]]:
     """Plan a script and compute its projections' poses, the phantom's middle at the
     sample's height.
 
@@ -192,7 +207,9 @@ def run_design(
                 "score": guess.score,
                 "sigmas": guess.sigmas,
                 "image_sigmas": guess.image_sigmas,
-                "measured": measured_spread(model, scans, trials=request.trials, seed=request.seed)
+                "measured": measured_spread(
+                    model, scans, trials=request.trials, seed=request.seed
+                )
                 if request.trials >= 2 and math.isfinite(guess.worst)
                 else None,
                 "shadows_used": guess.used,
@@ -213,7 +230,9 @@ def run_design(
         "discarded": found.discarded,
         "design": entries[0],
         "spiral": entries[1],
-        "gain": entries[1]["score"] / entries[0]["score"] if entries[1]["determined"] else None,
+        "gain": entries[1]["score"] / entries[0]["score"]
+        if entries[1]["determined"]
+        else None,
         "assumed": list(phantom.assumed),
     }
     if out is not None:
@@ -260,7 +279,11 @@ HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain
 
 
 def write(
-    out: Path, phantom: Phantom, body: BeadHolder, request: DesignRequest, document: dict[str, Any]
+    out: Path,
+    phantom: Phantom,
+    body: BeadHolder,
+    request: DesignRequest,
+    document: dict[str, Any],
 ) -> list[str]:
     """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json.
 
@@ -279,14 +302,24 @@ def write(
     (out / "phantom.json").write_text(json.dumps(phantom.to_dict()), encoding="utf-8")
     _solid(phantom, body).export(out / "phantom.stl", file_type="stl")
     if body.bricks is None:
-        word, drawings = "level", level_drawings(body.size_mm, phantom.beads, request.radius_mm)
+        word, drawings = (
+            "level",
+            level_drawings(body.size_mm, phantom.beads, request.radius_mm),
+        )
     else:
-        word, drawings = "brick", brick_drawings(body.bricks, phantom.beads, request.radius_mm)
+        word, drawings = (
+            "brick",
+            brick_drawings(body.bricks, phantom.beads, request.radius_mm),
+        )
     sections: list[str] = []
     for k, drawing in enumerate(drawings, 1):
         names.append(f"{word}-{k}.png")
         (out / names[-1]).write_bytes(drawing.png())
-        sections += [heading(drawing.title, level=2), drawing.svg(), bullets(drawing.steps)]
+        sections += [
+            heading(drawing.title, level=2),
+            drawing.svg(),
+            bullets(drawing.steps),
+        ]
     (out / "build.html").write_text(_page(phantom, sections, document), encoding="utf-8")
     names.append("design.json")
     (out / "design.json").write_text(
@@ -299,15 +332,24 @@ def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> De
     radius, where = request.radius_mm, dict[str, Any]()
     if body.bricks is not None:
         seats = seats_of(body.bricks, radius)
-        places, where = seats.places, {"slots": seats.brick, "per_slot": request.per_brick}
+        places, where = (
+            seats.places,
+            {"slots": seats.brick, "per_slot": request.per_brick},
+        )
     else:
         # A skin of a bead's radius stays round the beads, so that they are held.
         places = grid_seats(body.size_mm, 2.0 * radius, GRID_STEP_MM)
         where = {"bounds_mm": np.asarray(body.size_mm) / 2.0 - 2.0 * radius}
     return design(
-        places, radius, request.beads, scans, criterion=request.criterion,
-        starts=request.starts, seed=request.seed, **where,
-    )  # fmt: skip
+        places,
+        radius,
+        request.beads,
+        scans,
+        criterion=request.criterion,
+        starts=request.starts,
+        seed=request.seed,
+        **where,
+    )
 
 
 def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom:
@@ -333,10 +375,14 @@ def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom
         description=f"{request.beads} {request.bead_material} beads where they determine most in a "
         f"block of {body.material}",
     )
-    return replace(made, assumed=(f"body of {body.material}, beads of {request.bead_material}",))
+    return replace(
+        made, assumed=(f"body of {body.material}, beads of {request.bead_material}",)
+    )
 
 
-def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[npt.NDArray[np.float64], str]:
+def _spiral(
+    body: BeadHolder, request: DesignRequest
+) -> tuple[npt.NDArray[np.float64], str]:
     """Return the thesis's beads (k, 3) for the same body and number, and the name of
     the set."""
     if body.bricks == Brickwork() and request.beads == 5:
@@ -345,7 +391,9 @@ def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[npt.NDArray[np.fl
     if body.bricks is not None:
         wall = body.bricks.measures["wall_mm"]
         size = (size[0] - 2 * wall, size[1] - 2 * wall, size[2])
-    return spiral_positions(size, request.beads, request.radius_mm), "spiral of the same size"
+    return spiral_positions(
+        size, request.beads, request.radius_mm
+    ), "spiral of the same size"
 
 
 def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
@@ -383,7 +431,8 @@ def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -
         verdict(document),
     ]
     notes = [
-        f"Beads in the object's frame (x right, y away from the source, z up): {'; '.join(beads)}",
+        "Beads in the object's frame (x right, y away from the source, z up): "
+        f"{'; '.join(beads)}",
         f"Chosen by: {document['criterion_text']}",
         f"Assumed: {'; '.join(phantom.assumed)}",
     ]
@@ -517,7 +566,9 @@ def _rectangle(axes: Axes, wide: float, deep: float, fill: str) -> None:
     axes.add_patch(Rectangle((-wide / 2, -deep / 2), wide, deep, fc=fill, ec=LINE))
 
 
-def _disc(axes: Axes, x: float, y: float, radius: float, fill: str, above: int = 1) -> None:
+def _disc(
+    axes: Axes, x: float, y: float, radius: float, fill: str, above: int = 1
+) -> None:
     from matplotlib.patches import Circle
 
     axes.add_patch(Circle((x, y), radius, fc=fill, ec=LINE, zorder=above))

@@ -1,9 +1,9 @@
 """Places where beads can be glued into a stack of LEGO bricks, or held by a block.
 
-A seat is a position where a bead can be glued: touching the roof of the cavity anywhere on half the
-stud pitch, or touching a wall at one of three heights. Seats inside a tube, through a wall or where
-a stud of the brick below comes up are left out. Bricks are at least two studs wide. `bead_search`
-chooses among the seats.
+A seat is a position where a bead can be glued: touching the roof of the cavity anywhere on half
+the stud pitch, or touching a wall at one of three heights. Seats inside a tube, through a wall
+or where a stud of the brick below comes up are left out. Bricks are at least two studs wide.
+`bead_search` chooses among the seats.
 """
 
 from __future__ import annotations
@@ -93,19 +93,30 @@ def seats_of(work: Brickwork, radius_mm: float) -> Seats:
             near = np.linalg.norm(tubes_at(work) - [x, y], axis=1)
             if (near < v["tube_outer_diameter_mm"] / 2.0 + radius_mm - 1e-9).any():
                 continue
-            rows += [(float(x), float(y), z) for z in (levels if at_wall else levels[-1:])]
+            rows += [
+                (float(x), float(y), z) for z in (levels if at_wall else levels[-1:])
+            ]
     if not rows or roof < levels[0]:
         raise LimitError(
             f"a bead of radius {radius_mm:g} mm does not fit into the cavity of a brick",
-            {"asked": radius_mm, "allowed": (roof + radius_mm - v["stud_height_mm"]) / 2.0},
+            {
+                "asked": radius_mm,
+                "allowed": (roof + radius_mm - v["stud_height_mm"]) / 2.0,
+            },
         )
     local, count = np.array(rows), len(rows)
-    places = np.concatenate([local + [0.0, 0.0, work.floor(b)] for b in range(work.bricks)])
+    places = np.concatenate(
+        [local + [0.0, 0.0, work.floor(b)] for b in range(work.bricks)]
+    )
     return Seats(places, np.repeat(np.arange(work.bricks), count))
 
 
 def stack_phantom(
-    work: Brickwork, name: str, beads: npt.ArrayLike, radius_mm: float, bead_material: str = "steel"
+    work: Brickwork,
+    name: str,
+    beads: npt.ArrayLike,
+    radius_mm: float,
+    bead_material: str = "steel",
 ) -> Phantom:
     """Build the stack with beads in its cavities.
 
@@ -138,7 +149,11 @@ def stack_phantom(
         work.size_mm,
         centers,
         np.full(len(centers), radius_mm),
-        tuple(f"{k} = {v}" for k, v in assumed.items() if not k.startswith(("bead_h", "spir"))),
+        tuple(
+            f"{k} = {v}"
+            for k, v in assumed.items()
+            if not k.startswith(("bead_h", "spir"))
+        ),
     )
 
 

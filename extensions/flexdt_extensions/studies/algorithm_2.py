@@ -74,7 +74,8 @@ class Iterated:
 
 @dataclass(frozen=True, eq=False)
 class Algorithm2(Iterated):
-    """The outcome of Algorithm 2; `parameters` is the geometry, in `Poses.cone_vec`'s reading."""
+    """The outcome of Algorithm 2; `parameters` is the geometry, in `Poses.cone_vec`'s
+    reading."""
 
     parameters: Offsets
 
@@ -88,7 +89,9 @@ def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
     """
     pairs = bead_pairs(problem.seen)
     unit = np.array([edge_factor(n) for n in problem.layout.names])
-    small = [unit[i] != 1.0 or n.startswith("tau") for i, n in enumerate(problem.layout.names)]
+    small = [
+        unit[i] != 1.0 or n.startswith("tau") for i, n in enumerate(problem.layout.names)
+    ]
 
     def residual(x: FloatArray) -> FloatArray:
         try:
@@ -102,7 +105,10 @@ def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
 
 
 def iterate(
-    residual: Callable[[FloatArray], FloatArray], x: FloatArray, steps: FloatArray, lam: float
+    residual: Callable[[FloatArray], FloatArray],
+    x: FloatArray,
+    steps: FloatArray,
+    lam: float,
 ) -> Iterated:
     """Run the iteration of Algorithm 2 on any residuals.
 
@@ -120,10 +126,16 @@ def iterate(
     while iterations < MAX_ITERATIONS:
         iterations += 1
         jacobian = np.stack(
-            [(residual(x + e) - residual(x - e)) / (2.0 * e.sum()) for e in np.diag(steps)], axis=1
+            [
+                (residual(x + e) - residual(x - e)) / (2.0 * e.sum())
+                for e in np.diag(steps)
+            ],
+            axis=1,
         )
         try:
-            delta = np.linalg.solve(jacobian.T @ jacobian + lam * np.eye(len(x)), -jacobian.T @ r)
+            delta = np.linalg.solve(
+                jacobian.T @ jacobian + lam * np.eye(len(x)), -jacobian.T @ r
+            )
         except np.linalg.LinAlgError:
             stop = Stop.SINGULAR
             break

@@ -34,7 +34,12 @@ from flexdt.twin.calibration.detect.windows import blur_kernel
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import from_printed_reading, to_printed_reading
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, from_unity
@@ -51,7 +56,13 @@ from flexdt_extensions.studies.algorithm_2 import (
     iterate,
     stacked,
 )
-from flexdt_extensions.studies.experiments import PIXEL_MM, SHAPE, author, thesis, unity_poses
+from flexdt_extensions.studies.experiments import (
+    PIXEL_MM,
+    SHAPE,
+    author,
+    thesis,
+    unity_poses,
+)
 from flexdt_extensions.studies.rendered_runs import line_integrals, photons
 from flexdt_extensions.studies.runs import Run, attempted, clean, fitted_run
 
@@ -104,9 +115,16 @@ def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
     iterations."""
     number = scan_names().index(name) + 1
     row = thesis()[f"table_A_{number + 4}_scan_{number}"][str(used)]
-    after, iterations = next(f[2:] for f in author()["real"]["scans"][name]["fits"] if f[0] == used)
-    # Five beads: ten coordinates and ten distances a frame; the cost is half the sum of squares.
-    return np.array([row[n] for n in SIX]), math.sqrt(2.0 * after / (20 * used)), int(iterations)
+    after, iterations = next(
+        f[2:] for f in author()["real"]["scans"][name]["fits"] if f[0] == used
+    )
+    # Five beads: ten coordinates and ten distances a frame; the cost is half the sum of
+    # squares.
+    return (
+        np.array([row[n] for n in SIX]),
+        math.sqrt(2.0 * after / (20 * used)),
+        int(iterations),
+    )
 
 
 def counts() -> tuple[int, ...]:
@@ -125,7 +143,9 @@ def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArr
     angle = math.radians(truth[3])
     poses = poses_of(name, true_angles(name, used) + angle)
     poses = replace(
-        poses, axis=poses.axis + from_unity(truth[:3]), mount=_turned(truth[4], truth[5], angle)
+        poses,
+        axis=poses.axis + from_unity(truth[:3]),
+        mount=_turned(truth[4], truth[5], angle),
     )
     return poses.cone_vec().project_points(model.beads, SHAPE)
 
@@ -201,14 +221,19 @@ def physical_truth(group: slice, model: BeadModel) -> GroupTruth:
     values[3] += float(np.median(starts))
     fits: list[Iterated] = []
     for _ in range(4):
-        fits = [authors_fit(n, spots(n, values, FITTED_PROJECTIONS, model), model) for n in names]
+        fits = [
+            authors_fit(n, spots(n, values, FITTED_PROJECTIONS, model), model)
+            for n in names
+        ]
         off = [log[0] - fit.x for log, fit in zip(logs, fits, strict=True)]
         values = values + np.median(off, axis=0) * OFFSET_SIGNS
     excess: dict[float, list[float]] = {}
     for name, log, fit in zip(names, logs, fits, strict=True):
         rest = (log[1] ** 2 - 2.0 * fit.cost / (20 * FITTED_PROJECTIONS)) / NOISE_SHARE
         excess.setdefault(_sod(name), []).append(rest)
-    noise = {sod: math.sqrt(max(float(np.median(rest)), 0.0)) for sod, rest in excess.items()}
+    noise = {
+        sod: math.sqrt(max(float(np.median(rest)), 0.0)) for sod, rest in excess.items()
+    }
     return GroupTruth(values, noise)
 
 
@@ -232,19 +257,27 @@ def real_runs(
         model: the beads.
         truth: of the scan's group.
         seed: of the noise.
-        exact: points without rounding and noise; the noise counts in the rms residual all the same.
+        exact: points without rounding and noise; the noise counts in the rms residual all the
+            same.
         used: numbers of projections; None is those of the logs.
 
     Returns:
-        Runs of ours; for each N the logged, the simulated and our estimates, rms and iterations.
+        Runs of ours; for each N the logged, the simulated and our estimates, rms and
+        iterations.
     """
     start = author()["real"]["scans"][name]["start_deg"]
     dO_x, dO_y, dO_z, alpha, *mount = truth.values
     shift = _turned(mount[0], mount[1], math.radians(alpha))
     hidden = Offsets.from_edge(
-        {"dO_x": dO_x, "dO_y": dO_y, "dO_z": dO_z, "alpha": alpha, "tau_x": -shift[0],
-         "tau_z": -shift[1]}
-    )  # fmt: skip
+        {
+            "dO_x": dO_x,
+            "dO_y": dO_y,
+            "dO_z": dO_z,
+            "alpha": alpha,
+            "tau_x": -shift[0],
+            "tau_z": -shift[1],
+        }
+    )
     rows, runs = {}, []
     for n in counts() if used is None else used:
         points = spots(name, truth.values, n, model)
@@ -285,8 +318,9 @@ def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Returns:
         One row a scan: rms and largest difference of alpha [deg], largest difference of the rms
-        residual [%], numbers of fits compared and of those within 1 deg and 15 %, the differences'
-        rms of the other estimates [mm], and mean iterations of logs and simulation.
+        residual [%], numbers of fits compared and of those within 1 deg and 15 %, the
+        differences' rms of the other estimates [mm], and mean iterations of logs and
+        simulation.
     """
     out = []
     for curve in curves:
@@ -294,7 +328,9 @@ def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         if not rows:
             continue
         off = np.array([[r["simulated"][n] - r["logged"][n] for n in SIX] for r in rows])
-        rms = np.array([100.0 * (r["simulated_rms_px"] / r["logged_rms_px"] - 1.0) for r in rows])
+        rms = np.array(
+            [100.0 * (r["simulated_rms_px"] / r["logged_rms_px"] - 1.0) for r in rows]
+        )
         alpha = np.abs(off[:, 3])
         both = np.sqrt(np.mean(off**2, axis=0))
         out.append(
@@ -321,7 +357,8 @@ COUNTS: Final = (3, 5, 8, 10, 15, 24, 36, 60, 120)
 PHOTONS: Final = 20_000.0
 BLUR_PX: Final = 0.7
 VOXEL_MM: Final = 0.08
-"""Assumed: open-beam photons, blur [px], and voxel of the volume in which beads are sought [mm]."""
+"""Assumed: open-beam photons, blur [px], and voxel of the volume in which beads are sought
+[mm]."""
 TOLERANCE_MM: Final = 0.03
 """Assumed: standard deviation of a bead from its model [mm]."""
 
@@ -347,7 +384,9 @@ def hidden_phantom(scene: Scene, model: BeadModel, seed: int) -> tuple[Scene, Be
     return moved_beads(scene, model, off)
 
 
-def moved_beads(scene: Scene, model: BeadModel, shift: FloatArray) -> tuple[Scene, BeadModel]:
+def moved_beads(
+    scene: Scene, model: BeadModel, shift: FloatArray
+) -> tuple[Scene, BeadModel]:
     """Move beads (k, 3) off their model; the solids that are beads move too."""
     solids = []
     for solid in scene.solids:
@@ -388,7 +427,9 @@ def radiographs(
     return out
 
 
-def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel) -> BeadModel:
+def found_beads(
+    images: Sequence[Float32Array], cone: ConeVec, model: BeadModel
+) -> BeadModel:
     """Reconstruct a scan near the model's beads and find their centres in the volume.
 
     Args:
@@ -398,7 +439,9 @@ def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel)
     """
     stack = np.stack(images)
     centres = np.empty_like(model.beads)
-    for k, (centre, radius) in enumerate(zip(model.beads, model.bead_radius_mm, strict=True)):
+    for k, (centre, radius) in enumerate(
+        zip(model.beads, model.bead_radius_mm, strict=True)
+    ):
         side = 2 * int(np.ceil(1.8 * radius / VOXEL_MM)) + 1
         x0, y0, z0 = centre.tolist()
         grid = Volume(np.zeros((side, side, side), np.float32), VOXEL_MM, (x0, y0, z0))
@@ -412,11 +455,18 @@ def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel)
             centres[k, axis] = centre[axis] + float((weight * along).sum() / weight.sum())
     # Their places in each other's frame are found better than the model has them; the volume's
     # scale is no better known than its geometry, which the model's beads gave.
-    return BeadModel(centres, model.bead_radius_mm, TOLERANCE_MM, f"{model.name}, reconstructed")
+    return BeadModel(
+        centres, model.bead_radius_mm, TOLERANCE_MM, f"{model.name}, reconstructed"
+    )
 
 
 def first_scan(
-    name: str, scene: Scene, model: BeadModel, beam: EffectiveBeam, seed: int, frames: int = FRAMES
+    name: str,
+    scene: Scene,
+    model: BeadModel,
+    beam: EffectiveBeam,
+    seed: int,
+    frames: int = FRAMES,
 ) -> tuple[BeadModel, Calibration]:
     """Calibrate a scan from the phantom's model, reconstruct it, and find the beads.
 
@@ -439,10 +489,14 @@ def first_scan(
     request = CalibrationRequest(
         reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=TOLERANCE_MM, priors=exact()
     )
-    result = calibrate([Scan(ArrayFrames(images, SHAPE), poses, name)], model, request, scene=scene)
+    result = calibrate(
+        [Scan(ArrayFrames(images, SHAPE), poses, name)], model, request, scene=scene
+    )
     if result.fit is None:
         reasons = "; ".join(f.text for f in result.errors)
-        raise TwinError(f"{name}, whose volume gives the beads, has no geometry: {reasons}")
+        raise TwinError(
+            f"{name}, whose volume gives the beads, has no geometry: {reasons}"
+        )
     # The last image repeats the first angle.
     turn = poses[np.arange(frames - 1)].cone_vec(result.fit.parameters)
     return found_beads(images[:-1], turn, model), result
@@ -482,7 +536,9 @@ def image_runs(
             [Scan(some, poses[chosen], name)],
             found,
             CalibrationRequest(
-                reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=found.tolerance_mm, priors=exact()
+                reading=Reading.MOUNT_SHIFT,
+                bead_tolerance_mm=found.tolerance_mm,
+                priors=exact(),
             ),
             scene=scene,
         )

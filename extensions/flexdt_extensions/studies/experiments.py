@@ -77,8 +77,8 @@ SHAPE: Final = (760, 956)
 """Detector (rows, cols) of the thesis's experiments."""
 PIXEL_MM: Final = 0.1496
 FIDELITIES: Final = ("points", "noisy", "clean", "images")
-"""Exact points; points with noise; rendered images without noise; rendered noisy images. In both
-kinds of images the beads' identities are unknown."""
+"""Exact points; points with noise; rendered images without noise; rendered noisy images. In
+both kinds of images the beads' identities are unknown."""
 NOISE_PX: Final = 0.1
 """Noise of `noisy` points [px]."""
 EXPERIMENTS: Final = ("beads", "phantoms", "damping", "detector")
@@ -141,7 +141,9 @@ def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, O
     angle = 2.0 * math.pi * np.arange(frames) / frames
     poses = unity_poses(row["source"], row["object_start"], row["detector"], angle)
     x, y, z = row["dO"]
-    truth = Offsets.from_edge({"dO_x": x, "dO_y": y, "dO_z": z, "alpha": row["alpha_deg"]})
+    truth = Offsets.from_edge(
+        {"dO_x": x, "dO_y": y, "dO_z": z, "alpha": row["alpha_deg"]}
+    )
     return poses, truth
 
 
@@ -182,13 +184,27 @@ def tasks(
         (variant, VARIANTS, "variant"),
     ):
         if value not in allowed:
-            raise UnknownNameError.among(f"no {what} {value!r}; there are", value, allowed)
+            raise UnknownNameError.among(
+                f"no {what} {value!r}; there are", value, allowed
+            )
     n = projection_counts() if counts is None else tuple(counts)
     scenarios = tuple(thesis()["scenarios"])
 
     def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:
         return [
-            WorkUnit(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2, variant)
+            WorkUnit(
+                experiment,
+                setting,
+                g,
+                phantom,
+                SIX,
+                damping,
+                n,
+                fidelity,
+                seed,
+                0.2,
+                variant,
+            )
             for g in scenarios
         ]
 
@@ -205,6 +221,8 @@ def tasks(
         case _:
             home = placements()["scenario"]
             return [
-                WorkUnit(experiment, g, home, "normal-3", EIGHT, 1e-2, n, fidelity, seed, 1.0)
+                WorkUnit(
+                    experiment, g, home, "normal-3", EIGHT, 1e-2, n, fidelity, seed, 1.0
+                )
                 for g in placements()["sets"]
             ]

@@ -1,8 +1,9 @@
-"""Rendered radiographs for the studies, and runs of the full pipeline on them, identities unknown.
+"""Rendered radiographs for the studies, and runs of the full pipeline on them, identities
+unknown.
 
-Pixels integrate the intensity over 4 x 4 points wherever a bead is near, as a real detector does; a
-ball sampled once a pixel moves by 0.006 px. The image is blurred, and photons are counted. The
-pipeline knows the nominal poses and the phantom only.
+Pixels integrate the intensity over 4 x 4 points wherever a bead is near, as a real detector
+does; a ball sampled once a pixel moves by 0.006 px. The image is blurred, and photons are
+counted. The pipeline knows the nominal poses and the phantom only.
 """
 
 from __future__ import annotations
@@ -27,7 +28,12 @@ from flexdt.twin.calibration.detect.windows import (
 )
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import FrameSpots, look_at
-from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate, detector_for
+from flexdt.twin.calibration.pipeline import (
+    CalibrationRequest,
+    Scan,
+    calibrate,
+    detector_for,
+)
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
@@ -58,7 +64,11 @@ CLEAN = Rendering(counts=None, blur_px=0.0, fine=1)
 
 
 def intensities(
-    scene: Scene, model: BeadModel, cone: ConeVec, shape: tuple[int, int], fine: int = FINE
+    scene: Scene,
+    model: BeadModel,
+    cone: ConeVec,
+    shape: tuple[int, int],
+    fine: int = FINE,
 ) -> Float32Array:
     """Compute the transmitted share of the open beam, (n, rows, cols), integrated over
     pixels near beads."""
@@ -166,7 +176,10 @@ def render(
     looks: list[FrameSpots] = []
     for image in exposures(scene, model, poses.cone_vec(truth), camera, seed, shape):
         if camera.counts is None:
-            rows, cols = np.nonzero(image.any(axis=1))[0], np.nonzero(image.any(axis=0))[0]
+            rows, cols = (
+                np.nonzero(image.any(axis=1))[0],
+                np.nonzero(image.any(axis=0))[0],
+            )
             box = (
                 slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 1),
                 slice(int(cols[0]), int(cols[-1]) + 1) if len(cols) else slice(0, 1),
@@ -258,7 +271,10 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
             )
         ]
         result = calibrate(
-            scans, model, CalibrationRequest(free=task.free, priors=exact(task.free)), scene=scene
+            scans,
+            model,
+            CalibrationRequest(free=task.free, priors=exact(task.free)),
+            scene=scene,
         )
         note = "; ".join(f.text for f in result.errors)
         problem = None if result.fit is None or note else result.fit.problem
@@ -267,7 +283,9 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     return [attempted(task.setting, task.scenario, n, solve) for n in task.counts]
 
 
-def _rendered(task: WorkUnit, model: BeadModel, scene: Scene) -> tuple[RenderedFrames, ...]:
+def _rendered(
+    task: WorkUnit, model: BeadModel, scene: Scene
+) -> tuple[RenderedFrames, ...]:
     """Make the radiographs of a task's largest number of projections, or take those of
     the last.
 

@@ -1,7 +1,7 @@
 """One run of a study, and the tables made of many runs.
 
-A run is a number of projections in one setting and scenario, solved by our fit and by Algorithm 2.
-Errors are absolute throughout, because signed ones cancel in a mean.
+A run is a number of projections in one setting and scenario, solved by our fit and by Algorithm
+2. Errors are absolute throughout, because signed ones cancel in a mean.
 """
 
 from __future__ import annotations
@@ -109,7 +109,19 @@ def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) 
         return solve(n)
     except Exception as problem:
         note = f"{type(problem).__name__}: {problem}"
-        return Run(setting, scenario, n, False, {}, {}, 0, math.nan, False, note=note, failed=True)
+        return Run(
+            setting,
+            scenario,
+            n,
+            False,
+            {},
+            {},
+            0,
+            math.nan,
+            False,
+            note=note,
+            failed=True,
+        )
 
 
 def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
@@ -121,10 +133,21 @@ def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
         poses = Poses.concatenate(parts)
         tracks = poses.cone_vec(truth).project_points(model.beads, SHAPE)
         if task.fidelity == "noisy":
-            # One generator a run, so that runs can be made in any order; solvers share the noise.
-            key = [task.seed, *task.phantom.encode(), *task.scenario.encode(), n, len(parts)]
-            tracks = tracks + NOISE_PX * np.random.default_rng(key).normal(size=tracks.shape)
-        fit = estimate_geometry(tracks, model, poses, task.free, shape=SHAPE, noise_px=NOISE_PX)
+            # One generator a run, so that runs can be made in any order; solvers share the
+            # noise.
+            key = [
+                task.seed,
+                *task.phantom.encode(),
+                *task.scenario.encode(),
+                n,
+                len(parts),
+            ]
+            tracks = tracks + NOISE_PX * np.random.default_rng(key).normal(
+                size=tracks.shape
+            )
+        fit = estimate_geometry(
+            tracks, model, poses, task.free, shape=SHAPE, noise_px=NOISE_PX
+        )
         return run_of(task, n, fit, truth, fit.problem)
 
     return [attempted(task.setting, task.scenario, n, solve) for n in task.counts]
@@ -181,15 +204,36 @@ def fitted_run(
     """
     weak = () if fit is None else fit.certificate.weak
     if fit is None or not fit.identifiable or note:
-        iterations, note = 0 if fit is None else fit.iterations, note or "not identifiable"
+        iterations, note = (
+            0 if fit is None else fit.iterations,
+            note or "not identifiable",
+        )
         return Run(
-            setting, scenario, n, False, {}, {}, iterations, math.nan, False, weak, note=note
+            setting,
+            scenario,
+            n,
+            False,
+            {},
+            {},
+            iterations,
+            math.nan,
+            False,
+            weak,
+            note=note,
         )
     errors = errors_of(fit.values, truth)
     return Run(
-        setting, scenario, n, True, errors, fit.sigmas, fit.iterations, fit.cost_reduction_pct,
-        _mae(errors) < limit, weak,
-    )  # fmt: skip
+        setting,
+        scenario,
+        n,
+        True,
+        errors,
+        fit.sigmas,
+        fit.iterations,
+        fit.cost_reduction_pct,
+        _mae(errors) < limit,
+        weak,
+    )
 
 
 def _mae(errors: Mapping[str, float]) -> float:
@@ -201,12 +245,16 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
     not count."""
     edge = truth.to_edge()
     return {
-        name: abs(math.remainder(v - edge[name], 360.0) if name == "alpha" else v - edge[name])
+        name: abs(
+            math.remainder(v - edge[name], 360.0) if name == "alpha" else v - edge[name]
+        )
         for name, v in values.items()
     }
 
 
-def _algorithm_2(task: WorkUnit, n: int, problem: FitProblem, truth: Offsets) -> Run | None:
+def _algorithm_2(
+    task: WorkUnit, n: int, problem: FitProblem, truth: Offsets
+) -> Run | None:
     """Solve the same tracks by Algorithm 2; None if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
         return None
@@ -215,9 +263,17 @@ def _algorithm_2(task: WorkUnit, n: int, problem: FitProblem, truth: Offsets) ->
     values = {n: v for n, v in result.parameters.to_edge().items() if n in names}
     errors = errors_of(values, truth)
     return Run(
-        task.setting, task.scenario, n, True, errors, {}, result.iterations,
-        result.cost_reduction_pct, _mae(errors) < task.limit, method=ALGORITHM_2,
-    )  # fmt: skip
+        task.setting,
+        task.scenario,
+        n,
+        True,
+        errors,
+        {},
+        result.iterations,
+        result.cost_reduction_pct,
+        _mae(errors) < task.limit,
+        method=ALGORITHM_2,
+    )
 
 
 def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
@@ -257,7 +313,8 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                 "iterations_max": max((r.iterations for r in solved), default=None),
                 "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
                 "mean_sigma": {
-                    n: _mean([r.sigmas[n] for r in solved if n in r.sigmas]) for n in names
+                    n: _mean([r.sigmas[n] for r in solved if n in r.sigmas])
+                    for n in names
                 },
                 "method": some[0].method,
                 "beside": _beside(some[0].method, beside),
@@ -309,7 +366,11 @@ def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
     out = np.full((len(settings), len(counts)), np.nan)
     for i, setting in enumerate(settings):
         for j, n in enumerate(counts):
-            some = [r.mae for r in runs if r.setting == setting and r.projections == n and r.errors]
+            some = [
+                r.mae
+                for r in runs
+                if r.setting == setting and r.projections == n and r.errors
+            ]
             if some:
                 out[i, j] = float(np.mean(some))
     return settings, counts, out

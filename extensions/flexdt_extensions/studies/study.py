@@ -1,9 +1,9 @@
-"""`flexdt study` without its command line: distributes the runs of an experiment over processes and
-collects their results in one document. The runs are `flexdt_extensions.studies`.
+"""`flexdt study` without its command line: distributes the runs of an experiment over processes
+and collects their results in one document. The runs are `flexdt_extensions.studies`.
 
-The experiment `basin` is here, too: how far off may the start be? It is success against the start's
-error in mm and degrees (RQ5). Gauss-Newton and Levenberg-Marquardt of Algorithm 2 and our fit are
-given the beads' identities; our identification is given spots without them.
+The experiment `basin` is here, too: how far off may the start be? It is success against the
+start's error in mm and degrees (RQ5). Gauss-Newton and Levenberg-Marquardt of Algorithm 2 and
+our fit are given the beads' identities; our identification is given spots without them.
 """
 
 from __future__ import annotations
@@ -17,8 +17,20 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.library.figures import require_plots
-from flexdt.phantoms import Phantom, cuboid_with_beads, load_phantom, loop_positions, material
-from flexdt.twin.calibration import SIX, BeadModel, bead_model, build_problem, estimate_geometry
+from flexdt.phantoms import (
+    Phantom,
+    cuboid_with_beads,
+    load_phantom,
+    loop_positions,
+    material,
+)
+from flexdt.twin.calibration import (
+    SIX,
+    BeadModel,
+    bead_model,
+    build_problem,
+    estimate_geometry,
+)
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.identify import identify
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -68,7 +80,11 @@ class Cell:
 
 def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
     """List the cells of the grid of start errors."""
-    return [Cell(mm, deg, 10, "normal-5", seed, noise_px) for mm in START_MM for deg in START_DEG]
+    return [
+        Cell(mm, deg, 10, "normal-5", seed, noise_px)
+        for mm in START_MM
+        for deg in START_DEG
+    ]
 
 
 def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
@@ -88,19 +104,29 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
         way *= cell.mm / np.linalg.norm(way)
         turn = math.radians(cell.deg) * rng.choice([-1.0, 1.0])
         start = replace(
-            truth, dO_x=truth.dO_x + way[0], dO_y=truth.dO_y + way[1], dO_z=truth.dO_z + way[2],
+            truth,
+            dO_x=truth.dO_x + way[0],
+            dO_y=truth.dO_y + way[1],
+            dO_z=truth.dO_z + way[2],
             alpha=truth.alpha + turn,
-        )  # fmt: skip
+        )
         for method in METHODS:
             found, iterations = _solve(method, _Draw(tracks, model, poses, start, rng))
             values = {} if found is None else found.to_edge()
             errors = errors_of({n: v for n, v in values.items() if n in SIX}, truth)
             out.append(
                 Run(
-                    method, cell.name, FRAMES, found is not None, errors, {}, iterations, math.nan,
+                    method,
+                    cell.name,
+                    FRAMES,
+                    found is not None,
+                    errors,
+                    {},
+                    iterations,
+                    math.nan,
                     bool(errors) and float(np.mean(list(errors.values()))) < LIMIT,
                 )
-            )  # fmt: skip
+            )
     return out
 
 
@@ -132,7 +158,12 @@ def _damped(lam: float) -> Callable[[_Draw], _Found]:
 
 def _ours(draw: _Draw) -> _Found:
     fit = estimate_geometry(
-        draw.tracks, draw.model, draw.poses, shape=SHAPE, noise_px=NOISE_PX, start=draw.start
+        draw.tracks,
+        draw.model,
+        draw.poses,
+        shape=SHAPE,
+        noise_px=NOISE_PX,
+        start=draw.start,
     )
     return fit.parameters, fit.iterations
 
@@ -140,7 +171,8 @@ def _ours(draw: _Draw) -> _Found:
 def _nameless(draw: _Draw) -> _Found:
     # Points in random order, as if detected.
     seen = [
-        Detections.of_points(draw.rng.permutation(f), NOISE_PX, 15.0, SHAPE) for f in draw.tracks
+        Detections.of_points(draw.rng.permutation(f), NOISE_PX, 15.0, SHAPE)
+        for f in draw.tracks
     ]
     found = identify(seen, draw.model, draw.poses, start=draw.start)
     if found.ambiguous:
@@ -220,7 +252,9 @@ def run_study(
     allowed = FIDELITIES[experiment]
     fidelity = allowed[0] if fidelity is None else fidelity
     _require(f"experiment {experiment!r} has no fidelity", fidelity, allowed)
-    variants = VARIANTS if experiment in ("beads", "phantoms", "damping") else VARIANTS[:1]
+    variants = (
+        VARIANTS if experiment in ("beads", "phantoms", "damping") else VARIANTS[:1]
+    )
     _require(f"no variant of {experiment}", variant, variants)
     if experiment == "basin" and counts is not None:
         raise TwinError("basin has one number of projections; counts are not for it")
@@ -237,7 +271,9 @@ def run_study(
             case "real", _:
                 runs, more = _real(spread, say, fidelity, seed, counts)
             case _:
-                work = tasks(experiment, fidelity, counts=counts, seed=seed, variant=variant)
+                work = tasks(
+                    experiment, fidelity, counts=counts, seed=seed, variant=variant
+                )
                 names = [f"{task.setting} {task.scenario}" for task in work]
                 runs, more = _collected(spread(run_task, work), names, say), {}
     document = {**summary(experiment, fidelity, runs), "variant": variant, **more}
@@ -253,7 +289,9 @@ def _require(problem: str, name: str, allowed: Iterable[str]) -> None:
         raise UnknownNameError.among(f"{problem} {name!r}; allowed", name, allowed)
 
 
-def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) -> list[Run]:
+def _collected(
+    results: Iterable[list[Run]], names: Sequence[str], say: Tell
+) -> list[Run]:
     """Collect the runs of all tasks, with a line of progress for each task."""
     runs = []
     for i, (name, some) in enumerate(zip(names, results, strict=True)):
@@ -265,7 +303,9 @@ def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) ->
 
 def run_task(task: WorkUnit) -> list[Run]:
     """Run one task; a plain function, so that it can be sent to another process."""
-    phantom = load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
+    phantom = (
+        load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
+    )
     model = bead_model(phantom)
     if task.fidelity in ("points", "noisy"):
         return point_runs(task, model)
@@ -279,9 +319,14 @@ def authors(name: str) -> Phantom:
     cuboid, beads = name.split("-")
     w, b, h = author()["cuboids"][cuboid]
     return cuboid_with_beads(
-        name, (w, b, h), loop_positions((w, b, h), int(beads), LOOP_INSET_MM), LOOP_RADIUS_MM,
-        body_material="abs", bead_materials=("steel",) * int(beads), description="author's cuboid",
-    )  # fmt: skip
+        name,
+        (w, b, h),
+        loop_positions((w, b, h), int(beads), LOOP_INSET_MM),
+        LOOP_RADIUS_MM,
+        body_material="abs",
+        bead_materials=("steel",) * int(beads),
+        description="author's cuboid",
+    )
 
 
 def basin_task(cell: Cell) -> list[Run]:
@@ -289,18 +334,26 @@ def basin_task(cell: Cell) -> list[Run]:
     return basin_runs(cell, bead_model(load_phantom(cell.phantom)))
 
 
-def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run], Document]:
+def _basin(
+    spread: Map, say: Tell, fidelity: str, seed: int
+) -> tuple[list[Run], Document]:
     """Run all cells: success against the start's error, for Algorithm 2, our fit,
     unknown identities."""
     work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
     runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
     shares = {}
     for method in METHODS:
-        good = [run.success for run in runs if run.setting == method]  # by cells, then draws
-        shares[method] = np.reshape(good, (len(START_MM), len(START_DEG), -1)).mean(axis=2).tolist()
+        good = [
+            run.success for run in runs if run.setting == method
+        ]  # by cells, then draws
+        shares[method] = (
+            np.reshape(good, (len(START_MM), len(START_DEG), -1)).mean(axis=2).tolist()
+        )
     return runs, {
-        "start_mm": list(START_MM), "start_deg": list(START_DEG), "success_share": shares
-    }  # fmt: skip
+        "start_mm": list(START_MM),
+        "start_deg": list(START_DEG),
+        "success_share": shares,
+    }
 
 
 def real_task(
@@ -378,9 +431,15 @@ def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> li
     name, found, seed, frames, counts = task
     phantom = load_phantom("lego")
     return real.image_runs(
-        name, phantom.scene, bead_model(phantom), found, lego_beam(), seed, frames=frames,
+        name,
+        phantom.scene,
+        bead_model(phantom),
+        found,
+        lego_beam(),
+        seed,
+        frames=frames,
         counts=counts,
-    )  # fmt: skip
+    )
 
 
 def real_images_runs(

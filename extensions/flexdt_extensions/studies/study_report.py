@@ -55,20 +55,30 @@ def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str,
     title = f"{document['experiment']}, {document['fidelity']}: MAE"
     parameters = next((list(run.errors) for run in runs if run.errors), [])
     by_parameter = [
-        [_mean([r.errors[p] for r in runs if r.setting == s and r.errors]) for p in parameters]
+        [
+            _mean([r.errors[p] for r in runs if r.setting == s and r.errors])
+            for p in parameters
+        ]
         for s in settings
     ]
     return {
         "mae": heat_map(
-            values, settings, [str(n) for n in counts], title=title, x_label="projections N",
+            values,
+            settings,
+            [str(n) for n in counts],
+            title=title,
+            x_label="projections N",
             good_below=0.2,
         ),
         "parameters": heat_map(
-            np.reshape(by_parameter, (len(settings), len(parameters))), settings, parameters,
-            title="mean absolute error by parameter (mm, deg)", x_label="parameter",
+            np.reshape(by_parameter, (len(settings), len(parameters))),
+            settings,
+            parameters,
+            title="mean absolute error by parameter (mm, deg)",
+            x_label="parameter",
             good_below=0.2,
         ),
-    }  # fmt: skip
+    }
 
 
 def _basin_charts(document: Mapping[str, Any]) -> list[str]:
@@ -77,11 +87,15 @@ def _basin_charts(document: Mapping[str, Any]) -> list[str]:
     columns = [f"{v:g} deg" for v in document["start_deg"]]
     return [
         heat_map(
-            100.0 * np.asarray(share), rows, columns, title=f"{name}: successes (%)",
-            x_label="error of the start angle", good_from=95.0,
+            100.0 * np.asarray(share),
+            rows,
+            columns,
+            title=f"{name}: successes (%)",
+            x_label="error of the start angle",
+            good_from=95.0,
         )
         for name, share in document["success_share"].items()
-    ]  # fmt: skip
+    ]
 
 
 def _real_charts(document: Mapping[str, Any]) -> list[str]:
@@ -99,18 +113,22 @@ def _real_charts(document: Mapping[str, Any]) -> list[str]:
         x = np.log10([float(n) for n in rows])
         series = {
             "logged": [r["logged"]["alpha"] for r in rows.values()],
-            "simulated as the author fits": [r["simulated"]["alpha"] for r in rows.values()],
+            "simulated as the author fits": [
+                r["simulated"]["alpha"] for r in rows.values()
+            ],
             "simulated, right angles": [
-                math.nan if r["ours_alpha"] is None else r["ours_alpha"] for r in rows.values()
+                math.nan if r["ours_alpha"] is None else r["ours_alpha"]
+                for r in rows.values()
             ],
         }
         charts.append(
             plot(
                 [Series(name, x, y) for name, y in series.items()],
-                title=f"{curve['setting']}: alpha against N", x_label="log10 N",
+                title=f"{curve['setting']}: alpha against N",
+                x_label="log10 N",
                 y_label="alpha (deg)",
             )
-        )  # fmt: skip
+        )
         charts.append(curve_table(curve))
     return charts
 
@@ -147,16 +165,20 @@ def real_lines(document: Mapping[str, Any]) -> list[str]:
     if not found:
         return []
     whole = sum(row["within"] == row["fits"] for row in found)
-    most = sum(r["alpha_rms_deg"] < 1.0 and abs(r["rms_largest_pct"]) < 15.0 for r in found)
+    most = sum(
+        r["alpha_rms_deg"] < 1.0 and abs(r["rms_largest_pct"]) < 15.0 for r in found
+    )
     lines = [
         f"logged fits of real scans from N = {ENOUGH} up, against their simulation: "
-        f"{sum(r['within'] for r in found)} of {sum(r['fits'] for r in found)} agree within 1 deg "
+        f"{sum(r['within'] for r in found)} of {sum(r['fits'] for r in found)} agree "
+        "within 1 deg "
         f"of alpha and 15 % of the residual, all of a scan's in {whole} of {len(found)} scans; "
         f"with the rms of alpha's differences instead of each, {most} of {len(found)}"
     ]
     return lines + [
         f"{r['setting']}: alpha differs by {r['alpha_rms_deg']:.2f} deg (rms; largest "
-        f"{r['alpha_largest_deg']:.2f}), the residual by at most {r['rms_largest_pct']:+.0f} %; "
+        f"{r['alpha_largest_deg']:.2f}), the residual by at most "
+        f"{r['rms_largest_pct']:+.0f} %; "
         f"{r['iterations'][0]:.0f} iterations logged, {r['iterations'][1]:.0f} simulated; "
         f"{r['within']} of {r['fits']} within"
         for r in found
@@ -168,13 +190,26 @@ def curve_table(curve: Mapping[str, Any]) -> str:
     right angles."""
     names = ("alpha", "dO_z", "tau_x", "tau_z")
     return table(
-        ["N", *(f"{n}: logged, simulated ({UNITS[n]})" for n in names), "right angles: alpha (deg)",
-         "rms: logged, simulated, right angles (px)", "iterations: logged, simulated"],
-        [[n, *(f"{r['logged'][k]:.2f}, {r['simulated'][k]:.2f}" for k in names), r["ours_alpha"],
-          ", ".join(cell_text(r[f"{k}_rms_px"]) for k in ("logged", "simulated", "ours")),
-          f"{r['logged_iterations']}, {r['simulated_iterations']}"]
-         for n, r in curve["by_projections"].items()],
-    )  # fmt: skip
+        [
+            "N",
+            *(f"{n}: logged, simulated ({UNITS[n]})" for n in names),
+            "right angles: alpha (deg)",
+            "rms: logged, simulated, right angles (px)",
+            "iterations: logged, simulated",
+        ],
+        [
+            [
+                n,
+                *(f"{r['logged'][k]:.2f}, {r['simulated'][k]:.2f}" for k in names),
+                r["ours_alpha"],
+                ", ".join(
+                    cell_text(r[f"{k}_rms_px"]) for k in ("logged", "simulated", "ours")
+                ),
+                f"{r['logged_iterations']}, {r['simulated_iterations']}",
+            ]
+            for n, r in curve["by_projections"].items()
+        ],
+    )
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -190,23 +225,46 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
     """
     rows = [
         [
-            r["setting"], r["runs"], r["success"], r["unidentifiable"], r["mae"], r["mae_max"],
-            r["iterations"], r["cost_reduction_pct"],
-            r["beside"].get("mae"), r["beside"].get("iterations"),
-            r["thesis_mae"], r["thesis_iterations"], r["thesis_cost_reduction_pct"],
+            r["setting"],
+            r["runs"],
+            r["success"],
+            r["unidentifiable"],
+            r["mae"],
+            r["mae_max"],
+            r["iterations"],
+            r["cost_reduction_pct"],
+            r["beside"].get("mae"),
+            r["beside"].get("iterations"),
+            r["thesis_mae"],
+            r["thesis_iterations"],
+            r["thesis_cost_reduction_pct"],
         ]
         for r in document["rows"]
-    ]  # fmt: skip
+    ]
     weak = open_directions(document["rows"])
     others = [r["beside"].get("method") for r in document["rows"] if r["beside"]]
     other = others[0] if others else "other method"
-    head = ["setting", "runs", "success", "not identifiable", "MAE", "worst MAE", "iterations",
-            "cost red. %", f"{other} MAE", f"{other} iterations", "thesis MAE", "thesis iterations",
-            "thesis cost red. %"]  # fmt: skip
+    head = [
+        "setting",
+        "runs",
+        "success",
+        "not identifiable",
+        "MAE",
+        "worst MAE",
+        "iterations",
+        "cost red. %",
+        f"{other} MAE",
+        f"{other} iterations",
+        "thesis MAE",
+        "thesis iterations",
+        "thesis cost red. %",
+    ]
     if weak is not None:
         head += ["weak", "largest mean sigma"]
         rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
-    shown = [i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)]
+    shown = [
+        i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)
+    ]
     head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
     body = [
         heading(f"Study: {document['experiment']}, {document['fidelity']}"),
@@ -245,7 +303,11 @@ def heat_map(
     if good_below is not None:
         worse = np.log10(np.maximum(data, 1e-9) / good_below)
     axes.imshow(
-        np.where(np.isfinite(data), worse, np.nan), "RdYlGn_r", aspect="auto", vmin=-2, vmax=2
+        np.where(np.isfinite(data), worse, np.nan),
+        "RdYlGn_r",
+        aspect="auto",
+        vmin=-2,
+        vmax=2,
     )
     axes.set_xticks(range(len(columns)), columns)
     axes.set_yticks(range(len(rows)), rows)

@@ -92,7 +92,10 @@ def files(folder: Path) -> dict[str, str]:
     """Every file of a batch that must not depend on how it was made -> sha256."""
     found = [p for p in (folder / "data.zarr").rglob("*") if p.is_file()]
     found += [folder / "manifest.json", folder / "items.jsonl"]
-    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in found
+    }
 
 
 def here(path: Path, out: Path) -> dict[str, Any]:
@@ -109,11 +112,23 @@ def test_two_numbers_of_processes_give_equal_manifests_and_chunks(
     path = plan_file(("reconstruct", {"voxel_mm": 2.0, "shape": [8, 12, 12]}))
     for jobs in (1, 3):
         assert (
-            run(["batch", str(path), "--out", str(tmp_path / f"j{jobs}"), "--jobs", str(jobs)]) == 0
+            run(
+                [
+                    "batch",
+                    str(path),
+                    "--out",
+                    str(tmp_path / f"j{jobs}"),
+                    "--jobs",
+                    str(jobs),
+                ]
+            )
+            == 0
         )
     one, three = files(tmp_path / "j1"), files(tmp_path / "j3")
     assert one == three
-    assert len([n for n in one if "/c/" in n]) == 8 * 4 + 2  # a chunk an item and array; tables
+    assert (
+        len([n for n in one if "/c/" in n]) == 8 * 4 + 2
+    )  # a chunk an item and array; tables
 
 
 @pytest.mark.slow
@@ -121,9 +136,19 @@ def test_two_numbers_of_processes_give_equal_manifests_and_chunks(
 def test_a_killed_batch_goes_on_where_it_was(
     plan_file: Callable[..., Path], tmp_path: Path
 ) -> None:
-    path = plan_file(("batch.items", ITEMS), ("geometry.frames", 12), ("camera.shape", [192, 256]))
+    path = plan_file(
+        ("batch.items", ITEMS), ("geometry.frames", 12), ("camera.shape", [192, 256])
+    )
     out = tmp_path / "killed"
-    words = [sys.executable, "-m", "flexdt.clients.cli", "batch", str(path), "--jobs", "2"]
+    words = [
+        sys.executable,
+        "-m",
+        "flexdt.clients.cli",
+        "batch",
+        str(path),
+        "--jobs",
+        "2",
+    ]
     first = subprocess.Popen([*words, "--out", str(out)], stderr=subprocess.DEVNULL,
                              stdout=subprocess.DEVNULL, start_new_session=True)  # fmt: skip
     log = out / "items.jsonl"
@@ -140,7 +165,9 @@ def test_a_killed_batch_goes_on_where_it_was(
         file.write(b'{"index": 39, "seed')  # a line that the crash cut short
     # A chunk that the crash cut short, as Zarr names it.
     (out / "data.zarr" / "projections" / f"c.{'0' * 32}.partial").write_bytes(b"half")
-    done = subprocess.run([*words, "--out", str(out), "--json"], capture_output=True, text=True)
+    done = subprocess.run(
+        [*words, "--out", str(out), "--json"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert 5 <= summary["resumed"] < ITEMS
@@ -164,7 +191,9 @@ def wait_until_alone(group: int) -> None:
         time.sleep(0.05)
 
 
-def test_any_item_can_be_made_alone(plan_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_any_item_can_be_made_alone(
+    plan_file: Callable[..., Path], tmp_path: Path
+) -> None:
     import zarr
 
     path = plan_file()
@@ -196,7 +225,10 @@ def test_seeds_are_numpys_spawned_ones() -> None:
         ours = seed_of(plan, i)
         assert ours.generate_state(4).tolist() == child.generate_state(4).tolist()
         theirs = child.spawn(2)[1]
-        assert seed_of(plan, i, 1).generate_state(4).tolist() == theirs.generate_state(4).tolist()
+        assert (
+            seed_of(plan, i, 1).generate_state(4).tolist()
+            == theirs.generate_state(4).tolist()
+        )
     drawn = [draw_item(plan, i).parameters["sod_mm"] for i in range(8)]
     assert len(set(drawn)) == 8
     other = parse_plan(varied(("batch.seed", 12)))
@@ -227,7 +259,11 @@ def test_images_are_the_spheres_chords_seen_with_the_hidden_geometry() -> None:
         for s in spheres:
             to = np.asarray(s["center_mm"]) - source
             off = np.sum(to**2) - (ray @ to) ** 2
-            total += mu[s["material"]] * 2 * np.sqrt(np.clip(s["radius_mm"] ** 2 - off, 0, None))
+            total += (
+                mu[s["material"]]
+                * 2
+                * np.sqrt(np.clip(s["radius_mm"] ** 2 - off, 0, None))
+            )
         np.testing.assert_allclose(image, total, atol=2e-4)
     assert images.max() > 0.03
 
@@ -254,7 +290,9 @@ def test_the_panels_counts_are_deterministic_and_darker_behind_the_phantom() -> 
     counts = made.arrays["projections"][0]
     assert counts.dtype == np.uint16
     item = draw_item(plan, 0)
-    lines = project_scene(item.phantom.scene, item.poses.cone_vec(item.truth), item.shape)[0]
+    lines = project_scene(
+        item.phantom.scene, item.poses.cone_vec(item.truth), item.shape
+    )[0]
     thin, thick = np.quantile(lines, [0.1, 0.9])
     assert thick > thin + 0.3
     assert counts[lines >= thick].mean() < 0.85 * counts[lines <= thin].mean()
@@ -270,7 +308,9 @@ def test_a_reconstruction_finds_a_sphere_where_it_is() -> None:
     made = run_item(parse_plan(document).text, 0)
     volume = made.arrays["volumes"]
     (sphere,) = made.record["parameters"]["phantom"]["spheres"]
-    z, y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in volume.shape), indexing="ij")
+    z, y, x = np.meshgrid(
+        *(np.arange(n) - (n - 1) / 2 for n in volume.shape), indexing="ij"
+    )
     inside = volume > 0.5 * volume.max()
     centre = [float(axis[inside].mean()) for axis in (x, y, z)]
     np.testing.assert_allclose(centre, sphere["center_mm"], atol=0.4)
@@ -282,7 +322,9 @@ def test_calibrations_err_as_much_as_they_say() -> None:
     records = [run_item(plan.text, i).record for i in range(40)]
     used = [r for r in records if r["identifiable"]]
     assert len(used) > 20
-    pulls = np.array([[r["errors"][n] / r["sigmas"][n] for n in r["errors"]] for r in used])
+    pulls = np.array(
+        [[r["errors"][n] / r["sigmas"][n] for n in r["errors"]] for r in used]
+    )
     # 1 for honest sigmas; (runs x 6) values bound the sample's spread well inside this.
     assert 0.7 < pulls.std() < 1.4
     for record in records:
@@ -462,7 +504,9 @@ def test_draws_stay_within_what_they_say() -> None:
         assert draw.lowest <= min(values) <= max(values) <= draw.highest
         assert (draw.lowest, draw.highest) == (low, high)
         assert parse(draw.to_plain()) == draw
-    middle = np.median([parse({"loguniform": [0.1, 10.0]}).sample(rng) for _ in range(2000)])
+    middle = np.median(
+        [parse({"loguniform": [0.1, 10.0]}).sample(rng) for _ in range(2000)]
+    )
     assert 0.8 < middle < 1.25
     drawn = {parse({"integers": [2, 4]}).sample(rng) for _ in range(100)}
     assert drawn == {2, 3, 4}
@@ -471,7 +515,9 @@ def test_draws_stay_within_what_they_say() -> None:
 # -- elsewhere -----------------------------------------------------------------------------------
 
 
-def test_dask_workers_give_the_same_bytes(plan_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_dask_workers_give_the_same_bytes(
+    plan_file: Callable[..., Path], tmp_path: Path
+) -> None:
     from distributed import LocalCluster
 
     path = plan_file(("batch.items", 5))
@@ -501,7 +547,16 @@ def test_the_slurm_jobs_script(
 ) -> None:
     """As far as it can be tried without a cluster: what dask-jobqueue would hand to sbatch."""
     script = job_script(
-        Slurm(2, 8, "16GiB", "02:30:00", "gpu", "proj-7", ("--gres=gpu:1",), ("module load py",))
+        Slurm(
+            2,
+            8,
+            "16GiB",
+            "02:30:00",
+            "gpu",
+            "proj-7",
+            ("--gres=gpu:1",),
+            ("module load py",),
+        )
     )
     assert script.startswith("#!")
     for line in ("#SBATCH -p gpu", "#SBATCH -A proj-7", "#SBATCH -t 02:30:00", "#SBATCH --mem=16G",
@@ -530,7 +585,13 @@ def test_a_file_says_what_to_ask_slurm_for(
     wanted = read_slurm(file)
     assert (wanted.jobs, wanted.account) == (8, None)
     lines = job_script(wanted).splitlines()
-    for asked in ("-p gpu", "-t 12:00:00", "--mem=64G", "--cpus-per-task=16", "--gres=gpu:1"):
+    for asked in (
+        "-p gpu",
+        "-t 12:00:00",
+        "--mem=64G",
+        "--cpus-per-task=16",
+        "--gres=gpu:1",
+    ):
         assert f"#SBATCH {asked}" in lines
     assert "module load py" in lines
     for text, said in (
@@ -542,7 +603,14 @@ def test_a_file_says_what_to_ask_slurm_for(
             read_slurm(file)
     example = Path(__file__).resolve().parents[2] / "examples" / "batch" / "slurm.toml"
     assert "#SBATCH --exclusive" in job_script(read_slurm(example)).splitlines()
-    words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "v.tif"), "--slurm", str(file)]
+    words = [
+        "reconstruct",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "v.tif"),
+        "--slurm",
+        str(file),
+    ]
     for more in (["--scheduler", "x:1"], ["--algorithm", "em"], ["--preview"]):
         assert run([*words, *more]) == 2
         assert "--slurm" in capsys.readouterr().err
@@ -569,9 +637,20 @@ def test_reconstruct_by_jobs_of_a_stand_in_for_slurm(
     monkeypatch.setenv("PATH", f"{bin_}:{os.environ['PATH']}")
     monkeypatch.chdir(tmp_path)
     geometry = fx.ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(24, 32), pixel=2)
-    fx.simulate(fx.Volume(np.full((8, 8, 8), 0.02, np.float32), 2.0), geometry).save("scan")
+    fx.simulate(fx.Volume(np.full((8, 8, 8), 0.02, np.float32), 2.0), geometry).save(
+        "scan"
+    )
     Path("slurm.toml").write_text('jobs = 1\ncores = 2\nmemory = "1GiB"\n')
-    words = ["reconstruct", "scan", "--shape", "80,12,12", "--voxel", "2", "--json", "--out"]
+    words = [
+        "reconstruct",
+        "scan",
+        "--shape",
+        "80,12,12",
+        "--voxel",
+        "2",
+        "--json",
+        "--out",
+    ]
     assert run([*words, "v.mha", "--slurm", "slurm.toml"]) == 0, capsys.readouterr().err
     assert run([*words, "here.mha"]) == 0
     made, here = (fx.Volume.load(f"{n}.mha").data for n in ("v", "here"))
@@ -591,7 +670,9 @@ def test_slurm_where_there_is_none_is_said(
 
 
 @pytest.mark.parametrize("name", ["spheres", "panel", "calibrations", "radiographs"])
-def test_the_examples_run(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_examples_run(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     import zarr
 
     path = EXAMPLES / f"{name}.toml"
@@ -619,7 +700,9 @@ def test_without_the_extra_one_line_says_what_to_install(
         "from flexdt.clients.cli.command_tree import run\n"
         f"sys.exit(run(['batch', {str(plan_file())!r}, '--out', {str(tmp_path / 'out')!r}]))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 1
     size, missing = done.stderr.splitlines()
     assert size.startswith("8 items, ")

@@ -21,7 +21,8 @@ from flexdt_extensions.slurm_jobs import PLACEHOLDER, SlurmJobs, lifetime_s
 
 WORDS = "Batch job submission failed: Invalid account or account/partition combination specified"
 COMMANDS = {
-    # A job is a process group of this machine, and a file with its state while it is in the queue.
+    # A job is a process group of this machine, and a file with its state while it is in the
+    # queue.
     "sbatch": """
 cd {folder}
 echo x >> submitted
@@ -76,7 +77,9 @@ def submitted(folder: Path) -> int:
 SMALL = Slurm(jobs=1, cores=1, memory="1GiB")
 
 
-def test_what_sbatch_refuses_is_said_in_its_words_at_once(false_slurm: FalseSlurm) -> None:
+def test_what_sbatch_refuses_is_said_in_its_words_at_once(
+    false_slurm: FalseSlurm,
+) -> None:
     folder = false_slurm("refuses")
     said = "Invalid account or account/partition"
     with pytest.raises(CommandError, match=said) as told, slurm_executor(SMALL):
@@ -95,7 +98,8 @@ def test_a_queue_that_delays_is_told_with_its_reason(
         assert list(pool.map(math.sqrt, [4.0, 9.0])) == [2.0, 3.0]
     said = capsys.readouterr().err.splitlines()
     assert any(
-        "waits for workers of jobs" in line and "PENDING (Priority)" in line for line in said
+        "waits for workers of jobs" in line and "PENDING (Priority)" in line
+        for line in said
     )
     assert submitted(folder) == 1
     assert not list(folder.glob("*.job"))  # cancelled at the end
@@ -145,7 +149,9 @@ def test_a_scheduler_without_workers_is_told(
 
     monkeypatch.setattr(cluster_watch, "EVERY_S", 0.2)
     with (
-        LocalCluster(n_workers=0, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(
+            n_workers=0, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
         dask_executor(cluster.scheduler_address) as pool,
     ):
         waiting = pool.submit(math.sqrt, 16.0)
@@ -184,7 +190,9 @@ class Queue:
         out, code, error = "", 0, ""
         if words[0] == "squeue":
             out = "".join(f"{job} {state}\n" for job, state in self.listed.items())
-            code, error = (1, "Unable to contact slurm controller") if self.silent else (0, "")
+            code, error = (
+                (1, "Unable to contact slurm controller") if self.silent else (0, "")
+            )
         elif words[0] == "sbatch" and self.refuses:
             code, error = 1, WORDS
         elif words[0] == "sbatch":
@@ -208,7 +216,9 @@ def test_as_many_jobs_as_wanted_are_in_the_queue_whatever_ends(
     jobs.submit()
     for _ in range(60):
         queue.refuses, queue.silent = rng.random() < 0.2, rng.random() < 0.2
-        running = [job for job in jobs.jobs if job.id in queue.listed and rng.random() < 0.8]
+        running = [
+            job for job in jobs.jobs if job.id in queue.listed and rng.random() < 0.8
+        ]
         workers = [f"{job.name}-{i}" for job in running for i in range(2)]
         lines = jobs.tend(workers)
         for job in jobs.jobs:

@@ -60,7 +60,9 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def test_a_shard_is_a_file_and_holds_what_items_alone_are(folder: Path) -> None:
-    chunks = [p for p in (folder / "data.zarr" / "projections" / "c").rglob("*") if p.is_file()]
+    chunks = [
+        p for p in (folder / "data.zarr" / "projections" / "c").rglob("*") if p.is_file()
+    ]
     assert len(chunks) == 7  # of 8 items, the last of 2
     data = TrainingData(folder)
     plan = plan_of(50, 8)
@@ -72,7 +74,9 @@ def test_a_shard_is_a_file_and_holds_what_items_alone_are(folder: Path) -> None:
             np.testing.assert_array_equal(sample[name], values)
 
 
-def test_any_order_and_any_interruption_give_the_same_files(folder: Path, tmp_path: Path) -> None:
+def test_any_order_and_any_interruption_give_the_same_files(
+    folder: Path, tmp_path: Path
+) -> None:
     """Outcomes stored in random order, the log cut anywhere in between, then taken up."""
     plan, rng = plan_of(50, 8), np.random.default_rng(8)
     outcomes = {i: run_item(plan.text, i) for i in range(50)}
@@ -129,7 +133,9 @@ def test_a_pickled_one_goes_on_alike(folder: Path) -> None:
     data = TrainingData(folder, Augment(photons=(50.0, 5000.0), shift_px=0.7), seed=2)
     data.epoch = 3
     before = data[5]["projections"]
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(data))[5]["projections"], before)
+    np.testing.assert_array_equal(
+        pickle.loads(pickle.dumps(data))[5]["projections"], before
+    )
 
 
 def test_dose_is_the_spread_that_photons_have(folder: Path) -> None:
@@ -148,11 +154,16 @@ def test_dose_is_the_spread_that_photons_have(folder: Path) -> None:
 
 def test_a_shift_moves_image_and_true_geometry_together(folder: Path) -> None:
     """The centre of mass on the panel moves against the panel, which moved by the same."""
-    plain, data = TrainingData(folder)[0], TrainingData(folder, Augment(shift_px=0.4), seed=6)
+    plain, data = (
+        TrainingData(folder)[0],
+        TrainingData(folder, Augment(shift_px=0.4), seed=6),
+    )
     rows, cols = np.mgrid[0:12, 0:16]
     for data.epoch in range(5):
         moved = data[0]
-        np.testing.assert_array_equal(moved["cone_vec_nominal"], plain["cone_vec_nominal"])
+        np.testing.assert_array_equal(
+            moved["cone_vec_nominal"], plain["cone_vec_nominal"]
+        )
         change = moved["cone_vec_true"] - plain["cone_vec_true"]
         assert np.abs(change[:, [0, 1, 2, *range(6, 12)]]).max() == 0.0
         u, v = plain["cone_vec_true"][:, 6:9], plain["cone_vec_true"][:, 9:12]
@@ -203,4 +214,6 @@ def test_pytorch_streams_and_indexes_it(folder: Path, workers: int) -> None:
     if workers == 0:
         assert found == seen(data)
     by_number = torch.utils.data.DataLoader(data, batch_size=4, num_workers=workers)
-    assert [int(i) for batch in by_number for i in batch["index"]] == data.indices.tolist()
+    assert [
+        int(i) for batch in by_number for i in batch["index"]
+    ] == data.indices.tolist()

@@ -67,7 +67,9 @@ def small(monkeypatch):
             Peer("absent", "not installed", False, Doubled),
         ],
     )
-    monkeypatch.setenv("NUMBA_DISABLE_CUDA", "0")  # the command sets it: undone after the test
+    monkeypatch.setenv(
+        "NUMBA_DISABLE_CUDA", "0"
+    )  # the command sets it: undone after the test
 
 
 def test_document_has_the_published_shape(small) -> None:
@@ -83,7 +85,10 @@ def test_document_has_the_published_shape(small) -> None:
     # The peer's error is the mean of the images themselves, as a share of the maximum.
     assert 0.01 < case["peers"]["doubled"]["mean_error"] < 1
     assert case["ratio"]["doubled"] > 0
-    assert document["machine"]["peers"] == {"doubled": "took part", "absent": "not installed"}
+    assert document["machine"]["peers"] == {
+        "doubled": "took part",
+        "absent": "not installed",
+    }
     assert case["measured"] == document["machine"]["measured"]
     json.dumps(document)
 
@@ -102,7 +107,11 @@ def test_json_goes_to_standard_output_alone(small, monkeypatch, capsys, tmp_path
 
 
 def test_figure_shows_ratios_and_growth() -> None:
-    points = [{"series": s, "x": x, "ms": 0.1 * x} for s in ("level", "tilted") for x in (1, 2, 4)]
+    points = [
+        {"series": s, "x": x, "ms": 0.1 * x}
+        for s in ("level", "tilted")
+        for x in (1, 2, 4)
+    ]
     document = {
         "cases": [{"name": "C<1>", "ratio": {"itk-rtk": 12.34}}],
         "growth": {"threads": points},
@@ -133,7 +142,9 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
     page = tmp_path / "performance.md"
     page.write_text(f"# Title\n{PAGE.BEGIN}\n{PAGE.END}\n", "utf-8")
     monkeypatch.setattr(
-        further_bench, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
+        further_bench,
+        "growth_with_threads",
+        lambda: [{"series": "level", "x": 1, "ms": 7.5}],
     )
     further = ["--no-peers", "--only", "growth-threads"]
     words = ["bench", "--out", str(tmp_path / "out")]
@@ -151,22 +162,47 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
     assert "- ms against threads, level: 1: 7.50" in text
     kept = json.loads((tmp_path / "images" / "bench.json").read_text("utf-8"))
     assert [case["name"] for case in kept["cases"]] == ["C1"]
-    once_more = {**kept, "cases": [{**kept["cases"][0], "views": 9}, {"name": "new"}], "growth": {}}
+    once_more = {
+        **kept,
+        "cases": [{**kept["cases"][0], "views": 9}, {"name": "new"}],
+        "growth": {},
+    }
     together = PAGE.merged(kept, once_more)
-    assert [(c["name"], c.get("views")) for c in together["cases"]] == [("C1", 9), ("new", None)]
+    assert [(c["name"], c.get("views")) for c in together["cases"]] == [
+        ("C1", 9),
+        ("new", None),
+    ]
     assert together["growth"] == kept["growth"]
 
 
 def test_short_calls_get_more_rounds() -> None:
-    timing = interleaved({"short": lambda: None, "long": lambda: time.sleep(0.02)}, budget_s=0.2)
+    timing = interleaved(
+        {"short": lambda: None, "long": lambda: time.sleep(0.02)}, budget_s=0.2
+    )
     assert timing["short"].calls > 100
     assert 3 <= timing["long"].calls <= 15
 
 
 def test_cases_are_those_of_the_targets() -> None:
     names = [case.name for case in peer_cases()]
-    assert names[:8] == ["C1", "C2", "C3", "C1x36", "C2x10", "C1-tilt", "C2-tilt", "C3-tilt"]
-    assert names[8:] == ["above-30", "above-45", "above-60", "above-75", "row", "small-tilt"]
+    assert names[:8] == [
+        "C1",
+        "C2",
+        "C3",
+        "C1x36",
+        "C2x10",
+        "C1-tilt",
+        "C2-tilt",
+        "C3-tilt",
+    ]
+    assert names[8:] == [
+        "above-30",
+        "above-45",
+        "above-60",
+        "above-75",
+        "row",
+        "small-tilt",
+    ]
     geometry = {case.name: case.geometry for case in [*peer_cases(), *untuned_cases()]}
     assert len(geometry["C1x36"]) == 36
     c1, tilted = geometry["C1"], geometry["C1-tilt"]
@@ -192,9 +228,14 @@ def test_sixty_degrees_are_sixty() -> None:
 
 
 def test_two_exact_methods_agree() -> None:
-    volume, view = noise((9, 8, 7), 0.3), circle(2, SHAPE, pitch=0.5, tilt_deg=(3.0, 2.0, 1.0))
+    volume, view = (
+        noise((9, 8, 7), 0.3),
+        circle(2, SHAPE, pitch=0.5, tilt_deg=(3.0, 2.0, 1.0)),
+    )
     exact = exact_images(volume, view, SHAPE)
-    pixels = np.array([[v, r, c] for v in (0, 1) for r in (3, 15, 22) for c in (4, 20, 33)])
+    pixels = np.array(
+        [[v, r, c] for v in (0, 1) for r in (3, 15, 22) for c in (4, 20, 33)]
+    )
     second = sorted_crossings(volume, view, SHAPE, pixels)
     assert second.max() > 0.1
     assert np.abs(exact[tuple(pixels.T)] - second).max() < 1e-6 * second.max()
@@ -236,7 +277,9 @@ def test_targets_are_judged_from_the_document() -> None:
             entry("adjoint-on-axis", times_forward=2.2),
         ]
     }
-    rows = {line.split(" | ")[0].strip("| "): line for line in PAGE.target_table(document)}
+    rows = {
+        line.split(" | ")[0].strip("| "): line for line in PAGE.target_table(document)
+    }
     assert rows["C1, level"].endswith("| 10.0 x | 20.0 x | 19.0 x | accepted: met |")
     assert rows["C2, level"].endswith("| not measured | |")
     # 71 ms against 153 ms: LEAP is 2.15 times as fast as what we are compared with.
@@ -249,13 +292,19 @@ def test_targets_are_judged_from_the_document() -> None:
     assert "2e-05 (worst: near) | **missed**" in rows["worst error, all cases"]
     assert rows["bead phantom on C1's detector"].endswith("| 1.0 ms | wanted: met |")
     assert rows["FDK"].endswith("wanted: met |")
-    assert "1.20 x (worst: adjoint-C1) | accepted: met" in rows["adjoint against forward, C1 to C3"]
+    assert (
+        "1.20 x (worst: adjoint-C1) | accepted: met"
+        in rows["adjoint against forward, C1 to C3"]
+    )
     assert "2.20 x" in rows["adjoint against forward, cases nobody tuned for"]
 
 
 def test_a_page_says_which_cases_are_of_another_run(small) -> None:
     document = run.run_bench()
-    old = {**document, "cases": [dict(document["cases"][0], name=n) for n in ("A", "B", "C1")]}
+    old = {
+        **document,
+        "cases": [dict(document["cases"][0], name=n) for n in ("A", "B", "C1")],
+    }
     for case in old["cases"]:
         case["measured"] = "2001-01-01T00:00+00:00"
     page = PAGE.into_page(f"{PAGE.BEGIN}{PAGE.END}", PAGE.merged(old, document), "")
@@ -340,9 +389,13 @@ def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("installed", [False, True])
-def test_the_page_of_a_device_says_why_astra_takes_no_part(monkeypatch, installed) -> None:
+def test_the_page_of_a_device_says_why_astra_takes_no_part(
+    monkeypatch, installed
+) -> None:
     missing = "astra-toolbox is not installed"
-    monkeypatch.setattr(device_page, "absent", lambda name: None if installed else missing)
+    monkeypatch.setattr(
+        device_page, "absent", lambda name: None if installed else missing
+    )
     monkeypatch.setitem(sys.modules, "astra", None)  # as if a library of its did not load
     why = device_page.why_no_astra()
     assert why is not None

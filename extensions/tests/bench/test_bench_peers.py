@@ -1,4 +1,5 @@
-"""The benchmark's peers do what ours does: each where it is installed, RTK in its own process."""
+"""The benchmark's peers do what ours does: each where it is installed, RTK in its own
+process."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def needs(name):
 
 
 def smooth() -> Volume:
-    """No mirror and no exchange of axes leaves it as it is; smooth, for peers that interpolate."""
+    """No mirror and no exchange of axes leaves it as it is; smooth, for peers that
+    interpolate."""
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, n) for n in (36, 30, 32)], indexing="ij")
     near = np.exp(-30 * ((x - 0.4) ** 2 + (y + 0.25) ** 2 + 2 * (z - 0.15) ** 2))
     values = np.exp(-4 * (x * x + y * y + z * z)) + 2 * near
@@ -33,8 +35,8 @@ def smooth() -> Volume:
 
 
 def agree(runner, volume, view, worst: float, mean: float) -> None:
-    """Interpolation differs from steps of voxels by half a voxel of slope at most, and hardly in
-    the mean; a mirrored image does everywhere.
+    """Interpolation differs from steps of voxels by half a voxel of slope at most, and hardly
+    in the mean; a mirrored image does everywhere.
     """
     try:
         runner.run()
@@ -67,7 +69,9 @@ def test_rtk_fdk_in_its_own_process() -> None:
     ball = Scene((Solid(Sphere((4.0, -3.0, 2.0), 6.0), "abs", 0.02),))
     images = project_scene(ball, view, SHAPE)
     grid = Volume(np.zeros((20, 24, 28), np.float32), 1.0)
-    other = rtk.Rtk(rtk_fdk, images, view.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
+    other = rtk.Rtk(
+        rtk_fdk, images, view.rows, grid.shape, grid.voxel_xyz, grid.center_mm
+    )
     try:
         other.run()
         theirs = other.images()

@@ -1,4 +1,5 @@
-"""`examples/research/further_bench.py` on small problems: the references, and who takes part."""
+"""`examples/research/further_bench.py` on small problems: the references, and who takes
+part."""
 
 from __future__ import annotations
 
@@ -84,7 +85,9 @@ def test_what_memory_allows_is_counted_from_the_geometry(monkeypatch) -> None:
     assert entry["least_MB"] == pytest.approx(16 * 12 * 10 * 4e-6)
     assert entry["bound_ms"] == pytest.approx(1e3 * entry["least_MB"] / 1e-3 / 1e3)
     assert entry["share"] == pytest.approx(entry["bound_ms"] / entry["ms_per_view"])
-    assert all(entry[key] > 0 for key in ("cpu_ms", "cached_ms", "cached_cpu_ms", "serial_ms"))
+    assert all(
+        entry[key] > 0 for key in ("cpu_ms", "cached_ms", "cached_cpu_ms", "serial_ms")
+    )
     # Points close together on the lines from the source to a detector column's place.
     counted = 0
     for one in view.rows:
@@ -103,7 +106,9 @@ def test_no_peers_means_none(monkeypatch) -> None:
 
     parts = []
     monkeypatch.setattr(
-        further_bench, "GROUPS", {("mesh",): lambda wanted, part: parts.append(part) or []}
+        further_bench,
+        "GROUPS",
+        {("mesh",): lambda wanted, part: parts.append(part) or []},
     )
     monkeypatch.setattr(further_bench, "absent", lambda name: None)
     assert further_bench.run(["mesh"], with_peers=False)["machine"]["peers"] == {}
@@ -111,7 +116,9 @@ def test_no_peers_means_none(monkeypatch) -> None:
     assert parts == [frozenset(), {"itk-rtk", "embreex"}]
     monkeypatch.setattr(further_bench, "Embree", refuse)
     monkeypatch.setattr(further_bench, "BINNED", SHAPE)
-    monkeypatch.setattr(further_bench, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
+    monkeypatch.setattr(
+        further_bench, "circle", lambda n, shape: circle(n, shape, pitch=1.5)
+    )
     monkeypatch.setattr(further_bench, "CHECKED", 20)
     for made in further_bench.meshes(frozenset()):
         assert made["worst_error"] < 1e-6

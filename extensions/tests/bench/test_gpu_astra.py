@@ -14,7 +14,9 @@ from flexdt.twin.projection import Volume, forward, gpu
 from flexdt_extensions.bench import device_page
 
 FOUND = gpu.availability()
-needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUND.reason}")
+needs_gpu = pytest.mark.skipif(
+    not FOUND.present, reason=f"no CUDA device: {FOUND.reason}"
+)
 
 
 def circle(n: int, sod: float, sdd: float, pixel: float, roll: float = 0.0) -> fx.ConeVec:
@@ -29,7 +31,9 @@ def test_probing_without_a_device_answers_and_touches_no_astra() -> None:
         "from flexdt_extensions.bench import device_page; "
         "print(gpu.availability()); assert 'astra' not in sys.modules"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=100
+    )
     assert done.returncode == 0, done.stderr
     assert "Availability" in done.stdout
 
@@ -45,7 +49,11 @@ def test_astra_is_refused_without_a_device() -> None:
 def test_astra_geometry_is_ours() -> None:
     volume = Volume(np.ones((2, 3, 4), np.float32), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
     space, panel = device_page.geometries(volume, circle(3, 50, 100, 1), (5, 6))
-    assert (space["GridSliceCount"], space["GridRowCount"], space["GridColCount"]) == (2, 3, 4)
+    assert (space["GridSliceCount"], space["GridRowCount"], space["GridColCount"]) == (
+        2,
+        3,
+        4,
+    )
     window = space["option"]
     assert (window["WindowMinX"], window["WindowMaxX"]) == (8.0, 12.0)
     assert (window["WindowMinZ"], window["WindowMaxZ"]) == (27.0, 33.0)

@@ -48,7 +48,9 @@ pytestmark = pytest.mark.timeout(300)
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = Roi(800, 620, 1199, 939)
-TURN = ScanRequest(kind="fly", frames=9, exposure_ms=50.0, averages=10, roi=SMALL, darks=1, flats=1)
+TURN = ScanRequest(
+    kind="fly", frames=9, exposure_ms=50.0, averages=10, roi=SMALL, darks=1, flats=1
+)
 START = {"tra_obj": 0.0, "mag_obj": 600.0, "rot_obj": 0.0, "mag_det": 1000.0}
 
 
@@ -69,7 +71,9 @@ def twin(servers: Servers) -> Iterator[TwinClient]:
 
 
 @pytest.fixture
-def lab(engine: RunEngine, twin: TwinClient, servers: Servers, tmp_path: Path) -> Iterator[TwinLab]:
+def lab(
+    engine: RunEngine, twin: TwinClient, servers: Servers, tmp_path: Path
+) -> Iterator[TwinLab]:
     where = StaticPathProvider(UUIDFilenameProvider(), tmp_path / "camera")
     with init_devices():
         lab = TwinLab(where, *servers.address)
@@ -157,7 +161,9 @@ def test_two_axes_at_once_and_readings_of_the_moment(
 ) -> None:
     near, turn = lab.axis("mag_obj"), lab.axis("rot_obj")
     made = run(engine, bp.grid_scan([near], near, 550.0, 600.0, 2, turn, 0.0, 20.0, 2))
-    seen = [(e["data"]["lab-mag_obj"], e["data"]["lab-rot_obj"]) for e in made.named("event")]
+    seen = [
+        (e["data"]["lab-mag_obj"], e["data"]["lab-rot_obj"]) for e in made.named("event")
+    ]
     assert seen == [(550.0, 0.0), (550.0, 20.0), (600.0, 0.0), (600.0, 20.0)]
     engine(bps.mv(near.speed, 12.5))
     assert twin.state().axes["mag_obj"].speed == 12.5
@@ -193,7 +199,8 @@ def test_the_camera_counts_and_flies_as_any_detector(
 def test_five_plans_of_different_kinds_run_in_one_engine(
     engine: RunEngine, lab: TwinLab, twin: TwinClient
 ) -> None:
-    """Each run has image streams of its own, though plans stage the root of what they are given."""
+    """Each run has image streams of its own, though plans stage the root of what they are
+    given."""
     turn = lab.axis("rot_obj")
     runs = [
         run(engine, bp.count([lab.camera], num=2)),
@@ -204,16 +211,29 @@ def test_five_plans_of_different_kinds_run_in_one_engine(
         run(engine, bp.list_scan([lab.camera], turn, [3.0, 1.0, 2.0])),
         run(engine, bp.count([lab.camera], num=1)),
     ]  # fmt: skip
-    keys = ["lab-camera", "lab-camera", "lab-scan", "lab-camera", "lab-camera", "lab-camera"]
+    keys = [
+        "lab-camera",
+        "lab-camera",
+        "lab-scan",
+        "lab-camera",
+        "lab-camera",
+        "lab-camera",
+    ]
     files = [made.files(key) for made, key in zip(runs, keys, strict=True)]
     assert [len(f) for f in files] == [2, 2, 9, 4, 3, 1]
-    assert len({f for several in files for f in several}) == 21  # no run overwrites another's
+    assert (
+        len({f for several in files for f in several}) == 21
+    )  # no run overwrites another's
     assert all(f.is_file() for several in files for f in several)
     assert all(made.named("stop")[0]["exit_status"] == "success" for made in runs)
 
 
-def test_data_keys_are_named_as_the_documentation_says(engine: RunEngine, lab: TwinLab) -> None:
-    text = (Path(__file__).parents[3] / "docs/extensions/bluesky.md").read_text(encoding="utf-8")
+def test_data_keys_are_named_as_the_documentation_says(
+    engine: RunEngine, lab: TwinLab
+) -> None:
+    text = (Path(__file__).parents[3] / "docs/extensions/bluesky.md").read_text(
+        encoding="utf-8"
+    )
     told = set(re.findall(r"`(lab-[\w-]+)`", text))
     step = run(engine, bp.scan([lab.camera, lab.tube], lab.axis("rot_obj"), 0.0, 10.0, 2))
     fly = run(engine, fly_scan(lab.scan, FlyScan(TURN, seed=1), flush_s=0.05))
@@ -222,11 +242,19 @@ def test_data_keys_are_named_as_the_documentation_says(engine: RunEngine, lab: T
         made |= set(descriptor["data_keys"])
         for settings in descriptor["configuration"].values():
             made |= set(settings["data"])
-    assert {"lab-camera", "lab-camera-mean", "lab-scan", "lab-scan-angle_deg"} <= told <= made
+    assert (
+        {"lab-camera", "lab-camera-mean", "lab-scan", "lab-scan-angle_deg"}
+        <= told
+        <= made
+    )
 
 
-def test_tiled_reads_the_images_of_both_kinds_of_scan(engine: RunEngine, lab: TwinLab) -> None:
-    tiff = pytest.importorskip("tiled.adapters.tiff", reason="tiled, which is not a test's extra")
+def test_tiled_reads_the_images_of_both_kinds_of_scan(
+    engine: RunEngine, lab: TwinLab
+) -> None:
+    tiff = pytest.importorskip(
+        "tiled.adapters.tiff", reason="tiled, which is not a test's extra"
+    )
     from bluesky.consolidators import consolidator_factory
 
     step = run(engine, bp.scan([lab.camera], lab.axis("rot_obj"), 0.0, 10.0, 2))
@@ -240,7 +268,9 @@ def test_tiled_reads_the_images_of_both_kinds_of_scan(engine: RunEngine, lab: Tw
         assert reader.structure().shape == (len(made.files(key)), 160, 200)
         adapter = tiff.TiffSequenceAdapter.from_uris(*(a.data_uri for a in reader.assets))
         images = np.asarray(adapter.read()).reshape(-1, 160, 200)
-        np.testing.assert_array_equal(images, [tifffile.imread(f) for f in made.files(key)])
+        np.testing.assert_array_equal(
+            images, [tifffile.imread(f) for f in made.files(key)]
+        )
 
 
 # -- fly scan ------------------------------------------------------------------------------------
@@ -249,7 +279,9 @@ def test_tiled_reads_the_images_of_both_kinds_of_scan(engine: RunEngine, lab: Tw
 def test_a_fly_scan_announces_the_data_sets_own_tiffs(
     engine: RunEngine, lab: TwinLab, servers: Servers
 ) -> None:
-    made = run(engine, fly_scan(lab.scan, FlyScan(TURN, name="turn", seed=7), flush_s=0.05))
+    made = run(
+        engine, fly_scan(lab.scan, FlyScan(TURN, name="turn", seed=7), flush_s=0.05)
+    )
     assert made.named("stop")[0]["exit_status"] == "success"
     files = made.files("lab-scan")
     assert [f.name for f in files] == [f"scan_{i:06d}.tif" for i in range(9)]
@@ -258,7 +290,9 @@ def test_a_fly_scan_announces_the_data_sets_own_tiffs(
     assert [f.path for f in data.frames] == files
     assert {tifffile.imread(f).shape for f in files} == {(160, 200)}
     (pages,) = made.named("event_page")
-    np.testing.assert_allclose(pages["data"]["lab-scan-angle_deg"], data.angles_deg, atol=1e-9)
+    np.testing.assert_allclose(
+        pages["data"]["lab-scan-angle_deg"], data.angles_deg, atol=1e-9
+    )
     assert pages["seq_num"] == list(range(1, 10))
     assert np.all(np.diff(pages["data"]["lab-scan-time_s"]) > 0)
     descriptor = next(d for d in made.named("descriptor") if d["name"] == "primary")
@@ -293,7 +327,9 @@ def test_a_scan_that_would_not_work_is_refused_before_anything_moves(
 
 
 def test_a_series_that_is_not_one_is_refused(engine: RunEngine, lab: TwinLab) -> None:
-    text = compose_script(TURN, builtin_machine("flexray"), builtin_profile("cwi-2023-08-21"))
+    text = compose_script(
+        TURN, builtin_machine("flexray"), builtin_profile("cwi-2023-08-21")
+    )
     late = re.sub(r"(take and save image sequence\t\S+\t)0", r"\g<1>5", text)
     assert late != text
     with pytest.raises(FailedStatus) as caught:
@@ -347,7 +383,9 @@ def test_the_runengine_pauses_and_resumes_a_fly_scan(
     made = Documents()
 
     def pause_when_it_runs() -> None:
-        while not ((job := twin.state().job) and job.name == "held" and job.state == "running"):
+        while not (
+            (job := twin.state().job) and job.name == "held" and job.state == "running"
+        ):
             time.sleep(0.01)
         engine.request_pause()
 
@@ -367,7 +405,9 @@ def test_the_runengine_pauses_and_resumes_a_fly_scan(
     assert engine.state == "idle"
     made.validate()
     assert made.named("stop")[0]["exit_status"] == "success"
-    assert [f.name for f in made.files("lab-scan")] == [f"scan_{i:06d}.tif" for i in range(9)]
+    assert [f.name for f in made.files("lab-scan")] == [
+        f"scan_{i:06d}.tif" for i in range(9)
+    ]
     assert sum(j.name == "held" for j in twin.jobs().jobs) == 1
 
 
@@ -386,7 +426,9 @@ def test_check_limits_finds_limits_before_anything_moves(
     near = lab.axis("mag_obj")
     before = twin.state()
     check_limits(bp.scan([], near, 580.0, 620.0, 3))
-    with pytest.raises(LimitsExceeded, match=r"mag_obj target 1000 mm is outside \[70, 996\]") as e:
+    with pytest.raises(
+        LimitsExceeded, match=r"mag_obj target 1000 mm is outside \[70, 996\]"
+    ) as e:
         check_limits(bp.scan([], near, 500.0, 2000.0, 4))
     assert e.value.data == {"axis": "mag_obj", "asked": 1000.0, "allowed": [70.0, 996.0]}
     assert twin.state().axes == before.axes
@@ -414,7 +456,8 @@ def test_check_limits_finds_a_collision_that_the_twin_would_refuse(
 
 
 def moving(lab: TwinLab, end: Callable[[], Any]) -> tuple[Any, list[float]]:
-    """Start a long motion, call `end` while it goes on; the status's error and what was seen."""
+    """Start a long motion, call `end` while it goes on; the status's error and what was
+    seen."""
     turn = lab.axis("rot_obj")
     drive(lab.link.client.set_clock(1.0))
     seen: list[float] = []
@@ -438,7 +481,9 @@ def moving(lab: TwinLab, end: Callable[[], Any]) -> tuple[Any, list[float]]:
         drive(lab.link.client.set_clock("max"))
 
 
-def test_stop_brakes_one_axis_and_fails_its_status(lab: TwinLab, twin: TwinClient) -> None:
+def test_stop_brakes_one_axis_and_fails_its_status(
+    lab: TwinLab, twin: TwinClient
+) -> None:
     error, seen = moving(lab, lambda: lab.axis("rot_obj").stop(success=False))
     assert isinstance(error, RuntimeError)
     assert "stopped" in str(error)
@@ -452,7 +497,9 @@ def test_stop_as_planned_succeeds(lab: TwinLab, twin: TwinClient) -> None:
     assert 0 < twin.state().axes["rot_obj"].position < 180.0
 
 
-def test_somebody_elses_emergency_stop_fails_the_motion(lab: TwinLab, twin: TwinClient) -> None:
+def test_somebody_elses_emergency_stop_fails_the_motion(
+    lab: TwinLab, twin: TwinClient
+) -> None:
     def hit() -> None:
         threading.Thread(target=twin.estop).start()
 
@@ -483,7 +530,9 @@ def test_devices_follow_blueskys_protocols(lab: TwinLab) -> None:
 def test_nobody_there_is_said_device_by_device(engine: RunEngine, tmp_path: Path) -> None:
     where = StaticPathProvider(UUIDFilenameProvider(), tmp_path)
     nowhere = TwinLab(where, port=1, name="nowhere")
-    with pytest.raises(NotConnectedError, match=r"no server at 127\.0\.0\.1:1 \(Connection ref"):
+    with pytest.raises(
+        NotConnectedError, match=r"no server at 127\.0\.0\.1:1 \(Connection ref"
+    ):
         drive(nowhere.connect())
 
 
@@ -500,7 +549,10 @@ def test_the_example_runs(servers: Servers, twin: TwinClient, tmp_path: Path) ->
     assert step.startswith("step scan: 4 images, ")
     assert fly.startswith("fly scan: 13 images in ")
     assert len(list(tmp_path.glob("*.tif"))) == 4
-    assert len(list(Path(fly.removeprefix("fly scan: 13 images in ")).glob("scan_*.tif"))) == 13
+    assert (
+        len(list(Path(fly.removeprefix("fly scan: 13 images in ")).glob("scan_*.tif")))
+        == 13
+    )
 
 
 def test_without_the_extra_one_line_says_what_to_install() -> None:
@@ -510,13 +562,17 @@ def test_without_the_extra_one_line_says_what_to_install() -> None:
         "import flexdt_extensions.bluesky as lab\n"
         "try:\n    lab.TwinLab\nexcept TwinError as error:\n    print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("\n") == 1
     assert "pip install 'flexdt-extensions[lab]'" in done.stdout
 
 
-def test_the_pages_programme_runs(servers: Servers, twin: TwinClient, tmp_path: Path) -> None:
+def test_the_pages_programme_runs(
+    servers: Servers, twin: TwinClient, tmp_path: Path
+) -> None:
     page = (ROOT / "docs" / "extensions" / "bluesky.md").read_text("utf-8")
     (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     host, port = servers.address

@@ -68,7 +68,9 @@ def test_step_and_fly_scans_make_valid_documents_and_files(
         yield from bp.scan([lab.camera, lab.tube], lab.axis("rot_obj"), 0.0, 90.0, 3)
 
     engine(step())
-    wish = ScanRequest(frames=9, exposure_ms=50.0, averages=10, roi=Roi(800, 620, 1199, 939))
+    wish = ScanRequest(
+        frames=9, exposure_ms=50.0, averages=10, roi=Roi(800, 620, 1199, 939)
+    )
     engine(fly_scan(lab.scan, FlyScan(wish, seed=1)))
     for name, document in documents:
         schema_validators[DocumentNames[name]].validate(document)
@@ -85,7 +87,8 @@ def test_step_and_fly_scans_make_valid_documents_and_files(
 def test_moves_take_the_machines_time_whatever_the_plan_does(
     engine: RunEngine, lab: TwinLab, flexdt_twin: InProcessTwin
 ) -> None:
-    """90 deg at 45 deg/s after 2 s at 22.5 deg/s^2; then 360: 2 s up, 2 s down, 270 deg between."""
+    """90 deg at 45 deg/s after 2 s at 22.5 deg/s^2; then 360: 2 s up, 2 s down, 270 deg
+    between."""
 
     def plan() -> Generator[Any, Any, None]:
         for target, takes in ((90.0, 4.0), (450.0, 10.0)):
@@ -109,5 +112,8 @@ def test_an_engine_with_another_loop_is_told_which(
 ) -> None:
     RunEngine({})
     where = StaticPathProvider(UUIDFilenameProvider(), tmp_path)
-    with pytest.raises(Exception, match=r"RunEngine\(\{\}, loop=twin.loop\)"), init_devices():
+    with (
+        pytest.raises(Exception, match=r"RunEngine\(\{\}, loop=twin.loop\)"),
+        init_devices(),
+    ):
         lab = TwinLab(where, transport=flexdt_twin.transport())  # noqa: F841

@@ -42,7 +42,9 @@ def study(servers: Servers, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 
 @pytest.mark.parametrize("plan", PLANS)
-def test_a_plan_interrupted_at_drawn_moments_makes_valid_documents(study: Study, plan: str) -> None:
+def test_a_plan_interrupted_at_drawn_moments_makes_valid_documents(
+    study: Study, plan: str
+) -> None:
     assert study.learn(plan) == []
     for number in range(5):
         drawn = draw(random.Random(f"{plan} {number}"), plan, study.messages[plan])
@@ -54,7 +56,8 @@ def test_a_plan_interrupted_at_drawn_moments_makes_valid_documents(study: Study,
 
 
 def test_a_suspension_before_each_message_in_turn(study: Study) -> None:
-    """All of the first point: checkpoint, trigger, wait, create, read, save, and what follows."""
+    """All of the first point: checkpoint, trigger, wait, create, read, save, and what
+    follows."""
     study.learn("count")
     for message in range(1, 3 + study.messages["count"] // 4):
         drawn = Drawn("count", "max", [Interruption("suspender", message, 0.0, 0.0)])
@@ -63,7 +66,8 @@ def test_a_suspension_before_each_message_in_turn(study: Study) -> None:
 
 
 def test_a_pause_after_a_runs_end(study: Study) -> None:
-    """Between `close_run` and `unstage`; without the preprocessor the RunEngine measures again."""
+    """Between `close_run` and `unstage`; without the preprocessor the RunEngine measures
+    again."""
     engine = study.engine
 
     def pause(name: str, document: dict[str, Any]) -> None:
@@ -113,9 +117,13 @@ def test_the_validator_sees_what_is_wrong(study: Study) -> None:
         "frames [3, 4) come after 4": doubled,
         "3 events of 4 points": without("event"),
         "0 series of images": without("stream_resource"),
-        "frames [3, 5) stand for events": setting("stream_datum", "indices", "stop", value=5),
+        "frames [3, 5) stand for events": setting(
+            "stream_datum", "indices", "stop", value=5
+        ),
         "sequence numbers [1, 2, 3, 7]": setting("event", "seq_num", value=7),
-        "point 4: lab-rot_obj is 26.0": setting("event", "data", "lab-rot_obj", value=26.0),
+        "point 4: lab-rot_obj is 26.0": setting(
+            "event", "data", "lab-rot_obj", value=26.0
+        ),
         "mean of another image": setting("event", "data", "lab-camera-mean", value=1.0),
         "it ended fail": setting("stop", "exit_status", value="fail"),
         "unknown descriptor": setting("event", "descriptor", value="none"),
@@ -135,12 +143,16 @@ def test_the_validator_sees_what_is_wrong(study: Study) -> None:
     assert any("shows the pose of" in p for p in problems_of(documents, plan, swapped))
 
 
-def test_upstreams_own_detector_does_not_survive_a_suspension(study: Study, tmp_path: Path) -> None:
+def test_upstreams_own_detector_does_not_survive_a_suspension(
+    study: Study, tmp_path: Path
+) -> None:
     """What `TwinCamera` works around: when this fails, the workaround may go."""
     from ophyd_async.sim import SimBlobDetector
 
     with init_devices():
-        blob = SimBlobDetector(StaticPathProvider(UUIDFilenameProvider(), tmp_path), name="blob")
+        blob = SimBlobDetector(
+            StaticPathProvider(UUIDFilenameProvider(), tmp_path), name="blob"
+        )
     seen: list[str] = []
 
     def trip(message: Any) -> None:

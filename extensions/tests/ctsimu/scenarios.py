@@ -85,7 +85,9 @@ def box(folder: Path, name: str, size: FloatArray) -> None:
     mesh.export(folder / name)
 
 
-def sample(file: str, made_of: str, center: FloatArray, turn: FloatArray, names: str) -> Any:
+def sample(
+    file: str, made_of: str, center: FloatArray, turn: FloatArray, names: str
+) -> Any:
     """A sample whose r and t are the first and last column of `turn`."""
     return {
         "name": file, "file": {"value": file}, "unit": "mm", "material_id": made_of,

@@ -1,7 +1,7 @@
 """Evaluations that `ctsimu` ships, of images of ours, by their own criteria.
 
-`extensions/tests/studies/ctsimu_scenarios.py` simulates and evaluates; 2D-WE-1 and 2D-WE-2, which
-take a quarter of an hour, and 2D-SW-1 and 2D-SW-2 are run there only.
+`extensions/tests/studies/ctsimu_scenarios.py` simulates and evaluates; 2D-WE-1 and 2D-WE-2,
+which take a quarter of an hour, and 2D-SW-1 and 2D-SW-2 are run there only.
 """
 
 from __future__ import annotations
@@ -27,11 +27,15 @@ def numbers(pattern: str, text: str) -> list[float]:
 
 def test_noise_has_the_ratios_asked_for(tmp_path: Path) -> None:
     found = numbers(r"projection SNR: +(\S+)", case(tmp_path, "2D-FB-1"))
-    assert found == pytest.approx([100.0, 250.0], rel=3e-3)  # a million pixels: 7e-4 a sigma
+    assert found == pytest.approx(
+        [100.0, 250.0], rel=3e-3
+    )  # a million pixels: 7e-4 a sigma
 
 
 def test_the_open_beam_falls_off_as_it_should(tmp_path: Path) -> None:
-    assert numbers(r"Max Absolute GV Difference: (\S+)", case(tmp_path, "2D-FB-2"))[0] < 2.0
+    assert (
+        numbers(r"Max Absolute GV Difference: (\S+)", case(tmp_path, "2D-FB-2"))[0] < 2.0
+    )
 
 
 @pytest.mark.slow

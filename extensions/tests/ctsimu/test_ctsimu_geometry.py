@@ -49,7 +49,9 @@ def test_ctsimu_each_parameter_alone(name: str) -> None:
     back = read_ctsimu(json.dumps(document))
     assert back.real is None
     assert worst(back.cone_vec.rows, poses.cone_vec(known).rows) < SAME
-    hidden = read_ctsimu(json.dumps(scenario_document(Scenario(poses, SHAPE, NOMINAL, known))))
+    hidden = read_ctsimu(
+        json.dumps(scenario_document(Scenario(poses, SHAPE, NOMINAL, known)))
+    )
     assert hidden.real is not None
     assert worst(hidden.cone_vec.rows, poses.cone_vec().rows) < SAME
     assert worst(hidden.real.rows, poses.cone_vec(known).rows) < SAME
@@ -85,7 +87,11 @@ def put(document: Any, path: str, value: object) -> Any:
         ("file.file_format_version", {"major": 0, "minor": 9}, "format 0.9"),
         ("acquisition.number_of_projections", 0, "from 1"),
         ("acquisition.direction", "left", "CW or CCW"),
-        ("acquisition.start_angle", {"value": 1e4, "unit": "deg"}, "not below start_angle"),
+        (
+            "acquisition.start_angle",
+            {"value": 1e4, "unit": "deg"},
+            "not below start_angle",
+        ),
         ("acquisition.stop_angle", {"value": 1, "unit": "mm"}, "allowed: rad, deg"),
         ("geometry.source.type", "parallel", "allowed: cone"),
         ("geometry.stage.center", {"x": 1}, "geometry.stage.center"),
@@ -108,7 +114,9 @@ def test_bad_scenarios(path: str, value: object, says: str) -> None:
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-9, 9) | st.floats() | st.text(max_size=4),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner)
+    ),
     max_leaves=6,
 )
 PATHS = ["file", "acquisition", "geometry", "geometry.stage", "geometry.stage.center.x",
@@ -119,7 +127,9 @@ PATHS = ["file", "acquisition", "geometry", "geometry.stage", "geometry.stage.ce
 
 @settings(max_examples=40, deadline=None)
 @given(path=st.sampled_from(PATHS), value=JSON)
-def test_whatever_stands_in_a_scenario_is_read_or_refused(path: str, value: object) -> None:
+def test_whatever_stands_in_a_scenario_is_read_or_refused(
+    path: str, value: object
+) -> None:
     text = json.dumps(put(scenario(), path, value))
     with contextlib.suppress(ExchangeError):
         assert len(read_ctsimu(text)) >= 1

@@ -36,14 +36,23 @@ def vector(v: Any) -> FloatArray:
 
 
 def rows_by_ctsimu(document: Any, real: bool = False) -> FloatArray:
-    """cone_vec from ctsimu's coordinate systems alone: everything as the stage's u, v, w see it."""
+    """cone_vec from ctsimu's coordinate systems alone: everything as the stage's u, v, w see
+    it."""
     out = []
     for geometry in frames(document, real):
         stage, detector = geometry.stage, geometry.detector
         axes = np.stack([vector(a) for a in (stage.u, stage.v, stage.w)])
         center = vector(stage.center)
-        u, v = vector(detector.u) * detector.pitch_u, vector(detector.v) * detector.pitch_v
-        parts = (vector(geometry.source.center) - center, vector(detector.center) - center, u, v)
+        u, v = (
+            vector(detector.u) * detector.pitch_u,
+            vector(detector.v) * detector.pitch_v,
+        )
+        parts = (
+            vector(geometry.source.center) - center,
+            vector(detector.center) - center,
+            u,
+            v,
+        )
         out.append(np.concatenate([axes @ p for p in parts]))
     return np.array(out)
 
@@ -54,7 +63,9 @@ def test_ctsimu_sees_the_geometry_we_export(seed: int, even: bool, still: bool) 
     rng = np.random.default_rng(seed)
     poses = some_poses(rng, 5, even=even, still=still)
     known, real = some_parameters(rng), some_parameters(rng)
-    document = scenario_document(Scenario(poses, SHAPE, known, real, kV=90.0, power_W=50.0))
+    document = scenario_document(
+        Scenario(poses, SHAPE, known, real, kV=90.0, power_W=50.0)
+    )
     assert worst(rows_by_ctsimu(document), poses.cone_vec(known).rows) < 1e-9
     assert worst(rows_by_ctsimu(document, real=True), poses.cone_vec(real).rows) < 1e-9
 
@@ -69,9 +80,9 @@ def test_its_projection_matrices_put_a_chiral_phantom_where_we_do() -> None:
     for i, geometry in enumerate(frames(document, real=False)):
         image = np.asarray(geometry.projection_matrix().value) @ points
         pixels = (image[:2] / image[2]).T / geometry.detector.pitch_u + middle
-        assert worst(pixels, poses[i : i + 1].cone_vec(known).project_points(CHIRAL, SHAPE)[0]) < (
-            1e-9
-        )
+        assert worst(
+            pixels, poses[i : i + 1].cone_vec(known).project_points(CHIRAL, SHAPE)[0]
+        ) < (1e-9)
 
 
 def test_the_scenario_says_what_a_simulator_needs() -> None:
@@ -142,7 +153,11 @@ def test_ours_reads_what_ctsimu_reads() -> None:
 def test_what_ctsimu_writes_again_is_the_same() -> None:
     """ctsimu reads our file and writes its own: nothing geometric is lost on the way."""
     rng = np.random.default_rng(7)
-    poses, known, real = some_poses(rng, still=False), some_parameters(rng), some_parameters(rng)
+    poses, known, real = (
+        some_poses(rng, still=False),
+        some_parameters(rng),
+        some_parameters(rng),
+    )
     document = scenario_document(Scenario(poses, SHAPE, known, real))
     scenario = ctsimu.Scenario(json_dict=document)
     scenario.set_frame(0)

@@ -1,4 +1,5 @@
-"""CTSimU scenarios to images, beside own images of boxes in places that `ctsimu` itself finds."""
+"""CTSimU scenarios to images, beside own images of boxes in places that `ctsimu` itself
+finds."""
 
 from __future__ import annotations
 
@@ -43,7 +44,11 @@ def attenuation(formula: str, density: float, keV: float) -> float:
 
 
 def chord(
-    source: FloatArray, pixel: FloatArray, center: FloatArray, axes: FloatArray, size: FloatArray
+    source: FloatArray,
+    pixel: FloatArray,
+    center: FloatArray,
+    axes: FloatArray,
+    size: FloatArray,
 ) -> float:
     """Path through a box, slab by slab."""
     start, way = axes.T @ (source - center), axes.T @ (pixel - source)
@@ -58,7 +63,9 @@ def coordinates(v: Any) -> FloatArray:
 
 def pose(part: Any) -> tuple[FloatArray, FloatArray]:
     c = part.coordinate_system
-    return coordinates(c.center), np.stack([coordinates(x) for x in (c.u, c.v, c.w)], axis=1)
+    return coordinates(c.center), np.stack(
+        [coordinates(x) for x in (c.u, c.v, c.w)], axis=1
+    )
 
 
 def expected(
@@ -85,20 +92,26 @@ def expected(
             pixel = panel + x * along[:, 0] + y * along[:, 1]
             ray = pixel - source
             far = float(np.linalg.norm(ray))
-            paths = [chord(source, pixel, *p, s) for p, s in zip(placed, sizes, strict=True)]
+            paths = [
+                chord(source, pixel, *p, s) for p, s in zip(placed, sizes, strict=True)
+            ]
             depth = sum(m * d for m, d in zip(mu, paths, strict=True))
             depth += air * (far - sum(paths))
             out[i, r, c] = np.exp(-depth) * abs(ray @ along[:, 2]) / far**3
     return out
 
 
-def random_case(rng: np.random.Generator, folder: Path) -> tuple[dict[str, Any], Any, Any, float]:
+def random_case(
+    rng: np.random.Generator, folder: Path
+) -> tuple[dict[str, Any], Any, Any, float]:
     """Boxes on the stage and in the world, in a beam whose every part is moved and tilted."""
     document = scenario(18, 21, 3)
     sizes = [rng.uniform(8, 25, 3) for _ in range(2)]
     for i, (names, size) in enumerate(zip(("uvw", "xyz"), sizes, strict=True)):
         box(folder, f"box{i}.stl", size)
-        center = rng.normal(0, 4, 3) + (np.array([250.0, 0, 0]) if names == "xyz" else 0.0)
+        center = rng.normal(0, 4, 3) + (
+            np.array([250.0, 0, 0]) if names == "xyz" else 0.0
+        )
         one = sample(f"box{i}.stl", ("Al", "PMMA")[i], center, rotation(rng), names)
         scale = rng.uniform(0.5, 1.5, 3)
         one["scaling_factor"] = vector(scale, "rst")
@@ -151,10 +164,14 @@ def test_images_are_those_of_boxes_where_ctsimu_places_them(
     first = expected({**document, "samples": []}, [], [], air)[0].max()
     assert told.min() < 0.5 * first
     assert cols == 21 or bins[0] == 2
-    if cols < 21:  # an odd rest is cut off half a pixel on both sides: only its middle is compared
+    if (
+        cols < 21
+    ):  # an odd rest is cut off half a pixel on both sides: only its middle is compared
         told = (told[:, :, 1:] + told[:, :, :-1]) / 2.0
     told = 200 + 49800 * told / first
-    told = told.reshape(3, rows // bins[1], bins[1], cols // bins[0], bins[0]).mean(axis=(2, 4))
+    told = told.reshape(3, rows // bins[1], bins[1], cols // bins[0], bins[0]).mean(
+        axis=(2, 4)
+    )
     difference = np.abs(np.stack(list(made.projections())) - told)
     if cols < 21:
         assert np.median(difference) < 30.0
@@ -204,7 +221,9 @@ def test_the_command_writes_images_and_metadata_that_ctsimu_reads(
     assert again == (folder / "case_0001.tif").read_bytes()
 
 
-def test_noise_has_the_scenarios_ratio_and_falls_with_frames_and_pixels(tmp_path: Path) -> None:
+def test_noise_has_the_scenarios_ratio_and_falls_with_frames_and_pixels(
+    tmp_path: Path,
+) -> None:
     document = scenario(240, 240, 2)
     document["detector"]["pixel_pitch"] = {"u": mm(0.1), "v": mm(0.1)}
     document["detector"]["noise"]["snr_at_imax"]["value"] = 50
@@ -239,7 +258,9 @@ def test_noise_has_the_scenarios_ratio_and_falls_with_frames_and_pixels(tmp_path
     assert flat.std() == pytest.approx(50000 / 40 / np.sqrt(6), rel=0.03)
 
 
-def test_grey_values_by_joules_follow_current_time_and_the_spectrum(tmp_path: Path) -> None:
+def test_grey_values_by_joules_follow_current_time_and_the_spectrum(
+    tmp_path: Path,
+) -> None:
     """1e9 photons of 50 keV / (s sr mA), pixels of 4 mm at 400 mm: so many joules."""
     document = scenario(3, 3, 3)
     (tmp_path / "tube.csv").write_text("49.9,0\n50,1e9\n50.1,0\n")
@@ -254,14 +275,18 @@ def test_grey_values_by_joules_follow_current_time_and_the_spectrum(tmp_path: Pa
     document["detector"]["gray_value"] = {
         "factor": {"value": 4e14, "unit": "1/J"}, "offset": {"value": 40},
     }  # fmt: skip
-    images = np.stack(list(ScenarioImages(write(tmp_path, document), rays=1).projections()))
+    images = np.stack(
+        list(ScenarioImages(write(tmp_path, document), rays=1).projections())
+    )
     through = np.exp(-2.0 * attenuation("Al", 2.7, 50.0))
     joules = 1e9 * 0.12 * 0.5 * (4 / 400) ** 2 * 50 * 1.602176634e-16 * through
     values = 40 + 4e14 * joules * np.array([1.0, 1.5, 2.0])
     assert np.abs(images[:, 1, 1] / values - 1.0).max() < 5e-3
     document["detector"]["gray_value"]["intensity_characteristics_file"] = "curve.tsv"
     (tmp_path / "curve.tsv").write_text(f"0 7\n{joules} 1007\n{2 * joules} 3007\n")
-    images = np.stack(list(ScenarioImages(write(tmp_path, document), rays=1).projections()))
+    images = np.stack(
+        list(ScenarioImages(write(tmp_path, document), rays=1).projections())
+    )
     assert np.abs(images[:, 1, 1] / np.array([1007, 2007, 3007]) - 1.0).max() < 0.01
 
 
@@ -270,13 +295,19 @@ def test_lag_blur_and_spot(tmp_path: Path) -> None:
     document["source"]["current"] |= {"drifts": [{"value": [0, 60, 0], "unit": "uA"}]}
     document["detector"]["image_lag"] = {"value": 0.1}
     document["detector"]["gray_value"] = {"imax": {"value": 30000}}
-    images = np.stack(list(ScenarioImages(write(tmp_path, document), rays=1).projections()))
+    images = np.stack(
+        list(ScenarioImages(write(tmp_path, document), rays=1).projections())
+    )
     shown = images[:, 15, 15] / images[0, 15, 15]
-    assert shown == pytest.approx([1.0, 1.45, 1.045], abs=1e-3)  # 10 % of the frame before
+    assert shown == pytest.approx(
+        [1.0, 1.45, 1.045], abs=1e-3
+    )  # 10 % of the frame before
     document = scenario(41, 41, 1)
     document["detector"]["pixel_pitch"] = {"u": mm(0.1), "v": mm(0.1)}
     box(tmp_path, "edge.stl", np.array([10.0, 30.0, 30.0]))
-    document["samples"] = [sample("edge.stl", "Al", np.array([0, -15.0, 0]), np.eye(3), "uvw")]
+    document["samples"] = [
+        sample("edge.stl", "Al", np.array([0, -15.0, 0]), np.eye(3), "uvw")
+    ]
     document["source"]["spot"] = {"sigma": {"u": mm(0.25), "v": mm(0.0)}}
 
     def width() -> float:
@@ -306,13 +337,17 @@ def test_scatter_is_added_where_the_scenario_asks_for_it(tmp_path: Path) -> None
     document = scenario(12, 12, 1)
     box(tmp_path, "block.stl", np.array([40.0, 40.0, 40.0]))
     document["samples"] = [sample("block.stl", "PMMA", np.zeros(3), np.eye(3), "uvw")]
-    plain = next(ScenarioImages(write(tmp_path, document), rays=1).projections()).astype(float)
+    plain = next(ScenarioImages(write(tmp_path, document), rays=1).projections()).astype(
+        float
+    )
     document["acquisition"]["scattering"] = True
     more = next(ScenarioImages(write(tmp_path, document), rays=1).projections()) - plain
     assert 0.02 < (more / (plain - 200))[4:8, 4:8].mean() < 0.5
     document["samples"][0]["position"]["center"]["u"]["drifts"] = [{"value": [0, 1]}]
     document["acquisition"]["number_of_projections"] = 2
-    with pytest.raises(TwinError, match=r"acquisition.scattering is true; allowed: false"):
+    with pytest.raises(
+        TwinError, match=r"acquisition.scattering is true; allowed: false"
+    ):
         ScenarioImages(write(tmp_path, document))
 
 
@@ -346,7 +381,11 @@ BAD: tuple[tuple[str, Any, str], ...] = (
 
 @pytest.mark.parametrize(("place", "value", "says"), BAD, ids=[one[0] for one in BAD])
 def test_what_cannot_be_done_is_refused_by_its_place(
-    place: str, value: Any, says: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    place: str,
+    value: Any,
+    says: str | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     document = scenario(3, 3, 2)
     *path, last = place.split(".")
@@ -354,7 +393,9 @@ def test_what_cannot_be_done_is_refused_by_its_place(
     for key in path:
         found = found[key]
     found[last] = value
-    code = run(["simulate", str(write(tmp_path, document)), "--out", str(tmp_path / "out")])
+    code = run(
+        ["simulate", str(write(tmp_path, document)), "--out", str(tmp_path / "out")]
+    )
     told = capsys.readouterr().err
     if says is None:
         assert code == 0
@@ -381,7 +422,8 @@ JUNK: tuple[Any, ...] = (
 
 
 def test_spoiled_scenarios_are_read_or_refused(tmp_path: Path) -> None:
-    """Any value anywhere: a document or an error that names the file, never another exception."""
+    """Any value anywhere: a document or an error that names the file, never another
+    exception."""
     rng = np.random.default_rng(5)
     whole, *_ = random_case(rng, tmp_path)
     whole["detector"] |= {
@@ -390,7 +432,10 @@ def test_spoiled_scenarios_are_read_or_refused(tmp_path: Path) -> None:
         "window": {"front": [{"material_id": "Al", "thickness": mm(0.1)}]},
         "image_lag": {"value": 0.1},
     }  # fmt: skip
-    whole["source"]["spot"] = {"size": {"u": mm(0.1)}, "sigma": {"u": mm(0.1), "v": mm(0.1)}}
+    whole["source"]["spot"] = {
+        "size": {"u": mm(0.1)},
+        "sigma": {"u": mm(0.1), "v": mm(0.1)},
+    }
     everywhere = [p for p in places(whole) if p]
     refused = unnamed = 0
     for _ in range(300):
@@ -411,4 +456,6 @@ def test_spoiled_scenarios_are_read_or_refused(tmp_path: Path) -> None:
 
 def test_simulate_needs_a_geometry_or_a_scenario() -> None:
     with pytest.raises(TwinError, match="path of a CTSimU scenario"):
-        fx.simulate({"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"})
+        fx.simulate(
+            {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
+        )

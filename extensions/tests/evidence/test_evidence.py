@@ -1,4 +1,5 @@
-"""`flexdt evidence` on files of the published forms, written here from closed forms of our own."""
+"""`flexdt evidence` on files of the published forms, written here from closed forms of our
+own."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ import flexdt as fx
 from flexdt.clients.cli.command_tree import run
 
 Array = npt.NDArray[np.float64]
-POINTS = np.array([0.0, 0.0, 0.0]) + np.random.default_rng(4).uniform(-55.0, 55.0, (12, 3))
+POINTS = np.array([0.0, 0.0, 0.0]) + np.random.default_rng(4).uniform(
+    -55.0, 55.0, (12, 3)
+)
 
 
 def seen(
@@ -39,16 +42,25 @@ def seen(
 def needles(folder: Path, sdd: float, sense: float = 1.0) -> None:
     """Two scans as CaTE stores them: a pickled dictionary of frames."""
     rng = np.random.default_rng(2)
-    for scan, views, frames in (("pos_2", 3600, range(0, 3600, 400)), ("pert_2", 14, range(7))):
+    for scan, views, frames in (
+        ("pos_2", 3600, range(0, 3600, 400)),
+        ("pert_2", 14, range(7)),
+    ):
         marks: dict[int, Any] = {}
         for frame in frames:
-            places = seen(sense * 360.0 * frame / views, sdd, POINTS) + rng.normal(0, 0.2, (12, 2))
+            places = seen(sense * 360.0 * frame / views, sdd, POINTS) + rng.normal(
+                0, 0.2, (12, 2)
+            )
             marks[frame] = {("marker", str(k)): (x, y) for k, (x, y) in enumerate(places)}
-        np.save(folder / f"needle_25Sep2020_{scan}_locations.npy", np.array(marks, dtype=object))
+        np.save(
+            folder / f"needle_25Sep2020_{scan}_locations.npy",
+            np.array(marks, dtype=object),
+        )
 
 
 def helsinki(folder: Path, place: tuple[float, float] = (9.0, 4.0)) -> None:
-    """A fan-beam sinogram of a round Gaussian bump, and its image; the image may be elsewhere."""
+    """A fan-beam sinogram of a round Gaussian bump, and its image; the image may be
+    elsewhere."""
     turn = np.arange(0.0, 360.5, 0.5)
     a, c = np.radians(turn)[:, None], (np.arange(560) - 279.5) * 0.2
     # The stage turns clockwise, so in the object's frame source and panel turn the other way.
@@ -81,7 +93,10 @@ def tooth(folder: Path, turn: float = 179.0) -> None:
 def delft(folder: Path, mirrored: float = 1.0) -> None:
     """Marks of three sources in three frames as CaTE stores them, and its geometry in cm."""
     rng = np.random.default_rng(3)
-    name, pixel = "Calibration_needle_phantom_30degsec_table474mm", (302 / 1524, 307 / 1548)
+    name, pixel = (
+        "Calibration_needle_phantom_30degsec_table474mm",
+        (302 / 1524, 307 / 1548),
+    )
     points = POINTS[:9] * [0.5, 0.5, 1.0]
     xray: Any = ModuleType("cate.xray")
     xray.Geometry = type("Geometry", (), {"__module__": "cate.xray"})
@@ -120,14 +135,19 @@ def c_arm(folder: Path, lower: int = 0) -> None:
     centres, widths = rng.uniform(-40.0, 40.0, (4, 3)), rng.uniform(6.0, 10.0, 4)
     row, column = np.indices((190, 256))
     # Wide, and the second panel askew, so that the weights of the two views differ.
-    for name, angle, askew, tilt in (("proj000", 0.1, 0.0, 0.05), ("proj040", 2.4, 0.4, 0.3)):
+    for name, angle, askew, tilt in (
+        ("proj000", 0.1, 0.0, 0.05),
+        ("proj040", 2.4, 0.4, 0.3),
+    ):
         source, focal = -240.0 * np.array([np.cos(angle), np.sin(angle), 0.05]), 286.0
         right = np.array([-np.sin(angle + askew), np.cos(angle + askew), 0.0])
         toward = np.array([right[1], -right[0], tilt]) / np.hypot(1.0, tilt)
         down = np.cross(toward, right)
         turn = np.array([right, down, toward])
         middle = [126.0, 96.0] - focal * (turn @ source)[:2] / (turn @ source)[2]
-        rays = np.stack([column - middle[0], row - middle[1], np.full(row.shape, focal)], -1)
+        rays = np.stack(
+            [column - middle[0], row - middle[1], np.full(row.shape, focal)], -1
+        )
         rays = rays @ turn
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         image = np.zeros(row.shape)
@@ -136,20 +156,30 @@ def c_arm(folder: Path, lower: int = 0) -> None:
             image += width * np.exp(-0.5 * (off / width) ** 2)
         if name == "proj040":
             image = np.roll(image, lower, axis=0)
-        camera = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]) @ turn
+        camera = (
+            np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]) @ turn
+        )
         matrix = np.column_stack([camera, -camera @ source]).tolist()
         text = "; ".join(" ".join(map(repr, line)) for line in matrix)
         head = (
             "NRRD0004\ndimension: 2\nencoding: raw\nendian: little\nsizes: 256 190\n"
             f"spacings: 1.232 1.232\ntype: float\nProjection Matrix:=[{text}] \n# An end.\n\n"
         )
-        (folder / f"{name}.nrrd").write_bytes(head.encode() + image.astype("<f4").tobytes())
+        (folder / f"{name}.nrrd").write_bytes(
+            head.encode() + image.astype("<f4").tobytes()
+        )
 
 
 def zeiss(folder: Path, cone: int = 0) -> None:
     """A Zeiss file with as much as is read before its geometry is."""
     pytest.importorskip("olefile")
-    said = {"ImageWidth": 4, "ImageHeight": 4, "NoOfImages": 2, "ImagesTaken": 2, "DataType": 5}
+    said = {
+        "ImageWidth": 4,
+        "ImageHeight": 4,
+        "NoOfImages": 2,
+        "ImagesTaken": 2,
+        "DataType": 5,
+    }
     streams = {
         f"ImageInfo/{name}": np.uint32(number).tobytes()
         for name, number in {**said, "XrayGeometry": cone}.items()
@@ -197,7 +227,9 @@ def test_wrong_data_are_told_and_end_with_1(
     assert figures(capsys)[missed] is False
 
 
-def test_what_is_not_at_hand_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_at_hand_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["evidence", "--data", str(tmp_path)]) == 0
     assert capsys.readouterr().out.count("not at hand") == 6
     assert run(["evidence", "cate", "--data", str(tmp_path)]) == 1
@@ -230,7 +262,9 @@ def test_a_case_that_cannot_be_read_leaves_the_others_their_tables(
     assert run(["evidence", "--data", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "bump: correlation" in out
-    assert re.search(r"not read: \S*tooth\S*: HDF5 files needs h5py, which is not installed", out)
+    assert re.search(
+        r"not read: \S*tooth\S*: HDF5 files needs h5py, which is not installed", out
+    )
     assert "a parallel beam" in out
 
 
@@ -274,12 +308,16 @@ def test_an_error_out_of_flexdt_is_a_missed_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     helsinki(tmp_path)
-    monkeypatch.setattr(fx.Grid, "blank", lambda self: self.none)  # AttributeError inside of fdk
+    monkeypatch.setattr(
+        fx.Grid, "blank", lambda self: self.none
+    )  # AttributeError inside of fdk
     assert run(["evidence", "htc2022", "--data", str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert re.search(r"an answer +AttributeError: .* +NO", out)
 
 
-@pytest.mark.skipif("FLEXDT_REAL_DATA" not in os.environ, reason="FLEXDT_REAL_DATA names no folder")
+@pytest.mark.skipif(
+    "FLEXDT_REAL_DATA" not in os.environ, reason="FLEXDT_REAL_DATA names no folder"
+)
 def test_the_real_data_agree() -> None:
     assert run(["evidence", "--data", os.environ["FLEXDT_REAL_DATA"]]) == 0

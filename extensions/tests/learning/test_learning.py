@@ -21,7 +21,13 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.projection import Volume, forward
 from flexdt_extensions.learning import ENVIRONMENTS
 from flexdt_extensions.learning.moved_scanner import Lab
-from flexdt_extensions.learning.rewards import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
+from flexdt_extensions.learning.rewards import (
+    COARSE,
+    SIDE_MM,
+    QualityTask,
+    column_lengths,
+    noisy,
+)
 from flexdt_extensions.learning.scanning import POLICIES, ScanEnv, play
 
 
@@ -62,7 +68,9 @@ def test_same_seed_same_episode_and_another_differs(name: str) -> None:
         ("flexdt/Reconstruction-v0", {"attempts": 0}),
     ],
 )
-def test_numbers_that_make_no_sense_are_refused(name: str, words: dict[str, float]) -> None:
+def test_numbers_that_make_no_sense_are_refused(
+    name: str, words: dict[str, float]
+) -> None:
     with pytest.raises(LimitError, match="allowed: more than 0"):
         gymnasium.make(name, **words)
 
@@ -79,10 +87,16 @@ def test_costs_are_not_negative(weight: str, value: float) -> None:
     [
         ("flexdt/NextAngleDiscrete-v0", 3, (36, -1, 1.7, [1, 2], math.nan)),
         ("flexdt/NextPose-v0", np.zeros(4), (np.zeros(2), np.full(4, np.nan))),
-        ("flexdt/Reconstruction-v0", [0, 0, 0], ([3, 0, 0], [0, -1, 0], [0, 0], [0, 0.5, 0])),
+        (
+            "flexdt/Reconstruction-v0",
+            [0, 0, 0],
+            ([3, 0, 0], [0, -1, 0], [0, 0], [0, 0.5, 0]),
+        ),
     ],
 )
-def test_what_is_no_action_changes_nothing(name: str, good: Any, bad: tuple[Any, ...]) -> None:
+def test_what_is_no_action_changes_nothing(
+    name: str, good: Any, bad: tuple[Any, ...]
+) -> None:
     env = gymnasium.make(name).unwrapped
     with pytest.raises(ResetNeeded):
         env.step(good)
@@ -144,7 +158,9 @@ def test_reward_is_worth_less_costs() -> None:
     env = ScanEnv(action="discrete", time_weight=0.3, dose_weight=0.2)
     env.reset(seed=2)
     _, reward, _, _, info = env.step(np.int64(9))
-    assert reward == pytest.approx(info["worth"] - 0.3 * info["seconds"] - 0.2 * info["dose"])
+    assert reward == pytest.approx(
+        info["worth"] - 0.3 * info["seconds"] - 0.2 * info["dose"]
+    )
     assert info["information"] == pytest.approx(info["worth"])
 
 
@@ -172,7 +188,8 @@ def test_forecast_of_information_is_what_a_frame_brings_when_nothing_is_hidden()
 
 
 def test_planner_columns_agree_with_the_projector() -> None:
-    """Sampled lengths of rays in the object's columns beside exact ones of the voxel projector."""
+    """Sampled lengths of rays in the object's columns beside exact ones of the voxel
+    projector."""
     lab = Lab((SIDE_MM,) * 3)
     cone = lab.small(lab.poses({"rot_obj": 33.0}), NOMINAL)
     cols = lab.small_shape[1]
@@ -209,7 +226,9 @@ def test_noise_is_poisson() -> None:
 def test_greedy_knows_more_after_few_frames_than_random() -> None:
     env = ScanEnv(action="discrete", frames=5, time_weight=0.0)
     worst = {
-        name: np.mean([play(env, POLICIES[name], s).infos[-1]["information"] for s in range(3)])
+        name: np.mean(
+            [play(env, POLICIES[name], s).infos[-1]["information"] for s in range(3)]
+        )
         for name in ("random", "greedy")
     }
     assert worst["greedy"] > worst["random"]
@@ -253,7 +272,9 @@ def test_unknown_words_are_refused() -> None:
 
 
 def test_without_gymnasium_one_line_says_what_to_install() -> None:
-    code = "import sys; sys.modules['gymnasium'] = None; import flexdt_extensions.learning"
+    code = (
+        "import sys; sys.modules['gymnasium'] = None; import flexdt_extensions.learning"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1
     assert "pip install 'flexdt-extensions[learn]'" in done.stderr

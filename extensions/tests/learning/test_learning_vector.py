@@ -1,4 +1,5 @@
-"""Many environments at once: equal to single ones step by step, and to a reconstruction by hand."""
+"""Many environments at once: equal to single ones step by step, and to a reconstruction by
+hand."""
 
 from __future__ import annotations
 
@@ -48,7 +49,9 @@ def test_each_is_the_single_environment_step_by_step(
     """Two episodes and more, against environments of one, driven by Gymnasium's own loop."""
     count, rng = 3, np.random.default_rng(17)
     many = gymnasium.make_vec(name, num_envs=count, autoreset_mode=mode, **words)
-    alone = gymnasium.make_vec(name, count, "sync", vector_kwargs={"autoreset_mode": mode}, **words)
+    alone = gymnasium.make_vec(
+        name, count, "sync", vector_kwargs={"autoreset_mode": mode}, **words
+    )
     assert isinstance(many, ScanVectorEnv)
     assert not isinstance(alone, ScanVectorEnv)
     assert many.single_observation_space == alone.single_observation_space
@@ -60,13 +63,23 @@ def test_each_is_the_single_environment_step_by_step(
         ours, theirs = many.step(actions), alone.step(actions)
         # A grey level may fall to the other side of a rounding.
         np.testing.assert_allclose(
-            ours[0].astype(float), theirs[0], atol=1 if ours[0].dtype == np.uint8 else 1e-4
+            ours[0].astype(float),
+            theirs[0],
+            atol=1 if ours[0].dtype == np.uint8 else 1e-4,
         )
         np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-5, atol=1e-3)
         np.testing.assert_array_equal(ours[2], theirs[2])
         np.testing.assert_array_equal(ours[3], theirs[3])
         assert set(ours[4]) == set(theirs[4])
-        for key in ("worth", "frames", "seconds", "clock_s", "dose", "quality", "information"):
+        for key in (
+            "worth",
+            "frames",
+            "seconds",
+            "clock_s",
+            "dose",
+            "quality",
+            "information",
+        ):
             if key in theirs[4]:
                 close(ours[4][key], theirs[4][key])
 
@@ -87,7 +100,9 @@ def matrix_by_hand(cone: ConeVec, shape: tuple[int, int]) -> np.ndarray:
         shape3 = (len(way), *(1 if s else GRID for s in spread[::-1]))
         begin.append(np.minimum(a, b).reshape(shape3))
         end.append(np.maximum(a, b).reshape(shape3))
-    part = np.minimum(np.minimum(*end[:2]), end[2]) - np.maximum(np.maximum(*begin[:2]), begin[2])
+    part = np.minimum(np.minimum(*end[:2]), end[2]) - np.maximum(
+        np.maximum(*begin[:2]), begin[2]
+    )
     length = np.maximum(part, 0.0) * np.linalg.norm(way, axis=1)[:, None, None, None]
     return np.asarray(length.reshape(len(way), -1))
 
@@ -109,7 +124,9 @@ def test_volumes_are_those_of_sirt_written_out_in_numpy() -> None:
     volumes = np.zeros((2, GRID**3))
     chosen = np.array([[3, 20], [11, 5], [11, 31]])  # one twice the same
     views = {
-        s: matrix_by_hand(lab.small(lab.poses({"rot_obj": 10.0 * s}), NOMINAL), lab.small_shape)
+        s: matrix_by_hand(
+            lab.small(lab.poses({"rot_obj": 10.0 * s}), NOMINAL), lab.small_shape
+        )
         for s in set(chosen.ravel().tolist())
     }
     for frame, actions in enumerate(chosen):
@@ -132,7 +149,9 @@ def test_seeds_count_up_and_repeat() -> None:
 
     def run() -> tuple[np.ndarray, np.ndarray]:
         envs.reset(seed=[7, 8, 7])
-        out = [envs.step(np.array([4, 4, 4])) for _ in range(7)]  # beyond the first episode
+        out = [
+            envs.step(np.array([4, 4, 4])) for _ in range(7)
+        ]  # beyond the first episode
         return np.array([step[0] for step in out]), np.array([step[1] for step in out])
 
     images, rewards = run()
@@ -148,7 +167,11 @@ def test_seeds_count_up_and_repeat() -> None:
 @pytest.mark.parametrize("way", ["anywhere", "on and on, past the end of the travel"])
 def test_turns_looked_up_cost_what_the_scanner_takes(way: str) -> None:
     table, rng = Turntable((SIDE_MM,) * 3, 0.4), np.random.default_rng(3)
-    angles = rng.integers(0, 36, 60) * 10.0 if way == "anywhere" else np.arange(60) * 170.0 % 360.0
+    angles = (
+        rng.integers(0, 36, 60) * 10.0
+        if way == "anywhere"
+        else np.arange(60) * 170.0 % 360.0
+    )
     real, looked_up = Lab((SIDE_MM,) * 3, 0.4), TurnedLab(table)
     for angle in angles:
         taken, ours = real.take({"rot_obj": angle}), looked_up.take({"rot_obj": angle})

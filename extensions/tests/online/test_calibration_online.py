@@ -55,7 +55,8 @@ def test_it_stops_when_the_tolerance_is_met() -> None:
 
 
 def worst_after(frames: list[int], tolerance: dict[str, float], more: int) -> float:
-    """Worst sigma in tolerances after some of 90 frames and `more` that `next_angle` asks for."""
+    """Worst sigma in tolerances after some of 90 frames and `more` that `next_angle` asks
+    for."""
     poses, truth = scenario("G0", 90)
     detections = shadows(exact_tracks(poses, truth, MODEL), 3, noise=0.05)
     state = begin(MODEL)
@@ -73,11 +74,13 @@ def worst_after(frames: list[int], tolerance: dict[str, float], more: int) -> fl
 
 
 def test_the_next_angle_beats_the_next_in_line_and_matches_equidistant_ones() -> None:
-    """Nine frames: a slow sweep, the nine angles one would choose beforehand, and greedy ones."""
+    """Nine frames: a slow sweep, the nine angles one would choose beforehand, and greedy
+    ones."""
     tolerance = {"dO_x": 0.01, "dO_z": 0.05, "alpha": 0.02, "tau_x": 0.01, "tau_z": 0.01}
     greedy = worst_after([0, 1, 2], tolerance, 6)
     assert greedy < 0.6 * worst_after(list(range(9)), tolerance, 0)
-    # Greedy starts with three neighbours; what is best for the worst parameter is no even circle.
+    # Greedy starts with three neighbours; what is best for the worst parameter is no even
+    # circle.
     assert greedy < 1.1 * worst_after(list(range(0, 90, 10)), tolerance, 0)
 
 
@@ -85,7 +88,14 @@ def test_rendered_frames_are_detected_and_fed_one_by_one() -> None:
     """As at the scanner: an image comes, its beads are found, the estimate is renewed."""
     phantom = load_phantom("lego")
     poses, _ = careful_scan(np.random.default_rng(2), 12)
-    edge = {"dO_x": 1.5, "dO_y": -2.0, "dO_z": 4.0, "alpha": 40.0, "tau_x": 0.3, "tau_z": -0.4}
+    edge = {
+        "dO_x": 1.5,
+        "dO_y": -2.0,
+        "dO_z": 4.0,
+        "alpha": 40.0,
+        "tau_x": 0.3,
+        "tau_z": -0.4,
+    }
     truth = Offsets.from_edge(edge)
     images = radiographs(phantom, poses.cone_vec(truth), 20_000.0, 4)
     model = bead_model(phantom)
@@ -105,7 +115,9 @@ def test_rendered_frames_are_detected_and_fed_one_by_one() -> None:
 
 
 def test_a_tolerance_for_what_is_not_estimated_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match=r"'warp' is not estimated here; allowed: dO_x"):
+    with pytest.raises(
+        UnknownNameError, match=r"'warp' is not estimated here; allowed: dO_x"
+    ):
         begin(MODEL).done({"warp": 1.0})
     with pytest.raises(UnknownNameError, match="'tau_x' is not estimated here"):
         begin(MODEL, free=("dO_x",)).done({"tau_x": 1.0})

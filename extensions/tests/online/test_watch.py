@@ -1,7 +1,7 @@
 """A client that watches a scan ends it: twin, scan and watcher are processes and connections.
 
-The truth is what the twin is told to hide; the sigmas are those of `flexdt calibrate` on what is
-left of the data set, by the ordinary command line.
+The truth is what the twin is told to hide; the sigmas are those of `flexdt calibrate` on what
+is left of the data set, by the ordinary command line.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ FRAMES = 60
 SEEDS = range(6)
 
 
-def calibrated(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, Any]:
+def calibrated(
+    folder: Path, capsys: pytest.CaptureFixture[str], *options: str
+) -> dict[str, Any]:
     capsys.readouterr()
     assert run(["calibrate", str(folder), "--phantom", "lego", "--json", *options]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
@@ -46,7 +48,9 @@ def test_the_job_ends_early_and_its_data_set_is_worth_what_was_asked(
     truth = drawn_truth(rng)
     wanted = {"tau_x": rng.uniform(1.5e-4, 3e-4), "tau_z": rng.uniform(1.5e-4, 3e-4)}
     with hiding(rays, tmp_path, truth) as port, TwinClient("127.0.0.1", port) as mine:
-        job, _ = submit(mine, rng, FRAMES, 2.0)  # slow enough for a busy machine to look on
+        job, _ = submit(
+            mine, rng, FRAMES, 2.0
+        )  # slow enough for a busy machine to look on
         words = ",".join(f"{name}={most}" for name, most in wanted.items())
         capsys.readouterr()
         code = run(["job", "watch", "lego", job, "--stop-when", words,
@@ -57,7 +61,9 @@ def test_the_job_ends_early_and_its_data_set_is_worth_what_was_asked(
     assert told["frames"] <= status.frames_done < FRAMES
     data = fx.open(tmp_path / "data" / NAME)
     assert not data.complete
-    assert data.reason.startswith(f"aborted: sigmas reached after {told['frames']} frames: ")
+    assert data.reason.startswith(
+        f"aborted: sigmas reached after {told['frames']} frames: "
+    )
     assert all(f"{name} " in data.reason for name in wanted)
     assert len(data.present) == status.frames_done
     for i in data.present:  # each is whole, and none is half written
@@ -72,7 +78,9 @@ def test_the_job_ends_early_and_its_data_set_is_worth_what_was_asked(
         assert abs(fitted["value"] - value) < 4.0 * fitted["sigma"] + 5e-5
 
 
-def test_what_is_not_reached_lets_the_scan_end_by_itself(servers: Servers, data_dir: Path) -> None:
+def test_what_is_not_reached_lets_the_scan_end_by_itself(
+    servers: Servers, data_dir: Path
+) -> None:
     with TwinClient(*servers.address) as client:
         job, _ = submit(client, random.Random(1), 5, 50.0)
         heard = list[int]()

@@ -41,10 +41,14 @@ LEGO = bead_model(load_phantom("lego"))
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.1])
-def test_forecast_is_the_public_prediction_where_no_shadows_touch(tolerance: float) -> None:
+def test_forecast_is_the_public_prediction_where_no_shadows_touch(
+    tolerance: float,
+) -> None:
     planned = PlannedScans(circle(36), SHAPE, bead_tolerance_mm=tolerance)
     ours = forecast(LEGO, planned)
-    theirs = identifiability(LEGO, planned.poses, 0.1, shape=SHAPE, bead_tolerance_mm=tolerance)
+    theirs = identifiability(
+        LEGO, planned.poses, 0.1, shape=SHAPE, bead_tolerance_mm=tolerance
+    )
     assert ours.used == 1.0
     for name, sigma in (theirs.sigmas | theirs.image_sigmas).items():
         assert (ours.sigmas | ours.image_sigmas)[name] == pytest.approx(sigma, rel=1e-6)
@@ -90,7 +94,9 @@ def test_design_on_bricks_beats_the_spiral_and_fits_agree() -> None:
     spread = measured_spread(model, planned, trials=150)
     for name, sigma in (found.forecast.sigmas | found.forecast.image_sigmas).items():
         assert spread[name] == pytest.approx(sigma, rel=0.24), name
-    one_each = design(seats.places, 1.0, 5, planned, slots=seats.brick, per_slot=1, starts=2)
+    one_each = design(
+        seats.places, 1.0, 5, planned, slots=seats.brick, per_slot=1, starts=2
+    )
     assert sorted(seats.brick[one_each.seats].tolist()) == [0, 1, 2, 3, 4]
     assert one_each.forecast.score >= found.forecast.score
 
@@ -103,7 +109,9 @@ def test_symmetric_set_is_not_told_apart_and_not_chosen() -> None:
     assert turned_likeness(pair) == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(TwinError, match="ambiguous"):
         design(pair, 1.0, 2, planned, starts=2)
-    square = np.array([[9.0, 9.0, 5.0], [-9.0, 9.0, 5.0], [-9.0, -9.0, 5.0], [9.0, -9.0, 5.0]])
+    square = np.array(
+        [[9.0, 9.0, 5.0], [-9.0, 9.0, 5.0], [-9.0, -9.0, 5.0], [9.0, -9.0, 5.0]]
+    )
     places = np.concatenate([square, square * [0.7, 0.2, -3.0]])
     found = design(places, 1.0, 4, planned, starts=6)
     assert turned_likeness(found.beads) >= 1.0
@@ -113,7 +121,9 @@ def test_symmetric_set_is_not_told_apart_and_not_chosen() -> None:
 def test_block_design_moves_beads_off_the_grid() -> None:
     planned = PlannedScans(circle(24), SHAPE)
     bounds = np.array([8.0, 18.0, 28.0])
-    grid = np.stack(np.meshgrid(*[[-b, 0.0, b] for b in bounds], indexing="ij"), -1).reshape(-1, 3)
+    grid = np.stack(
+        np.meshgrid(*[[-b, 0.0, b] for b in bounds], indexing="ij"), -1
+    ).reshape(-1, 3)
     on = design(grid, 1.0, 4, planned, starts=2)
     off = design(grid, 1.0, 4, planned, starts=2, bounds_mm=bounds, resolution_mm=1.0)
     assert off.forecast.score < on.forecast.score

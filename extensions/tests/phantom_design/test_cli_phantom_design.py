@@ -16,7 +16,9 @@ from flexdt.phantoms.samples import as_phantom
 QUICK = ["--frames", "24", "--trials", "4"]
 
 
-def test_lego_design_is_written_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lego_design_is_written_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "mine"
     words = ["phantom", "design", "--bricks", "3", "--beads", "4", *QUICK]
     assert run([*words, "--out", str(out), "--json"]) == 0
@@ -24,7 +26,9 @@ def test_lego_design_is_written_whole(tmp_path: Path, capsys: pytest.CaptureFixt
     ours = document["design"]
     assert document["gain"] > 1.0
     assert ours["identified"] == 1.0
-    assert set(ours["sigmas"]) == set(document["spiral"]["sigmas"]) == set(document["free"])
+    assert (
+        set(ours["sigmas"]) == set(document["spiral"]["sigmas"]) == set(document["free"])
+    )
     felt = {"axis_column", "axis_angle", "magnification"}
     assert set(ours["image_sigmas"]) == felt
     assert set(ours["measured"]) == set(document["free"]) | felt
@@ -32,7 +36,9 @@ def test_lego_design_is_written_whole(tmp_path: Path, capsys: pytest.CaptureFixt
     found = as_phantom(str(out / "phantom.json"))
     np.testing.assert_allclose(found.beads, ours["beads"])
     np.testing.assert_allclose(
-        trimesh.load(out / "phantom.stl", file_type="stl").extents, (24, 16, 30.6), atol=1e-2
+        trimesh.load(out / "phantom.stl", file_type="stl").extents,
+        (24, 16, 30.6),
+        atol=1e-2,
     )
     assert sorted(document["files"]) == sorted(p.name for p in out.iterdir())
     page = (out / "build.html").read_text()
@@ -43,7 +49,9 @@ def test_lego_design_is_written_whole(tmp_path: Path, capsys: pytest.CaptureFixt
     assert red.any()
 
 
-def test_free_design_in_a_block(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_free_design_in_a_block(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["phantom", "design", "--grid", "free", "--size", "16,20,24", "--beads", "3"]
     places = ["--position", "600", "--position", "450:15"]
     out = tmp_path / "block"
@@ -59,7 +67,10 @@ def test_free_design_in_a_block(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_design_for_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script = tmp_path / "scan.txt"
-    assert run(["script", "new", "--kind", "step", "--frames", "12", "--out", str(script)]) == 0
+    assert (
+        run(["script", "new", "--kind", "step", "--frames", "12", "--out", str(script)])
+        == 0
+    )
     capsys.readouterr()
     words = ["phantom", "design", "--plan", str(script), "--trials", "0", "--beads", "3"]
     assert run([*words, "--json"]) == 0
@@ -92,7 +103,11 @@ def test_bad_wishes(
 def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
     from flexdt_extensions.phantom_design.phantom_design import table_rows, verdict
 
-    entry = {"sigmas": {"dO_x": 0.1}, "image_sigmas": {"axis_column": 0.01}, "measured": None}
+    entry = {
+        "sigmas": {"dO_x": 0.1},
+        "image_sigmas": {"axis_column": 0.01},
+        "measured": None,
+    }
     document: dict[str, object] = {
         "design": entry,
         "spiral": {**entry, "sigmas": {"dO_x": 5e5}, "name": "spiral-50"},

@@ -39,7 +39,11 @@ def plastic(work: Brickwork, points: np.ndarray) -> np.ndarray:
             for y in (-4.0, 4.0):
                 r = np.hypot(points[:, 0] - x, points[:, 1] - y)
                 top = z - v["brick_height_mm"]
-                inside |= (r < v["stud_diameter_mm"] / 2) & (top >= 0) & (top < v["stud_height_mm"])
+                inside |= (
+                    (r < v["stud_diameter_mm"] / 2)
+                    & (top >= 0)
+                    & (top < v["stud_height_mm"])
+                )
     return inside
 
 
@@ -55,7 +59,9 @@ def test_no_seat_lies_in_plastic_and_each_touches_some() -> None:
     assert set(seats.brick.tolist()) == set(range(5))
     floors = np.array([work.floor(brick) for brick in range(5)])
     levels = np.round(seats.places[:, 2] - floors[seats.brick], 6)
-    assert len(set(levels.tolist())) == 3  # just above the studs, half way up, against the roof
+    assert (
+        len(set(levels.tolist())) == 3
+    )  # just above the studs, half way up, against the roof
 
 
 def test_stack_is_the_thesis_phantom_but_for_its_beads() -> None:

@@ -2,11 +2,12 @@
 
     python extensions/tests/studies/adaptive_stopping.py [--scans 20] [--seed 0]
 
-Each drawn scan is 60 to 120 images of the LEGO phantom at golden-section angles, of a twin process
-that hides a drawn misalignment; the watcher asks for drawn sigmas of tau_x and tau_z. Minutes are
-those of the scan's own clock. It runs `--speed-up` times as fast as the laboratory's, so frames go
-by during a fit that a real scan would not have taken. The sigmas afterwards are those of
-`flexdt.calibrate` on the data set as it is left, and the truth is compared with them.
+Each drawn scan is 60 to 120 images of the LEGO phantom at golden-section angles, of a twin
+process that hides a drawn misalignment; the watcher asks for drawn sigmas of tau_x and tau_z.
+Minutes are those of the scan's own clock. It runs `--speed-up` times as fast as the
+laboratory's, so frames go by during a fit that a real scan would not have taken. The sigmas
+afterwards are those of `flexdt.calibrate` on the data set as it is left, and the truth is
+compared with them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ def drawn_truth(rng: random.Random) -> dict[str, float]:
 
 def drawn_wish(rng: random.Random) -> dict[str, float]:
     """Sigmas to ask for [mm], from easy ones to some that take a good part of the scan."""
-    return {name: float(f"{1e-4 * 4.0 ** rng.random():.3g}") for name in ("tau_x", "tau_z")}
+    return {
+        name: float(f"{1e-4 * 4.0 ** rng.random():.3g}") for name in ("tau_x", "tau_z")
+    }
 
 
 @contextmanager
@@ -60,7 +63,8 @@ def hiding(rays: Process, folder: Path, truth: Mapping[str, float]) -> Iterator[
 def submit(
     client: TwinClient, rng: random.Random, frames: int, speed_up: float
 ) -> tuple[str, float]:
-    """A job whose angles lie all over the turn from the first on, and how long it is to take."""
+    """A job whose angles lie all over the turn from the first on, and how long it is to
+    take."""
     client.set_sample("lego")
     client.set_camera(mode="HW4SW1High")
     client.set_tube(power_W=rng.uniform(5.0, 30.0))
@@ -68,7 +72,9 @@ def submit(
     first = rng.uniform(0.0, 360.0)
     poses = [{"rot_obj": round((first + 222.4922 * i) % 360.0, 3)} for i in range(frames)]
     planned = client.check_trajectory(poses, 100.0).duration_s
-    job = client.submit_trajectory(poses, 100.0, NAME, speed_up, seed=rng.randrange(99)).job
+    job = client.submit_trajectory(
+        poses, 100.0, NAME, speed_up, seed=rng.randrange(99)
+    ).job
     return job, planned
 
 
@@ -80,7 +86,9 @@ def main() -> None:
     options = parser.parse_args()
     rays = projector()
     print(f"{machine()}; seeds {options.seed} to {options.seed + options.scans - 1}")
-    print("scan  frames   of  minutes    of  ended  sigma/asked  worst |truth - value|/sigma")
+    print(
+        "scan  frames   of  minutes    of  ended  sigma/asked  worst |truth - value|/sigma"
+    )
     rows, pulls = [], []
     for seed in range(options.seed, options.seed + options.scans):
         rng = random.Random(seed)
@@ -96,7 +104,10 @@ def main() -> None:
                 status = client.job_status(job)
             fit = fx.calibrate(folder / "data" / NAME, "lego").parameters
         share = max(float(fit[n]["sigma"]) / most for n, most in wish.items())
-        off = [abs(float(fit[n]["value"]) - x) / float(fit[n]["sigma"]) for n, x in truth.items()]
+        off = [
+            abs(float(fit[n]["value"]) - x) / float(fit[n]["sigma"])
+            for n, x in truth.items()
+        ]
         pulls += off
         early = status.state == "aborted"
         took = status.elapsed_s if early else planned

@@ -2,11 +2,11 @@
 
     python extensions/tests/studies/bluesky_interruptions.py [--runs 100] [--seed 1]
 
-A real RunEngine, a real twin. Each run is one of five plans with one to four interruptions: pauses
-at once, pauses at the next checkpoint, and trips of a suspender, before or while a drawn message is
-processed. `problems_of` reads the documents and the files on disk alone; it knows event-model's
-schemas and what the plan should have measured, and nothing of the devices. Prints how many runs
-were valid, and what is wrong with the others.
+A real RunEngine, a real twin. Each run is one of five plans with one to four interruptions:
+pauses at once, pauses at the next checkpoint, and trips of a suspender, before or while a drawn
+message is processed. `problems_of` reads the documents and the files on disk alone; it knows
+event-model's schemas and what the plan should have measured, and nothing of the devices. Prints
+how many runs were valid, and what is wrong with the others.
 """
 
 from __future__ import annotations
@@ -129,7 +129,9 @@ def draw(random_: random.Random, plan: str, messages: int) -> Drawn:
             Interruption(
                 random_.choice(KINDS),
                 random_.randint(1, max(1, messages // count)),
-                random_.choice([0.0, random_.uniform(0.0, 0.005), random_.uniform(0.0, 0.1)]),
+                random_.choice(
+                    [0.0, random_.uniform(0.0, 0.005), random_.uniform(0.0, 0.1)]
+                ),
                 random_.choice([0.0, random_.uniform(0.0, 0.2)]),
             )
             for _ in range(count)
@@ -181,7 +183,9 @@ class Interrupter:
             self.current = self.left.pop(0)
             self.seen = 0
             if self.current.kind == "suspender" and not self.current.delay_s:
-                self.fire(self.current)  # in the engine's own loop, before anything else happens
+                self.fire(
+                    self.current
+                )  # in the engine's own loop, before anything else happens
             else:
                 threading.Timer(self.current.delay_s, self.fire, [self.current]).start()
 
@@ -202,7 +206,9 @@ class Interrupter:
         self.beam.put(False)
         self.current = None
 
-    def run(self, plan: Iterator[Any], watcher: Callable[[str, dict[str, Any]], None]) -> None:
+    def run(
+        self, plan: Iterator[Any], watcher: Callable[[str, dict[str, Any]], None]
+    ) -> None:
         """Run a plan to its end, resumed after each pause."""
         call: Callable[[], object] = lambda: self.engine(plan, watcher)  # noqa: E731
         while True:
@@ -222,14 +228,16 @@ class Interrupter:
 Documents = list[tuple[str, dict[str, Any]]]
 
 
-def problems_of(documents: Documents, plan: Plan, reference: Images | None = None) -> list[str]:
+def problems_of(
+    documents: Documents, plan: Plan, reference: Images | None = None
+) -> list[str]:
     """What is wrong with a run's documents and the files they name; nothing, if it is valid.
 
     Args:
         documents: in their order.
         plan: what should have been measured.
-        reference: an image of each point, taken undisturbed: each frame must resemble that of its
-            own point more than that of another pose.
+        reference: an image of each point, taken undisturbed: each frame must resemble that of
+            its own point more than that of another pose.
     """
     found: list[str] = []
     by_kind: dict[str, list[dict[str, Any]]] = {}
@@ -258,7 +266,9 @@ def problems_of(documents: Documents, plan: Plan, reference: Images | None = Non
         if sorted(events) != list(range(1, len(events) + 1)):
             found.append(f"stream {stream}: sequence numbers {sorted(events)}")
         if stop.get("num_events", {}).get(stream) != len(events):
-            found.append(f"stop counts {stop.get('num_events')}, {stream} has {len(events)}")
+            found.append(
+                f"stop counts {stop.get('num_events')}, {stream} has {len(events)}"
+            )
     events = rows.get(plan.stream, {})
     for number, point in enumerate(plan.points, 1):
         data = events.get(number, {})
@@ -287,9 +297,11 @@ def _unresolved(documents: Documents, run: str) -> Iterator[str]:
 
 
 def _rows(
-    by_kind: Mapping[str, Sequence[Mapping[str, Any]]], descriptors: Mapping[str, Mapping[str, Any]]
+    by_kind: Mapping[str, Sequence[Mapping[str, Any]]],
+    descriptors: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[int, Mapping[str, Any]]]:
-    """The data of each stream's events by sequence number; a measurement taken again replaces."""
+    """The data of each stream's events by sequence number; a measurement taken again
+    replaces."""
     rows: dict[str, dict[int, Mapping[str, Any]]] = {}
     for event in by_kind.get("event", []):
         stream = descriptors[event["descriptor"]]["name"]
@@ -336,7 +348,10 @@ def _wrong_frames(
         return
     (resource,) = resources.values()
     folder = Path(unquote(urlsplit(resource["uri"]).path))
-    named = {resource["parameters"]["template"].format(i) for i in range(max(expected.values()))}
+    named = {
+        resource["parameters"]["template"].format(i)
+        for i in range(max(expected.values()))
+    }
     series = resource["parameters"]["template"].split("{")[0]
     there = {f.name for f in folder.glob(f"{series}*")}
     if there != named:
@@ -351,7 +366,9 @@ def _wrong_frames(
         if mean is not None and mean != float(image.mean(dtype=np.float64)):
             yield f"event {number} has the mean of another image than {file.name}"
         if reference is not None and plan.points[0]:
-            apart = {i: float(np.mean((image - other) ** 2)) for i, other in reference.items()}
+            apart = {
+                i: float(np.mean((image - other) ** 2)) for i, other in reference.items()
+            }
             nearest = min(apart, key=apart.__getitem__)
             if plan.points[nearest - 1] != plan.points[number - 1]:
                 yield f"event {number}'s image shows the pose of event {nearest}"
@@ -445,7 +462,9 @@ def begin(address: tuple[str, int], images: Path) -> Study:
         client.control("release")
     engine, beam = RunEngine({}), Beam()
     with init_devices():
-        lab = TwinLab(StaticPathProvider(UUIDFilenameProvider(), images), *address, name="lab")
+        lab = TwinLab(
+            StaticPathProvider(UUIDFilenameProvider(), images), *address, name="lab"
+        )
     engine.install_suspender(SuspendBoolHigh(beam))
     engine.preprocessors.append(checkpoint_before_close)
     return Study(engine, lab, beam, scene)
@@ -470,7 +489,10 @@ def main(runs: int, seed: int, plans: Sequence[str]) -> None:
                 met.update(reached)
                 valid[plan] += not found
                 for problem in found[:3]:
-                    print(f"run {i} ({plan}, {drawn.speed_up}, {reached}): {problem}", flush=True)
+                    print(
+                        f"run {i} ({plan}, {drawn.speed_up}, {reached}): {problem}",
+                        flush=True,
+                    )
             drive(study.lab.close())
     kinds = Counter(kind for kind, _ in met.elements())
     where = Counter(message for _, message in met.elements())

@@ -1,21 +1,22 @@
-"""CTSimU scenarios beside images that BAM published, and by the evaluations that `ctsimu` ships.
+"""CTSimU scenarios beside images that BAM published, and by the evaluations that `ctsimu`
+ships.
 
     python extensions/tests/studies/ctsimu_scenarios.py published CHECKOUT
     python extensions/tests/studies/ctsimu_scenarios.py evaluate FOLDER [TEST...]  # needs ctsimu
     python extensions/tests/studies/ctsimu_scenarios.py wedges FOLDER       # likewise
 
 `published` simulates the examples of a checkout of github.com/BAMresearch/ctsimu-scenarios and
-compares every projection with the one that aRTist made of it. `evaluate` simulates scenarios that
-`ctsimu` ships or describes, lets it evaluate the images and prints what it finds: 2D-FB-1, 2D-FB-2,
-2D-DW-1, 2D-HS-1, 2D-SW-3, 2D-WE-1, 2D-WE-2. Their meshes and spectra are not public: edges are
-blocks of tungsten whose sides run towards the source, the wires those of ISO 19232-5, the foil has
-holes where its evaluation expects their shadows, the two halves of the step wedge are as their
-documentation draws them, the spectra are ours. `wedges` is 2D-SW-1 and 2D-SW-2, primary radiation:
-spherical steps as their documentation draws them, thicknesses from the ideal detector at one
-energy, spectra ours behind as much aluminium as fits the ideal detector; then all CsI and GOS cases
-beside ROSI and McRay, and how far spectra within 20 % of ours that fit the ideal detector, too,
-move them. For 2D-SW-4 nobody says what sample and geometry are, and `testTwin` evaluates lengths
-that somebody measured, not images.
+compares every projection with the one that aRTist made of it. `evaluate` simulates scenarios
+that `ctsimu` ships or describes, lets it evaluate the images and prints what it finds: 2D-FB-1,
+2D-FB-2, 2D-DW-1, 2D-HS-1, 2D-SW-3, 2D-WE-1, 2D-WE-2. Their meshes and spectra are not public:
+edges are blocks of tungsten whose sides run towards the source, the wires those of ISO 19232-5,
+the foil has holes where its evaluation expects their shadows, the two halves of the step wedge
+are as their documentation draws them, the spectra are ours. `wedges` is 2D-SW-1 and 2D-SW-2,
+primary radiation: spherical steps as their documentation draws them, thicknesses from the ideal
+detector at one energy, spectra ours behind as much aluminium as fits the ideal detector; then
+all CsI and GOS cases beside ROSI and McRay, and how far spectra within 20 % of ours that fit
+the ideal detector, too, move them. For 2D-SW-4 nobody says what sample and geometry are, and
+`testTwin` evaluates lengths that somebody measured, not images.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ MANY_RAYS = 15
 
 
 def published(checkout: Path) -> None:
-    """Differences in grey values, of about 50 000 in the open beam; then both beside many rays."""
+    """Differences in grey values, of about 50 000 in the open beam; then both beside many
+    rays."""
     for path in sorted(checkout.glob("examples/*/*.json")):
         try:
             images, finer = ScenarioImages(path), ScenarioImages(path, rays=MANY_RAYS)
@@ -68,8 +70,12 @@ def published(checkout: Path) -> None:
         for i, (ours, truth) in enumerate(
             zip(images.projections(), finer.projections(), strict=True)
         ):
-            theirs = tifffile.imread(path.parent / "projections" / f"{path.stem}_{i:04d}.tif")
-            one, two, three = (image.astype(np.float64) for image in (ours, theirs, truth))
+            theirs = tifffile.imread(
+                path.parent / "projections" / f"{path.stem}_{i:04d}.tif"
+            )
+            one, two, three = (
+                image.astype(np.float64) for image in (ours, theirs, truth)
+            )
             apart.append((one - two, one - three, two - three))
             most = max(most, float(theirs.max()))
         found = np.array(apart)
@@ -89,29 +95,39 @@ def write_spectrum(path: Path, photons: np.ndarray[Any, Any]) -> None:
     np.savetxt(path, np.column_stack([ENERGY, photons * 1e4]))
 
 
-def between(corners: Sequence[Sequence[float]], near: float, far: float) -> trimesh.Trimesh:
-    """The cone from the origin through a convex polygon (y, z) at x = 1, from x = near to far."""
+def between(
+    corners: Sequence[Sequence[float]], near: float, far: float
+) -> trimesh.Trimesh:
+    """The cone from the origin through a convex polygon (y, z) at x = 1, from x = near to
+    far."""
     ring = np.array([[1.0, y, z] for y, z in corners])
     hull = trimesh.convex.convex_hull(np.concatenate([near * ring, far * ring]))
     assert isinstance(hull, trimesh.Trimesh)
     return hull
 
 
-def shipped(name: str, folder: Path, mesh: trimesh.Trimesh | None = None) -> dict[str, Any]:
-    """A scenario of the package with our mesh in its place; `mesh` has the world's coordinates."""
-    text = (resources.files("ctsimu") / "evaluation" / "scenarios" / f"{name}.json").read_text(
-        encoding="utf-8-sig"
-    )
+def shipped(
+    name: str, folder: Path, mesh: trimesh.Trimesh | None = None
+) -> dict[str, Any]:
+    """A scenario of the package with our mesh in its place; `mesh` has the world's
+    coordinates."""
+    text = (
+        resources.files("ctsimu") / "evaluation" / "scenarios" / f"{name}.json"
+    ).read_text(encoding="utf-8-sig")
     document: dict[str, Any] = json.loads(text)
     spectrum = document["source"]["spectrum"]["file"]["value"]
     if spectrum:
-        write_spectrum(folder / spectrum, beam(document["source"]["voltage"]["value"], 4.0))
+        write_spectrum(
+            folder / spectrum, beam(document["source"]["voltage"]["value"], 4.0)
+        )
     if mesh is not None:
         sample = document["samples"][0]
         mesh.export(folder / sample["file"]["value"])
         middle = mesh.bounds.mean(axis=0)
         for a, x in zip("uvw", middle, strict=True):
-            stage = document["geometry"]["stage"]["center"]["xyz"["uvw".index(a)]]["value"]
+            stage = document["geometry"]["stage"]["center"]["xyz"["uvw".index(a)]][
+                "value"
+            ]
             sample["position"]["center"][a]["value"] = x - stage
     return document
 
@@ -137,9 +153,15 @@ def evaluated(test: str, metadata: dict[str, str]) -> str:
     from ctsimu.toolbox import Toolbox
 
     if test.startswith("2D-WE"):
-        Geometry.create_detector_flat_field_sphere = analytic(Path(min(metadata.values())))
+        Geometry.create_detector_flat_field_sphere = analytic(
+            Path(min(metadata.values()))
+        )
     # 2D-HS-1 multiplies text by truth values, which numpy 2 allows of Python's own only.
-    for owner, name in ((Vector, "distance"), (Vector, "angle"), (holes, "list_mean_and_stddev")):
+    for owner, name in (
+        (Vector, "distance"),
+        (Vector, "angle"),
+        (holes, "list_mean_and_stddev"),
+    ):
         inner = getattr(owner, name)
         if not hasattr(inner, "plainly"):
             setattr(owner, name, plain(inner))
@@ -159,7 +181,10 @@ def analytic(metadata: Path) -> Callable[..., Any]:
     from ctsimu.geometry import Geometry
     from ctsimu.image import Image
 
-    inner, kept = Geometry.create_detector_flat_field_sphere, metadata.parents[1] / "edge.npz"
+    inner, kept = (
+        Geometry.create_detector_flat_field_sphere,
+        metadata.parents[1] / "edge.npz",
+    )
     if hasattr(inner, "kept"):
         return inner  # type: ignore[no-any-return]
 
@@ -200,7 +225,9 @@ def quarter(pitch: float) -> trimesh.Trimesh:
 def duplex() -> trimesh.Trimesh:
     """Pairs of wires as far apart as they are thick, where the evaluation looks for them."""
     wires, at = [], -18.0
-    tilt = trimesh.transformations.rotation_matrix(math.radians(3.0), [1, 0, 0], [998.6, 0, 0])
+    tilt = trimesh.transformations.rotation_matrix(
+        math.radians(3.0), [1, 0, 0], [998.6, 0, 0]
+    )
     for d in WIRES:
         for k in (0, 2):
             wire = trimesh.creation.cylinder(d / 2.0, 15.0, sections=48)
@@ -227,7 +254,9 @@ def foil(document: dict[str, Any]) -> trimesh.Trimesh:
 
     panel, part = geometry.detector, scenario.samples[0].coordinate_system
     spots = [(160.0, 140.0, 133 * 0.15)]
-    spots += [(y, z, 66 * 0.15) for y in (-205.0, 0.0, 205.0) for z in (-205.0, 0.0, 205.0)]
+    spots += [
+        (y, z, 66 * 0.15) for y in (-205.0, 0.0, 205.0) for z in (-205.0, 0.0, 205.0)
+    ]
     near, far = (at / 400.0 for at in (10.0, 10.01))
     whole = [trimesh.creation.box((480.0, 480.0, 1.0))]
     for u, v, radius in spots:
@@ -236,7 +265,8 @@ def foil(document: dict[str, Any]) -> trimesh.Trimesh:
     made = trimesh.boolean.difference(whole, engine="manifold")
     local = np.array(made.vertices)
     depth = np.where(local[:, 2] < 0.0, near, far)[:, None]
-    # Walls of holes run towards the source, the rim does not: the middle of its box is the foil's.
+    # Walls of holes run towards the source, the rim does not: the middle of its box is the
+    # foil's.
     rim = np.abs(local[:, :1]) > 239.0
     across = np.where(rim, 0.5 * (near + far), depth) * local[:, :2]
     world = depth * of(panel.center) + across @ np.stack([of(panel.u), of(panel.v)])
@@ -246,9 +276,13 @@ def foil(document: dict[str, Any]) -> trimesh.Trimesh:
 
 
 def halves() -> list[trimesh.Trimesh]:
-    """The step wedge of 2D-SW-3 in two: between the upper steps a gap, below they overlap, where
-    the right one takes the left one's place."""
-    thick, pitch, step = (41.0, 35.89, 30.79, 25.68, 20.58, 15.47, 10.36, 5.26, 0.15), 0.4, 1e3 / 11
+    """The step wedge of 2D-SW-3 in two: between the upper steps a gap, below they overlap,
+    where the right one takes the left one's place."""
+    thick, pitch, step = (
+        (41.0, 35.89, 30.79, 25.68, 20.58, 15.47, 10.36, 5.26, 0.15),
+        0.4,
+        1e3 / 11,
+    )
 
     def seam(row: float) -> float:
         gap, slant = 5.0 / 3.0 * (4.0 - row / step), 10.0 / 3.0 * (7.0 - row / step)
@@ -263,7 +297,8 @@ def halves() -> list[trimesh.Trimesh]:
             y = [[(500.0 - at) * pitch / 1e3 for at in side] for side in (right, left)]
             parts[part].append(shell(d, 518.0, y[0], y[1], low, high))
     surfaces = [
-        Surface(m.vertices, m.faces, "Al", 0.05) for m in map(trimesh.util.concatenate, parts)
+        Surface(m.vertices, m.faces, "Al", 0.05)
+        for m in map(trimesh.util.concatenate, parts)
     ]
     nothing = Scene(())
     _, found = cut([(nothing, [one], rank) for rank, one in enumerate(surfaces)])
@@ -356,16 +391,23 @@ def evaluate(folder: Path, *tests: str) -> None:
 def reference(number: int) -> np.ndarray[Any, Any]:
     """Primary grey values by step: ROSI, McRay, McRay's standard deviation, (10, 3)."""
     data = resources.files("ctsimu") / "evaluation" / "data"
-    found = [p for p in data.iterdir() if p.name.startswith(f"2D-SW-1_scenario{number:02d}_")]
+    found = [
+        p for p in data.iterdir() if p.name.startswith(f"2D-SW-1_scenario{number:02d}_")
+    ]
     table = np.loadtxt(found[0].read_text().splitlines(), delimiter="\t")
     return np.asarray(table[:, [9, 12, 13]])
 
 
 def shell(
-    d: float, radius: float, left: Sequence[float], right: Sequence[float], low: float, high: float
+    d: float,
+    radius: float,
+    left: Sequence[float],
+    right: Sequence[float],
+    low: float,
+    high: float,
 ) -> trimesh.Trimesh:
-    """A spherical shell about the source between z = low and high at x = 1; `left` and `right` are
-    where it begins and ends there along y, at low and at high."""
+    """A spherical shell about the source between z = low and high at x = 1; `left` and `right`
+    are where it begins and ends there along y, at low and at high."""
     part = np.linspace(0.0, 1.0, 21)
     across, up = np.meshgrid(part, part)
     begin, end = (side[0] + (side[1] - side[0]) * up for side in (left, right))
@@ -373,7 +415,9 @@ def shell(
     way = np.stack([np.ones_like(y), y, z], axis=-1).reshape(-1, 3)
     way /= np.linalg.norm(way, axis=1)[:, None]
     n = np.arange(21 * 21).reshape(21, 21)
-    a, b, c, e = (n[i : i + 20, j : j + 20].ravel() for i, j in ((0, 0), (0, 1), (1, 1), (1, 0)))
+    a, b, c, e = (
+        n[i : i + 20, j : j + 20].ravel() for i, j in ((0, 0), (0, 1), (1, 1), (1, 0))
+    )
     outer = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, e], 1)])
     rim = np.concatenate([n[0, :-1], n[:-1, -1], n[-1, :0:-1], n[:0:-1, 0]])
     after, m = np.roll(rim, -1), 21 * 21
@@ -385,7 +429,8 @@ def shell(
 
 
 def steps(thick: np.ndarray[Any, Any], radius: float) -> trimesh.Trimesh:
-    """Spherical shells about the source, the lowest the thickest; a hair of space between them."""
+    """Spherical shells about the source, the lowest the thickest; a hair of space between
+    them."""
     parts, half = [], 0.5 * PANEL_MM / 1000.0
     for k, d in enumerate(thick):
         low, high = (-half + 2 * half * (k + e) / 10 for e in (1e-4, 1 - 1e-4))
@@ -433,7 +478,8 @@ def standing(file: str, mesh: trimesh.Trimesh, metal: str) -> dict[str, Any]:
 
 
 def wedges(folder: Path) -> None:
-    """2D-SW-1 and 2D-SW-2: steps of aluminium and iron behind four detectors and two filters."""
+    """2D-SW-1 and 2D-SW-2: steps of aluminium and iron behind four detectors and two
+    filters."""
     folder.mkdir(parents=True)
     screens = {"D2": Filter(Substance.of("CsI", "CsI", 4.51), 0.2),
                "D3": Filter(Substance.of("CsI", "CsI", 4.51), 0.5),
@@ -444,14 +490,18 @@ def wedges(folder: Path) -> None:
     beams, depth, ideal = {}, {}, {}
     for metal, density, radius, keV, kV, first in metals:
         mu = Substance.of(metal, metal, density).attenuation()
-        thick = -np.log(reference(first)[:9, :2].mean(axis=1) / 6e4) / np.interp(keV, ENERGY, mu)
+        thick = -np.log(reference(first)[:9, :2].mean(axis=1) / 6e4) / np.interp(
+            keV, ENERGY, mu
+        )
         depth[metal] = through = np.exp(-mu * thick[:, None])
         wanted = reference(first + 2)[:9, :2].mean(axis=1) / 6e4
 
         def behind(aluminium: float, kV: float = kV) -> np.ndarray[Any, Any]:
             return beam(kV, aluminium) * ENERGY
 
-        def misfit(aluminium: float, t: Any = through, w: Any = wanted, f: Any = behind) -> float:
+        def misfit(
+            aluminium: float, t: Any = through, w: Any = wanted, f: Any = behind
+        ) -> float:
             s = f(aluminium)
             return float((np.log(t @ s / s.sum() / w) ** 2).sum())
 
@@ -473,7 +523,9 @@ def wedges(folder: Path) -> None:
                         "type": "real",
                         "scintillator": {"material_id": "screen", "thickness": thickness},
                     }
-                    formulas["screen"] = ("Gd2O2S", 7.34) if detector == "D4" else ("CsI", 4.51)
+                    formulas["screen"] = (
+                        ("Gd2O2S", 7.34) if detector == "D4" else ("CsI", 4.51)
+                    )
                 document["materials"] = materials(formulas)
                 document["samples"] = [standing(f"{metal}.stl", mesh, metal)]
                 if detector == "D1":
@@ -485,7 +537,10 @@ def wedges(folder: Path) -> None:
     rows = []
     text = next(folder.rglob("2D-SW-1_all_GV_means.txt")).read_text().splitlines()
     names = text[0].split("\t")[1:]
-    rows = [[float(x) if x != "-" else np.nan for x in line.split("\t")[1:]] for line in text[1:]]
+    rows = [
+        [float(x) if x != "-" else np.nan for x in line.split("\t")[1:]]
+        for line in text[1:]
+    ]
     means = np.array(rows)
     number = 5
     for name in names:
@@ -503,12 +558,16 @@ def wedges(folder: Path) -> None:
         if detector != "D1" and energy in ("120", "200"):
             s = beams[metal] / beams[metal].sum()
             wanted = reference(9 if metal == "Al" else 13)[:9, :2].mean(axis=1) / 6e4
-            low, high = explained(s, deposited(screens[detector]).mean, depth[metal], wanted)
+            low, high = explained(
+                s, deposited(screens[detector]).mean, depth[metal], wanted
+            )
             line += f"; spectra explain step 1 from {100 * (low * 6e4 / both[0] - 1):.1f}"
             line += f" to {100 * (high * 6e4 / both[0] - 1):.1f}"
         print(line)
     filtered = {}
-    for key, document in [(metal + cu, ideal[metal]) for metal in ideal for cu in ("", "Cu")]:
+    for key, document in [
+        (metal + cu, ideal[metal]) for metal in ideal for cu in ("", "Cu")
+    ]:
         # The 200 kV of the iron's tube for both, with the thickness of aluminium fitted above.
         document["source"] |= {
             "voltage": {"value": 200.0}, "spectrum": {"file": {"value": "Fe.csv"}},
@@ -517,7 +576,9 @@ def wedges(folder: Path) -> None:
         filtered[key] = simulated(folder, key, document, 1)
     evaluated("2D-SW-2", filtered)
     for key in filtered:
-        text = (folder / key / "2D-SW-2-results" / f"2D-SW-2_{key}_ratios.txt").read_text()
+        text = (
+            folder / key / "2D-SW-2-results" / f"2D-SW-2_{key}_ratios.txt"
+        ).read_text()
         table = np.loadtxt(text.splitlines())
         print(f"2D-SW-2 {key:4s} ratios of neighbouring steps, % off the reference: "
               + " ".join(f"{100 * x:.1f}" for x in table[:, 6]) + "; its uncertainty: "

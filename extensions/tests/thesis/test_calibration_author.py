@@ -1,4 +1,5 @@
-"""The author's code and logs: his model against one written by hand, his phantoms, his 242 fits."""
+"""The author's code and logs: his model against one written by hand, his phantoms, his 242
+fits."""
 
 from __future__ import annotations
 
@@ -33,12 +34,15 @@ LEGO = bead_model(load_phantom("lego"))
 def by_hand(
     name: str, values: list[float], mount: complex, turn: np.ndarray, offset: np.ndarray
 ) -> np.ndarray:
-    """Spots (n, k, 2) written in Unity's plane as complex numbers x + i z, projected by hand."""
+    """Spots (n, k, 2) written in Unity's plane as complex numbers x + i z, projected by
+    hand."""
     real = author()["real"]
     scan = real["scans"][name]
     sx, sy, sz = scan["source"]
     ox, oy, oz = (o + d for o, d in zip(scan["object"], values[:3], strict=True))
-    dx, dy, dz = (d + a for d, a in zip(scan["detector"], real["detector_added"], strict=True))
+    dx, dy, dz = (
+        d + a for d, a in zip(scan["detector"], real["detector_added"], strict=True)
+    )
     out = np.empty((len(turn), len(LEGO.beads), 2))
     for i, (a, o) in enumerate(zip(turn, offset, strict=True)):
         for k, (x, y, z) in enumerate(LEGO.beads):
@@ -79,7 +83,9 @@ def test_binary_centroids_are_those_of_a_mask() -> None:
         for index in np.ndindex(4, 3):
             x, y = centres[index]
             inside = (columns - x) ** 2 + (rows - y) ** 2 <= radius**2
-            assert_allclose(found[index], [columns[inside].mean(), rows[inside].mean()], atol=1e-9)
+            assert_allclose(
+                found[index], [columns[inside].mean(), rows[inside].mean()], atol=1e-9
+            )
 
 
 def test_all_242_logs_are_there_and_agree_with_the_thesis() -> None:
@@ -123,7 +129,9 @@ def test_logged_fits_follow_from_the_sign_and_the_angles() -> None:
     (3, [[7, -17, -27], [-7, 17, 0], [7, -17, 27]]),
     (5, [[7, -17, -27], [-7, -7, -13.5], [-7, 17, 0], [7, 7, 13.5], [7, -17, 27]]),
 ])  # fmt: skip
-def test_the_authors_beads_stand_on_a_loop(beads: int, expected: list[list[float]]) -> None:
+def test_the_authors_beads_stand_on_a_loop(
+    beads: int, expected: list[list[float]]
+) -> None:
     """20 x 40 x 60 mm, 3 mm inside the faces: the loop is 96 mm round."""
     assert_allclose(authors(f"normal-{beads}").beads, expected, atol=1e-12)
 

@@ -57,7 +57,9 @@ def test_exact_points_solve_everything_but_one_bead(tmp_path: Path) -> None:
         assert rows[k]["thesis_mae"] > 0
     stored = json.loads((tmp_path / "summary.json").read_text())
     assert stored["rows"] == json.loads(json.dumps(document["rows"]))
-    assert {"report.html", "mae.svg", "parameters.svg"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"report.html", "mae.svg", "parameters.svg"} <= {
+        p.name for p in tmp_path.iterdir()
+    }
     run = stored["runs"][-1]
     assert set(run["errors"]) == {"dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z"}
     assert run["projections"] == 36
@@ -82,8 +84,11 @@ def test_damping_rows_are_algorithm_2() -> None:
 
 
 def test_rendered_noisy_images_with_unknown_identities() -> None:
-    """One scenario in images: Beer-Lambert, blur, 5000 counts, nobody told which bead is which."""
-    task = next(t for t in tasks("phantoms", "images", counts=(6, 12)) if t.setting == "normal")
+    """One scenario in images: Beer-Lambert, blur, 5000 counts, nobody told which bead is
+    which."""
+    task = next(
+        t for t in tasks("phantoms", "images", counts=(6, 12)) if t.setting == "normal"
+    )
     runs = run_task(task)
     assert [r.projections for r in runs] == [6, 12]
     for run in runs:
@@ -95,7 +100,8 @@ def test_rendered_noisy_images_with_unknown_identities() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_in_images_runs_to_its_end(experiment: str) -> None:
-    """Whole by `flexdt study EXPERIMENT --fidelity images`; here with two numbers of projections.
+    """Whole by `flexdt study EXPERIMENT --fidelity images`; here with two numbers of
+    projections.
 
     One bead determines nothing; of two beads, three images may be too few.
     """
@@ -107,7 +113,9 @@ def test_an_experiment_in_images_runs_to_its_end(experiment: str) -> None:
         if few == 1:
             assert row["unidentifiable"] == row["runs"]
         else:
-            assert row["success"] >= (row["runs"] if few > 2 else row["runs"] - 2), row["setting"]
+            assert row["success"] >= (row["runs"] if few > 2 else row["runs"] - 2), row[
+                "setting"
+            ]
 
 
 def test_a_run_that_raises_is_a_row_with_its_reason(
@@ -156,8 +164,8 @@ def test_basin_of_our_fit_is_not_smaller_than_algorithm_2s() -> None:
 
 @pytest.mark.slow
 def test_experiment_4_on_images_does_not_depend_on_the_number_of_projections() -> None:
-    """Beam hardening, noise, beads off their model; the first scan's volume gives the model of the
-    others (short: 24 images of two scans)."""
+    """Beam hardening, noise, beads off their model; the first scan's volume gives the model of
+    the others (short: 24 images of two scans)."""
     runs, document = real_images_runs(map, print, 1, (3, 12), scans=("Scan2",), frames=24)
     off = document["beads_off_truth_mm"]
     designed = bead_model(load_phantom("lego"))
@@ -171,7 +179,9 @@ def test_experiment_4_on_images_does_not_depend_on_the_number_of_projections() -
     assert abs(few["errors"]["alpha"] - many["errors"]["alpha"]) < 0.05
 
 
-def test_exact_points_say_why_one_placement_succeeds(capsys: pytest.CaptureFixture[str]) -> None:
+def test_exact_points_say_why_one_placement_succeeds(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert command(["study", "detector", "--jobs", "1"]) == 0
     assert "because exact points have no noise" in capsys.readouterr().out
     assert command(["study", "detector", "--jobs", "1", "--json"]) == 0

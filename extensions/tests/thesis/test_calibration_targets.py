@@ -17,7 +17,13 @@ from spoilt_scans import Outcome
 from flexdt.clients.cli.command_tree import run
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt_extensions.studies.experiment_4 import scan_names
-from flexdt_extensions.studies.study import FIDELITIES, METHODS, Cell, basin_runs, run_study
+from flexdt_extensions.studies.study import (
+    FIDELITIES,
+    METHODS,
+    Cell,
+    basin_runs,
+    run_study,
+)
 from flexdt_extensions.studies.study_report import open_directions, real_lines
 
 
@@ -38,7 +44,10 @@ def test_every_target_is_met_missed_or_missing(
     ours, thesis, met = next(v for k, v in rows.items() if "K = 2 to 7" in k)
     assert (met, ours[:5]) == ("yes", "30/30")
     assert "MAE 0.01 to 0.33" in thesis
-    assert next(v for k, v in rows.items() if "K = 1:" in k)[0] == "5/5 reported unidentifiable"
+    assert (
+        next(v for k, v in rows.items() if "K = 1:" in k)[0]
+        == "5/5 reported unidentifiable"
+    )
     assert next(v for k, v in rows.items() if "camera demo" in k)[2] == "NO"
     missing = [v for v in rows.values() if v[2] == "missing"]
     assert all(v[0].startswith(("flexdt study", "python examples")) for v in missing)
@@ -53,13 +62,21 @@ def test_a_missed_target_is_a_miss(tmp_path: Path) -> None:
     file = tmp_path / "summary.json"
     document = json.loads(file.read_text())
     file.write_text(json.dumps(document | {"fidelity": "points"}))
-    row = next(r for r in targets_table(collected([tmp_path])) if "seven phantoms" in r[0])
+    row = next(
+        r for r in targets_table(collected([tmp_path])) if "seven phantoms" in r[0]
+    )
     assert row[3] == "NO"
 
 
 def test_what_an_experiment_would_ignore_is_refused() -> None:
-    for experiment, fidelity in (("real", "clean"), ("basin", "clean"), ("basin", "images")):
-        with pytest.raises(UnknownNameError, match=f"{experiment}.* has no fidelity '{fidelity}'"):
+    for experiment, fidelity in (
+        ("real", "clean"),
+        ("basin", "clean"),
+        ("basin", "images"),
+    ):
+        with pytest.raises(
+            UnknownNameError, match=f"{experiment}.* has no fidelity '{fidelity}'"
+        ):
             run_study(experiment, fidelity)
     with pytest.raises(UnknownNameError, match="no experiment 'bees'; allowed: beads"):
         run_study("bees")
@@ -93,7 +110,9 @@ def test_basin_without_noise_is_without_noise() -> None:
     from flexdt.phantoms import load_phantom
     from flexdt.twin.calibration.bead_model import bead_model
 
-    runs = basin_runs(Cell(5.0, 30.0, 1, "normal-5", 3, 0.0), bead_model(load_phantom("normal-5")))
+    runs = basin_runs(
+        Cell(5.0, 30.0, 1, "normal-5", 3, 0.0), bead_model(load_phantom("normal-5"))
+    )
     assert [r.setting for r in runs] == list(METHODS)
     assert all(r.mae < 1e-6 for r in runs)
 

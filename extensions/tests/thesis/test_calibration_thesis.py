@@ -13,10 +13,14 @@ from flexdt_extensions.studies.experiments import placements, thesis, thesis_row
 
 @pytest.mark.parametrize("lam", [0.0, 1e-4, 1e-2, 1.0])
 @pytest.mark.parametrize("name", list(SCENARIOS))
-def test_algorithm_2_solves_exact_points_with_every_damping(name: str, lam: float) -> None:
+def test_algorithm_2_solves_exact_points_with_every_damping(
+    name: str, lam: float
+) -> None:
     poses, truth = scenario(name, 12)
     model = spiral((20, 22, 40), 3)
-    problem = build_problem(exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE)
+    problem = build_problem(
+        exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE
+    )
     result = algorithm_2(problem, lam)
     edge = result.parameters.to_edge()
     assert result.stop is Stop.CONVERGED
@@ -28,18 +32,24 @@ def test_algorithm_2_solves_exact_points_with_every_damping(name: str, lam: floa
 def test_damping_of_zero_stays_zero_and_a_bad_start_stalls() -> None:
     poses, truth = scenario("G0", 12)
     model = spiral((20, 22, 40), 3)
-    problem = build_problem(exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE)
+    problem = build_problem(
+        exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE
+    )
     far = problem.with_base(problem.base + np.array([0, 0, 0, np.pi, *[0.0] * 13]))
     result = algorithm_2(far, 0.0)
     assert result.lam == 0.0
-    good = max(abs(result.parameters.to_edge()[n] - truth.to_edge()[n]) for n in SIX) < 1e-6
+    good = (
+        max(abs(result.parameters.to_edge()[n] - truth.to_edge()[n]) for n in SIX) < 1e-6
+    )
     assert good or result.stop in (Stop.STALLED, Stop.LIMIT)
 
 
 def test_one_bead_has_singular_normal_equations_without_damping() -> None:
     poses, truth = scenario("G0", 6)
     model = spiral((20, 40, 60), 1)
-    problem = build_problem(exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE)
+    problem = build_problem(
+        exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE
+    )
     result = algorithm_2(problem, 1e-2)
     wrong = max(abs(result.parameters.to_edge()[n] - truth.to_edge()[n]) for n in SIX)
     assert wrong > 1.0  # a low cost, and not the truth

@@ -1,4 +1,5 @@
-"""`flexdt reconstruct --scheduler`: equal bytes, taken up after any end, a volume nobody holds."""
+"""`flexdt reconstruct --scheduler`: equal bytes, taken up after any end, a volume nobody
+holds."""
 
 from __future__ import annotations
 
@@ -55,7 +56,9 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(20)
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 24)] * 3, indexing="ij")
     values = 0.02 * (x * x + y * y + z * z < 0.8) * (1 + rng.random((24, 24, 24)))
-    geometry = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=VIEWS, shape=(ROWS, COLS), pixel=PIXEL)
+    geometry = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=VIEWS, shape=(ROWS, COLS), pixel=PIXEL
+    )
     folder = tmp_path_factory.mktemp("scans") / "blob"
     fx.simulate(fx.Volume(values.astype(np.float32), 2.0), geometry, noise=5).save(folder)
     return folder
@@ -65,7 +68,9 @@ def files(path: Path) -> dict[str, bytes]:
     """Bytes of a file, or of all in a folder."""
     if path.is_file():
         return {"": path.read_bytes()}
-    return {str(f.relative_to(path)): f.read_bytes() for f in path.rglob("*") if f.is_file()}
+    return {
+        str(f.relative_to(path)): f.read_bytes() for f in path.rglob("*") if f.is_file()
+    }
 
 
 def test_who_is_interrupted_between_two_results_leaves_no_task_behind() -> None:
@@ -84,7 +89,8 @@ def test_who_is_interrupted_between_two_results_leaves_no_task_behind() -> None:
 
 
 def test_workers_make_what_the_local_command_makes(scan: Path, tmp_path: Path) -> None:
-    """The same values in all formats, and the local command's but for the last digit of a few."""
+    """The same values in all formats, and the local command's but for the last digit of a
+    few."""
     data = load_dataset(scan)
     reconstruct_dataset(data, tmp_path / "here.zarr", REQUEST)
     here = fx.Volume.load(tmp_path / "here.zarr")
@@ -127,9 +133,14 @@ def test_a_voxel_by_the_formula(scan: Path, tmp_path: Path) -> None:
     ramp[n == 0] = 0.25 / pitch**2
     rng = np.random.default_rng(3)
     for _ in range(5):
-        iz, iy, ix = 75 + rng.integers(-30, 30), 35 + rng.integers(-15, 15), rng.integers(15, 45)
+        iz, iy, ix = (
+            75 + rng.integers(-30, 30),
+            35 + rng.integers(-15, 15),
+            rng.integers(15, 45),
+        )
         x, y, z = (
-            (i - (n - 1) / 2) * VOXEL for i, n in zip((ix, iy, iz), SHAPE[::-1], strict=True)
+            (i - (n - 1) / 2) * VOXEL
+            for i, n in zip((ix, iy, iz), SHAPE[::-1], strict=True)
         )
         total = 0.0
         for image, row in zip(images, data.geometry.rows, strict=True):
@@ -141,20 +152,25 @@ def test_a_voxel_by_the_formula(scan: Path, tmp_path: Path) -> None:
             c0, r0 = int(np.floor(at_c)), int(np.floor(at_r))
             q = [
                 [
-                    (image[k] * cosine[k] * ramp[COLS - 1 + j - np.arange(COLS)]).sum() * pitch
+                    (image[k] * cosine[k] * ramp[COLS - 1 + j - np.arange(COLS)]).sum()
+                    * pitch
                     for j in (c0, c0 + 1)
                 ]
                 for k in (r0, r0 + 1)
             ]
             fc, fr = at_c - c0, at_r - r0
-            total += np.array([1 - fr, fr]) @ np.array(q) @ np.array([1 - fc, fc]) / depth**2
+            total += (
+                np.array([1 - fr, fr]) @ np.array(q) @ np.array([1 - fc, fc]) / depth**2
+            )
         expected = 0.5 * (2 * np.pi / VIEWS) * total
         assert made[iz, iy, ix] == pytest.approx(expected, abs=2e-4 * 0.03)
 
 
 def test_a_broken_one_is_taken_up(scan: Path, tmp_path: Path) -> None:
     data = load_dataset(scan)
-    reconstruct_dataset(data, tmp_path / "whole.zarr", REQUEST, workers=nullcontext(Here()))
+    reconstruct_dataset(
+        data, tmp_path / "whole.zarr", REQUEST, workers=nullcontext(Here())
+    )
     out = tmp_path / "v.zarr"
     with pytest.raises(TwinError, match="worker is gone"):
         reconstruct_dataset(data, out, REQUEST, workers=nullcontext(Here(fails=2)))
@@ -180,13 +196,19 @@ def test_coarser_resolutions_are_means(tmp_path: Path) -> None:
     assert [d["path"] for d in scales["datasets"]] == ["0", "1", "2"]
     np.testing.assert_array_equal(group["0"][:], values)
     for k, described in enumerate(scales["datasets"]):
-        size, place = (list(t.values())[1] for t in described["coordinateTransformations"])
+        size, place = (
+            list(t.values())[1] for t in described["coordinateTransformations"]
+        )
         made, edge = group[str(k)], 2**k
         assert size == [0.5 * edge] * 3
         mean = values[edge : 2 * edge, :edge, 2 * edge : 3 * edge].astype(float).mean()
         assert made[1, 0, 2] == pytest.approx(mean, rel=1e-6)
-        centre = np.array([1.5, 0.5, 2.5]) * edge - 0.5  # of that voxel, in the finest ones
-        finest = np.array(scales["datasets"][0]["coordinateTransformations"][1]["translation"])
+        centre = (
+            np.array([1.5, 0.5, 2.5]) * edge - 0.5
+        )  # of that voxel, in the finest ones
+        finest = np.array(
+            scales["datasets"][0]["coordinateTransformations"][1]["translation"]
+        )
         np.testing.assert_allclose(
             np.array(place) + np.array([1, 0, 2]) * size, finest + centre * 0.5
         )
@@ -213,19 +235,36 @@ def test_what_workers_do_not_do(
 ) -> None:  # fmt: skip
     data = load_dataset(scan)
     with pytest.raises(LimitError, match=r"by fdk; not .* by sirt"):
-        reconstruct_dataset(data, tmp_path / "v.zarr", Request("sirt"), workers=nullcontext(Here()))
-    monkeypatch.setattr("flexdt_extensions.fdk_on_workers.version", lambda name: next(old))
+        reconstruct_dataset(
+            data, tmp_path / "v.zarr", Request("sirt"), workers=nullcontext(Here())
+        )
+    monkeypatch.setattr(
+        "flexdt_extensions.fdk_on_workers.version", lambda name: next(old)
+    )
     old = iter(["0.3", "0.2", "0.2", "0.2"])
     with pytest.raises(TwinError, match=r"a worker has flexdt 0\.2, this is 0\.3"):
-        reconstruct_dataset(data, tmp_path / "v.zarr", REQUEST, workers=nullcontext(Here()))
+        reconstruct_dataset(
+            data, tmp_path / "v.zarr", REQUEST, workers=nullcontext(Here())
+        )
     pytest.importorskip("distributed", reason="the extra `batch`")
     monkeypatch.setattr("flexdt_extensions.executors.SCHEDULER_S", 0.5)
-    words = ["reconstruct", str(scan), "--out", str(tmp_path / "v.zarr"), "--json", "--scheduler"]
+    words = [
+        "reconstruct",
+        str(scan),
+        "--out",
+        str(tmp_path / "v.zarr"),
+        "--json",
+        "--scheduler",
+    ]
     for more, code, said in (
         (["tcp://127.0.0.1:1"], 4, "no dask scheduler at tcp://127.0.0.1:1"),
         (["nonsense"], 1, "'nonsense' is no address"),
         (["abc://x:1"], 1, "'abc://x:1' is no address"),
-        (["127.0.0.1:1", "--algorithm", "sirt"], 2, "--scheduler: sirt is not done by workers"),
+        (
+            ["127.0.0.1:1", "--algorithm", "sirt"],
+            2,
+            "--scheduler: sirt is not done by workers",
+        ),
         (["127.0.0.1:1", "--preview"], 2, "--preview chooses for itself"),
     ):
         assert run([*words, *more]) == code, more
@@ -237,7 +276,10 @@ def test_what_workers_do_not_do(
 
 @pytest.mark.slow
 def test_dask_workers_write_the_same_bytes_however_many(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    scan: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra `batch`")
     monkeypatch.chdir(scan.parent)  # the workers' folder is another one

@@ -1,4 +1,5 @@
-"""`flexdt align` without its command line: a data set in, a correction and a JSON document out."""
+"""`flexdt align` without its command line: a data set in, a correction and a JSON document
+out."""
 
 from __future__ import annotations
 
@@ -69,8 +70,8 @@ class Aligned(Generic[Images_co]):
 
     @property
     def correction(self) -> NamedCorrection:
-        """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that was
-        in force, with dO_x, det_roll, det_yaw and dD_y replaced.
+        """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that
+        was in force, with dO_x, det_roll, det_yaw and dD_y replaced.
 
         Raises:
             NotIdentifiableError: there is no correction; the message gives the reason.
@@ -105,10 +106,16 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     passes = long_work.Passes(len(data))
     with long_work.during("aligning") as passes.advance:
         found = align_turn(
-            passes.counting(frames), poses, data.present, data.shape, base,
-            prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
+            passes.counting(frames),
+            poses,
+            data.present,
+            data.shape,
+            base,
+            prior_widths(data.machine, data.profile),
+            np.random.default_rng(0),
+            per_frame,
             data.panel,
-        )  # fmt: skip
+        )
     document: dict[str, object] = {
         "identifiable": found.identifiable,
         "parameters": {name: told._asdict() for name, told in found.parameters.items()},
@@ -142,9 +149,13 @@ def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
     """
     poses = data.poses
     aside = poses.detector - poses.detector.mean(axis=0)
-    steps = np.stack([(aside * side).sum(1) / (side**2).sum(1) for side in (poses.v, poses.u)], 1)
+    steps = np.stack(
+        [(aside * side).sum(1) / (side**2).sum(1) for side in (poses.v, poses.u)], 1
+    )
     if not STANDS < np.abs(steps).max() < MAX_STEP_SHARE * min(data.shape):
         return data.line_integrals, poses
     still = poses.detector - steps[:, :1] * poses.v - steps[:, 1:] * poses.u
     moved = replace(poses, detector=still)
-    return lambda i: shift(data.line_integrals(i), steps[i], order=1, mode="nearest"), moved
+    return lambda i: shift(
+        data.line_integrals(i), steps[i], order=1, mode="nearest"
+    ), moved

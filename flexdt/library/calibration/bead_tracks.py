@@ -51,7 +51,9 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
     if fit is None:
         return document
     corrections = [d.correction for d in outcome.datasets]
-    before = predictions(fit, tuple(NOMINAL if c is None else c.parameters for c in corrections))
+    before = predictions(
+        fit, tuple(NOMINAL if c is None else c.parameters for c in corrections)
+    )
     after = predictions(fit, fit.group_parameters) if result.identifiable else None
     measured = fit.problem.pixels
     rows: list[dict[str, Any]] = []
@@ -62,7 +64,9 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
                 "folder": dataset.where,
                 "before": "nominal" if correction is None else correction.name,
                 "rms_before_px": _seen_rms(measured[part] - before[part]),
-                "rms_after_px": None if after is None else _seen_rms(measured[part] - after[part]),
+                "rms_after_px": None
+                if after is None
+                else _seen_rms(measured[part] - after[part]),
                 "frames": [
                     {
                         "file": frame.file,
@@ -85,7 +89,9 @@ def write_tracks(outcome: Outcome[ImageSet], path: Path) -> None:
 
 def _pixels(points: npt.NDArray[np.float64]) -> list[list[float] | None]:
     return [
-        [round(c, DIGITS), round(r, DIGITS)] if math.isfinite(c) and math.isfinite(r) else None
+        [round(c, DIGITS), round(r, DIGITS)]
+        if math.isfinite(c) and math.isfinite(r)
+        else None
         for c, r in points.tolist()
     ]
 

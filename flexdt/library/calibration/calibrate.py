@@ -1,6 +1,7 @@
 """`flexdt calibrate` without its command line: data sets in, JSON documents out.
 
-The functions return plain values in the JSON shapes of docs/calibration.md, and the full outcome.
+The functions return plain values in the JSON shapes of docs/calibration.md, and the full
+outcome.
 
 A verdict states in a sentence how a calibration may be used; the commands after it would
 determine more.
@@ -46,7 +47,12 @@ from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import FitResult, image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES, Offsets
@@ -126,7 +132,9 @@ class Outcome(Generic[Images_co]):
         """
         result = self.calibration
         if not result.identifiable or result.fit is None:
-            raise TwinError(f"this calibration offers no correction. {self.document['verdict']}")
+            raise TwinError(
+                f"this calibration offers no correction. {self.document['verdict']}"
+            )
         now = datetime.now(UTC)
         rms = result.fit.certificate.rms_px
         return NamedCorrection(
@@ -202,7 +210,9 @@ def calibrate_datasets(
             {"asked": len(datasets), "allowed": 1},
         )
     if scale is not None and not unknown:
-        raise TwinError("a scale is for phantom unknown: this phantom states its own size")
+        raise TwinError(
+            "a scale is for phantom unknown: this phantom states its own size"
+        )
     told: dict[str, object] = {}
     marked = None
     if markers is not None:
@@ -210,21 +220,37 @@ def calibrate_datasets(
         datasets, marked = seen_alone(datasets[0], marked)
     if unknown:
         result, told = calibrate_unknown(
-            datasets[0], frames[0] if marked is None else None, marked, want, scale, sought
+            datasets[0],
+            frames[0] if marked is None else None,
+            marked,
+            want,
+            scale,
+            sought,
         )
         beads, radii = result.model.beads, result.model.bead_radius_mm
         size = tuple((np.ptp(beads, axis=0) + 2 * radii.max()).tolist())
-        target = Phantom(UNKNOWN, "markers of unknown positions", Scene(()), size, beads, radii)
+        target = Phantom(
+            UNKNOWN, "markers of unknown positions", Scene(()), size, beads, radii
+        )
     else:
         target = find_phantom(phantom)
         if marked is not None:
             result = calibrate_known(datasets[0], marked, target, want)
         else:
             scans = [
-                Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile), arc=exposure_share(d))
+                Scan(
+                    f,
+                    d.poses,
+                    d.name,
+                    prior_widths(d.machine, d.profile),
+                    arc=exposure_share(d),
+                )
                 for f, d in zip(frames, datasets, strict=True)
             ]
-            with long_work.during("calibrating") as passes.advance, saturation_named(saturated):
+            with (
+                long_work.during("calibrating") as passes.advance,
+                saturation_named(saturated),
+            ):
                 result = calibrate(scans, target, want, detector=sought)
     result = replace(result, findings=explained_by(saturated, result.findings))
     result = with_undetermined(result)
@@ -234,7 +260,9 @@ def calibrate_datasets(
     document["next"] = next_commands(result, [d.where for d in datasets], given)
     if result.identifiable and result.motions:
         document["motion"] = [m.to_dict() for m in result.motions]
-        datasets = [d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)]
+        datasets = [
+            d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)
+        ]
     document["datasets"] = [d.where for d in datasets]
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
@@ -257,7 +285,9 @@ def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
         raise TwinError(f"{causes} ({error})", error.data) from error
 
 
-def explained_by(saturated: Sequence[Finding], findings: Sequence[Finding]) -> tuple[Finding, ...]:
+def explained_by(
+    saturated: Sequence[Finding], findings: Sequence[Finding]
+) -> tuple[Finding, ...]:
     """List saturated images first, and leave out the sizes of beads that they falsify."""
     if not saturated:
         return tuple(findings)
@@ -288,7 +318,8 @@ def saturation(dataset: ImageSet) -> Finding | None:
     return Finding(
         "saturated",
         Severity.WARNING,
-        f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: lower the exposure "
+        f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: lower the "
+        "exposure "
         "or the power",
     )
 
@@ -310,7 +341,8 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
             found = read_phantom_file(Path(phantom))
     if len(found.beads) == 0:
         raise TwinError(
-            f"phantom {found.name!r} has no beads to calibrate with", {"asked": found.name}
+            f"phantom {found.name!r} has no beads to calibrate with",
+            {"asked": found.name},
         )
     return found
 
@@ -353,7 +385,8 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "outliers": [],
         "seconds": round(seconds, 4),
         "problems": [
-            {"code": f.code, "severity": f.severity.value, "text": f.text} for f in result.findings
+            {"code": f.code, "severity": f.severity.value, "text": f.text}
+            for f in result.findings
         ],
     }
     if fit is None:
@@ -382,8 +415,12 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "noise": _finite(certificate.noise),
         "enlargement": certificate.enlargement,
         "reading": fit.reading.value,
-        "correlation": [[_finite(v) for v in row] for row in certificate.correlation.tolist()],
-        "covariance": [[_finite(v) for v in row] for row in certificate.covariance.tolist()],
+        "correlation": [
+            [_finite(v) for v in row] for row in certificate.correlation.tolist()
+        ],
+        "covariance": [
+            [_finite(v) for v in row] for row in certificate.covariance.tolist()
+        ],
         "degrees_of_freedom": certificate.dof,
         "beads_per_frame": certificate.beads_per_frame.tolist(),
         "rms_per_bead_px": [_finite(v) for v in certificate.rms_per_bead.tolist()],
@@ -395,7 +432,10 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
             document["panel"] = result.panel.to_json()
         document["limited"] = certificate.limited
         document["image_space"] = [
-            {n: {"value": e.value, "sigma": e.sigma, "unit": e.unit} for n, e in some.items()}
+            {
+                n: {"value": e.value, "sigma": e.sigma, "unit": e.unit}
+                for n, e in some.items()
+            }
             for some in seen
         ]
     return document
@@ -437,8 +477,8 @@ def _finite(value: float) -> float | None:
 
 
 SHARP_PX: Final = 0.25
-"""Largest sigma of the axis column with which a volume is as sharp as its voxels [px]; assumed: a
-column that is off by d makes an edge d pixels wider."""
+"""Largest sigma of the axis column with which a volume is as sharp as its voxels [px]; assumed:
+a column that is off by d makes an edge d pixels wider."""
 SECOND_SOD_RATIO: Final = 0.7
 """Source-object distance of a second placement over the first's: nearer, where offsets
 act differently."""
@@ -447,8 +487,12 @@ _COMPARE: Final = "flexdt compare {data} --phantom {phantom} --out DIR"
 NEXT: Final[Mapping[str, Sequence[str]]] = {
     "wrong_phantom": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
     "bead_size": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
-    "misfit": ("flexdt calibrate {data} --phantom {phantom} --per-frame dO_x,dO_y,alpha",),
-    "angle_scale": ("flexdt calibrate {data} --phantom {phantom} --free {free},angle_scale",),
+    "misfit": (
+        "flexdt calibrate {data} --phantom {phantom} --per-frame dO_x,dO_y,alpha",
+    ),
+    "angle_scale": (
+        "flexdt calibrate {data} --phantom {phantom} --free {free},angle_scale",
+    ),
     "held_parameter": (),  # its own sentence names the parameter to free
 }
 """Code of a finding that forbids a result -> commands that would settle it; other codes
@@ -467,14 +511,20 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         why = [f.text for f in result.errors] or list(weak) or ["there is no fit"]
         return f"Not to be used: {why[0]}."
     column = _column(seen)
-    use = "Safe to reconstruct" if column.sigma <= SHARP_PX else "Too uncertain for a sharp volume"
+    use = (
+        "Safe to reconstruct"
+        if column.sigma <= SHARP_PX
+        else "Too uncertain for a sharp volume"
+    )
     if result.fit.panel is not None:
         use += " with this correction, which undoes the panel's distortion"
     if any(f.code == "saturated" for f in result.findings):
         use = "Geometry to be used, images not to be reconstructed (the flat field is saturated)"
     first = f"{use}: the rotation axis is known to {rounded_up(column.sigma)} px."
     lengths = {
-        n: e for n, e in result.fit.certificate.estimates.items() if e.asked and e.unit == "mm"
+        n: e
+        for n, e in result.fit.certificate.estimates.items()
+        if e.asked and e.unit == "mm"
     }
     if not lengths:
         return first
@@ -509,7 +559,10 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
     if result.errors and result.errors[0].code != UNDETERMINED:
         free = ",".join(name for name, e in estimates.items() if e.asked)
         lines = NEXT.get(result.errors[0].code, (_COMPARE,))
-        return [line.format(data=names, phantom=shlex.quote(phantom), free=free) for line in lines]
+        return [
+            line.format(data=names, phantom=shlex.quote(phantom), free=free)
+            for line in lines
+        ]
     # Whatever options the calibration had: its own report is used, not another calibration.
     use = [
         "flexdt reconstruct SAMPLE --correction REPORT.json --out volume.tif"
@@ -529,7 +582,10 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         return closer
     return [
         *use,
-        *(f"{line}  # for the absolute position, which volumes do not need" for line in closer),
+        *(
+            f"{line}  # for the absolute position, which volumes do not need"
+            for line in closer
+        ),
     ]
 
 

@@ -15,12 +15,29 @@ from scipy.special import fdtri
 from flexdt.library.calibration.calibrate import Outcome, digits
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.figures import Series, arrows, ellipse_plot, image_under, plot
-from flexdt.library.report_page import bullets, code, figure, heading, page, paragraph, table
+from flexdt.library.report_page import (
+    bullets,
+    code,
+    figure,
+    heading,
+    page,
+    paragraph,
+    table,
+)
 from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult
 
-HEAD = ("parameter", "value", "sigma", "of it from the images", "prior", "95 % from", "to", "unit")
+HEAD = (
+    "parameter",
+    "value",
+    "sigma",
+    "of it from the images",
+    "prior",
+    "95 % from",
+    "to",
+    "unit",
+)
 ELLIPSES = 6
 """Number of parameter pairs drawn, most correlated first."""
 MAP_FRAMES = 180
@@ -60,7 +77,10 @@ def report(outcome: Outcome[ImageSet]) -> str:
     problems: Any = document["problems"]
     if problems:
         kinds = ["bad" if p["severity"] == "error" else "" for p in problems]
-        body += [heading("Findings", level=2), bullets([p["text"] for p in problems], kinds)]
+        body += [
+            heading("Findings", level=2),
+            bullets([p["text"] for p in problems], kinds),
+        ]
     if result.fit is not None:
         body += _fit_parts(result.fit, document)
         body += _pictures(outcome, result.fit)
@@ -94,7 +114,9 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         *(paragraph(f"{n} {t}.") for n, t in document.get("limited", {}).items()),
         heading("In the images", level=3) if seen else "",
         table(["quantity", "value", "sigma", "unit"], seen) if seen else "",
-        paragraph(f"Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal."),
+        paragraph(
+            f"Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal."
+        ),
         heading("Certificate", level=2),
         table(
             ["", ""],
@@ -116,7 +138,9 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         body.append(paragraph(f"{name} is {why}."))
     if c.spectrum.full:
         names = list(c.estimates)
-        rows = [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)]
+        rows = [
+            [n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)
+        ]
         body += [heading("Correlations", level=3), table(["", *names], rows)]
     return body
 
@@ -124,7 +148,9 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
 def _ellipses(c: Certificate) -> list[str]:
     """Joint 95 % ellipses of the most correlated pairs."""
     names = list(c.estimates)
-    pairs = [(abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
+    pairs = [
+        (abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)
+    ]
     scale = math.sqrt(2.0 * float(fdtri(2, c.dof, 0.95)))
     out: list[str] = [heading("Joint 95 % ellipses about the estimate", level=2)]
     for _, i, j in sorted(pairs, reverse=True)[:ELLIPSES]:
@@ -154,24 +180,36 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
         body.append(
             plot(
                 [Series(f"bead {k}", frames, r[:, k, axis], line=False) for k in beads],
-                title=f"{name} residual by frame", x_label="frame", y_label="px",
+                title=f"{name} residual by frame",
+                x_label="frame",
+                y_label="px",
             )
-        )  # fmt: skip
+        )
     body.append(
         plot(
             [Series(f"bead {k}", r[:, k, 0], r[:, k, 1], line=False) for k in beads],
-            title="residuals", x_label="column (px)", y_label="row (px)", width=340, height=340,
-            flip_y=True, equal=True,
+            title="residuals",
+            x_label="column (px)",
+            y_label="row (px)",
+            width=340,
+            height=340,
+            flip_y=True,
+            equal=True,
         )
-    )  # fmt: skip
+    )
     body += _maps(outcome, fit, r)
     body.append(
         plot(
             [Series("beads used", frames, c.beads_per_frame)],
-            title="usable beads by frame", x_label="frame", y_label="beads", height=180,
+            title="usable beads by frame",
+            x_label="frame",
+            y_label="beads",
+            height=180,
         )
-    )  # fmt: skip
-    for dataset, motion in zip(outcome.datasets, outcome.calibration.motions, strict=False):
+    )
+    for dataset, motion in zip(
+        outcome.datasets, outcome.calibration.motions, strict=False
+    ):
         for name, told in motion.to_dict().items():
             if told["moves"]:
                 values = np.array(told["values"])
@@ -179,11 +217,18 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
                     plot(
                         [Series(name, np.arange(len(values)), values)],
                         title=f"{dataset.name}: {name} during the scan",
-                        x_label="frame", y_label=str(told["unit"]), height=180,
+                        x_label="frame",
+                        y_label=str(told["unit"]),
+                        height=180,
                     )
-                )  # fmt: skip
+                )
     rows = [
-        [k, int(c.used[:, k].sum()), sum(o.bead == k for o in c.outliers), float(c.rms_per_bead[k])]
+        [
+            k,
+            int(c.used[:, k].sum()),
+            sum(o.bead == k for o in c.outliers),
+            float(c.rms_per_bead[k]),
+        ]
         for k in beads
     ]
     table_of_beads = table(["bead", "frames used", "left out", "rms (px)"], rows)

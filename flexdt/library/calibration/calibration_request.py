@@ -52,7 +52,9 @@ def request_of(phantom: object, options: CalibrationOptions) -> CalibrationReque
         if name in given
     }
     return CalibrationRequest(
-        free=tuple(free), priors=exact(tuple(free)) if priors == "none" else priors, **made
+        free=tuple(free),
+        priors=exact(tuple(free)) if priors == "none" else priors,
+        **made,
     )
 
 

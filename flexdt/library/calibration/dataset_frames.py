@@ -1,7 +1,7 @@
 """The images of a data set as calibration needs them: detected and cut into windows by threads.
 
-Counts stay in memory while they fit the budget, so that the second measurement does not read the
-files again.
+Counts stay in memory while they fit the budget, so that the second measurement does not read
+the files again.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class DatasetFrames:
         seen: called for each frame that has been looked at.
     """
 
-    def __init__(self, dataset: ImageSet, seen: Callable[[], object] = lambda: None) -> None:
+    def __init__(
+        self, dataset: ImageSet, seen: Callable[[], object] = lambda: None
+    ) -> None:
         self._dataset, self._seen = dataset, seen
         rows, cols = dataset.shape
         self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
@@ -82,7 +84,9 @@ class DatasetFrames:
                 return
             for bead in range(k):
                 inside, there = overlap(plan, index, bead)
-                signal = np.maximum(counts[there] - normalise.dark[there], np.float32(MIN_COUNTS))
+                signal = np.maximum(
+                    counts[there] - normalise.dark[there], np.float32(MIN_COUNTS)
+                )
                 out[index, bead][inside] = log_open[there] - np.log(signal)
 
         self._each(one)

@@ -15,8 +15,8 @@ STEP_SCAN: Final = "step scan"
 def exposure_share(data: ImageSet) -> float | None:
     """Return the part of a step that the object turns while a frame is exposed.
 
-    A smooth scan turns on, so the part is that of the time between two frames. A scan that stops
-    for every image turns by nothing.
+    A smooth scan turns on, so the part is that of the time between two frames. A scan that
+    stops for every image turns by nothing.
 
     Args:
         data: a scan with `flexdt.json` or the scanner's settings text.

@@ -32,9 +32,25 @@ from flexdt.twin.calibration.diagnose import error
 from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX
-from flexdt.twin.calibration.frame_source import Frames, FrameSpots, FrameState, SpotFrames
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
-from flexdt.twin.calibration.unknown_markers import ANYWHERE_MM, Index, centred, link, triangulate
+from flexdt.twin.calibration.frame_source import (
+    Frames,
+    FrameSpots,
+    FrameState,
+    SpotFrames,
+)
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
+from flexdt.twin.calibration.unknown_markers import (
+    ANYWHERE_MM,
+    Index,
+    centred,
+    link,
+    triangulate,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -108,11 +124,15 @@ class Scale:
         a, dash, b = pair.partition("-")
         mm, _, sigma = size.partition("+-")
         try:
-            found = cls(a.strip(), b.strip(), float(mm), float(sigma) if sigma else cls.sigma_mm)
+            found = cls(
+                a.strip(), b.strip(), float(mm), float(sigma) if sigma else cls.sigma_mm
+            )
         except ValueError:
             found = cls(a, b, math.nan)
         sizes = (found.mm, found.sigma_mm)
-        if not (dash and found.a and found.b and all(0 < size <= LONGEST_MM for size in sizes)):
+        if not (
+            dash and found.a and found.b and all(0 < size <= LONGEST_MM for size in sizes)
+        ):
             raise TwinError.instead(f"scale {text!r}", text, SCALE_FORM)
         return found
 
@@ -130,7 +150,11 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
     path = Path(source)
-    return _of_array(path, views) if path.suffix.lower() == ".npy" else _of_table(path, views)
+    return (
+        _of_array(path, views)
+        if path.suffix.lower() == ".npy"
+        else _of_table(path, views)
+    )
 
 
 def _of_array(path: Path, views: int) -> Markers:
@@ -149,7 +173,9 @@ def _of_array(path: Path, views: int) -> Markers:
     except (AttributeError, OSError, TypeError, ValueError) as error:
         raise TwinError(f"cannot read {path}: {error}") from None
     if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
-        raise TwinError.of_shape(f"{path}: array", tracks.shape, (f"{views} frames", "markers", 2))
+        raise TwinError.of_shape(
+            f"{path}: array", tracks.shape, (f"{views} frames", "markers", 2)
+        )
     if (np.abs(tracks) > FAR_PX).any():
         farthest = float(np.nanmax(np.abs(tracks)))
         allowed = f"{FAR_PX:g}, nan where unseen"
@@ -173,10 +199,15 @@ def _of_table(path: Path, views: int) -> Markers:
     except csv.Error as error:
         raise TwinError(f"cannot read {path}: {error}") from None
     head = [word.strip().lower() for word in rows[0]] if rows else []
-    at = {n: next((head.index(w) for w in words if w in head), -1) for n, words in NAMES.items()}
+    at = {
+        n: next((head.index(w) for w in words if w in head), -1)
+        for n, words in NAMES.items()
+    }
     if -1 in at.values():
         said = f"{path}, line 1: columns {', '.join(head) or 'none'}"
-        raise TwinError.instead(said, head, "frame, marker, column, row and, optionally, sigma")
+        raise TwinError.instead(
+            said, head, "frame, marker, column, row and, optionally, sigma"
+        )
     width = head.index("sigma") if "sigma" in head else -1
     marks: list[tuple[str, Mark]] = []
     for line, row in enumerate(rows[1:], start=2):
@@ -187,7 +218,9 @@ def _of_table(path: Path, views: int) -> Markers:
             x, y = (float(row[at[n]] or "nan") for n in ("column", "row"))
             sigma = float(row[width]) if width >= 0 else None
         except (ValueError, IndexError):
-            raise TwinError(f"{path}, line {line}: {','.join(row)!r} is not {head}") from None
+            raise TwinError(
+                f"{path}, line {line}: {','.join(row)!r} is not {head}"
+            ) from None
         marks.append((f"{path}, line {line}", (frame, name, x, y, sigma)))
     return _gathered(marks, views)
 
@@ -197,7 +230,13 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
     try:
         frame, name, column, line, sigma = row
         stated = None if sigma is None else float(sigma)
-        return where, (operator.index(frame), str(name), float(column), float(line), stated)
+        return where, (
+            operator.index(frame),
+            str(name),
+            float(column),
+            float(line),
+            stated,
+        )
     except (TypeError, ValueError):
         allowed = "(frame, marker, column, row, sigma), sigma None where it is not known"
         raise TwinError.instead(f"{where} is {row!r}", repr(row), allowed) from None
@@ -245,8 +284,12 @@ def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
     """
     some = np.flatnonzero(markers.seen.any(axis=1))
     if not len(some):
-        raise TwinError("no marker is marked in any frame: there is nothing to calibrate from")
-    return [data[some]], replace(markers, tracks=markers.tracks[some], sigma=markers.sigma[some])
+        raise TwinError(
+            "no marker is marked in any frame: there is nothing to calibrate from"
+        )
+    return [data[some]], replace(
+        markers, tracks=markers.tracks[some], sigma=markers.sigma[some]
+    )
 
 
 def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots], Index]:
@@ -324,9 +367,13 @@ def calibrate_unknown(
     poses = data.poses
     if markers is None:
         if images is None:
-            raise TwinError("neither images nor markers: there is nothing to calibrate from")
+            raise TwinError(
+                "neither images nor markers: there is nothing to calibrate from"
+            )
         looks = images.look(detector or SpotFinder())
-        index, places, at = link([look.detections for look in looks], poses, request.start)
+        index, places, at = link(
+            [look.detections for look in looks], poses, request.start
+        )
         names = tuple(str(k) for k in range(len(places)))
         radii = _radii(looks, index, poses)
     else:
@@ -346,9 +393,12 @@ def calibrate_unknown(
     if "dO_x" in request.free and "dO_x" not in request.priors:
         start = replace(start, dO_x=at.dO_x)
     want = replace(
-        request, start=start, priors=known | dict(request.priors), bead_tolerance_mm=ANYWHERE_MM,
+        request,
+        start=start,
+        priors=known | dict(request.priors),
+        bead_tolerance_mm=ANYWHERE_MM,
         known_sizes=False,
-    )  # fmt: skip
+    )
     model = BeadModel(places, radii, 0.0, "unknown")
     if scale is None:
         told = "estimated" if "dO_z" in request.free else "free"
@@ -369,7 +419,9 @@ def calibrate_unknown(
         # Everything smaller by a factor and nearer by it gives the same images.
         away = (poses.axis - poses.source)[0] + [start.dO_x, start.dO_z, start.dO_y]
         dx, dz, dy = ((ratio - 1.0) * away).tolist()
-        start = replace(start, dO_x=start.dO_x + dx, dO_y=start.dO_y + dy, dO_z=start.dO_z + dz)
+        start = replace(
+            start, dO_x=start.dO_x + dx, dO_y=start.dO_y + dy, dO_z=start.dO_z + dz
+        )
         model = replace(model, beads=model.beads * ratio, bead_radius_mm=radii * ratio)
         scaled = replace(want, start=start, priors={**want.priors, "dO_z": width})
         found = _calibrated(data, looks, index, model, scaled, images)
@@ -385,7 +437,9 @@ def calibrate_unknown(
     return found, {"markers": _described(found, names, index), "scale": said}
 
 
-def _turning_back(found: Calibration, data: ImageSet, markers: Markers | None) -> Calibration:
+def _turning_back(
+    found: Calibration, data: ImageSet, markers: Markers | None
+) -> Calibration:
     """Add an error if markers do not move, or fit twice as well with the stage reversed.
 
     Without perspective both directions would fit, with each marker as far behind the axis
@@ -398,24 +452,38 @@ def _turning_back(found: Calibration, data: ImageSet, markers: Markers | None) -
     """
     if markers is None or found.fit is None:
         return found
-    moved = float(np.nanmax(np.nanmax(markers.tracks, axis=0) - np.nanmin(markers.tracks, axis=0)))
+    moved = float(
+        np.nanmax(np.nanmax(markers.tracks, axis=0) - np.nanmin(markers.tracks, axis=0))
+    )
     if moved < 6.0 * float(np.median(markers.sigma)):
-        off = error("not_turning", f"the markers move by {moved:.2g} px at most in all frames: the "
-                    "object does not turn although the angles say so")  # fmt: skip
+        off = error(
+            "not_turning",
+            f"the markers move by {moved:.2g} px at most in all frames: the "
+            "object does not turn although the angles say so",
+        )
         return replace(found, findings=(off, *found.findings))
     poses = replace(data.poses, angle=-data.poses.angle)
     at = centred(markers.tracks, poses, data.shape, NOMINAL)
     places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
     fit = estimate_geometry(
-        markers.tracks, places, poses, ("dO_x", "det_roll"), shape=data.shape, start=at,
-        free_beads=True, bead_tolerance_mm=ANYWHERE_MM, priors={"det_roll": 1.0}, bound=math.inf,
-    )  # fmt: skip
+        markers.tracks,
+        places,
+        poses,
+        ("dO_x", "det_roll"),
+        shape=data.shape,
+        start=at,
+        free_beads=True,
+        bead_tolerance_mm=ANYWHERE_MM,
+        priors={"det_roll": 1.0},
+        bound=math.inf,
+    )
     if not fit.certificate.rms_px < 0.5 * found.fit.certificate.rms_px:
         return found
     off = error(
         "angle_reversed",
         f"the markers fit to {fit.certificate.rms_px:.2g} px instead of "
-        f"{found.fit.certificate.rms_px:.2g} if the stage turns the other way than the angles say, "
+        f"{found.fit.certificate.rms_px:.2g} if the stage turns the other way than the "
+        "angles say, "
         "or if the images are mirrored",
     )
     return replace(found, findings=(off, *found.findings))
@@ -441,10 +509,18 @@ def _calibrated(
     """
     priors = prior_widths(data.machine, data.profile)
     scan = Scan(
-        SpotFrames(looks, images), data.poses, data.name, priors, index, exposure_share(data)
+        SpotFrames(looks, images),
+        data.poses,
+        data.name,
+        priors,
+        index,
+        exposure_share(data),
     )
     if images is None:
-        sigma = np.concatenate([look.detections.covariances[:, 0, 0] for look in looks]) ** 0.5
+        sigma = (
+            np.concatenate([look.detections.covariances[:, 0, 0] for look in looks])
+            ** 0.5
+        )
         most = max(request.misfit_px, 3.0 * float(np.median(sigma)))
         request = replace(request, second_look=False, known_sizes=False, misfit_px=most)
     return calibrate([scan], model, request, scene=Scene(()))
@@ -462,14 +538,20 @@ def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArra
     return np.array(
         [
             np.median(
-                [scale[i] * looks[i].detections.radii_px[j] for i, j in enumerate(column) if j >= 0]
+                [
+                    scale[i] * looks[i].detections.radii_px[j]
+                    for i, j in enumerate(column)
+                    if j >= 0
+                ]
             )
             for column in index.T.tolist()
         ]
     )
 
 
-def _described(found: Calibration, names: Sequence[str], index: Index) -> list[dict[str, object]]:
+def _described(
+    found: Calibration, names: Sequence[str], index: Index
+) -> list[dict[str, object]]:
     """Name, position [mm] in the object's frame, frames and residual of each marker."""
     if found.fit is None:
         return []
@@ -481,5 +563,7 @@ def _described(found: Calibration, names: Sequence[str], index: Index) -> list[d
             "frames": int((index[:, k] >= 0).sum()),
             "rms_px": round(float(rms[k]), 4) if math.isfinite(rms[k]) else None,
         }
-        for k, (name, place) in enumerate(zip(names, found.fit.beads.tolist(), strict=True))
+        for k, (name, place) in enumerate(
+            zip(names, found.fit.beads.tolist(), strict=True)
+        )
     ]

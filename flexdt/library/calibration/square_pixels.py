@@ -1,7 +1,7 @@
 """Resample images of oblong pixels to square ones.
 
-Spots of balls are then nearly round, as detection and the second measurement expect. Columns stay
-as they are, and with them the column of the rotation axis.
+Spots of balls are then nearly round, as detection and the second measurement expect. Columns
+stay as they are, and with them the column of the rotation axis.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ MAX_SIDE_DIFFERENCE = 1e-3
 def squared(data: Images) -> Images:
     """Return `data`, with rows resampled to the columns' pitch where pixels are not square."""
     poses = data.poses
-    ratio = float(np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1)))
+    ratio = float(
+        np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1))
+    )
     if abs(ratio - 1.0) < MAX_SIDE_DIFFERENCE:
         return data
     rows, cols = data.shape
@@ -33,7 +35,8 @@ def squared(data: Images) -> Images:
     table = np.array(data.cone_vec.rows)
     table[:, 9:] /= ratio
     said = (
-        f"the pixels are {np.linalg.norm(poses.u[0]):.4g} x {np.linalg.norm(poses.v[0]):.4g} mm; "
+        f"the pixels are {np.linalg.norm(poses.u[0]):.4g} x "
+        f"{np.linalg.norm(poses.v[0]):.4g} mm; "
         f"calibration takes their {rows} rows as {shape[0]} of the columns' pitch"
     )
     images = ResampledRows(data, shape[0], ratio)
@@ -89,7 +92,9 @@ class ResampledRows:
             (rows, cols): means of the spline that has the sums of the old rows.
         """
         rows, cols = image.shape
-        total = np.concatenate([np.zeros((1, cols)), np.cumsum(image, axis=0, dtype=np.float64)])
+        total = np.concatenate(
+            [np.zeros((1, cols)), np.cumsum(image, axis=0, dtype=np.float64)]
+        )
         edges = (np.arange(self.rows + 1) - self.rows / 2) / self.ratio + rows / 2
         up_to = CubicSpline(np.arange(rows + 1), total)(edges.clip(0, rows))
         return np.asarray(np.diff(up_to, axis=0) * self.ratio, dtype=np.float32)

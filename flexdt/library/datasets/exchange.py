@@ -28,7 +28,11 @@ from flexdt.library.datasets.geometry_content import Given, arrays_of, text_of
 from flexdt.library.datasets.image_set import Images, ImageSet
 from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.number_tables import geometry_text, read_geometry_text, read_vectors_array
+from flexdt.twin.exchange.number_tables import (
+    geometry_text,
+    read_geometry_text,
+    read_vectors_array,
+)
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.plausibility import Operation, examine, settled
@@ -117,7 +121,9 @@ def export_dataset(
     out, form = Path(out), _to_write(Path(out), format, exported())
     if real is not None and not form.states_unknown:
         able = " and ".join(name for name, one in FORMATS.items() if one.states_unknown)
-        raise ExchangeError(f"{format} cannot tell what is so from what is known; {able} can")
+        raise ExchangeError(
+            f"{format} cannot tell what is so from what is known; {able} can"
+        )
     if rows_up and form.rows is not None:
         raise ExchangeError(f"{format} has rows that grow {form.rows}wards by itself")
     geometry = geometry_of(dataset, parameters)
@@ -174,7 +180,9 @@ def import_geometry(
             raise ExchangeError(said, {"asked": asked, "allowed": found})
     known.check_pitch(geometry, path)
     shape = known.shape if geometry.shape is None else geometry.shape
-    return _examined(replace(geometry, shape=shape, name=geometry.name or path.stem), path)
+    return _examined(
+        replace(geometry, shape=shape, name=geometry.name or path.stem), path
+    )
 
 
 def _examined(geometry: ScanGeometry, path: Path) -> ScanGeometry:
@@ -213,7 +221,8 @@ def _to_write(out: Path, format: str, allowed: Iterable[str]) -> Format:
 
 
 def write_geometry(geometry: ScanGeometry, out: str | PathLike[str], format: str) -> None:
-    """Write a geometry in a peer's format; some formats are made of a data set (`export_dataset`).
+    """Write a geometry in a peer's format; some formats are made of a data set
+    (`export_dataset`).
 
     Raises:
         ExchangeError: the format cannot carry it, or the file's ending is not the format's.
@@ -232,7 +241,9 @@ def save_geometry(geometry: ScanGeometry, out: str | PathLike[str]) -> None:
     out = Path(out)
     ending = out.suffix.lower()
     if ending not in OWN_ENDINGS:
-        raise ExchangeError(f"{out.name}: a geometry file ends with {' or '.join(OWN_ENDINGS)}")
+        raise ExchangeError(
+            f"{out.name}: a geometry file ends with {' or '.join(OWN_ENDINGS)}"
+        )
     if ending == NPY:
         write_whole(out, _content(geometry, FORMATS["astra"], out))
     else:
@@ -273,7 +284,8 @@ def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> I
         raise ExchangeError(said, {"asked": len(geometry), "allowed": len(dataset)})
     if geometry.shape not in (None, dataset.shape):
         raise ExchangeError(
-            f"{dataset.where} has images of {dataset.shape}, the geometry is of {geometry.shape} "
+            f"{dataset.where} has images of {dataset.shape}, the geometry is of "
+            f"{geometry.shape} "
             "(rows, columns)",
             {"asked": geometry.shape, "allowed": list(dataset.shape)},
         )

@@ -1,4 +1,5 @@
-"""Formats of other programs for geometry: names, endings, and the functions that write and read.
+"""Formats of other programs for geometry: names, endings, and the functions that write and
+read.
 
 `FORMATS` lists them once. The command line takes its choices from it before it imports
 anything heavy, so each function imports what it needs.
@@ -120,7 +121,9 @@ def _read_astra(path: Path, given: Given) -> ScanGeometry:
     from flexdt.twin.exchange.number_tables import read_vectors_array, read_vectors_text
 
     if path.suffix.lower() == NPY:
-        return ScanGeometry(read_vectors_array(arrays_of(path)["array"], str(path)), given.shape)
+        return ScanGeometry(
+            read_vectors_array(arrays_of(path)["array"], str(path)), given.shape
+        )
     return ScanGeometry(read_vectors_text(text_of(path), str(path)), given.shape)
 
 
@@ -239,7 +242,9 @@ FORMATS: Final[Mapping[str, Format]] = {
         Format("leap", (".leap",), _write_leap, read=_read_leap),
         Format("flexdata", (".toml",), _write_flexdata, read=_read_flexdata, rows="up"),
         Format("csv", (".csv",), _write_csv, read=_read_csv),
-        Format("nxtomo", (".nxs", ".nx", ".h5", ".hdf5"), export=_export_nxtomo, rows="down"),
+        Format(
+            "nxtomo", (".nxs", ".nx", ".h5", ".hdf5"), export=_export_nxtomo, rows="down"
+        ),
     )
 }
 """Name -> format, in the order of listings."""

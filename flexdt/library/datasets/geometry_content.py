@@ -42,7 +42,9 @@ class Given:
         if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
             found, asked = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))
             said = f"{path} says pixels of {found} mm, not {asked}"
-            raise ExchangeError(said, {"asked": list(self.pitch_mm), "allowed": list(pitch)})
+            raise ExchangeError(
+                said, {"asked": list(self.pitch_mm), "allowed": list(pitch)}
+            )
 
 
 def text_of(path: Path) -> str:
@@ -66,4 +68,6 @@ def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
         with loaded:
             return {name: loaded[name] for name in loaded.files}
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ExchangeError(f"{path} is no NumPy file: {error}", {"path": str(path)}) from None
+        raise ExchangeError(
+            f"{path} is no NumPy file: {error}", {"path": str(path)}
+        ) from None

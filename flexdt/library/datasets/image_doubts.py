@@ -13,7 +13,11 @@ from flexdt.runtime.files.dataset_folder import read_image
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS, WARNING_SHARE
 from flexdt.twin.plausibility import settled
-from flexdt.twin.plausibility.reference_images import beam_findings, flat_findings, open_beam
+from flexdt.twin.plausibility.reference_images import (
+    beam_findings,
+    flat_findings,
+    open_beam,
+)
 
 MAX_FROM_DISK: Final = 32
 """Radiographs in files that are looked at."""
@@ -21,7 +25,9 @@ RADIOGRAPHS: Final = "radiographs"
 FLAT_IMAGE: Final = "flat image"
 SATURATED: Final = "are saturated, where attenuation comes out wrong"
 """Words that every sentence about saturated images contains."""
-DARK: Final = "no pixel of the flat images is brighter than the dark ones: was the tube off?"
+DARK: Final = (
+    "no pixel of the flat images is brighter than the dark ones: was the tube off?"
+)
 
 
 def saturated_part(what: str, share: float) -> str:
@@ -32,7 +38,8 @@ def saturated_part(what: str, share: float) -> str:
         share: of their pixels, 0 to 1.
     """
     return (
-        f"{100.0 * share:.3g} % of the pixels of the {what} {SATURATED}: lower the tube's power or "
+        f"{100.0 * share:.3g} % of the pixels of the {what} {SATURATED}: lower the "
+        "tube's power or "
         "the exposure"
     )
 
@@ -78,8 +85,8 @@ def image_doubts(
             that the data set interpolates are skipped.
 
     Raises:
-        DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the
-            flat image is brighter than the dark one, or all are saturated.
+        DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of
+            the flat image is brighter than the dark one, or all are saturated.
     """
     if scan.arrays is not None and scan.arrays.integrals is not None:
         return []  # they were given, not exposed
@@ -115,12 +122,15 @@ def image_doubts(
         }
         held = min(shares.values()) <= 1.0 - WARNING_SHARE
         doubts = [
-            saturated_part(what, share) for what, share in shares.items() if share >= WARNING_SHARE
+            saturated_part(what, share)
+            for what, share in shares.items()
+            if share >= WARNING_SHARE
         ]
         if starved >= WARNING_SHARE:
             doubts.append(
                 f"{100.0 * starved:.3g} % of the pixels of the radiographs are starved (fewer "
-                f"than {FEW_COUNTS:g} counts of signal), where attenuation is mostly noise: raise "
+                f"than {FEW_COUNTS:g} counts of signal), where attenuation is mostly "
+                "noise: raise "
                 "the tube's power, its voltage or the exposure"
             )
         if held:

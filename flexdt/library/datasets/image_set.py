@@ -1,4 +1,5 @@
-"""The images of a scan as a value: frames read on demand or held in memory, with their geometry.
+"""The images of a scan as a value: frames read on demand or held in memory, with their
+geometry.
 
 `ImageSet` is the input of calibration, alignment, reconstruction and the writers of
 files. Users meet it as `DataSet` (`flexdt.library.data_set`), which adds a method for
@@ -47,7 +48,8 @@ Images_co = TypeVar("Images_co", bound="ImageSet", covariant=True)
 
 
 class CountsReader(Protocol):
-    """Images that are made when they are read: an array of (n, rows, cols) as far as indexing."""
+    """Images that are made when they are read: an array of (n, rows, cols) as far as
+    indexing."""
 
     @overload
     def __getitem__(self, index: int) -> Counts: ...
@@ -84,8 +86,8 @@ class Arrays:
 class ImageSet:
     """The projections of a scan with dark and flat images and geometry.
 
-    Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is the
-    data set of those projections.
+    Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is
+    the data set of those projections.
 
     Attributes:
         name: the scan's.
@@ -106,7 +108,8 @@ class ImageSet:
         warnings: doubts about the data set.
         full_scale: largest count of the panel; None where it is not known.
         truth: of a simulated data set, its sample and settings.
-        interpolated: pixels whose line integrals are interpolated, (rows, cols); None: dead ones.
+        interpolated: pixels whose line integrals are interpolated, (rows, cols); None: dead
+            ones.
 
     Example:
         >>> import numpy as np
@@ -163,8 +166,8 @@ class ImageSet:
                 functions of counts; a warning gives the number beyond the range of
                 counts.
             geometry: one view for each image.
-            dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is taken.
-                Without a flat image, counts have no line integrals.
+            dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is
+                taken. Without a flat image, counts have no line integrals.
             name: of the data set.
             warnings: doubts about it.
             truth: sample and settings of a simulation.
@@ -180,7 +183,9 @@ class ImageSet:
         """
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
-            raise DatasetFormatError.of_shape("counts", values.shape, ("n", "rows", "cols"))
+            raise DatasetFormatError.of_shape(
+                "counts", values.shape, ("n", "rows", "cols")
+            )
         integrals = None
         if flat is not None and values.dtype.kind in "fiu" and not _are_counts(values):
             values = _normalised(values, dark, flat)
@@ -191,18 +196,25 @@ class ImageSet:
             values, opened, lost = _counts_of(values)
             dark, flat = np.zeros(values.shape[1:]), np.full(values.shape[1:], opened)
             warnings = [*lost, *doubts, *warnings]
-        if values.dtype.kind in "ui" and flat is None and 0 < int(values[0].max()) < FEWEST_COUNTS:
+        if (
+            values.dtype.kind in "ui"
+            and flat is None
+            and 0 < int(values[0].max()) < FEWEST_COUNTS
+        ):
             doubt = f"whole numbers up to {values[0].max()} without a flat image: counts, or line "
             warnings = [f"{doubt}integrals whose fractions are cut off?", *warnings]
         if values.dtype != np.uint16:
             if not _are_counts(values):
                 raise DatasetFormatError(
-                    f"counts of {values.dtype} from {values.min():g} to {values.max():g}; allowed: "
+                    f"counts of {values.dtype} from {values.min():g} to "
+                    f"{values.max():g}; allowed: "
                     "whole numbers from 0 to 65535",
                     {"asked": str(values.dtype), "allowed": "uint16"},
                 )
             values = values.astype(np.uint16)
-        cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+        cone = (
+            geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+        )
         shape = cone.of_shape((values.shape[1], values.shape[2]))
         if len(cone) != len(values):
             raise DatasetFormatError(
@@ -214,11 +226,21 @@ class ImageSet:
         placed = settled(examine(Operation.OPEN, cone, shape), DatasetFormatError, name)
         blank = _blank(values)
         reason = f"{blank.sum()} of {len(values)} images are zero everywhere: nothing was recorded"
-        frames = tuple(Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(values)))
+        frames = tuple(
+            Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(values))
+        )
         told = () if dark is not None else ("no dark image: zero is taken",)
-        return cls(name, frames, shape, cone.with_shape(shape), arrays=arrays,
-                   complete=not blank.any(), reason=reason if blank.any() else "",
-                   warnings=(*told, *placed, *warnings), truth=truth)  # fmt: skip
+        return cls(
+            name,
+            frames,
+            shape,
+            cone.with_shape(shape),
+            arrays=arrays,
+            complete=not blank.any(),
+            reason=reason if blank.any() else "",
+            warnings=(*told, *placed, *warnings),
+            truth=truth,
+        )
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -271,7 +293,9 @@ class ImageSet:
             nominal=None if self.nominal is None else self.nominal[chosen],
             positions={name: values[chosen] for name, values in self.positions.items()},
             arrays=None if arrays is None else arrays.of_views(chosen),
-            truth=self.truth.of_views(chosen) if hasattr(self.truth, "of_views") else None,
+            truth=self.truth.of_views(chosen)
+            if hasattr(self.truth, "of_views")
+            else None,
         )
 
     def __iter__(self) -> Iterator[Float32Array]:
@@ -300,7 +324,9 @@ class ImageSet:
         Raises:
             GeometryError: a panel on its side, so that the stage's angle is unknown.
         """
-        return Poses.from_cone_vec(self.cone_vec) if self.nominal is None else self.nominal
+        return (
+            Poses.from_cone_vec(self.cone_vec) if self.nominal is None else self.nominal
+        )
 
     @property
     def angles_deg(self) -> FloatArray:
@@ -309,7 +335,8 @@ class ImageSet:
 
     @property
     def geometry(self) -> ConeVec:
-        """Geometry of `frames` with the correction in force; it carries the detector's shape."""
+        """Geometry of `frames` with the correction in force; it carries the detector's
+        shape."""
         alike = all(frame.shape == self.shape for frame in self.frames)
         return self.corrected().with_shape(self.shape if alike else None)
 
@@ -330,7 +357,9 @@ class ImageSet:
         if parameters is None:
             if self.correction is None and self.nominal is None:
                 return self.cone_vec
-            parameters = NOMINAL if self.correction is None else self.correction.parameters
+            parameters = (
+                NOMINAL if self.correction is None else self.correction.parameters
+            )
         return self.poses.cone_vec(parameters)
 
     def with_correction(self, correction: NamedCorrection | Offsets | None) -> Self:
@@ -351,7 +380,8 @@ class ImageSet:
 
     @property
     def panel(self) -> Panel | None:
-        """The panel's distortion and lag that the correction in force undoes in line integrals."""
+        """The panel's distortion and lag that the correction in force undoes in line
+        integrals."""
         return None if self.correction is None else self.correction.panel
 
     def with_motion(self, motion: Motion) -> Self:
@@ -428,7 +458,9 @@ class ImageSet:
             )
         return flat
 
-    def _mean(self, files: Sequence[Path], images: npt.NDArray[Any] | None) -> Float32Array | None:
+    def _mean(
+        self, files: Sequence[Path], images: npt.NDArray[Any] | None
+    ) -> Float32Array | None:
         if images is not None:
             return np.asarray(images.mean(axis=0), dtype=np.float32)
         return mean_image(files, self.shape) if files else None
@@ -437,7 +469,9 @@ class ImageSet:
     def normalisation(self) -> LineIntegrals:
         """How counts become line integrals; `dead` marks the pixels for which they cannot."""
         plain = LineIntegrals.of(self.dark, self.flat)
-        return plain if self.interpolated is None else plain.interpolating(self.interpolated)
+        return (
+            plain if self.interpolated is None else plain.interpolating(self.interpolated)
+        )
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
         """Compute projections as -log((p - d) / (f - d)), always finite; the panel's
@@ -468,7 +502,11 @@ class ImageSet:
             return image
         index = range(len(self))[index]
         before = self.frames[max(index - 1, 0)]
-        if self.panel.lag and before.present and before.index == self.frames[index].index - 1:
+        if (
+            self.panel.lag
+            and before.present
+            and before.index == self.frames[index].index - 1
+        ):
             image = self.panel.without_lag(image, self._recorded(index - 1))
         return self.panel.undistorted(image)
 
@@ -564,7 +602,9 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
     top = np.iinfo(np.uint16).max
     images = np.exp(-np.maximum(integrals.astype(np.float32), -80.0))
     # Brighter pixels than the open beam, as noise makes them, need room above it.
-    opened = float(np.clip(np.floor(top / max(images.max(), 1e-9)), OPEN_COUNTS / 3, OPEN_COUNTS))
+    opened = float(
+        np.clip(np.floor(top / max(images.max(), 1e-9)), OPEN_COUNTS / 3, OPEN_COUNTS)
+    )
     images *= opened
     lost = float(((images < 1.0) | (images > top)).mean())
     held = f"{np.log(opened / top):.3g} to {np.log(opened):.3g}"
@@ -572,7 +612,11 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
         f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut in "
         "counts, as files have them, and kept in line_integrals()"
     )
-    return np.rint(np.clip(images, 0, top)).astype(np.uint16), opened, [told] if lost else []
+    return (
+        np.rint(np.clip(images, 0, top)).astype(np.uint16),
+        opened,
+        [told] if lost else [],
+    )
 
 
 def _several(

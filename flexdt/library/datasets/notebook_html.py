@@ -37,7 +37,8 @@ def values_table(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """Write a table with a row of heads; texts are escaped."""
     head = "".join(f"<th>{escape(one)}</th>" for one in heads)
     body = "".join(
-        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
+        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>"
+        for row in rows
     )
     return f"<table><tr>{head}</tr>{body}</table>"
 

@@ -35,7 +35,8 @@ def save_nxtomo(data: ImageSet, file: File) -> None:
     h5py = package("h5py", "to_nxtomo")
     if any(frame.shape != data.shape for frame in data.frames):
         raise DatasetFormatError(
-            f"{data.where}: projections of several shapes; NXtomo has one", {"path": data.where}
+            f"{data.where}: projections of several shapes; NXtomo has one",
+            {"path": data.where},
         )
     images = len(references(data)) + len(data)
     require_bytes(Path(file), images * data.shape[0] * data.shape[1] * BYTES_A_PIXEL)
@@ -84,7 +85,9 @@ def _write(data: ImageSet, out: Any) -> None:
     _measured(detector, "y_rotation_axis_pixel_position", axis_row, "px")
 
     sample = _group(entry, "sample", "NXsample")
-    sample["name"] = data.name if data.document is None else data.document.sample.name or data.name
+    sample["name"] = (
+        data.name if data.document is None else data.document.sample.name or data.name
+    )
     turned = np.concatenate([np.full(len(before), angles[0]), angles])
     _measured(sample, "rotation_angle", turned, "deg")
 
@@ -105,8 +108,8 @@ def _field_of_view(axis_column: float, columns: int) -> str:
 
 
 def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any) -> None:
-    """Write tube and exposure, as far as they are known: count_time, energies, and the current of
-    each image as its monitor (`control`).
+    """Write tube and exposure, as far as they are known: count_time, energies, and the current
+    of each image as its monitor (`control`).
 
     A tube has a spectrum: `incident_energy` is the mean of flexdt's own spectrum, and the
     source's energy is its end.
@@ -120,7 +123,12 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
     kV, power_W, exposure_ms = _exposure_of(data)
     count = len(keys)
     if exposure_ms is not None:
-        _measured(instrument["detector"], "count_time", np.full(count, exposure_ms / 1000.0), "s")
+        _measured(
+            instrument["detector"],
+            "count_time",
+            np.full(count, exposure_ms / 1000.0),
+            "s",
+        )
     if kV is None:
         return
     source = instrument["source"]

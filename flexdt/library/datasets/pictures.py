@@ -45,11 +45,15 @@ def windowed(
     low, high = np.percentile(seen, PERCENTILES) if seen.size else (0.0, 0.0)
     if high <= low:
         return np.zeros(image.shape, dtype=np.uint8)
-    scaled = (np.nan_to_num(image.astype(np.float64), nan=low) - low) * (255.0 / (high - low))
+    scaled = (np.nan_to_num(image.astype(np.float64), nan=low) - low) * (
+        255.0 / (high - low)
+    )
     return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
 
 
-def coloured(grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
+def coloured(
+    grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]
+) -> npt.NDArray[np.uint8]:
     """Draw the marked pixels of a grey picture (rows, cols) in colour, (rows, cols, 3)
     red first.
     """
@@ -81,7 +85,9 @@ def legend(marks: npt.NDArray[np.generic]) -> list[str]:
     for bit, _, name, what in MARKS:
         part = float(np.mean((values & bit) > 0))
         if part > 0:
-            lines.append(f"{name}: {what}" + ("" if bit == 4 else f" ({part:.2%} of the pixels)"))
+            lines.append(
+                f"{name}: {what}" + ("" if bit == 4 else f" ({part:.2%} of the pixels)")
+            )
     return lines
 
 
@@ -116,8 +122,8 @@ def png_of(pixels: npt.NDArray[np.uint8]) -> bytes:
         pixels: (rows, cols) grey, or (rows, cols, 3) red first.
 
     Source:
-        ISO/IEC 15948: chunks IHDR, IDAT, IEND; each row is stored as its difference from the row
-        above (filter type 2), which deflates well.
+        ISO/IEC 15948: chunks IHDR, IDAT, IEND; each row is stored as its difference from the
+        row above (filter type 2), which deflates well.
     """
     rows, cols = pixels.shape[:2]
     colours = PNG_COLOUR if pixels.ndim == 3 else PNG_GREY

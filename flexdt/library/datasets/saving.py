@@ -156,7 +156,9 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
     weights = np.repeat([1.0, 1.0, shape[1] / 2.0, shape[0] / 2.0], 3)
     if np.abs((said - geometry.rows) * weights).max() > MATCH_MM:
         return None
-    exposure, camera = (getattr(data.truth, name, None) for name in ("exposure", "camera"))
+    exposure, camera = (
+        getattr(data.truth, name, None) for name in ("exposure", "camera")
+    )
     before = [name[:2] for name, _ in references(data)]
     start, last = np.degrees(even[[0, -1]]).tolist()
     return ScanSettings(
@@ -187,9 +189,13 @@ def _geometry(data: ImageSet) -> tuple[str, bytes]:
     )
     if document is None or moved or document.files("projection") != files:
         geometry = ScanGeometry(
-            data.geometry, data.shape, name=data.name, files=files, notes=data.warnings,
+            data.geometry,
+            data.shape,
+            name=data.name,
+            files=files,
+            notes=data.warnings,
             full_scale=data.full_scale,
-        )  # fmt: skip
+        )
         return GEOMETRY, geometry_text(geometry).encode()
     entry = CorrectionEntry.of(data.correction)
     return DOCUMENT, document.model_copy(update={"correction": entry}).to_json().encode()

@@ -1,8 +1,9 @@
-"""Show volumes, data sets and geometries in a notebook, with sliders: pages of HTML by themselves.
+"""Show volumes, data sets and geometries in a notebook, with sliders: pages of HTML by
+themselves.
 
 The pages need no package and no server: the images are in them, and a slider shows one of them.
-They are kept when a notebook is saved, and `save` writes them as files. `notebook_widgets` shows
-volumes live where ipywidgets is installed.
+They are kept when a notebook is saved, and `save` writes them as files. `notebook_widgets`
+shows volumes live where ipywidgets is installed.
 """
 
 from __future__ import annotations
@@ -102,7 +103,8 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
         parts.append(_sliding(pictures, f"across {name}", sizes[1] / sizes[0], middle))
     caption = f"{volume!r}".strip("<>")
     return NotebookPage(
-        _row(parts) + f"<div>{escape(caption)}; black {low:.4g}, white {high:.4g} 1/mm</div>",
+        _row(parts)
+        + f"<div>{escape(caption)}; black {low:.4g}, white {high:.4g} 1/mm</div>",
         caption,
     )
 
@@ -117,7 +119,9 @@ def data_page(data: ImageSet) -> NotebookPage:
         DatasetError: an image cannot be read.
     """
     present = data.present
-    has_flat = bool(data.flats) or (data.arrays is not None and data.arrays.flats is not None)
+    has_flat = bool(data.flats) or (
+        data.arrays is not None and data.arrays.flats is not None
+    )
     read = data.line_integrals if has_flat else data.counts
     chosen = [present[i] for i in _some(len(present))]
     images = [np.asarray(read(i), dtype=np.float32) for i in chosen]
@@ -134,7 +138,9 @@ def data_page(data: ImageSet) -> NotebookPage:
     tall = np.repeat(sinogram, max(1, SIDE_PX // (2 * len(sinogram))), axis=0)
     parts = [
         _sliding(pictures, what),
-        _sliding([(f"row {middle}, views downwards", _grey(tall, low, high))], "sinogram"),
+        _sliding(
+            [(f"row {middle}, views downwards", _grey(tall, low, high))], "sinogram"
+        ),
     ]
     caption = f"{data!r}".strip("<>")
     return NotebookPage(_row(parts) + f"<div>{escape(caption)}</div>", caption)
@@ -161,7 +167,9 @@ def geometry_page(cone_vec: ConeVec) -> NotebookPage:
     handler = SHOW_CHOSEN.replace("e.hidden = i != this.value", HIDE_DRAWN)
     caption = f"{cone_vec!r}".strip("<>")
     slider = _slider(len(shown), "view", handler, 0)
-    scale = f"{drawing.millimetres:.4g} mm across; red source, orange panel, circle sample"
+    scale = (
+        f"{drawing.millimetres:.4g} mm across; red source, orange panel, circle sample"
+    )
     return NotebookPage(
         f"<div>{svg}<br>{slider}<span>view {shown[0]} of {len(cone_vec)}</span></div>"
         f"<div>{escape(caption)}; {scale}</div>",

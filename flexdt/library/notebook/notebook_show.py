@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from flexdt.library.extras import lacking, package
-from flexdt.library.notebook.notebook_pages import NotebookPage, geometry_page, volume_page
+from flexdt.library.notebook.notebook_pages import (
+    NotebookPage,
+    geometry_page,
+    volume_page,
+)
 from flexdt.library.notebook.notebook_widgets import volume_widgets
 from flexdt.runtime.progress_bars import in_notebook
 

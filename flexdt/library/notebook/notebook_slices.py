@@ -35,7 +35,9 @@ def grey_of(values: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np
     return np.asarray(np.clip(grey, 0, 255), dtype=np.uint8)
 
 
-def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple[float, float]:
+def window_of(
+    values: npt.NDArray[Any], window: Sequence[float] | None
+) -> tuple[float, float]:
     """Return the values of black and white.
 
     Args:
@@ -52,5 +54,7 @@ def window_of(values: npt.NDArray[Any], window: Sequence[float] | None) -> tuple
         low, high = np.percentile(seen, PERCENTILES).tolist() if seen.size else (0.0, 1.0)
         return low, high if high > low else low + 1.0
     if len(window) != 2 or not window[0] < window[1]:
-        raise TwinError.instead(f"window {window!r}", list(window), "(black, white), black first")
+        raise TwinError.instead(
+            f"window {window!r}", list(window), "(black, white), black first"
+        )
     return float(window[0]), float(window[1])

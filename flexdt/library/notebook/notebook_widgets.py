@@ -1,4 +1,5 @@
-"""Show a volume live in a notebook with ipywidgets (the extra `notebook`): any layer and window."""
+"""Show a volume live in a notebook with ipywidgets (the extra `notebook`): any layer and
+window."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ REACH: Final = 0.5
 """Reach of the window's slider beyond the window, on each side, as a share of its width."""
 
 
-def volume_widgets(widgets: Any, volume: Volume, window: Sequence[float] | None = None) -> Any:
+def volume_widgets(
+    widgets: Any, volume: Volume, window: Sequence[float] | None = None
+) -> Any:
     """Make three linked slices of a volume: a slider for each axis, and one for the window.
 
     Args:
@@ -33,13 +36,20 @@ def volume_widgets(widgets: Any, volume: Volume, window: Sequence[float] | None 
     low, high = window_of(volume.data, window)
     beyond = REACH * (high - low)
     chosen = widgets.FloatRangeSlider(
-        value=(low, high), min=low - beyond, max=high + beyond, step=(high - low) / 200.0,
-        description="1/mm", readout_format=".4f", continuous_update=False,
-    )  # fmt: skip
+        value=(low, high),
+        min=low - beyond,
+        max=high + beyond,
+        step=(high - low) / 200.0,
+        description="1/mm",
+        readout_format=".4f",
+        continuous_update=False,
+    )
     sliders, pictures = {}, {}
     for name, axis, _ in AXES:
         count = volume.shape[axis]
-        sliders[name] = widgets.IntSlider(value=count // 2, min=0, max=count - 1, description=name)
+        sliders[name] = widgets.IntSlider(
+            value=count // 2, min=0, max=count - 1, description=name
+        )
         pictures[name] = widgets.Image(format="png", width=WIDTH_PX)
 
     def draw(_: object = None) -> None:

@@ -1,8 +1,8 @@
 """Read and save data sets in folders: frames, geometry, completeness.
 
-Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings texts
-alone). Errors are typed and name the file; what leaves the rest usable is a warning in `warnings`.
-Missing frames are listed, and reading one is an error.
+Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings
+texts alone). Errors are typed and name the file; what leaves the rest usable is a warning in
+`warnings`. Missing frames are listed, and reading one is an error.
 """
 
 from __future__ import annotations
@@ -29,7 +29,11 @@ from flexdt.runtime.files.dataset_folder import (
     read_text,
     read_values,
 )
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetError,
+    DatasetFormatError,
+    DatasetMissingError,
+)
 from flexdt.twin.dataset.file_names import (
     DOCUMENT,
     GEOMETRY,
@@ -78,8 +82,8 @@ def load_dataset(
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
-            .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a folder with one of
-            these.
+            .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a folder with one
+            of these.
         machine: the scanner, for texts that do not name one that ships with the package.
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
@@ -101,7 +105,8 @@ def load_dataset(
     content = list_folder(Path(folder))
     if UNFINISHED in content.names:
         raise DatasetMissingError(
-            f"{unfinished(content.path)}; save it once more with resume=True, or remove the folder",
+            f"{unfinished(content.path)}; save it once more with resume=True, or remove "
+            "the folder",
             {"path": str(content.path)},
         )
     foreign = _foreign_file(content)
@@ -131,8 +136,8 @@ def read_tiffs(
 
     Args:
         folder: where the images are.
-        geometry: one view for each projection, in the order of their names, where 10 comes after
-            9; or a file that `ConeVec.load` reads.
+        geometry: one view for each projection, in the order of their names, where 10 comes
+            after 9; or a file that `ConeVec.load` reads.
         frames, dark, flat: patterns of the names of projections, dark and flat images.
             Dark and flat images are no projections.
 
@@ -201,7 +206,8 @@ def _of_floats(
     if not np.isfinite(images).all():
         bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]
         raise DatasetFormatError(
-            f"{folder / bad} has pixels that are no numbers; allowed: finite", {"path": bad}
+            f"{folder / bad} has pixels that are no numbers; allowed: finite",
+            {"path": bad},
         )
     if flats:
         dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
@@ -210,7 +216,9 @@ def _of_floats(
     return DataSet.from_arrays(images, geometry, name=folder.name)
 
 
-def _from_document(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+def _from_document(
+    content: Folder, machine: Machine | None, profile: Profile | None
+) -> DataSet:
     """Read a data set by its flexdt.json.
 
     Args:
@@ -259,7 +267,9 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
         document=doc,
         full_scale=(1 << machine.detector.bits) - 1,
     )
-    return replace(made, warnings=(*made.warnings, *_predicted_doubts(doc, made.warnings)))
+    return replace(
+        made, warnings=(*made.warnings, *_predicted_doubts(doc, made.warnings))
+    )
 
 
 def _foreign_file(content: Folder) -> Path | None:
@@ -268,7 +278,11 @@ def _foreign_file(content: Folder) -> Path | None:
     Returns:
         None where the folder has images of ours, or no such file, or several.
     """
-    if content.projections or content.document is not None or content.geometry is not None:
+    if (
+        content.projections
+        or content.document is not None
+        or content.geometry is not None
+    ):
         return None
     known = tuple(ending for form in SCAN_FORMATS for ending in form.endings)
     named = [name for name in content.names if name.lower().endswith(known)]
@@ -308,11 +322,21 @@ def _from_geometry(content: Folder) -> DataSet:
     names = geometry.files or [content.projection_name(i) for i in range(len(geometry))]
     notes = [note for note in geometry.notes if not note.startswith(NO_DARK)]
     cone = geometry.cone_vec.with_shape(geometry.shape)
-    return listed(content, cone, names, content.darks, content.flats, geometry.name,
-                  warnings=notes, full_scale=geometry.full_scale)  # fmt: skip
+    return listed(
+        content,
+        cone,
+        names,
+        content.darks,
+        content.flats,
+        geometry.name,
+        warnings=notes,
+        full_scale=geometry.full_scale,
+    )
 
 
-def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+def _from_texts(
+    content: Folder, machine: Machine | None, profile: Profile | None
+) -> DataSet:
     """Read a data set by the scanner's settings texts.
 
     Args:
@@ -332,9 +356,13 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
     settings = read_settings(content, warnings)
     if settings is None:
         raise DatasetMissingError(
-            f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} is there, "
+            f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} "
+            "is there, "
             "so the geometry is unknown",
-            {"path": str(content.path), "missing": [DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS]},
+            {
+                "path": str(content.path),
+                "missing": [DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS],
+            },
         )
     _require_one_circle(content)
     count = max(content.last_index + 1, settings.projections or 0)
@@ -348,7 +376,8 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
     names = [content.projection_name(i) for i in range(count)]
     if settings.projections is not None and count > settings.projections:
         warnings.append(
-            f"{count} projections are there, the text says {settings.projections}; angles follow "
+            f"{count} projections are there, the text says {settings.projections}; "
+            "angles follow "
             "the text"
         )
     return listed(
@@ -366,7 +395,9 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
         machine=rebuilt.machine,
         profile=rebuilt.profile,
         settings=settings,
-        full_scale=None if rebuilt.machine is None else (1 << rebuilt.machine.detector.bits) - 1,
+        full_scale=None
+        if rebuilt.machine is None
+        else (1 << rebuilt.machine.detector.bits) - 1,
     )
 
 
@@ -430,7 +461,8 @@ def _require_one_circle(content: Folder) -> None:
         return
     if not one:
         raise DatasetFormatError(
-            f"{path} says that the scan has several sections (tiled, helical, repeated): the texts "
+            f"{path} says that the scan has several sections (tiled, helical, repeated): "
+            "the texts "
             f"state the pose of one only; {DOCUMENT} is needed",
             {"path": str(path), "missing": [DOCUMENT]},
         )

@@ -69,9 +69,14 @@ def open_file(
             more = () if distances is None else (distances,)
             with parsing(path, form.name):
                 return form.read(path, geometry, *more)
-    listed = ", ".join(f"{form.name} ({', '.join(form.endings)})" for form in SCAN_FORMATS)
+    listed = ", ".join(
+        f"{form.name} ({', '.join(form.endings)})" for form in SCAN_FORMATS
+    )
     raise DatasetFormatError(
         f"{path} is a file; allowed: a folder, {listed}; else TIFFs with a geometry, "
         "fx.read_tiffs(folder, geometry)",
-        {"asked": str(path), "allowed": [one for form in SCAN_FORMATS for one in form.endings]},
+        {
+            "asked": str(path),
+            "allowed": [one for form in SCAN_FORMATS for one in form.endings],
+        },
     )

@@ -35,8 +35,12 @@ def parsing(path: Path, form: str) -> Iterator[None]:
     except MemoryError:
         said = f"{path} takes more memory than there is"
         raise DatasetFormatError(said, {"path": str(path)}) from None
-    except Exception as error:  # A third party's parser on a damaged file: anything may come.
-        words = " ".join(str(error).split())[:MAX_REPEATED_CHARACTERS] or type(error).__name__
+    except (
+        Exception
+    ) as error:  # A third party's parser on a damaged file: anything may come.
+        words = (
+            " ".join(str(error).split())[:MAX_REPEATED_CHARACTERS] or type(error).__name__
+        )
         said = f"{path} is no {form} file, or a damaged one ({words})"
         raise DatasetFormatError(said, {"path": str(path)}) from error
 
@@ -51,7 +55,9 @@ def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
     size = path.stat().st_size
     if size > most:
         said = f"{path} has {size} bytes"
-        raise DatasetFormatError.instead(said, size, f"{most} bytes of text", path=str(path))
+        raise DatasetFormatError.instead(
+            said, size, f"{most} bytes of text", path=str(path)
+        )
     return path.read_text("utf-8-sig", "replace")
 
 
@@ -64,4 +70,6 @@ def require_memory(path: Path, what: str, size: int) -> None:
     most = memory_bytes()
     if size > most:
         said = f"{path} claims {what} of {size / 2**30:.4g} GiB"
-        raise DatasetFormatError.instead(said, size, f"{most / 2**30:.4g} GiB", path=str(path))
+        raise DatasetFormatError.instead(
+            said, size, f"{most / 2**30:.4g} GiB", path=str(path)
+        )

@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.datasets.image_doubts import FLAT_IMAGE, RADIOGRAPHS, SATURATED, first_look
+from flexdt.library.datasets.image_doubts import (
+    FLAT_IMAGE,
+    RADIOGRAPHS,
+    SATURATED,
+    first_look,
+)
 from flexdt.runtime.files.dataset_folder import Folder, Frame, blank_images, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.errors import TwinError
@@ -19,7 +24,9 @@ from flexdt.twin.plausibility.image_order import ordered, other_name
 NO_DARK: Final = "no dark image"
 
 
-def in_order(content: Folder, names: Sequence[str], views: int) -> tuple[list[str], list[str]]:
+def in_order(
+    content: Folder, names: Sequence[str], views: int
+) -> tuple[list[str], list[str]]:
     """Sort images by the numbers in their names.
 
     Args:
@@ -35,7 +42,10 @@ def in_order(content: Folder, names: Sequence[str], views: int) -> tuple[list[st
         DatasetFormatError: two have one number.
     """
     found = ordered(names)
-    kept, told = [*found.names], settled(found.findings, DatasetFormatError, str(content.path))
+    kept, told = (
+        [*found.names],
+        settled(found.findings, DatasetFormatError, str(content.path)),
+    )
     if found.others:
         doubt = other_name(found.others, kept)
         without = [name for name in kept if name not in found.others]
@@ -90,7 +100,8 @@ def listed(
         there = [n for n in names if n in content.names]
         if not there:
             raise DatasetMissingError(
-                f"{content.path}: no projections ({', '.join(names[:1]) or 'none is listed'} ...)",
+                f"{content.path}: no projections "
+                f"({', '.join(names[:1]) or 'none is listed'} ...)",
                 {"path": str(content.path), "missing": list(names[:100])},
             )
         if len(names) != len(geometry):
@@ -116,7 +127,10 @@ def listed(
         flats=flat_paths,
         complete=not reasons,
         reason="; ".join(reasons),
-        warnings=(*warnings, *([] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"])),
+        warnings=(
+            *warnings,
+            *([] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]),
+        ),
         full_scale=full_scale,
         **known,
     )
@@ -128,7 +142,9 @@ def _first_look(
     """Check whether the first flat image is saturated, or the projection in the middle."""
     taken = [frame.path for frame in frames if frame.present and frame.path is not None]
     kinds = {FLAT_IMAGE: [*flats], RADIOGRAPHS: taken[len(taken) // 2 :]}
-    return first_look({what: paths[0] for what, paths in kinds.items() if paths}, full_scale)
+    return first_look(
+        {what: paths[0] for what, paths in kinds.items() if paths}, full_scale
+    )
 
 
 def nothing_in(blank: Sequence[str]) -> str:
@@ -136,7 +152,9 @@ def nothing_in(blank: Sequence[str]) -> str:
     if not blank:
         return ""
     more = f" to {blank[-1]}" if len(blank) > 1 else ""
-    many = f"{len(blank)} projections, {blank[0]}{more}, are" if more else f"{blank[0]} is"
+    many = (
+        f"{len(blank)} projections, {blank[0]}{more}, are" if more else f"{blank[0]} is"
+    )
     return f"{many} zero everywhere: nothing was recorded"
 
 
@@ -148,9 +166,12 @@ def markers_alone(geometry: ConeVec, name: str) -> DataSet:
     """
     if geometry.shape is None:
         raise TwinError(
-            f"{name}: the geometry does not state the detector's rows and columns; write one that "
+            f"{name}: the geometry does not state the detector's rows and columns; write "
+            "one that "
             "does with flexdt import, or give the frames too"
         )
     shape = (geometry.shape[1], geometry.shape[2])
-    frames = tuple(Frame(i, f"view {i}", None, False, shape) for i in range(len(geometry)))
+    frames = tuple(
+        Frame(i, f"view {i}", None, False, shape) for i in range(len(geometry))
+    )
     return DataSet(name, frames, shape, geometry.with_shape(shape))

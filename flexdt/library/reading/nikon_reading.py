@@ -51,22 +51,32 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     views = int(_number(path, said, "Projections"))
     sod, sdd = (_number(path, said, key) for key in ("SrcToObject", "SrcToDetector"))
     across, down = (_number(path, said, f"DetectorPixelSize{axis}") for axis in "XY")
-    impossible = distance_findings(sod, sdd, (across, down), ("SrcToObject", "SrcToDetector"))
+    impossible = distance_findings(
+        sod, sdd, (across, down), ("SrcToObject", "SrcToDetector")
+    )
     if geometry is None:
         settled(impossible, DatasetFormatError, str(path))
     size = [int(_number(path, said, f"DetectorPixels{axis}")) for axis in "YX"]
     if not 0 < views <= MOST_VIEWS:
-        raise DatasetFormatError.instead(f"{path}: Projections is {views}", views,
-                                         f"1 to {MOST_VIEWS}")  # fmt: skip
-    top, bottom = (_number(path, said, f"CentreOfRotation{end}", 0.0) for end in ("Top", "Bottom"))
+        raise DatasetFormatError.instead(
+            f"{path}: Projections is {views}", views, f"1 to {MOST_VIEWS}"
+        )
+    top, bottom = (
+        _number(path, said, f"CentreOfRotation{end}", 0.0) for end in ("Top", "Bottom")
+    )
     aside = _number(path, said, "ObjectOffsetX", 0.5 * (top + bottom) * sod / sdd)
     lean = -np.rad2deg(np.arctan2(top - bottom, size[0] * down))
-    tilts = _number(path, said, "ObjectRoll", lean), -_number(path, said, "ObjectTilt", 0.0)
+    tilts = (
+        _number(path, said, "ObjectRoll", lean),
+        -_number(path, said, "ObjectTilt", 0.0),
+    )
     turn = np.deg2rad(
         _number(path, said, "InitialAngle", 0.0)
         + _number(path, said, "AngularStep") * np.arange(views)
     )
-    place = np.array([[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]])
+    place = np.array(
+        [[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]]
+    )
     rows = (place @ _axis(*np.deg2rad(tilts)))[None] @ rotation_z(-turn)
     folder = list_folder(path.parent / said.get("InputFolderName", "").replace("\\", "/"))
     cone = ConeVec(rows.reshape(views, 12)) if geometry is None else geometry
@@ -75,13 +85,15 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     if list(data.shape) != size:
         raise DatasetFormatError(
             f"{path} says {size[1]} x {size[0]} pixels, {names[0]} has "
-            f"{data.shape[1]} x {data.shape[0]}", {"asked": size, "allowed": list(data.shape)},
-        )  # fmt: skip
+            f"{data.shape[1]} x {data.shape[0]}",
+            {"asked": size, "allowed": list(data.shape)},
+        )
     white = np.full((1, *data.shape), _number(path, said, "WhiteLevel"), np.float32)
     doubts = told + [
         f"{path.name} states {key} {said[key]}, which is not applied"
-        for key in ("DetectorOffsetX", "DetectorOffsetY") if _number(path, said, key, 0.0)
-    ]  # fmt: skip
+        for key in ("DetectorOffsetX", "DetectorOffsetY")
+        if _number(path, said, key, 0.0)
+    ]
     arrays = Arrays(None, np.zeros_like(white), white)
     more = [doubt for doubt in data.warnings if not doubt.startswith(NO_DARK)]
     return replace(data, arrays=arrays, warnings=(*more, *doubts))
@@ -103,10 +115,14 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     images = [name for name in folder.names if name.lower().endswith((".tif", ".tiff"))]
     found = ordered(images)
     told = settled(
-        [one for one in found.findings if one.kind != "gap"], DatasetFormatError, str(folder.path)
+        [one for one in found.findings if one.kind != "gap"],
+        DatasetFormatError,
+        str(folder.path),
     )
     if found.others:
-        told.append(f"{', '.join(found.others)} are no projections by their names: left out")
+        told.append(
+            f"{', '.join(found.others)} are no projections by their names: left out"
+        )
     names = [name for name in found.names if name not in found.others]
     parts = [PROJECTION.fullmatch(name) for name in names]
     numbers = {int(part[2]): part for part in parts if part is not None}
@@ -121,7 +137,9 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)], told
 
 
-def _number(path: Path, said: Mapping[str, str], key: str, default: float | None = None) -> float:
+def _number(
+    path: Path, said: Mapping[str, str], key: str, default: float | None = None
+) -> float:
     """Return a number of the file, with a decimal point or comma.
 
     Args:
@@ -137,18 +155,22 @@ def _number(path: Path, said: Mapping[str, str], key: str, default: float | None
     try:
         if not text and default is not None:
             return default
-        value = float(text.replace(",", ".", 1) if DECIMAL_COMMA.fullmatch(text) else text)
+        value = float(
+            text.replace(",", ".", 1) if DECIMAL_COMMA.fullmatch(text) else text
+        )
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise DatasetFormatError(
-            f"{path}: {key} is {text[:60] or 'missing'}; allowed: a number", {"missing": key}
+            f"{path}: {key} is {text[:60] or 'missing'}; allowed: a number",
+            {"missing": key},
         )
     return value
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:
-    """Takes rows of vectors into the frame whose z is the axis: rolled about y, tilted about x."""
+    """Takes rows of vectors into the frame whose z is the axis: rolled about y, tilted about
+    x."""
     c, s = np.cos([roll, tilt]), np.sin([roll, tilt])
     rolled = np.array([[c[0], 0.0, s[0]], [0.0, 1.0, 0.0], [-s[0], 0.0, c[0]]])
     tilted = np.array([[1.0, 0.0, 0.0], [0.0, c[1], -s[1]], [0.0, s[1], c[1]]])

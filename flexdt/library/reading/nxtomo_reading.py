@@ -47,7 +47,9 @@ def read_nxtomo(
         with h5py.File(path) as file:
             return _read(file, path, geometry, distances)
     except OSError as error:
-        raise DatasetFormatError(f"{path} is no HDF5 file: {error}", {"path": str(path)}) from None
+        raise DatasetFormatError(
+            f"{path} is no HDF5 file: {error}", {"path": str(path)}
+        ) from None
 
 
 def _read(
@@ -72,13 +74,19 @@ def _read(
     others = sorted(set(keys.tolist()) - set(KNOWN_KEYS))
     if others:
         many = int(np.isin(keys, others).sum())
-        doubts.append(f"{many} images of the keys {', '.join(map(str, others))} are left out")
+        doubts.append(
+            f"{many} images of the keys {', '.join(map(str, others))} are left out"
+        )
     images = data[:]
-    several = [images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)]
+    several = [
+        images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)
+    ]
     projections = keys == PROJECTION
     if not projections.any():
-        raise DatasetFormatError(f"{path}: no image has the key of a projection, {PROJECTION}",
-                                 {"path": str(path)})  # fmt: skip
+        raise DatasetFormatError(
+            f"{path}: no image has the key of a projection, {PROJECTION}",
+            {"path": str(path)},
+        )
     given = geometry
     if given is None:
         given, told = _geometry(file, name, path, projections, data.shape[1:], distances)
@@ -86,7 +94,9 @@ def _read(
     made = DataSet.from_arrays(
         images[projections], given, dark=several[0], flat=several[1], name=path.stem
     )
-    doubts += settled(_stated(file, name, given, projections), DatasetFormatError, path.name)
+    doubts += settled(
+        _stated(file, name, given, projections), DatasetFormatError, path.name
+    )
     return replace(made, warnings=(*made.warnings, *doubts))
 
 
@@ -121,7 +131,9 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
     told = []
     if len(entries) > 1:
         more = ", ".join(entries[1:6])
-        told.append(f"{path.name} holds {len(entries)} scans: {entries[0]} is read, not {more}")
+        told.append(
+            f"{path.name} holds {len(entries)} scans: {entries[0]} is read, not {more}"
+        )
     return found[0], told
 
 
@@ -134,11 +146,15 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     data, keys = group["data"], np.asarray(group["image_key"])
     if data.ndim != 3 or keys.ndim != 1:
         said = f"{path}: data of shape {data.shape}, image_key {keys.shape}"
-        raise DatasetFormatError.instead(said, list(data.shape), "(n, rows, cols) and (n,)")
+        raise DatasetFormatError.instead(
+            said, list(data.shape), "(n, rows, cols) and (n,)"
+        )
     if len(keys) != len(data):
         turned = " (sinograms? give them as images)" if len(keys) in data.shape else ""
         said = f"{path}: {len(data)} images and {len(keys)} image keys{turned}"
-        raise DatasetFormatError.instead(said, len(keys), f"one for each of {len(data)} images")
+        raise DatasetFormatError.instead(
+            said, len(keys), f"one for each of {len(data)} images"
+        )
     size, held = data.size * data.dtype.itemsize, path.stat().st_size
     gone = [name for name in _sources(data) if not (path.parent / name).exists()]
     if gone:
@@ -148,7 +164,9 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     if not data.is_virtual and not data.external:
         stored = data.id.get_storage_size()
         if not stored or size > max(SMALL_BYTES, MOST_DEFLATED * min(stored, held)):
-            said = f"{path} claims images of {size / 2**30:.4g} GiB and holds {stored} bytes"
+            said = (
+                f"{path} claims images of {size / 2**30:.4g} GiB and holds {stored} bytes"
+            )
             raise DatasetFormatError.instead(said, size, "images that were recorded")
     return data, keys
 
@@ -156,7 +174,9 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
 def _sources(data: Any) -> Iterator[str]:
     """Iterate over the external files that hold the images."""
     if data.is_virtual:
-        yield from dict.fromkeys(s.file_name for s in data.virtual_sources() if s.file_name != ".")
+        yield from dict.fromkeys(
+            s.file_name for s in data.virtual_sources() if s.file_name != "."
+        )
     if data.external:
         yield from dict.fromkeys(str(name) for name, *_ in data.external)
 
@@ -186,8 +206,14 @@ def _geometry(
         DatasetFormatError: the file states too little; lists the missing quantities.
     """
     entry = file[name.split("/")[0]]
-    rows = next((g for g in (_member(file, "cone_vec"), _member(entry, "flexdt/cone_vec"))
-                 if g is not None), None)  # fmt: skip
+    rows = next(
+        (
+            g
+            for g in (_member(file, "cone_vec"), _member(entry, "flexdt/cone_vec"))
+            if g is not None
+        ),
+        None,
+    )
     if rows is not None:
         return ConeVec(rows[:]), []
     angles = _angles(file, name, projections)
@@ -196,18 +222,24 @@ def _geometry(
         sod, sdd = distances
         lengths |= {"source distance": sod, "detector distance": sdd - sod}
     pixel = lengths["x_pixel_size"]
-    missing = [what for what, length in lengths.items() if not length and what in NEEDED_LENGTHS]
+    missing = [
+        what for what, length in lengths.items() if not length and what in NEEDED_LENGTHS
+    ]
     if angles is None:
         missing.insert(0, "rotation_angle")
     if missing or angles is None or pixel is None:
         way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
         if {*missing} <= {"source distance", "detector distance"}:
-            way = "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
+            way = (
+                "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
+            )
         raise DatasetFormatError(
             f"{path}: the file has no cone_vec and no {', '.join(missing)}; give {way}",
             {"missing": missing},
         )
-    sod, beyond = (abs(lengths[what] or 0.0) for what in ("source distance", "detector distance"))
+    sod, beyond = (
+        abs(lengths[what] or 0.0) for what in ("source distance", "detector distance")
+    )
     cone = ConeVec.circular(
         sod=sod,
         sdd=sod + beyond,
@@ -216,8 +248,10 @@ def _geometry(
         pixel=(pixel, lengths["y_pixel_size"] or pixel),
     )
     return cone, [
-        f"{path.name} says angles, pixels and distances (source to axis {sod:g} mm, axis to panel "
-        f"{beyond:g} mm): an upright panel is assumed, and the axis in its middle column; `align` "
+        f"{path.name} says angles, pixels and distances (source to axis {sod:g} mm, axis "
+        "to panel "
+        f"{beyond:g} mm): an upright panel is assumed, and the axis in its middle "
+        "column; `align` "
         "or `calibrate` finds them"
     ]
 

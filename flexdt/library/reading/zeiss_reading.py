@@ -48,13 +48,17 @@ def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
     try:
         with opened(path) as raw:
             head, size = raw.read(76), os.fstat(raw.fileno()).st_size
-            if 512 * int.from_bytes(head[44:48], "little") > size:  # of these a list is made
+            if (
+                512 * int.from_bytes(head[44:48], "little") > size
+            ):  # of these a list is made
                 raise OSError("its list of sectors is longer than itself")
             with olefile.OleFileIO(raw, raise_defects=olefile.DEFECT_INCORRECT) as ole:
                 return _read(_Streams(ole, size), geometry, path.stem)
     except TwinError as error:
         said = error.message
-    except Exception as error:  # A third party's parser on a damaged file: anything may come.
+    except (
+        Exception
+    ) as error:  # A third party's parser on a damaged file: anything may come.
         said = f"it is no OLE2 file, or a damaged one ({error})"
     raise DatasetFormatError(f"{path}: {said}", {"path": str(path)})
 
@@ -67,7 +71,12 @@ class _Streams:
     size: int
 
     def values(
-        self, name: str, kind: str, count: int = 1, default: float | None = None, hint: str = ""
+        self,
+        name: str,
+        kind: str,
+        count: int = 1,
+        default: float | None = None,
+        hint: str = "",
     ) -> npt.NDArray[Any]:
         """Read the first numbers of a stream; the default where the stream is missing.
 
@@ -81,18 +90,27 @@ class _Streams:
         there = self.ole.exists(name)
         if not there and default is not None:
             return np.full(count, default)
-        wanted, held = count * np.dtype(kind).itemsize, self.ole.get_size(name) if there else 0
+        wanted, held = (
+            count * np.dtype(kind).itemsize,
+            self.ole.get_size(name) if there else 0,
+        )
         if not wanted <= held <= self.size:
             said = f"has {held} bytes" if there else "is missing"
-            raise DatasetFormatError(f"{name} {said}; allowed: {wanted} to {self.size} bytes{hint}")
+            raise DatasetFormatError(
+                f"{name} {said}; allowed: {wanted} to {self.size} bytes{hint}"
+            )
         return np.frombuffer(self.ole.openstream(name).read(wanted), kind)
 
     def whole(self, name: str, default: float | None = None) -> int:
         return int(self.values(name, "<u4", default=default)[0])
 
-    def images(self, names: Sequence[str], code: int, shape: tuple[int, int]) -> npt.NDArray[Any]:
+    def images(
+        self, names: Sequence[str], code: int, shape: tuple[int, int]
+    ) -> npt.NDArray[Any]:
         if code not in KINDS:
-            raise DatasetFormatError(f"DataType is {code}; allowed: {', '.join(map(str, KINDS))}")
+            raise DatasetFormatError(
+                f"DataType is {code}; allowed: {', '.join(map(str, KINDS))}"
+            )
         out = np.empty((len(names), *shape), KINDS[code])
         for image, name in zip(out, names, strict=True):
             image[:] = self.values(name, KINDS[code], image.size).reshape(shape)
@@ -101,10 +119,14 @@ class _Streams:
     def lengths(self, name: str, count: int) -> FloatArray:
         """Read lengths (count,) of `ImageInfo`, without their signs."""
         found = abs(
-            self.values(f"ImageInfo/{name}", "<f4", count, hint=GEOMETRY_HINT).astype(np.float64)
+            self.values(f"ImageInfo/{name}", "<f4", count, hint=GEOMETRY_HINT).astype(
+                np.float64
+            )
         )
         if not np.all((found > 0) & np.isfinite(found)):
-            raise DatasetFormatError(f"{name} is {found.min():g}; allowed: above 0{GEOMETRY_HINT}")
+            raise DatasetFormatError(
+                f"{name} is {found.min():g}; allowed: above 0{GEOMETRY_HINT}"
+            )
         return found
 
 
@@ -124,7 +146,9 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
     rows, cols, planned, code = (file.whole(f"ImageInfo/{n}") for n in sizes)
     taken = min(file.whole("ImageInfo/ImagesTaken", planned), planned)
     if not 0 < taken * rows * cols <= file.size:
-        said = f"{taken} images of {cols} x {rows} pixels are claimed in {file.size} bytes"
+        said = (
+            f"{taken} images of {cols} x {rows} pixels are claimed in {file.size} bytes"
+        )
         raise DatasetFormatError(said)
     cone, doubts = _geometry(file, taken, rows) if geometry is None else (geometry, [])
     names = [f"ImageData{k // 100 + 1}/Image{k + 1}" for k in range(taken)]
@@ -132,22 +156,32 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
     flats = _reference(file, code, (rows, cols))
     if images.dtype.kind == "f":
         if flats is None:
-            raise DatasetFormatError(f"images of floats; allowed: with {REFERENCES[0]}/Image")
+            raise DatasetFormatError(
+                f"images of floats; allowed: with {REFERENCES[0]}/Image"
+            )
         with np.errstate(all="ignore"):  # what is not finite is refused by its name
             images = images / np.maximum(flats.mean(axis=0), 1e-6 * flats.max())
             images, flats = -np.log(np.maximum(images, np.finfo(np.float32).tiny)), None
     elif flats is None:
-        doubts.append("no reference: DataSet.from_arrays(data.counts(), data.geometry, flat=FLAT)")
+        doubts.append(
+            "no reference: DataSet.from_arrays(data.counts(), data.geometry, flat=FLAT)"
+        )
     dark = np.zeros((rows, cols))
-    data = DataSet.from_arrays(images, cone, dark=dark, flat=flats, name=name, warnings=doubts)
+    data = DataSet.from_arrays(
+        images, cone, dark=dark, flat=flats, name=name, warnings=doubts
+    )
     reason = f"{taken} of {planned} images were taken" if taken < planned else ""
     return replace(data, complete=not reason, reason=reason)
 
 
-def _reference(file: _Streams, code: int, shape: tuple[int, int]) -> npt.NDArray[Any] | None:
+def _reference(
+    file: _Streams, code: int, shape: tuple[int, int]
+) -> npt.NDArray[Any] | None:
     """Read the images of the open beam (k, rows, cols), None without any."""
     for folder in REFERENCES:
-        names = [n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")]
+        names = [
+            n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")
+        ]
         if names:
             images = file.images(names, file.whole(f"{folder}/DataType", code), shape)
             if not np.isfinite(images).all():
@@ -168,23 +202,36 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
         DatasetFormatError: a parallel beam, or a stage that rises.
     """
     if file.whole("ImageInfo/XrayGeometry", 1) != 1:
-        raise DatasetFormatError("XrayGeometry says a parallel beam; allowed: a cone beam")
+        raise DatasetFormatError(
+            "XrayGeometry says a parallel beam; allowed: a cone beam"
+        )
     near, far = file.lengths("StoRADistance", views), file.lengths("DtoRADistance", views)
     size = file.lengths("PixelSize", 1) / 1000.0
     rise = np.ptp(file.values("ImageInfo/YPosition", "<f4", views, 0.0)) / 1000.0
-    if rise > 0.25 * rows * size:  # Shifts undo the small steps against rings, and no more.
-        raise DatasetFormatError(f"the stage rises by YPosition; allowed: a circle{GEOMETRY_HINT}")
+    if (
+        rise > 0.25 * rows * size
+    ):  # Shifts undo the small steps against rings, and no more.
+        raise DatasetFormatError(
+            f"the stage rises by YPosition; allowed: a circle{GEOMETRY_HINT}"
+        )
     pixel = size * (near[:1] + far[:1]) / near[:1]
     center = file.values("ReconSettings/CenterShift", "<f4", default=0.0)
     shifts = (file.values(f"Alignment/{axis}-Shifts", "<f4", views, 0.0) for axis in "XY")
-    right, up = (pixel * (shift + more) for shift, more in zip(shifts, (center, 0), strict=True))
+    right, up = (
+        pixel * (shift + more) for shift, more in zip(shifts, (center, 0), strict=True)
+    )
     angles = np.deg2rad(
-        file.values("ImageInfo/Angles", "<f4", views, hint=GEOMETRY_HINT), dtype=np.float64
+        file.values("ImageInfo/Angles", "<f4", views, hint=GEOMETRY_HINT),
+        dtype=np.float64,
     )
     stated = {name: file.values(name, "<f4", default=0.0)[0] for name in NOT_APPLIED}
-    doubts = [f"{name} of {value:g} is not applied" for name, value in stated.items() if value]
+    doubts = [
+        f"{name} of {value:g} is not applied" for name, value in stated.items() if value
+    ]
     if center[0]:
         doubts.append(f"CenterShift of {center[0]:g} pixels is applied")
     o, p = np.zeros(views), np.full(views, pixel)
-    place = np.stack([o, -near, o, right, far, up, p, o, o, o, o, p], axis=-1).reshape(-1, 4, 3)
+    place = np.stack([o, -near, o, right, far, up, p, o, o, o, o, p], axis=-1).reshape(
+        -1, 4, 3
+    )
     return ConeVec((place @ rotation_z(angles)).reshape(-1, 12)), doubts

@@ -101,7 +101,9 @@ class ImagesOnDisk:
         return count
 
     def _placed(self, error: OSError) -> OSError:
-        return type(error)(error.errno, error.strerror, f"{self._folder} (images kept for a while)")
+        return type(error)(
+            error.errno, error.strerror, f"{self._folder} (images kept for a while)"
+        )
 
 
 class CountsOnce:
@@ -123,11 +125,15 @@ class CountsOnce:
         return self._looked_at[index]
 
     def __getitem__(self, index: int) -> Counts:
-        """Counts that are held until two others have been read: a lag takes the frame before."""
+        """Counts that are held until two others have been read: a lag takes the frame
+        before."""
         if index not in self._latest:
             counts = self._looked_at.pop(index, None)
             newest = list(self._latest.items())[-1:]
-            self._latest = {**dict(newest), index: self._read(index) if counts is None else counts}
+            self._latest = {
+                **dict(newest),
+                index: self._read(index) if counts is None else counts,
+            }
         return self._latest[index]
 
     def read_by(self, dataset: ImageSet) -> ImageSet:
@@ -171,7 +177,9 @@ class KeptImages:
             ValueError: its prepared image has replaced it.
         """
         if number in self._prepared:
-            raise ValueError(f"image {number} is kept as prepared, no longer as it was read")
+            raise ValueError(
+                f"image {number} is kept as prepared, no longer as it was read"
+            )
         if number in self._as_read:
             return self._store.get(number)
         image = self._read(number)

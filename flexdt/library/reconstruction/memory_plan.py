@@ -42,7 +42,13 @@ class MemoryPlan:
 
 
 def plan_memory(
-    grid: Grid, images: int, again: int, most_pixels: int, memory: int, *, least: bool = False
+    grid: Grid,
+    images: int,
+    again: int,
+    most_pixels: int,
+    memory: int,
+    *,
+    least: bool = False,
 ) -> MemoryPlan:
     """Divide a volume into as few slabs as fit into the memory.
 
@@ -52,7 +58,8 @@ def plan_memory(
         again: images that are needed more than once even of a single slab.
         most_pixels: of an image that is kept.
         memory: to use [bytes].
-        least: take no more slabs than layers where there is too little memory, instead of an error.
+        least: take no more slabs than layers where there is too little memory, instead of an
+            error.
 
     Raises:
         LimitError: a layer, and the images that are worked on, need more memory.

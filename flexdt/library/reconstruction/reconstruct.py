@@ -1,9 +1,10 @@
 """`flexdt reconstruct` without its command line: a data set in, a volume file out.
 
-FDK goes slab by slab and prepares images in parts, so memory stays bounded whatever the volume's
-size, and each image is read once: `memory_plan` decides what is in memory at a time, and images
-that are needed again are in `kept_images`. The iterative algorithms hold everything and are for
-small or binned problems. Missing frames are left out, and the outcome states how many.
+FDK goes slab by slab and prepares images in parts, so memory stays bounded whatever the
+volume's size, and each image is read once: `memory_plan` decides what is in memory at a time,
+and images that are needed again are in `kept_images`. The iterative algorithms hold everything
+and are for small or binned problems. Missing frames are left out, and the outcome states how
+many.
 """
 
 from __future__ import annotations
@@ -33,7 +34,12 @@ from flexdt.library.reconstruction.kept_images import (
     ImagesOnDisk,
     KeptImages,
 )
-from flexdt.library.reconstruction.memory_plan import PART, MemoryPlan, plan_memory, plan_whole
+from flexdt.library.reconstruction.memory_plan import (
+    PART,
+    MemoryPlan,
+    plan_memory,
+    plan_whole,
+)
 from flexdt.library.reconstruction.ring_correction import scan_rings
 from flexdt.library.reconstruction.slab_fdk import StandingImages, Work, fdk_slabs
 from flexdt.library.reconstruction.volume_files import (
@@ -101,7 +107,8 @@ class VolumeRequest:
     Attributes:
         algorithm: one of `flexdt.twin.algorithms.ALGORITHMS`.
         voxel_mm: edge of a voxel; None is the pixel's size at the rotation axis.
-        shape: (z, y, x) about the rotation axis at the sample's height; None is the field of view.
+        shape: (z, y, x) about the rotation axis at the sample's height; None is the field of
+            view.
         binning: pixels a side over which images are averaged first.
         every: use every n-th frame.
         iterations: of an iterative algorithm; None is its own default.
@@ -113,8 +120,8 @@ class VolumeRequest:
         material: the object is made of this alone: correct beam hardening with the data set's
             tube (the default one where it names none); several with `sirt` and `sart` (see
             `Polychromatic`); None for no correction.
-        kV: of the scan, for `material` and `scatter_correction`; None is the voltage in the data
-            set.
+        kV: of the scan, for `material` and `scatter_correction`; None is the voltage in the
+            data set.
         png: write the three middle slices next to the volume.
         weight: of the total variation (`tv`); None is its own default.
         scatter_correction: materials of the object: find their scatter and subtract it; None
@@ -209,7 +216,11 @@ class ScanFrames:
 
 
 def views_of(
-    dataset: ImageSet, parameters: Offsets | None = None, *, binning: int = 1, every: int = 1
+    dataset: ImageSet,
+    parameters: Offsets | None = None,
+    *,
+    binning: int = 1,
+    every: int = 1,
 ) -> ScanFrames:
     """Select the frames that are there, and compute their geometry.
 
@@ -228,7 +239,9 @@ def views_of(
         raise LimitError.instead(f"every {every} frames", every, "a whole number from 1")
     indices = dataset.present[::every]
     if not indices:
-        raise LimitError(f"{dataset.where}: no projections to reconstruct from", {"asked": every})
+        raise LimitError(
+            f"{dataset.where}: no projections to reconstruct from", {"asked": every}
+        )
     cone_vec = dataset.corrected(parameters)[np.array(indices)]
     if binning > 1:
         cone_vec = cone_vec.binned(binning, dataset.shape)
@@ -302,16 +315,24 @@ class ReconstructionTask:
             LimitError: too little memory.
         """
         given = FREE_SHARE * free_memory_bytes() if memory is None else memory
-        images, pixels, again = len(self.views.indices), math.prod(self.views.shape), self.again
+        images, pixels, again = (
+            len(self.views.indices),
+            math.prod(self.views.shape),
+            self.again,
+        )
         if not self.direct:
             return plan_whole(self.grid, again, pixels, int(given))
         pixels = max(pixels, math.prod(self.standing.shape))
-        if gpu.availability().present:  # which may fail, or lack room, and take images anew
+        if (
+            gpu.availability().present
+        ):  # which may fail, or lack room, and take images anew
             again = images
         if not slabs:
             plan = plan_whole(self.grid, again, pixels, int(given))
         else:
-            plan = plan_memory(self.grid, images, again, pixels, int(given), least=memory is None)
+            plan = plan_memory(
+                self.grid, images, again, pixels, int(given), least=memory is None
+            )
         return replace(plan, prepared=plan.prepared or gpu.availability().present)
 
 
@@ -327,8 +348,8 @@ def reconstruct_dataset(
 ) -> dict[str, Any]:
     """Reconstruct a data set into a file, which appears under its name only when complete.
 
-    Each image is read once, but by workers. Those that are needed again are kept in memory, or in a
-    file without a name in the folder of `out`.
+    Each image is read once, but by workers. Those that are needed again are kept in memory, or
+    in a file without a name in the folder of `out`.
 
     Args:
         dataset: from `load_dataset`.
@@ -341,9 +362,9 @@ def reconstruct_dataset(
         memory: that FDK may use; None for half of the free memory [bytes].
 
     Returns:
-        JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
-        correction (edge units), accuracy (see `Volume.accuracy`; None but for FDK), warnings,
-        seconds.
+        JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames,
+        missing, correction (edge units), accuracy (see `Volume.accuracy`; None but for FDK),
+        warnings, seconds.
 
     Raises:
         UnknownNameError: unknown algorithm, window or material.
@@ -356,7 +377,9 @@ def reconstruct_dataset(
     """
     out = Path(out)
     check_name(out)
-    images = {f.file for f in dataset.frames} | {p.name for p in (*dataset.darks, *dataset.flats)}
+    images = {f.file for f in dataset.frames} | {
+        p.name for p in (*dataset.darks, *dataset.flats)
+    }
     home = None if dataset.folder is None else dataset.folder.resolve()
     if out.parent.resolve() == home and out.name in images:
         raise LimitError(f"{out} is an image of the data set itself", {"asked": str(out)})
@@ -381,7 +404,13 @@ def reconstruct_dataset(
         doubts = [*bias_warnings(bias, task.grid), *doubts]
     pictures = slices.write(out) if task.request.png else []
     in_force = dataset.correction
-    used = parameters if parameters is not None else in_force.parameters if in_force else None
+    used = (
+        parameters
+        if parameters is not None
+        else in_force.parameters
+        if in_force
+        else None
+    )
     return {
         "file": str(out),
         "slices": [str(file) for file in pictures],
@@ -407,7 +436,11 @@ def _bias(views: ScanFrames) -> Bias | None:
 
 
 def _here(
-    task: ReconstructionTask, plan: MemoryPlan, out: Path, slices: MiddleSlices, tell: Progress
+    task: ReconstructionTask,
+    plan: MemoryPlan,
+    out: Path,
+    slices: MiddleSlices,
+    tell: Progress,
 ) -> tuple[ScanFrames, Bias | None, list[str]]:
     """Reconstruct into a file in this process.
 
@@ -423,7 +456,10 @@ def _here(
     """
     folder, grid = out.absolute().parent, task.grid
     _require_room_for_images(folder, plan, grid.bytes)
-    with _reading_once(task, plan, folder, tell) as (kept, work), volume_writer(out, grid) as write:
+    with (
+        _reading_once(task, plan, folder, tell) as (kept, work),
+        volume_writer(out, grid) as write,
+    ):
         views = _corrected(replace(task.views, kept=kept), task.request)
         if not task.direct:
             volume = _iterative(views, grid, task.request, tell)
@@ -467,9 +503,15 @@ def _fdk_slabs(
             view, kept, images, task.grid, plan.slabs, window, work.slab, errors=errors
         )
     whole = fdk_parts(
-        views.parts, views.cone_vec, views.shape, task.grid, window, partial(work.slab, 0),
-        views.truncation, errors=errors,
-    )  # fmt: skip
+        views.parts,
+        views.cone_vec,
+        views.shape,
+        task.grid,
+        window,
+        partial(work.slab, 0),
+        views.truncation,
+        errors=errors,
+    )
     return iter([whole])
 
 
@@ -487,7 +529,11 @@ def _reading_once(
     """
     views, fdk = task.views, task.direct
     dataset = task.counts.read_by(views.dataset)
-    work = Work.of(task.standing, task.grid, plan.slabs, tell) if fdk else Work(1, 1.0, (), _untold)
+    work = (
+        Work.of(task.standing, task.grid, plan.slabs, tell)
+        if fdk
+        else Work(1, 1.0, (), _untold)
+    )
     store = ImagesOnDisk(folder, plan.most_pixels) if plan.on_disk else ImagesInMemory()
     with KeptImages(partial(views.measured, dataset), store, work.read) as kept:
         yield kept, work
@@ -567,7 +613,9 @@ def _task(
     wanted = VolumeRequest() if request is None else request
     name = wanted.algorithm
     if name not in ALGORITHMS:
-        raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
+        raise UnknownNameError.among(
+            f"unknown algorithm {name!r}; allowed", name, ALGORITHMS
+        )
     several = _names(wanted.material)
     if len(several) > 1 and "materials" not in ALGORITHMS[name].options:
         said = f"materials {', '.join(several)} with {name}"
@@ -582,7 +630,9 @@ def _task(
     box = np.array([grid.center_mm - half, grid.center_mm + half])
     found = examine(operation, views.cone_vec, views.shape, grid=box)
     doubts = settled(found, GeometryError)
-    mended, bad = without_bad_pixels(dataset, dataset.corrected(parameters), counts.looked_at)
+    mended, bad = without_bad_pixels(
+        dataset, dataset.corrected(parameters), counts.looked_at
+    )
     doubts += [*bad, *image_doubts(mended, needed=True, counts=counts.looked_at)]
     views = replace(views, dataset=mended, doubts=tuple(doubts))
     return ReconstructionTask(wanted, views, grid, counts)
@@ -612,7 +662,9 @@ def preview(
         window="hann",
         png=True,
     )
-    return reconstruct_dataset(dataset, out, request, parameters=parameters, progress=progress)
+    return reconstruct_dataset(
+        dataset, out, request, parameters=parameters, progress=progress
+    )
 
 
 def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
@@ -638,7 +690,9 @@ def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
         kV, tube, mono_keV = _source(views.dataset, request)
         substances = [one.substance for one in made_of]
         if mono_keV is None and len(made_of) == 1:
-            harden = hardening(substances[0], kV, made_of[0].effective_energy_keV, tube=tube)
+            harden = hardening(
+                substances[0], kV, made_of[0].effective_energy_keV, tube=tube
+            )
             views = replace(views, harden=harden)
         elif mono_keV is None:
             mixture = Polychromatic.of(substances, kV, stated_keV(), tube=tube)
@@ -672,7 +726,10 @@ def _without_scatter(
     if figures and not any(name.startswith("scatter_") for name in figures):
         raise TwinError(
             f"{views.dataset.where} was made without scatter: there is none to subtract",
-            {"asked": "scatter correction", "allowed": "a scanner's data, or scatter simulated"},
+            {
+                "asked": "scatter correction",
+                "allowed": "a scanner's data, or scatter simulated",
+            },
         )
     substances = tuple(material(name).substance for name in names)
     kV, tube, mono_keV = _source(views.dataset, request)
@@ -688,7 +745,9 @@ def _without_scatter(
     return replace(views, scatter=scatter, doubts=(*views.doubts, *found.doubts))
 
 
-def _source(dataset: ImageSet, request: VolumeRequest) -> tuple[float, TubeModel, float | None]:
+def _source(
+    dataset: ImageSet, request: VolumeRequest
+) -> tuple[float, TubeModel, float | None]:
     """Return voltage, tube and single energy, as requested or as the data set names them.
 
     Raises:
@@ -703,7 +762,8 @@ def _source(dataset: ImageSet, request: VolumeRequest) -> tuple[float, TubeModel
     kV = said if request.kV is None else request.kV
     if kV is None:
         raise LimitError(
-            f"{dataset.where} does not say its tube voltage, which corrections of beam hardening "
+            f"{dataset.where} does not say its tube voltage, which corrections of beam "
+            "hardening "
             "and scatter need; give kV= or tube=",
             {"missing": "kV"},
         )
@@ -746,7 +806,8 @@ def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) 
     if need > free:
         raise LimitError(
             f"{plan.kept} images that are needed again take {plan.disk_bytes / 2**30:.3g} GiB "
-            f"beside the volume's {volume_bytes / 2**30:.3g} GiB; there are {free / 2**30:.3g} GiB "
+            f"beside the volume's {volume_bytes / 2**30:.3g} GiB; there are "
+            f"{free / 2**30:.3g} GiB "
             f"free in {folder}: choose another folder, binning, fewer frames, or more memory",
             {"asked": need, "allowed": free},
         )
@@ -763,7 +824,9 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
         )
 
 
-def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
+def _iterative(
+    views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress
+) -> Volume:
     """Reconstruct by an iterative algorithm, after checking that the memory suffices."""
     algorithm = ALGORITHMS[request.algorithm]
     stacks, grids = algorithm.stacks, algorithm.grids
@@ -772,10 +835,14 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
     _require(f"of memory for {request.algorithm}", need, int(0.8 * memory_bytes()), grid)
     asked = {
-        "iterations": request.iterations, "weight": request.weight, "hardening": views.mixture,
-    }  # fmt: skip
+        "iterations": request.iterations,
+        "weight": request.weight,
+        "hardening": views.mixture,
+    }
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PlausibilityWarning)  # it is among the views' doubts
+        warnings.simplefilter(
+            "ignore", PlausibilityWarning
+        )  # it is among the views' doubts
         made: Volume = algorithm.load()(
             _stacked(views),
             views.cone_vec,

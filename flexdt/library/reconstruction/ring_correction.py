@@ -15,8 +15,8 @@ from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle, circle_of
 
 MOST_LEAN_PX: Final = 1.0
-"""Columns between the axis at the panel's upper and lower edge, at most: beyond, columns on both
-sides of it do not see the same rays."""
+"""Columns between the axis at the panel's upper and lower edge, at most: beyond, columns on
+both sides of it do not see the same rays."""
 SECTORS: Final = 8
 """Number of parts of a turn whose numbers of views are compared."""
 MOST_UNEVEN: Final = 1.3
@@ -43,7 +43,9 @@ def scan_rings(
     return found.T if lies else found
 
 
-def _axis_column(cone_vec: ConeVec, shape: tuple[int, int], *, lies: bool) -> float | None:
+def _axis_column(
+    cone_vec: ConeVec, shape: tuple[int, int], *, lies: bool
+) -> float | None:
     """Return the column of the axis of a full turn.
 
     Args:
@@ -62,7 +64,9 @@ def _axis_column(cone_vec: ConeVec, shape: tuple[int, int], *, lies: bool) -> fl
     if circle.rise or not circle.full or not _evenly_turned(circle):
         return None
     around, height = np.tile(circle.centre, (2, 1)), cone_vec.source[0, 2]
-    axis = np.column_stack([around, height + 0.01 * circle.radius * np.array([-1.0, 1.0])])
+    axis = np.column_stack(
+        [around, height + 0.01 * circle.radius * np.array([-1.0, 1.0])]
+    )
     columns, rows = np.median(cone_vec.project_points(axis, shape), axis=0).T
     tall = shape[0]
     if lies:

@@ -1,7 +1,7 @@
 """FDK slab by slab from images that are prepared once: a slab takes the rows in its shadow.
 
-Prepared images are those of upright panels, so that a slab's shadow is some rows of them, one piece
-of a file.
+Prepared images are those of upright panels, so that a slab's shadow is some rows of them, one
+piece of a file.
 """
 
 from __future__ import annotations
@@ -82,7 +82,8 @@ class StandingImages:
         wide = round(FINER * cols) if leans(cone_vec) else cols
         level = cone_vec if is_upright(cone_vec) else upright(cone_vec, wide / cols)
         if wide != cols and narrow_overlap(circle, level, wide):
-            # FDK moves the axis between columns as it stands these up: resampled once, not twice.
+            # FDK moves the axis between columns as it stands these up: resampled once, not
+            # twice.
             return cls(cone_vec, turned, cone_vec, shape, rises, truncation)
         return cls(cone_vec, turned, level, (rows, wide), rises, truncation)
 
@@ -109,7 +110,9 @@ class StandingImages:
         shape = rows.stop - rows.start, self.shape[1]
         if shape == self.shape:
             return self.cone_vec, self.shape, self.truncation
-        cone_vec = window(self.cone_vec, self.shape, (rows.start, rows.stop), (0, shape[1]))
+        cone_vec = window(
+            self.cone_vec, self.shape, (rows.start, rows.stop), (0, shape[1])
+        )
         truncation = self.truncation
         if truncation is not None:
             truncation = replace(truncation, rows=truncation.rows - rows.start)
@@ -182,7 +185,12 @@ class Work:
         slabs: Sequence[float],
         tell: Callable[[float, float], None],
     ) -> None:
-        self._images, self._reading, self._slabs, self._tell = images, reading, slabs, tell
+        self._images, self._reading, self._slabs, self._tell = (
+            images,
+            reading,
+            slabs,
+            tell,
+        )
         self._read, self._done = 0, [0.0] * len(slabs)
 
     @classmethod
@@ -222,6 +230,8 @@ class Work:
 
     def _say(self) -> None:
         done = self._reading * (self._read / self._images)
-        done += sum(work * part for work, part in zip(self._slabs, self._done, strict=True))
+        done += sum(
+            work * part for work, part in zip(self._slabs, self._done, strict=True)
+        )
         whole = self._reading + sum(self._slabs)
         self._tell(self._images * (done / whole), self._images)

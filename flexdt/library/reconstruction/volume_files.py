@@ -30,7 +30,8 @@ from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.signatures import File
 
 NO_PLACE: Final = (
-    "NumPy's files have no room for the voxel size; write with numpy.save(FILE, volume.data) and "
+    "NumPy's files have no room for the voxel size; write with numpy.save(FILE, "
+    "volume.data) and "
     "read with Volume(numpy.load(FILE), voxel_mm)"
 )
 
@@ -49,9 +50,15 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
     form = check_name(path)
     places = VoxelPlaces.of(grid) if isinstance(grid, Grid) else grid
     if not (form.oblong or places.cubes):
-        allowed = [ending for one in VOLUME_FORMATS if one.oblong for ending in one.endings]
-        said = f"{path}: voxels of {' x '.join(f'{edge:g}' for edge in places.edges_mm)} mm"
-        raise LimitError.instead(said, list(places.edges_mm), f"cubes, or {', '.join(allowed)}")
+        allowed = [
+            ending for one in VOLUME_FORMATS if one.oblong for ending in one.endings
+        ]
+        said = (
+            f"{path}: voxels of {' x '.join(f'{edge:g}' for edge in places.edges_mm)} mm"
+        )
+        raise LimitError.instead(
+            said, list(places.edges_mm), f"cubes, or {', '.join(allowed)}"
+        )
     if not form.packed:
         require_bytes(path, 4 * math.prod(places.shape))
     part = path.with_name(f".{path.name}.part{path.suffix}")
@@ -80,7 +87,9 @@ def check_name(path: Path) -> VolumeFormat:
     """Return the format of a file name; checks, before any work, that it can be written."""
     form = _format(path)
     if not path.absolute().parent.is_dir():
-        raise LimitError(f"{path}: the folder does not exist", {"asked": str(path.parent)})
+        raise LimitError(
+            f"{path}: the folder does not exist", {"asked": str(path.parent)}
+        )
     return form
 
 
@@ -114,12 +123,16 @@ def read_volume(file: File) -> Volume:
     form = _format(path)
     try:
         values, voxel, place, first = form.read(path)
-        along_x, along_y, along_z = np.broadcast_to(np.asarray(voxel, dtype=float), 3).tolist()
+        along_x, along_y, along_z = np.broadcast_to(
+            np.asarray(voxel, dtype=float), 3
+        ).tolist()
         edges = along_x, along_y, along_z
         if first:  # the place is that of the first voxel
             sizes = [*reversed(values.shape)]
-            place = [float(p) + (n - 1) / 2 * edge
-                     for p, n, edge in zip(place, sizes, edges, strict=True)]  # fmt: skip
+            place = [
+                float(p) + (n - 1) / 2 * edge
+                for p, n, edge in zip(place, sizes, edges, strict=True)
+            ]
         x, y, z = (float(p) for p in place)
         cubes = along_x == along_y == along_z
         return Volume(values, along_x if cubes else edges, (x, y, z))

@@ -1,4 +1,5 @@
-"""Formats of volume files: TIFF, NRRD, MetaImage, NIfTI, HDF5, Zarr; how each is written and read.
+"""Formats of volume files: TIFF, NRRD, MetaImage, NIfTI, HDF5, Zarr; how each is written and
+read.
 
 `VOLUME_FORMATS` is the only list of them. `flexdt-extensions` writes and reads Zarr.
 """
@@ -39,8 +40,8 @@ BIG_TIFF_BYTES: Final = 3 << 30
 Sink = Callable[["Float32Array"], None]
 """Takes slabs (k, ny, nx) of layers from low z to high."""
 Stored = tuple[npt.NDArray[Any], float | Sequence[float], Sequence[float], bool]
-"""Values, edge or edges (x, y, z) of a voxel [mm], place (x, y, z) [mm], and whether that is the
-first voxel's or the middle."""
+"""Values, edge or edges (x, y, z) of a voxel [mm], place (x, y, z) [mm], and whether that is
+the first voxel's or the middle."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,9 @@ class VoxelPlaces:
         """
         if not self.cubes:
             said = f"voxels of {' x '.join(f'{edge:g}' for edge in self.edges_mm)} mm"
-            raise GeometryError.instead(said, list(self.edges_mm), "cubes, three equal edges")
+            raise GeometryError.instead(
+                said, list(self.edges_mm), "cubes, three equal edges"
+            )
         return Grid(self.shape, self.edges_mm[0], self.center_mm)
 
     @property
@@ -140,7 +143,11 @@ def _headed(
 
     def write(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         first = header(places)
-        with gzip.open(part, "wb", compresslevel=1) if compress else part.open("wb") as file:
+        with (
+            gzip.open(part, "wb", compresslevel=1)
+            if compress
+            else part.open("wb") as file
+        ):
             file.write(first)
             yield _raw(file)
 
@@ -221,8 +228,8 @@ def _nrrd_header(places: VoxelPlaces) -> bytes:
 def _mha_header(places: VoxelPlaces) -> bytes:
     """Write MetaImage, header and data in one file.
 
-    ITK takes its axes to point left, back and up, so x and y are turned: the place is then that of
-    the NRRD and NIfTI files.
+    ITK takes its axes to point left, back and up, so x and y are turned: the place is then that
+    of the NRRD and NIfTI files.
     """
     nz, ny, nx = places.shape
     x, y, z = places.first_mm
@@ -271,8 +278,9 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     grid = places.grid
     with _h5py().File(part, "w") as file:
         values = file.create_dataset("volume", grid.shape, "f4")
-        values.attrs.update(unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm,
-                            center_mm=grid.center_mm)  # fmt: skip
+        values.attrs.update(
+            unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm, center_mm=grid.center_mm
+        )
         done = 0
 
         def write(slab: Float32Array) -> None:

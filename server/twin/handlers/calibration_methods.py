@@ -7,7 +7,11 @@ from pathlib import Path
 from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
-from flexdt.protocol.methods.calibration_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
+from flexdt.protocol.methods.calibration_messages import (
+    DATASET_FRAME,
+    DATASET_GET,
+    DATASET_LIST,
+)
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.memory import Memory
 from flexdt.server.twin.core import TwinServer
@@ -24,17 +28,28 @@ async def apply(
         history = twin.corrections.after(correction)
         ready = h.ensure_allowed(twin, client, "calibration.apply")
         warnings = await h.change_stage(
-            twin, twin.scanner.sample, correction, ready, history=history, source=params.source
+            twin,
+            twin.scanner.sample,
+            correction,
+            ready,
+            history=history,
+            source=params.source,
         )
     return _in_force(twin, f"correction {correction.name!r} is in force", warnings)
 
 
 @h.answers(p.CALIBRATION_GET)
-def get(twin: TwinServer, client: h.Client, params: p.CalibrationGet) -> p.CorrectionResult:
+def get(
+    twin: TwinServer, client: h.Client, params: p.CalibrationGet
+) -> p.CorrectionResult:
     """Return the applied correction, or the named one."""
     if params.name is None:
-        return p.CorrectionResult(correction=twin.correction_state(twin.scanner.correction))
-    return p.CorrectionResult(correction=twin.correction_state(twin.corrections.get(params.name)))
+        return p.CorrectionResult(
+            correction=twin.correction_state(twin.scanner.correction)
+        )
+    return p.CorrectionResult(
+        correction=twin.correction_state(twin.corrections.get(params.name))
+    )
 
 
 @h.answers(p.CALIBRATION_LIST)
@@ -58,7 +73,9 @@ async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.Correct
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
         ready = h.ensure_allowed(twin, client, "calibration.revert")
-        warnings = await h.change_stage(twin, twin.scanner.sample, before, ready, history=history)
+        warnings = await h.change_stage(
+            twin, twin.scanner.sample, before, ready, history=history
+        )
     return _in_force(twin, "the correction was reverted", warnings)
 
 
@@ -74,7 +91,9 @@ async def delete(
         ready = h.ensure_allowed(twin, client, "calibration.delete")
 
         def after(memory: Memory) -> Memory:
-            return memory.model_copy(update={"corrections": twin.corrections.in_state(history)})
+            return memory.model_copy(
+                update={"corrections": twin.corrections.in_state(history)}
+            )
 
         def files(changes: Changes) -> None:
             twin.corrections.store_history(changes, history)
@@ -98,7 +117,9 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.Correcti
     return p.CorrectionResult(correction=correction, warnings=warnings)
 
 
-@h.answers(DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN)
+@h.answers(
+    DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN
+)
 async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> Encoded:
     """Run a method on the data directory in a worker process and return its encoded
     result.

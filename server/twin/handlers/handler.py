@@ -1,7 +1,8 @@
 """Common parts of handlers: their type, the client connection, changes that are saved.
 
-A change of the scanner that survives a restart is checked, certified, written, and only then made.
-One that is refused or cannot be written leaves everything as it is, in the scanner and on the disk.
+A change of the scanner that survives a restart is checked, certified, written, and only then
+made. One that is refused or cannot be written leaves everything as it is, in the scanner and on
+the disk.
 """
 
 from __future__ import annotations
@@ -60,7 +61,9 @@ class Client:
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
 """Handles (twin, client, parameters) and returns the result."""
-_Handler: TypeAlias = Callable[[TwinServer, Client, _P], Answer[_R] | Awaitable[Answer[_R]]]
+_Handler: TypeAlias = Callable[
+    [TwinServer, Client, _P], Answer[_R] | Awaitable[Answer[_R]]
+]
 
 
 def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_P, _R]]:
@@ -80,7 +83,9 @@ def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], 
     return lambda: twin.control.ensure_allowed(client.name, what)
 
 
-def ensure_idle(twin: TwinServer, client: Client, method: str, what: str) -> Callable[[], None]:
+def ensure_idle(
+    twin: TwinServer, client: Client, method: str, what: str
+) -> Callable[[], None]:
     """Checks that neither control has changed hands nor a job begun since the request."""
 
     def check() -> None:
@@ -162,8 +167,8 @@ async def change_stage(
     Raises:
         UnknownNameError, LimitError, PhantomError: there is no such sample.
         GeometryError: a correction that no scanner can have.
-        CollisionError, SafetyError: what is under way, or stands, is not free of it; nothing has
-            changed (see `ScannerTwin.take_stage`).
+        CollisionError, SafetyError: what is under way, or stands, is not free of it; nothing
+            has changed (see `ScannerTwin.take_stage`).
         DatasetWriteError: it cannot be written; nothing has changed.
     """
     names = twin.corrections.history if history is None else history
@@ -171,10 +176,13 @@ async def change_stage(
     scanner.require_applicable(correction)  # before anything is built of it
     guard = await twin.guard(sample, correction, upload)
     change = scanner.stage_change(
-        sample, correction, guard, twin.clock.now(),
+        sample,
+        correction,
+        guard,
+        twin.clock.now(),
         targets=None if scene is None else scene.positions,
         paces=None if scene is None else paces_of(scene, scanner),
-    )  # fmt: skip
+    )
     change = await asyncio.to_thread(change.certified)
 
     def files(changes: Changes) -> None:

@@ -30,7 +30,9 @@ from flexdt.twin.scanner.state import changed_camera, changed_tube, switched
 
 
 @answers(p.PROJECTION_GET)
-async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
+async def get_projection(
+    twin: TwinServer, client: Client, params: p.ProjectionGet
+) -> Encoded:
     """Compute an image at the present pose, or predict one for other poses or settings.
 
     Raises:
@@ -68,7 +70,9 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
 def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
     machine, asked = twin.machine, params.tube or TubeSet()
     tube = changed_tube(machine.tube, shot.tube, asked.kV, asked.power_W)
-    tube = switched(machine, tube, tube.on if asked.on is None else asked.on, None, warm=True)
+    tube = switched(
+        machine, tube, tube.on if asked.on is None else asked.on, None, warm=True
+    )
     change = camera_change(params.camera or CameraSet())
     camera = changed_camera(machine.detector, shot.camera, change)
     there = dict(shot.positions) | (params.positions or {})
@@ -95,7 +99,9 @@ async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult
     rows, cols = scanner.camera.shape
     if not (-0.5 <= column < cols - 0.5 and -0.5 <= row < rows - 0.5):
         asked = {"asked": [column, row], "allowed": [[0, cols - 1], [0, rows - 1]]}
-        raise LimitError(f"no pixel ({column:g}, {row:g}) in {cols} columns, {rows} rows", asked)
+        raise LimitError(
+            f"no pixel ({column:g}, {row:g}) in {cols} columns, {rows} rows", asked
+        )
     whole = scanner.cone_vec(twin.clock.now())
     off = (column - (cols - 1) / 2) * whole.u + (row - (rows - 1) / 2) * whole.v
     pixel = ConeVec(np.hstack([whole.source, whole.detector + off, whole.u, whole.v]))
@@ -132,11 +138,17 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
         "power_W": lit.power_W if params.power_W is None else params.power_W,
         "exposure_ms": params.exposure_ms or camera.exposure_ms,
         "averages": params.averages or camera.averages,
-        "mode": params.mode or camera.mode, "roi": Roi(*(params.roi or camera.roi.edges)),
-        "filter": params.filter, "images": params.frames, "detail": params.detail,
-        "kind": params.kind, "profile": scanner.profile, "start": twin.submissions.start(),
-        "sod": params.sod_mm or at.SOD_mm, "sdd": params.sdd_mm or at.SDD_mm,
-    }  # fmt: skip
+        "mode": params.mode or camera.mode,
+        "roi": Roi(*(params.roi or camera.roi.edges)),
+        "filter": params.filter,
+        "images": params.frames,
+        "detail": params.detail,
+        "kind": params.kind,
+        "profile": scanner.profile,
+        "start": twin.submissions.start(),
+        "sod": params.sod_mm or at.SOD_mm,
+        "sdd": params.sdd_mm or at.SDD_mm,
+    }
     async with twin.samples.turn:
         phantom = await asyncio.to_thread(twin.samples.load, name, material)
     codec = client.peer.codec

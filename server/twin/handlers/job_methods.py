@@ -29,7 +29,10 @@ PATIENCE_S = 2.0
 """Longest wait of an answer for a job to reach the requested state [s]."""
 ScanInput: TypeAlias = p.ScriptInput | p.TrajectoryInput
 CHECK: tuple[Method[ScanInput, p.CheckResult], ...] = (p.SCRIPT_CHECK, p.TRAJECTORY_CHECK)
-SUBMIT: tuple[Method[ScanInput, p.SubmitResult], ...] = (p.SCRIPT_SUBMIT, p.TRAJECTORY_SUBMIT)
+SUBMIT: tuple[Method[ScanInput, p.SubmitResult], ...] = (
+    p.SCRIPT_SUBMIT,
+    p.TRAJECTORY_SUBMIT,
+)
 
 
 @h.answers(*CHECK)
@@ -74,7 +77,9 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
         await twin.submissions.again(job, h.ensure_allowed(twin, client, "a scan"))
         return twin.jobs.status(job)
     twin.jobs.resume(job)
-    status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
+    status = await _when(
+        twin, job, lambda: job.phase != "paused" or job.error is not None
+    )
     return _unless_obstructed(job, status)
 
 
@@ -106,14 +111,18 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
 
 
 @h.answers(p.JOB_LIST)
-async def list_jobs(twin: TwinServer, client: h.Client, params: Empty) -> p.JobListResult | Encoded:
+async def list_jobs(
+    twin: TwinServer, client: h.Client, params: Empty
+) -> p.JobListResult | Encoded:
     """List all jobs, oldest first."""
     jobs = await h.in_turns(twin.jobs.all(), twin.jobs.status)
     return await h.encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
 
 
 @h.answers(p.JOB_FORGET)
-async def forget(twin: TwinServer, client: h.Client, params: p.JobForget) -> p.JobForgetResult:
+async def forget(
+    twin: TwinServer, client: h.Client, params: p.JobForget
+) -> p.JobForgetResult:
     """Remove ended jobs from the list; an incomplete one is resumed if submitted again."""
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 
@@ -124,7 +133,9 @@ async def forget(twin: TwinServer, client: h.Client, params: p.JobForget) -> p.J
                 JobRecord.forget(changes, twin.directory, job.name)
 
     def take() -> list[Job]:
-        gone = [job for job in jobs if job.phase in ENDED]  # one may have been resumed meanwhile
+        gone = [
+            job for job in jobs if job.phase in ENDED
+        ]  # one may have been resumed meanwhile
         twin.jobs.forget(gone)
         twin.changed()
         return gone
@@ -154,7 +165,11 @@ def _source(params: ScanInput) -> ScanSource:
     """Make the requested scan from a script or poses."""
     if isinstance(params, p.TrajectoryInput):
         return ScanSource.of_poses(
-            params.poses, params.exposure_ms, params.motion_samples, params.seed, params.flat
+            params.poses,
+            params.exposure_ms,
+            params.motion_samples,
+            params.seed,
+            params.flat,
         )
     if params.text is not None:
         script = params.text.encode("utf-8")
@@ -163,7 +178,8 @@ def _source(params: ScanInput) -> ScanSource:
             script = base64.b64decode(params.data_base64 or "", validate=True)
         except (binascii.Error, ValueError):
             raise invalid_params(
-                "data_base64 is not base64", [{"path": "data_base64", "message": "not base64"}]
+                "data_base64 is not base64",
+                [{"path": "data_base64", "message": "not base64"}],
             ) from None
     if len(script) > MAX_SCRIPT_BYTES:
         raise too_large("a script", len(script), MAX_SCRIPT_BYTES)

@@ -1,4 +1,5 @@
-"""axes.*, safety.*, clock.set, tube.set and camera.set: commands to the motors, and settings."""
+"""axes.*, safety.*, clock.set, tube.set and camera.set: commands to the motors, and
+settings."""
 
 from __future__ import annotations
 
@@ -12,7 +13,12 @@ from flexdt.protocol.methods import scanner_messages as p
 from flexdt.server.scans.stage import finished
 from flexdt.server.twin import state_views
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, change_settings, ensure_idle
+from flexdt.server.twin.handlers.handler import (
+    Client,
+    answers,
+    change_settings,
+    ensure_idle,
+)
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -36,7 +42,9 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
         short = await _unreached_targets(twin, wanted)
         warnings, arrived = [*told, *short], not short
     seconds = max(durations.values(), default=0.0)
-    return p.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
+    return p.MoveResult(
+        duration_s=seconds, warnings=warnings, moves=None, arrived=arrived
+    )
 
 
 async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
@@ -67,7 +75,9 @@ def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
         twin.changed()
 
 
-async def _move_around_obstacles(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
+async def _move_around_obstacles(
+    twin: TwinServer, client: Client, params: p.Move
+) -> p.MoveResult:
     """Start free moves one by one; an earlier way ends with its present leg."""
     twin.detours.cancel()
     now = twin.clock.now()
@@ -87,29 +97,43 @@ async def _move_around_obstacles(twin: TwinServer, client: Client, params: p.Mov
     moves = [dict(leg) for leg in way.legs]
     if params.wait:
         short = await finished(task)
-        short += await _unreached_targets(twin, {m: t for leg in moves for m, t in leg.items()})
+        short += await _unreached_targets(
+            twin, {m: t for leg in moves for m, t in leg.items()}
+        )
         warnings, arrived = warnings + short, not short
-    return p.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived)
+    return p.MoveResult(
+        duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived
+    )
 
 
 @answers(p.AXES_JOG)
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
     """Run until the lease ends (`twin.motion.drives.plan_jog`), or as far as it is free."""
     with _cancelling_detour(twin):
-        jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
-    return p.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
+        jogged = twin.scanner.jog(
+            params.axis, params.velocity, params.lease_s, twin.clock.now()
+        )
+    return p.MoveResult(
+        duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None
+    )
 
 
 @answers(p.AXES_SET)
-async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> p.AxisSetResult:
+async def set_axis(
+    twin: TwinServer, client: Client, params: p.AxisSet
+) -> p.AxisSetResult:
     """Set speed and acceleration of future motions."""
 
     def change(scanner: ScannerTwin) -> None:
-        scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
+        scanner.set_axis(
+            params.axis, speed=params.speed, acceleration=params.acceleration
+        )
 
     await change_settings(twin, change, ensure_idle(twin, client, "axes.set", "axes.set"))
     axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
-    return p.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
+    return p.AxisSetResult(
+        axis=params.axis, speed=axis.speed, acceleration=axis.acceleration
+    )
 
 
 @answers(p.AXES_STOP)
@@ -167,21 +191,29 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
         scanner.set_tube(kV=params.kV, power_W=params.power_W, on=params.on, now=now)
 
     if params.kV is None and params.power_W is None:
-        change(twin.scanner)  # X-rays never come on by themselves, so nothing must be remembered
+        change(
+            twin.scanner
+        )  # X-rays never come on by themselves, so nothing must be remembered
         twin.changed()
     else:
-        await change_settings(twin, change, ensure_idle(twin, client, "tube.set", "tube.set"))
+        await change_settings(
+            twin, change, ensure_idle(twin, client, "tube.set", "tube.set")
+        )
     return state_views.tube_view(twin.scanner.tube, twin.clock.now())
 
 
 @answers(p.CAMERA_SET)
-async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w.CameraState:
+async def set_camera(
+    twin: TwinServer, client: Client, params: p.CameraSet
+) -> w.CameraState:
     """Change the camera; omitted settings stay."""
 
     def change(scanner: ScannerTwin) -> None:
         scanner.set_camera(**camera_change(params))
 
-    await change_settings(twin, change, ensure_idle(twin, client, "camera.set", "camera.set"))
+    await change_settings(
+        twin, change, ensure_idle(twin, client, "camera.set", "camera.set")
+    )
     return state_views.camera_view(twin.scanner.camera, twin.machine)
 
 

@@ -22,7 +22,9 @@ MAX_NAMED_UPLOADS = 50
 
 
 @h.answers(p.SAMPLE_SET)
-async def set_sample(twin: TwinServer, client: h.Client, params: p.SampleSet) -> p.SampleResult:
+async def set_sample(
+    twin: TwinServer, client: h.Client, params: p.SampleSet
+) -> p.SampleResult:
     """Put a shipped phantom or an upload on the stage; without an offset it is centred."""
     name = params.file if params.name is None else params.name
     assert name is not None
@@ -30,7 +32,9 @@ async def set_sample(twin: TwinServer, client: h.Client, params: p.SampleSet) ->
     if params.file is not None and head is None:
         raise _unknown(twin, name)
     offset = (
-        StagePlacement() if params.offset is None else StagePlacement(**params.offset.model_dump())
+        StagePlacement()
+        if params.offset is None
+        else StagePlacement(**params.offset.model_dump())
     )
     if name == EMPTY:
         sample = Sample()
@@ -50,9 +54,17 @@ async def list_samples(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.SampleListResult | Encoded:
     """List everything that may be put on the stage."""
-    empty = p.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
-    shipped = await h.in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
-    heads = [head for name in twin.samples.uploads if (head := twin.samples.head(name)) is not None]
+    empty = p.SampleInfo(
+        name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
+    )
+    shipped = await h.in_turns(
+        phantom_names(), lambda name: _info(name, load_phantom(name))
+    )
+    heads = [
+        head
+        for name in twin.samples.uploads
+        if (head := twin.samples.head(name)) is not None
+    ]
     uploads = await h.in_turns(heads, _upload_info)
     samples = [empty, *shipped, *uploads]
     result = p.SampleListResult(samples=samples, materials=list(materials()))
@@ -60,7 +72,9 @@ async def list_samples(
 
 
 @h.answers(p.SAMPLE_MESH)
-async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.SampleMeshResult:
+async def mesh(
+    twin: TwinServer, client: h.Client, params: p.SampleMesh
+) -> p.SampleMeshResult:
     """Send a part of the mesh of the sample on the stage, for drawing."""
     sample = twin.scanner.sample
     if not sample.name:
@@ -68,9 +82,15 @@ async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.Sa
     revision = twin.samples.revision(sample.name)
     shape = twin.shapes.known(sample.name, revision)
     if shape is None:
-        async with twin.samples.turn:  # one at a time, so that a scan always finds a thread
-            phantom = await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
-            shape = await asyncio.to_thread(twin.shapes.of, sample.name, revision, phantom)
+        async with (
+            twin.samples.turn
+        ):  # one at a time, so that a scan always finds a thread
+            phantom = await asyncio.to_thread(
+                twin.samples.load, sample.name, sample.material
+            )
+            shape = await asyncio.to_thread(
+                twin.shapes.of, sample.name, revision, phantom
+            )
     part = shape.stl[params.start : params.start + params.count]
     return p.SampleMeshResult(
         name=shape.name,
@@ -82,11 +102,15 @@ async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.Sa
 
 
 @h.answers(p.SAMPLE_UPLOAD)
-async def upload(twin: TwinServer, client: h.Client, params: p.SampleUpload) -> p.UploadResult:
+async def upload(
+    twin: TwinServer, client: h.Client, params: p.SampleUpload
+) -> p.UploadResult:
     """Store one chunk of an upload; the last one completes the sample."""
     head = UploadHead.of(params)
     _ensure_idle_if_used(twin, client, head.name)
-    received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
+    received = await asyncio.to_thread(
+        twin.samples.receive, head, params.start, params.data
+    )
     if received < head.total:
         return p.UploadResult(name=head.name, received=received, complete=False)
     async with twin.samples.turn, twin.stage_turn:
@@ -100,9 +124,12 @@ async def upload(twin: TwinServer, client: h.Client, params: p.SampleUpload) -> 
         warnings = list(upload.phantom.assumed)
         if there:
             warnings += await h.change_stage(
-                twin, stands, twin.scanner.correction,
-                lambda: _ensure_idle_if_used(twin, client, head.name), upload=upload,
-            )  # fmt: skip
+                twin,
+                stands,
+                twin.scanner.correction,
+                lambda: _ensure_idle_if_used(twin, client, head.name),
+                upload=upload,
+            )
         else:
             await twin.keeper.keep(
                 lambda: twin.samples.know(upload),
@@ -136,7 +163,9 @@ async def delete(
             _ensure_unused(twin, name)
             twin.samples.forget(name)
 
-        await twin.keeper.keep(take, files=lambda changes: twin.samples.remove(changes, name))
+        await twin.keeper.keep(
+            take, files=lambda changes: twin.samples.remove(changes, name)
+        )
         await asyncio.to_thread(twin.samples.tidy)
     twin.tell("info", f"sample {name!r} was deleted", bytes=head.total)
     return p.SampleDeleteResult(name=name, bytes=head.total)
@@ -163,8 +192,8 @@ def _ensure_unused(twin: TwinServer, name: str) -> None:
 
 
 def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
-    """Check that a sample may change: if it is on the stage, under this connection's control and in
-    no scan.
+    """Check that a sample may change: if it is on the stage, under this connection's control
+    and in no scan.
 
     Raises:
         RpcError: -32003, names the controller or the job.
@@ -193,7 +222,11 @@ def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
     uploads = list(twin.samples.uploads)[-MAX_NAMED_UPLOADS:]
     older = len(twin.samples.uploads) - len(uploads)
     more = f"{older} older ones and " if older else ""
-    there = f"there are: {more}{', '.join(uploads)}" if uploads else "nothing has been uploaded yet"
+    there = (
+        f"there are: {more}{', '.join(uploads)}"
+        if uploads
+        else "nothing has been uploaded yet"
+    )
     return UnknownNameError(
         f"no upload called {name!r}; {there}", {"asked": name, "allowed": uploads}
     )

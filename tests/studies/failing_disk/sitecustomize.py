@@ -1,7 +1,9 @@
-"""On the path of a server that `faults.py writes` starts: its data directory fails as it is told.
+"""On the path of a server that `faults.py writes` starts: its data directory fails as it is
+told.
 
-FLEXDT_TEST_FAULT is a JSON document: root, at, error, lasting, short (see `simulated_disk.Fault`).
-The file `.NAME-failed` beside the data directory NAME tells that it did.
+FLEXDT_TEST_FAULT is a JSON document: root, at, error, lasting, short (see
+`simulated_disk.Fault`). The file `.NAME-failed` beside the data directory NAME tells that it
+did.
 """
 
 import json

@@ -25,11 +25,19 @@ MEASURES = (rooms, circles, lookups, copied_lists, glue, prose, density)
 def main() -> None:
     """Print the table, or the findings of the measures that `--list` names."""
     parser = argparse.ArgumentParser(
-        prog="house", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="house",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("root", nargs="?", type=Path, default=REPOSITORY, help="another clone")
-    parser.add_argument("--list", metavar="WORD", help="print findings of measures with this word")
-    parser.add_argument("--save", metavar="VERSION", help="keep the figures as those of a release")
+    parser.add_argument(
+        "root", nargs="?", type=Path, default=REPOSITORY, help="another clone"
+    )
+    parser.add_argument(
+        "--list", metavar="WORD", help="print findings of measures with this word"
+    )
+    parser.add_argument(
+        "--save", metavar="VERSION", help="keep the figures as those of a release"
+    )
     chosen = parser.parse_args()
     found = measured(read_modules(chosen.root))
     if chosen.list is not None:
@@ -50,7 +58,9 @@ def measured(modules: Sequence[Module]) -> list[Measure]:
     return [result for measure in MEASURES for result in measure.measure(modules)]
 
 
-def table(found: Sequence[Measure], version: str, before: Mapping[str, float]) -> list[str]:
+def table(
+    found: Sequence[Measure], version: str, before: Mapping[str, float]
+) -> list[str]:
     """Return the lines of the table: measure, figure of the last release, figure now.
 
     Args:
@@ -69,11 +79,17 @@ def table(found: Sequence[Measure], version: str, before: Mapping[str, float]) -
 
 
 def findings(found: Sequence[Measure], word: str) -> list[str]:
-    """Return the findings of the measures whose name contains `word`, or which names there are."""
+    """Return the findings of the measures whose name contains `word`, or which names there
+    are."""
     chosen = [measure for measure in found if word.lower() in measure.name.lower()]
     if not chosen:
-        return [f'no measure has "{word}" in its name; there are:', *(m.name for m in found)]
-    return [line for m in chosen for line in (f"# {m.name}: {_figure(m.value)}", *m.findings)]
+        return [
+            f'no measure has "{word}" in its name; there are:',
+            *(m.name for m in found),
+        ]
+    return [
+        line for m in chosen for line in (f"# {m.name}: {_figure(m.value)}", *m.findings)
+    ]
 
 
 def last_release(folder: Path, before: str | None = None) -> tuple[str, dict[str, float]]:

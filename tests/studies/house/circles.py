@@ -18,7 +18,9 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
     folders: dict[str, set[str]] = {module.room: set() for module in modules}
     room_of = {module.name: module.room for module in modules}
     for name, targets in graph.items():
-        folders[room_of[name]] |= {room_of[target] for target in targets} - {room_of[name]}
+        folders[room_of[name]] |= {room_of[target] for target in targets} - {
+            room_of[name]
+        }
     return [
         counted("import circles of modules", [" ".join(c) for c in circles(graph)]),
         counted("import circles of folders", [" ".join(c) for c in circles(folders)]),
@@ -29,7 +31,8 @@ def imports(modules: Sequence[Module]) -> dict[str, set[str]]:
     """Return module -> modules of the same tree that it imports anywhere."""
     known = {module.name for module in modules}
     return {
-        module.name: {t for t in _targets(module, known) if t != module.name} for module in modules
+        module.name: {t for t in _targets(module, known) if t != module.name}
+        for module in modules
     }
 
 
@@ -70,7 +73,8 @@ def _targets(module: Module, known: set[str]) -> Iterator[str]:
 
 
 def _from_targets(module: Module, node: ast.ImportFrom, known: set[str]) -> Iterator[str]:
-    """Yield the modules that `from ... import ...` names: the submodules, or else the package."""
+    """Yield the modules that `from ... import ...` names: the submodules, or else the
+    package."""
     origin = node.module or ""
     if node.level:
         levels = node.level - module.is_package

@@ -32,7 +32,8 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
 
 
 def _lists(module: Module) -> Iterator[tuple[list[str], int]]:
-    """Yield words and line of tuples, lists, sets, keys of dictionaries, and `Literal` types."""
+    """Yield words and line of tuples, lists, sets, keys of dictionaries, and `Literal`
+    types."""
     for node in module.nodes:
         if isinstance(node, ast.Tuple | ast.List | ast.Set):
             elements: Sequence[ast.expr | None] = node.elts
@@ -41,7 +42,9 @@ def _lists(module: Module) -> Iterator[tuple[list[str], int]]:
         else:
             continue
         words = [
-            e.value for e in elements if isinstance(e, ast.Constant) and isinstance(e.value, str)
+            e.value
+            for e in elements
+            if isinstance(e, ast.Constant) and isinstance(e.value, str)
         ]
         if len(words) == len(elements) and len(set(words)) >= LEAST_WORDS:
             yield words, node.lineno

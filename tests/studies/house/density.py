@@ -18,7 +18,9 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
         "stacked assignments": _nodes(modules, _is_stacked),
         "conditional expressions": _nodes(modules, _is_conditional),
         "fmt: skip": _lines(modules, lambda line: line.rstrip().endswith("# fmt: skip")),
-        f"lines above {LONG_LINE} characters": _lines(modules, lambda line: len(line) > LONG_LINE),
+        f"lines above {LONG_LINE} characters": _lines(
+            modules, lambda line: len(line) > LONG_LINE
+        ),
     }
     return [
         Measure(name, len(found) / thousands, "/ 1000 lines", tuple(found))

@@ -33,7 +33,8 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
 
 
 def large_parts(module: Module) -> list[int]:
-    """Return the sizes in lines of the large groups of names that use each other, largest first."""
+    """Return the sizes in lines of the large groups of names that use each other, largest
+    first."""
     owner = {name: node for node in module.tree.body for name in _names(node)}
     group = {name: {name} for name in owner}
     for name, node in owner.items():
@@ -44,7 +45,9 @@ def large_parts(module: Module) -> list[int]:
     sizes: dict[frozenset[str], int] = {}
     for members in group.values():
         nodes = {id(owner[m]): owner[m] for m in members}.values()
-        sizes[frozenset(members)] = sum((n.end_lineno or n.lineno) - n.lineno + 1 for n in nodes)
+        sizes[frozenset(members)] = sum(
+            (n.end_lineno or n.lineno) - n.lineno + 1 for n in nodes
+        )
     return sorted((size for size in sizes.values() if size >= PART_LINES), reverse=True)
 
 
@@ -60,7 +63,8 @@ def _names(node: ast.stmt) -> Iterator[str]:
 
 
 def _used(node: ast.stmt) -> set[str]:
-    """Return the names in a statement; annotations and dispatch tables may hold them as texts."""
+    """Return the names in a statement; annotations and dispatch tables may hold them as
+    texts."""
     found: dict[type, set[str]] = defaultdict(set)
     for inner in ast.walk(node):
         if isinstance(inner, ast.Name):

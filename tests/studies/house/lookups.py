@@ -9,15 +9,20 @@ from collections.abc import Callable, Iterator, Sequence
 from house.sources import PACKAGE, Measure, Module, counted
 
 LOADERS = {"import_module", "__import__"}
-ATTRIBUTE_TEXT = re.compile(rf"(?:{PACKAGE}(?:\.\w+)*|\w+(?:\.\w+)+):[A-Za-z_]\w*(?:\.\w+)*")
+ATTRIBUTE_TEXT = re.compile(
+    rf"(?:{PACKAGE}(?:\.\w+)*|\w+(?:\.\w+)+):[A-Za-z_]\w*(?:\.\w+)*"
+)
 """`module:attribute`, as entry points write it."""
 
 
 def measure(modules: Sequence[Module]) -> list[Measure]:
-    """Return calls that import a text, texts `module:attribute`, and modules' names as texts."""
+    """Return calls that import a text, texts `module:attribute`, and modules' names as
+    texts."""
     names = {module.name for module in modules if module.name != PACKAGE}
     calls = [at for module in modules for at in _calls(module)]
-    attributes = [at for module in modules for at in _texts(module, ATTRIBUTE_TEXT.fullmatch)]
+    attributes = [
+        at for module in modules for at in _texts(module, ATTRIBUTE_TEXT.fullmatch)
+    ]
     dotted = [at for module in modules for at in _texts(module, names.__contains__)]
     return [
         counted("look-ups: calls that import a text", calls),
@@ -44,7 +49,9 @@ def _is_foreign(argument: ast.expr) -> bool:
 
 
 def _texts(module: Module, wanted: Callable[[str], object]) -> Iterator[str]:
-    documentation = {id(node.value) for node in module.nodes if isinstance(node, ast.Expr)}
+    documentation = {
+        id(node.value) for node in module.nodes if isinstance(node, ast.Expr)
+    }
     for node in module.nodes:
         if (
             isinstance(node, ast.Constant)

@@ -11,7 +11,9 @@ from pathlib import Path
 
 from house.sources import Measure, Module
 
-VERBS = frozenset(Path(__file__).with_name("verbs.txt").read_text(encoding="utf-8").split())
+VERBS = frozenset(
+    Path(__file__).with_name("verbs.txt").read_text(encoding="utf-8").split()
+)
 """Verbs in the form of a command. Add one to the file where a docstring begins with another."""
 
 WORDS = {
@@ -25,7 +27,9 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 def measure(modules: Sequence[Module]) -> list[Measure]:
     """Return the share of docstrings that begin with a verb, and rates of words to replace."""
-    documented = [(m, f, ast.get_docstring(f) or "") for m in modules for f in _functions(m)]
+    documented = [
+        (m, f, ast.get_docstring(f) or "") for m in modules for f in _functions(m)
+    ]
     documented = [(m, f, text) for m, f, text in documented if text]
     other = [
         f"{m.path}:{f.lineno} {f.name}: {text.splitlines()[0]}"
@@ -38,7 +42,8 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
 
 
 def begins_with_a_verb(docstring: str) -> bool:
-    """Return True if the first word is a verb; "Plan of ..." and "Name: ..." begin with a noun."""
+    """Return True if the first word is a verb; "Plan of ..." and "Name: ..." begin with a
+    noun."""
     first, _, rest = docstring.strip().partition(" ")
     if first.rstrip(".;,").lower() not in VERBS:
         return False
@@ -55,7 +60,9 @@ def _rates(modules: Sequence[Module]) -> list[Measure]:
             for place, text in prose
             for m in re.finditer(pattern, text)
         ]
-        rates.append(Measure(name, 1000 * len(found) / count, "/ 1000 words", tuple(found)))
+        rates.append(
+            Measure(name, 1000 * len(found) / count, "/ 1000 words", tuple(found))
+        )
     return rates
 
 

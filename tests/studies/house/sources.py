@@ -84,7 +84,8 @@ def counted(name: str, findings: Sequence[str]) -> Measure:
 
 
 def read_modules(root: Path, folders: Sequence[str] = CORE) -> list[Module]:
-    """Read the Python files below `folders`, in the order of their paths; links are not followed.
+    """Read the Python files below `folders`, in the order of their paths; links are not
+    followed.
 
     Args:
         root: the repository.

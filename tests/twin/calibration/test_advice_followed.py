@@ -10,7 +10,9 @@ def test_every_advised_argument_is_read_from_its_sentence() -> None:
     said = "moves: --per-frame dO_x,alpha follows it; free dD_z, det_roll too, or give the prior"
     told = [argument for argument, _ in advice_followed.arguments(said)]
     assert told == ["--per-frame dO_x,alpha", "free dD_z,det_roll"]
-    assert [a for a, _ in advice_followed.arguments("measure it, or give --bead-tolerance")]
+    assert [
+        a for a, _ in advice_followed.arguments("measure it, or give --bead-tolerance")
+    ]
 
 
 @pytest.mark.slow

@@ -17,11 +17,16 @@ from flexdt.twin.projection import Scene, Solid, Sphere
 ANGLES = 20.0 * np.arange(18)
 RADIUS = 1.0
 BEAM = 1.4
-"""Factor by which the faint material attenuates more in the beam than the phantom's file says."""
+"""Factor by which the faint material attenuates more in the beam than the phantom's file
+says."""
 
 
 def calibrated(
-    seed: int, attenuations: npt.ArrayLike, *, stated: bool = True, radii: npt.ArrayLike = RADIUS
+    seed: int,
+    attenuations: npt.ArrayLike,
+    *,
+    stated: bool = True,
+    radii: npt.ArrayLike = RADIUS,
 ) -> tuple[Calibration, dict[str, float]]:
     """A calibration of balls of these attenuations [1/mm], and the truth."""
     rng = np.random.default_rng([31, seed])
@@ -42,7 +47,9 @@ def calibrated(
     solids = Scene(
         tuple(
             Solid(Sphere((x, y, z), r), f"material {mu:g}", mu)
-            for (x, y, z), mu, r in zip(beads.tolist(), said.tolist(), radius.tolist(), strict=True)
+            for (x, y, z), mu, r in zip(
+                beads.tolist(), said.tolist(), radius.tolist(), strict=True
+            )
         )
     )
     poses = Poses.upright(

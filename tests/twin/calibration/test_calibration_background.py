@@ -1,4 +1,5 @@
-"""What lies beside the beads: foreign edges and bent backgrounds; copies of frames; pixel grids."""
+"""What lies beside the beads: foreign edges and bent backgrounds; copies of frames; pixel
+grids."""
 
 from __future__ import annotations
 
@@ -60,7 +61,9 @@ def test_how_contrast_falls_is_read_from_beads_of_any_size(seed: int) -> None:
 
 def test_a_bead_that_fades_across_its_shadow_is_evened() -> None:
     i = np.arange(SIDE) - SIDE // 2
-    ball = 3.0 * np.sqrt(np.clip(1.0 - (i[None, :] ** 2 + i[:, None] ** 2) / 14.0**2, 0.0, None))
+    ball = 3.0 * np.sqrt(
+        np.clip(1.0 - (i[None, :] ** 2 + i[:, None] ** 2) / 14.0**2, 0.0, None)
+    )
     more = 0.01 * i[None, :] - 0.004 * i[:, None]
     step = np.where(i[None, :] > 5, 0.3, 0.0) * np.ones((SIDE, 1))
     for body, beyond in ((None, more), (step[None].astype(np.float32), more + step)):
@@ -85,7 +88,9 @@ def test_a_bent_background_is_what_is_subtracted() -> None:
     found = survey(flat + bend, alone)
     assert found.bend is not None
     rest = bend - found.bend.mean(axis=0)
-    design = np.stack([np.ones(SIDE * SIDE), *(a.ravel() for a in np.meshgrid(i, i))], axis=1)
+    design = np.stack(
+        [np.ones(SIDE * SIDE), *(a.ravel() for a in np.meshgrid(i, i))], axis=1
+    )
     plane = np.linalg.lstsq(design, rest.ravel(), rcond=None)[0]
     assert np.abs(rest.ravel() - design @ plane).max() < 0.004
     assert not found.disturbed.any()
@@ -117,7 +122,14 @@ def look(centers: np.ndarray) -> FrameSpots:
     k = len(centers)
     one = np.ones(k)
     found = Detections(
-        centers, np.tile(np.eye(2), (k, 1, 1)), 10 * one, one, 0 * one, one > 0, one, SHAPE
+        centers,
+        np.tile(np.eye(2), (k, 1, 1)),
+        10 * one,
+        one,
+        0 * one,
+        one > 0,
+        one,
+        SHAPE,
     )
     return FrameSpots(found, FrameState.USABLE)
 
@@ -137,9 +149,12 @@ def test_an_object_at_rest_without_noise_is_no_stutter() -> None:
     assert all(each.state is FrameState.USABLE for each in without_repeats(frames))
 
 
-def test_positions_are_unbiased_where_a_bead_stays_at_one_place_of_the_pixel_grid() -> None:
-    """The mean error of each bead over the frames, without noise: pixels that integrate finer than
-    the correction's, blur that has to be estimated, and a body's face that touches a bead."""
+def test_positions_are_unbiased_where_a_bead_stays_at_one_place_of_the_pixel_grid() -> (
+    None
+):
+    """The mean error of each bead over the frames, without noise: pixels that integrate finer
+    than the correction's, blur that has to be estimated, and a body's face that touches a
+    bead."""
     phantom = load_phantom("normal-4")
     model = bead_model(phantom)
     poses, truth = scenario("G0", 12)
@@ -160,7 +175,9 @@ def test_detection_in_parts_sees_what_the_whole_image_shows() -> None:
     model = bead_model(phantom)
     poses, truth = scenario("G0", 3)
     camera = Rendering(5000.0, 0.7, 2)
-    counts = next(iter(exposures(phantom.scene, model, poses.cone_vec(truth), camera, [4])))
+    counts = next(
+        iter(exposures(phantom.scene, model, poses.cone_vec(truth), camera, [4]))
+    )
     image = line_integrals(counts, 5000.0)
     found = detect_beads(image, radius_px=(10.0, 30.0))
     places = poses.cone_vec(truth).project_points(model.beads, SHAPE)[0]

@@ -20,7 +20,8 @@ def outcome(kind: str, seed: int = 0) -> Outcome:
 @pytest.mark.parametrize(
     ("kind", "code"),
     [
-        # Named in drawn scans in test_calibration_causes.py, and by its volume in test_chiral.py.
+        # Named in drawn scans in test_calibration_causes.py, and by its volume in
+        # test_chiral.py.
         pytest.param("mirrored_phantom", "mirrored_phantom", marks=pytest.mark.slow),
         pytest.param("wrong_phantom", "wrong_phantom", marks=pytest.mark.slow),
         pytest.param("no_beads", "no_beads", marks=pytest.mark.slow),
@@ -71,7 +72,8 @@ def test_a_blur_of_two_pixels_is_seen_and_allowed_for() -> None:
 
 @pytest.mark.slow
 def test_dead_columns_and_pixels_are_no_shadows() -> None:
-    """They were taken for a body and for beads elsewhere: the magnification was 5 sigmas off."""
+    """They were taken for a body and for beads elsewhere: the magnification was 5 sigmas
+    off."""
     _, found = run_case(("dead_pixels", 325, "normal-5"))
     assert not found.refused
     assert not {"body_differs", "bead_displaced"} & set(found.findings)
@@ -83,7 +85,9 @@ DRAWN = ("frames_repeated", "vibration", "angle_slip", "angle_jitter", "angle_sc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [k for k in SURVIVABLE if k not in (*dict(SURVIVED), *DRAWN)])
+@pytest.mark.parametrize(
+    "kind", [k for k in SURVIVABLE if k not in (*dict(SURVIVED), *DRAWN)]
+)
 @pytest.mark.campaign(1)
 def test_never_confidently_wrong(kind: str) -> None:
     assert not outcome(kind, 1001).wrong

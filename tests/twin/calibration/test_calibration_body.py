@@ -18,7 +18,13 @@ from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt_extensions.studies.experiments import SHAPE, scenario
 
 BEADS = np.array(
-    [[7.0, 2.0, -16.0], [-6.0, 6.0, -7.0], [-5.0, -7.0, 2.0], [6.0, -6.0, 9.0], [0.0, 7.5, 17.0]]
+    [
+        [7.0, 2.0, -16.0],
+        [-6.0, 6.0, -7.0],
+        [-5.0, -7.0, 2.0],
+        [6.0, -6.0, 9.0],
+        [0.0, 7.5, 17.0],
+    ]
 )
 RADIUS, METAL, PLASTIC = 1.0, 2.0, 0.03
 SIZE, CENTRE = np.array([15.0, 9.0, 36.0]), np.array([1.5, -1.0, 0.0])
@@ -33,12 +39,15 @@ DESCRIBED = Scene((
 
 @cache
 def images(plastic: float, turn_deg: float, aside_mm: float) -> list[np.ndarray]:
-    """Noisy line integrals of the beads and of a body, turned about z and moved along x and y."""
+    """Noisy line integrals of the beads and of a body, turned about z and moved along x and
+    y."""
     rng = np.random.default_rng(5)
     poses, truth = scenario("G0", FRAMES)
     cone = np.asarray(poses.cone_vec(truth))
     c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    about = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # into the body's own axes
+    about = np.array(
+        [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+    )  # into the body's own axes
     rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]
     out = []
     for source, detector, u, v in cone.reshape(-1, 4, 3):
@@ -71,7 +80,9 @@ def calibrated(
     result = calibrate([Scan(frames, poses, "body")], MODEL, scene=told)
     fit, true = result.fit, truth.to_edge()
     assert fit is not None
-    return result, max(abs(fit.values[n] - true[n]) / sigma for n, sigma in fit.sigmas.items())
+    return result, max(
+        abs(fit.values[n] - true[n]) / sigma for n, sigma in fit.sigmas.items()
+    )
 
 
 @pytest.mark.daily(1)
@@ -89,7 +100,9 @@ def test_the_body_is_subtracted_as_the_images_have_it(
     plastic: float, turn_deg: float, aside_mm: float, code: str | None, factor: float
 ) -> None:
     result, worst = calibrated(plastic, turn_deg, aside_mm, DESCRIBED)
-    assert {f.code for f in result.findings if f.code.startswith("body")} == {code} - {None}
+    assert {f.code for f in result.findings if f.code.startswith("body")} == {code} - {
+        None
+    }
     body = result.measured[0].body
     assert body.factor == pytest.approx(factor, abs=0.05)
     assert np.abs(body.shift_mm - aside_mm * ASIDE).max() < 0.02
@@ -106,4 +119,6 @@ def test_a_body_that_is_not_there_costs_nothing() -> None:
     assert told.fit is not None
     assert untold.fit is not None
     assert math.isnan(untold.measured[0].body.factor)
-    assert told.fit.certificate.rms_px == pytest.approx(untold.fit.certificate.rms_px, rel=0.02)
+    assert told.fit.certificate.rms_px == pytest.approx(
+        untold.fit.certificate.rms_px, rel=0.02
+    )

@@ -1,4 +1,5 @@
-"""Causes have their right names: faults are drawn, with shadows from a geometry of their own."""
+"""Causes have their right names: faults are drawn, with shadows from a geometry of their
+own."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ def spots(angles, keep, seed: int = 0) -> list[Detections]:  # type: ignore[no-u
         covariance = np.broadcast_to(4e-4 * np.eye(2), (k, 2, 2))
         radii, one = np.full(k, 11.8), np.ones(k)
         out.append(
-            Detections(points, covariance, radii, one, 0 * one, one.astype(bool), one, SHAPE)
+            Detections(
+                points, covariance, radii, one, 0 * one, one.astype(bool), one, SHAPE
+            )
         )
     return out
 
@@ -59,7 +62,9 @@ def test_beads_that_are_lost_are_named() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [0.0, 37.0])
 @pytest.mark.campaign(1)
-def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: float) -> None:
+def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(
+    first: float,
+) -> None:
     """Four of the five beads fit images turned by 180 deg, too, and more closely."""
     detections = spots(first - ANGLES, [0, 1, 2, 3, 4])
     assert codes(detections) == [("angle_reversed", "error")]
@@ -67,7 +72,9 @@ def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: flo
 
 @pytest.mark.slow
 def test_steps_of_a_turn_over_one_frame_less_are_named() -> None:
-    assert codes(spots(ANGLES * 36 / 35, [0, 1, 2, 3, 4])) == [("angle_endpoint", "error")]
+    assert codes(spots(ANGLES * 36 / 35, [0, 1, 2, 3, 4])) == [
+        ("angle_endpoint", "error")
+    ]
 
 
 @pytest.mark.slow
@@ -114,7 +121,9 @@ def test_no_other_drawn_fault_is_offered_wrong(kind: str) -> None:
 
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", [50, 221])
-def test_an_sdd_that_the_images_doubt_is_not_offered_by_its_prior_alone(seed: int) -> None:
+def test_an_sdd_that_the_images_doubt_is_not_offered_by_its_prior_alone(
+    seed: int,
+) -> None:
     """13 and 17 mm off where the prior says 1: images that tell it to 5 mm came second."""
     found = scored("sdd_far_off", seed)
     assert not found.wrong, found
@@ -123,8 +132,8 @@ def test_an_sdd_that_the_images_doubt_is_not_offered_by_its_prior_alone(seed: in
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("kind", ["scanner_held", "height_held", "across_held"])
 def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str) -> None:
-    """Held 0.2 to 2 mm from where it is: dO_x came out 650 of its sigmas off without a word. Where
-    images can tell it is refused, else it is said what hangs on it, and how much."""
+    """Held 0.2 to 2 mm from where it is: dO_x came out 650 of its sigmas off without a word.
+    Where images can tell it is refused, else it is said what hangs on it, and how much."""
     for seed in range(60, 64):
         found = scored(kind, seed)
         codes = [s.split(":")[0] for s in found.said]

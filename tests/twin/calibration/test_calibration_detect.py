@@ -1,4 +1,5 @@
-"""Detection against known places: accuracy, completeness, clutter, and what must not be found."""
+"""Detection against known places: accuracy, completeness, clutter, and what must not be
+found."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def matched(found: Detections, expected: FloatArray, gate: float = 4.0) -> Float
     return out
 
 
-def ball(shape: tuple[int, int], x: float, y: float, radius: float, peak: float) -> FloatArray:
+def ball(
+    shape: tuple[int, int], x: float, y: float, radius: float, peak: float
+) -> FloatArray:
     """A ball's chords, averaged over 5 x 5 points of each pixel."""
     rows, cols = shape
     sub = (np.arange(5) + 0.5) / 5 - 0.5
@@ -70,10 +73,14 @@ def test_covariance_is_the_scatter() -> None:
     for seed in range(200):
         rng = np.random.default_rng(seed)
         counts = rng.poisson(8000 * np.exp(-clean))
-        found = detect_beads(np.log(8000 / np.maximum(counts, 0.5)), radius_px=(8.0, 18.0))
+        found = detect_beads(
+            np.log(8000 / np.maximum(counts, 0.5)), radius_px=(8.0, 18.0)
+        )
         errors.append(found.centers[0] - [50.3, 48.8])
         predicted.append(np.diag(found.covariances[0]))
-    assert np.std(errors, axis=0) == pytest.approx(np.sqrt(np.mean(predicted, axis=0)), rel=0.25)
+    assert np.std(errors, axis=0) == pytest.approx(
+        np.sqrt(np.mean(predicted, axis=0)), rel=0.25
+    )
     assert np.abs(np.mean(errors, axis=0)).max() < 0.003
 
 
@@ -84,7 +91,9 @@ def test_every_lego_bead_is_found_in_spite_of_bricks_and_studs() -> None:
         found = detect_beads(image)
         error = matched(found, places)
         assert len(found) == 5
-        assert np.abs(error).max() < 0.4  # a brick's edge behind a bead pulls its centroid
+        assert (
+            np.abs(error).max() < 0.4
+        )  # a brick's edge behind a bead pulls its centroid
 
 
 def test_gradient_blur_and_foreign_objects_are_tolerated() -> None:
@@ -127,7 +136,9 @@ def test_nothing_is_found_in_noise_or_in_a_plain_box(seed: int) -> None:
 
 
 def test_a_bead_cut_by_the_edge_is_fitted() -> None:
-    image = ball((200, 200), 100.2, 90.7, 14.0, 3.0) + ball((200, 200), 60.4, 195.6, 14.0, 3.0)
+    image = ball((200, 200), 100.2, 90.7, 14.0, 3.0) + ball(
+        (200, 200), 60.4, 195.6, 14.0, 3.0
+    )
     found = detect_beads(image)
     assert found.whole.tolist() == [True, False]
     error = found.centers[1] - [60.4, 195.6]
@@ -139,7 +150,9 @@ def test_a_bead_cut_by_the_edge_is_fitted() -> None:
 def test_two_sizes_of_beads_when_asked() -> None:
     from flexdt.twin.calibration.detect.detection import SpotFinder
 
-    image = ball((200, 200), 60.2, 90.7, 16.0, 4.0) + ball((200, 200), 140.4, 95.6, 8.0, 2.0)
+    image = ball((200, 200), 60.2, 90.7, 16.0, 4.0) + ball(
+        (200, 200), 140.4, 95.6, 8.0, 2.0
+    )
     both = detect_beads(image, SpotFinder(radius_px=(5.0, 20.0), same=float("inf")))
     assert len(both) == 2
     assert len(detect_beads(image)) == 1
@@ -188,12 +201,16 @@ def test_second_look_removes_the_pull_of_the_body() -> None:
 
 def test_second_look_separates_touching_beads_and_fits_cut_ones() -> None:
     poses, truth = scenario("G0", 18)
-    error, _, whole = second_look_errors(bead_phantom("coplanar", 3), poses.cone_vec(truth), 2e4)
+    error, _, whole = second_look_errors(
+        bead_phantom("coplanar", 3), poses.cone_vec(truth), 2e4
+    )
     assert (~whole).sum() >= 5
     assert np.isfinite(error[~whole]).all()
     assert np.sqrt(np.mean(error[~whole] ** 2)) < 0.06
     poses, truth = scenario("G3", 12)
-    error, _, whole = second_look_errors(bead_phantom("tall", 3), poses.cone_vec(truth), 2e4)
+    error, _, whole = second_look_errors(
+        bead_phantom("tall", 3), poses.cone_vec(truth), 2e4
+    )
     assert (~whole).sum() == 24  # two of three beads cut in every frame
     assert np.isfinite(error).all()
     assert np.sqrt(np.mean(error[~whole] ** 2)) < 0.1

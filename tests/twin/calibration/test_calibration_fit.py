@@ -84,10 +84,15 @@ def test_joint_95_ellipsoid_covers_95_percent(beads: int, frames: int) -> None:
     hits, intervals = 0, 0.0
     for seed in range(1000):
         noise = 0.1 * np.random.default_rng(seed).normal(size=exact.shape)
-        certificate = estimate_geometry(exact + noise, model, poses, shape=SHAPE).certificate
+        certificate = estimate_geometry(
+            exact + noise, model, poses, shape=SHAPE
+        ).certificate
         hits += certificate.inside_95(edge(truth))
         intervals += np.mean(
-            [e.low < truth.to_edge()[n] < e.high for n, e in certificate.estimates.items()]
+            [
+                e.low < truth.to_edge()[n] < e.high
+                for n, e in certificate.estimates.items()
+            ]
         )
     assert 930 <= hits <= 970
     assert 930 <= intervals <= 970
@@ -156,14 +161,25 @@ def test_both_readings_of_equation_5_4_give_the_same_geometry() -> None:
     assert mount.values["dO_z"] == pytest.approx(9 + 13.6)
     assert mount.values["tau_x"] == pytest.approx(14.2)
     assert_allclose(
-        poses.cone_vec(mount.parameters).rows, poses.cone_vec(printed.parameters).rows, atol=1e-9
+        poses.cone_vec(mount.parameters).rows,
+        poses.cone_vec(printed.parameters).rows,
+        atol=1e-9,
     )
 
 
 def placements(count: int, frames: int) -> Poses:
     """Scenario G0's start at two SODs, each at lateral positions."""
     poses, _ = scenario("G0", frames)
-    steps = [(0, 0), (30, -150), (-30, -150), (30, 0), (-30, 0), (15, -150), (-15, 0), (0, -150)]
+    steps = [
+        (0, 0),
+        (30, -150),
+        (-30, -150),
+        (30, 0),
+        (-30, 0),
+        (15, -150),
+        (-15, 0),
+        (0, -150),
+    ]
     return Poses.concatenate(
         [
             Poses(
@@ -181,14 +197,18 @@ def placements(count: int, frames: int) -> Poses:
 
 def test_detector_shift_is_weak_from_one_placement_and_fine_from_two() -> None:
     model = spiral(NORMAL, 3)
-    one = identifiability(model, placements(1, 36), 0.1, EIGHT, shape=SHAPE, priors="none")
+    one = identifiability(
+        model, placements(1, 36), 0.1, EIGHT, shape=SHAPE, priors="none"
+    )
     assert one.rank == 8
     assert one.weak[0].names[:2] == ("dD_x", "dO_x")
     assert "another SOD" in one.weak[0].advice
     assert 1.0 < one.sigmas["dD_x"] < 3.0
     assert one.suggestions[0].change.startswith("add a placement at SOD")
     assert one.suggestions[0].worst < 0.2
-    two = identifiability(model, placements(2, 36), 0.1, EIGHT, shape=SHAPE, priors="none")
+    two = identifiability(
+        model, placements(2, 36), 0.1, EIGHT, shape=SHAPE, priors="none"
+    )
     assert not two.weak
     assert two.sigmas["dD_x"] < 0.05
 
@@ -205,7 +225,9 @@ def test_detector_tilts_and_axis_tilts_from_several_placements(count: int) -> No
     truth = Offsets.from_edge(values)
     poses = placements(count, 24)
     model = spiral(NORMAL, 5)
-    result = fit_geometry(exact_tracks(poses, truth, model), model, poses, names, shape=SHAPE)
+    result = fit_geometry(
+        exact_tracks(poses, truth, model), model, poses, names, shape=SHAPE
+    )
     for name, value in values.items():
         assert result.values[name] == pytest.approx(value, abs=1e-6), name
 
@@ -214,7 +236,10 @@ def test_remounted_phantom_has_its_own_mount_parameters() -> None:
     poses, _ = scenario("G0", 18)
     both = Poses.concatenate([poses, poses])
     shared = {"dO_x": -5.0, "dO_y": 3.0, "dO_z": -9.0}
-    mounts = [{"alpha": 10.0, "tau_x": 0.2, "tau_z": -0.1}, {"alpha": 55.0, "tau_x": 3, "tau_z": 2}]
+    mounts = [
+        {"alpha": 10.0, "tau_x": 0.2, "tau_z": -0.1},
+        {"alpha": 55.0, "tau_x": 3, "tau_z": 2},
+    ]
     model = spiral(NORMAL, 4)
     tracks = np.concatenate(
         [exact_tracks(poses, Offsets.from_edge(shared | m), model) for m in mounts]
@@ -243,14 +268,16 @@ def test_gauge_of_a_common_shift_is_held_and_explained() -> None:
 
 
 def test_bundle_adjustment_is_honest_about_bead_tolerance() -> None:
-    """Beads off by 0.05 mm: s^2 (J'J)^-1 alone is many sigma off; freed beads are not, nor is the
-    certificate that sees their errors repeat with the turn."""
+    """Beads off by 0.05 mm: s^2 (J'J)^-1 alone is many sigma off; freed beads are not, nor is
+    the certificate that sees their errors repeat with the turn."""
     poses, truth = scenario("G0", 36)
     nominal = spiral(NORMAL, 5)
     naive, widened, honest = 0, 0, 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        real = BeadModel(nominal.beads + 0.05 * rng.normal(size=(5, 3)), nominal.bead_radius_mm)
+        real = BeadModel(
+            nominal.beads + 0.05 * rng.normal(size=(5, 3)), nominal.bead_radius_mm
+        )
         tracks = exact_tracks(poses, truth, real) + 0.02 * rng.normal(size=(36, 5, 2))
         plain = estimate_geometry(tracks, nominal, poses, shape=SHAPE).certificate
         bundle = estimate_geometry(
@@ -274,14 +301,19 @@ def test_free_beads_need_a_tolerance() -> None:
     poses, truth = scenario("G0", 6)
     model = spiral(NORMAL, 3)
     with pytest.raises(TwinError, match="tolerance"):
-        fit_geometry(exact_tracks(poses, truth, model), model, poses, shape=SHAPE, free_beads=True)
+        fit_geometry(
+            exact_tracks(poses, truth, model), model, poses, shape=SHAPE, free_beads=True
+        )
 
 
 def test_angle_scale_absorbs_the_endpoint_error() -> None:
-    """360 / (N - 1) steps read as 360 / N: the factor is recovered (calibration.md, point 2)."""
+    """360 / (N - 1) steps read as 360 / N: the factor is recovered (calibration.md, point
+    2)."""
     poses, truth = scenario("G0", 36)
     model = spiral(NORMAL, 5)
-    real = Poses(poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle * 36 / 35)
+    real = Poses(
+        poses.source, poses.axis, poses.detector, poses.u, poses.v, poses.angle * 36 / 35
+    )
     tracks = exact_tracks(real, truth, model)
     wrong = estimate_geometry(tracks, model, poses, shape=SHAPE)
     right = fit_geometry(tracks, model, poses, (*SIX, "angle_scale"), shape=SHAPE)

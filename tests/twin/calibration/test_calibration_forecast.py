@@ -10,7 +10,13 @@ import prior_coverage as own
 import pytest
 
 from flexdt.phantoms import load_phantom, spiral_positions
-from flexdt.twin.calibration import SIX, BeadModel, FitResult, estimate_geometry, identifiability
+from flexdt.twin.calibration import (
+    SIX,
+    BeadModel,
+    FitResult,
+    estimate_geometry,
+    identifiability,
+)
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.priors import Given, exact, known, known_strain
 from flexdt.twin.calibration.frame_source import ArrayFrames
@@ -20,8 +26,17 @@ from flexdt.twin.geometry.poses import Poses
 
 FRAMES = 36
 ANGLES = 360.0 * np.arange(FRAMES) / FRAMES
-POSES = Poses.upright([0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(ANGLES))
-TRUTH = {"dO_x": 1.0, "dO_y": -2.0, "dO_z": 3.0, "alpha": 17.0, "tau_x": 0.4, "tau_z": -0.3}
+POSES = Poses.upright(
+    [0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(ANGLES)
+)
+TRUTH = {
+    "dO_x": 1.0,
+    "dO_y": -2.0,
+    "dO_z": 3.0,
+    "alpha": 17.0,
+    "tau_x": 0.4,
+    "tau_z": -0.3,
+}
 AGREE = 0.2
 STATED: tuple[Given | None, ...] = (None, {"dD_x": 0.1, "dD_y": 0.1}, "none")
 
@@ -44,7 +59,9 @@ def assert_as_forecast(fit: FitResult, model: BeadModel, priors: Given | None) -
         assert forecast.sigmas[name] == pytest.approx(fit.sigmas[name], rel=AGREE), name
     (seen,) = image_quantities(fit)
     for name, estimate in seen.items():
-        assert forecast.image_sigmas[name] == pytest.approx(estimate.sigma, rel=AGREE), name
+        assert forecast.image_sigmas[name] == pytest.approx(estimate.sigma, rel=AGREE), (
+            name
+        )
 
 
 @pytest.mark.parametrize("priors", STATED)

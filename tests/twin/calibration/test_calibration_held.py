@@ -13,15 +13,31 @@ from spoilt_scans import careful_scan
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import SIX, Reading, estimate_geometry
 from flexdt.twin.calibration.bead_model import bead_model
-from flexdt.twin.calibration.diagnose.fixed_parameters import HELD_SIGMAS, held_distance, judge_held
+from flexdt.twin.calibration.diagnose.fixed_parameters import (
+    HELD_SIGMAS,
+    held_distance,
+    judge_held,
+)
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
-TRUTH = {"dO_x": 0.5, "dO_y": -0.2, "dO_z": 0.8, "alpha": 2.0, "tau_x": -0.2, "tau_z": 0.5}
+TRUTH = {
+    "dO_x": 0.5,
+    "dO_y": -0.2,
+    "dO_z": 0.8,
+    "alpha": 2.0,
+    "tau_x": -0.2,
+    "tau_z": 0.5,
+}
 LEGO = load_phantom("lego")
 FRAMES = 24
 
@@ -71,7 +87,9 @@ def scan() -> tuple[Poses, Float32Array]:
     return poses, radiographs(LEGO, cone, 20_000.0, 5)
 
 
-def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) -> Calibration:
+def calibrated(
+    scan: tuple[Poses, Float32Array], request: CalibrationRequest
+) -> Calibration:
     poses, images = scan
     return calibrate([Scan(ArrayFrames(list(images), SHAPE), poses)], LEGO, request)
 
@@ -88,7 +106,10 @@ def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) ->
 )
 @pytest.mark.campaign(4)
 def test_a_held_parameter_that_is_off_is_no_confident_answer(
-    scan: tuple[Poses, Float32Array], free: tuple[str, ...], says: str, tolerance: float | None
+    scan: tuple[Poses, Float32Array],
+    free: tuple[str, ...],
+    says: str,
+    tolerance: float | None,
 ) -> None:
     """Freed bead positions used to absorb it: hundreds of sigmas off, called identifiable."""
     known = exact(free)
@@ -103,7 +124,8 @@ def test_a_held_parameter_that_is_off_is_no_confident_answer(
 def test_a_parameter_that_is_not_asked_for_is_not_taken_to_be_exact(
     scan: tuple[Poses, Float32Array],
 ) -> None:
-    """tau lies 0.2 and 0.5 mm from where it is fixed; what is estimated is right all the same."""
+    """tau lies 0.2 and 0.5 mm from where it is fixed; what is estimated is right all the
+    same."""
     fit = calibrated(scan, CalibrationRequest(free=("dO_x", "dO_y", "dO_z", "alpha"))).fit
     assert fit is not None
     for name, true in TRUTH.items():
@@ -133,7 +155,9 @@ def test_a_cause_that_looks_like_another_is_named_beside_it() -> None:
 
 
 @pytest.mark.parametrize("reading", list(Reading))
-@pytest.mark.parametrize("held", [("tau_x", "tau_z"), ("dO_y", "dO_z", "alpha", "tau_x", "tau_z")])
+@pytest.mark.parametrize(
+    "held", [("tau_x", "tau_z"), ("dO_y", "dO_z", "alpha", "tau_x", "tau_z")]
+)
 @pytest.mark.daily(2)
 def test_a_parameter_held_where_it_is_stays_held(
     scan: tuple[Poses, Float32Array], held: tuple[str, ...], reading: Reading
@@ -146,7 +170,9 @@ def test_a_parameter_held_where_it_is_stays_held(
     assert result.identifiable
     assert result.findings == ()
     assert result.fit is not None
-    assert [n for n, e in result.fit.certificate.estimates.items() if e.asked] == list(free)
+    assert [n for n, e in result.fit.certificate.estimates.items() if e.asked] == list(
+        free
+    )
     edge = result.fit.parameters.to_edge()
     for name in free:
         assert abs(edge[name] - TRUTH[name]) < 5 * result.fit.sigmas[name]
@@ -155,13 +181,16 @@ def test_a_parameter_held_where_it_is_stays_held(
 def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
     scan: tuple[Poses, Float32Array],
 ) -> None:
-    """Held three sigmas off: too little to be named, enough to move what hangs together with it."""
+    """Held three sigmas off: too little to be named, enough to move what hangs together with
+    it."""
     best = calibrated(scan, CalibrationRequest(priors=exact(SIX))).fit
     assert best is not None
     off = best.values["tau_x"] + 3.5 * best.sigmas["tau_x"]
     free = tuple(n for n in SIX if n != "tau_x")
     start = Offsets.from_edge({"tau_x": off})
-    result = calibrated(scan, CalibrationRequest(free=free, start=start, priors=exact(free)))
+    result = calibrated(
+        scan, CalibrationRequest(free=free, start=start, priors=exact(free))
+    )
     assert result.identifiable
     assert result.fit is not None
     moved = abs(result.fit.values["dO_x"] - best.values["dO_x"])
@@ -196,7 +225,9 @@ def test_one_bead_can_still_show_where_it_is() -> None:
     held = {n: TRUTH[n] for n in ("dO_z", "alpha", "tau_x", "tau_z")}
     for start, good in ((held, True), (held | {"tau_z": 0.0}, False)):
         free = ("dO_x", "dO_y")
-        request = CalibrationRequest(free=free, start=Offsets.from_edge(start), priors=exact(free))
+        request = CalibrationRequest(
+            free=free, start=Offsets.from_edge(start), priors=exact(free)
+        )
         frames = ArrayFrames(list(images), SHAPE)
         result = calibrate([Scan(frames, poses)], model, request, scene=bead.scene)
         assert result.identifiable == good

@@ -1,4 +1,5 @@
-"""Identification at any angle, with missing and false shadows; ambiguity; the thesis's matching."""
+"""Identification at any angle, with missing and false shadows; ambiguity; the thesis's
+matching."""
 
 from __future__ import annotations
 
@@ -27,13 +28,19 @@ def test_beads_are_told_apart_at_any_start_angle(
     model = spiral((20, 40, 60), beads)
     for seed in range(12):
         poses, truth = scenario(f"G{seed % 5}", frames)
-        truth = replace(truth, alpha=float(np.random.default_rng(seed).uniform(-3.1, 3.1)))
+        truth = replace(
+            truth, alpha=float(np.random.default_rng(seed).uniform(-3.1, 3.1))
+        )
         tracks = exact_tracks(poses, truth, model)
-        found = identify(shadows(tracks, seed, missing=missing, false=false), model, poses)
+        found = identify(
+            shadows(tracks, seed, missing=missing, false=false), model, poses
+        )
         error = np.linalg.norm(found.tracks - tracks, axis=2)
         seen = np.isfinite(error)
         assert seen.mean() > 0.9 * (1 - missing) - 0.1
-        assert np.mean(error[seen] < 0.5) > 0.98, seed  # a false shadow may lie within the gate
+        assert np.mean(error[seen] < 0.5) > 0.98, (
+            seed
+        )  # a false shadow may lie within the gate
         assert not found.ambiguous
         assert abs(found.parameters.alpha) <= np.pi + 1e-9
 

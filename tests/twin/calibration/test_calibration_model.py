@@ -10,7 +10,12 @@ from calibration_scenarios import SHAPE, exact_tracks, scenario, spiral
 from numpy.testing import assert_allclose
 
 from flexdt.twin.calibration import BeadModel, Centre, Reading
-from flexdt.twin.calibration.fit.problem import build_problem, layout, to_printed_reading, whitening
+from flexdt.twin.calibration.fit.problem import (
+    build_problem,
+    layout,
+    to_printed_reading,
+    whitening,
+)
 from flexdt.twin.calibration.fit.weak_directions import Direction, advise
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES, Offsets
@@ -39,7 +44,9 @@ def test_kernel_projects_as_cone_vec_does(seed: int, reading: Reading) -> None:
     assert_allclose(predicted, tracks, atol=1e-9)
     assert norms.max() < 1e-9
     back = problem.parameters(problem.start)[0]
-    assert_allclose(list(back.to_edge().values()), list(truth.to_edge().values()), atol=1e-12)
+    assert_allclose(
+        list(back.to_edge().values()), list(truth.to_edge().values()), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("centre", list(Centre))
@@ -63,7 +70,8 @@ def test_jacobian_is_the_derivative(centre: Centre, reading: Reading) -> None:
     def whitened(value: np.ndarray) -> np.ndarray:
         p = problem.residuals(value)[0]
         return np.stack(
-            [w[..., 0] * p[..., 0] + w[..., 1] * p[..., 1], w[..., 2] * p[..., 1]], axis=-1
+            [w[..., 0] * p[..., 0] + w[..., 1] * p[..., 1], w[..., 2] * p[..., 1]],
+            axis=-1,
         ).ravel()
 
     for j, name in enumerate(problem.layout.names):
@@ -74,7 +82,10 @@ def test_jacobian_is_the_derivative(centre: Centre, reading: Reading) -> None:
             - (whitened(x + 2 * step) - whitened(x - 2 * step))
         ) / (12 * 1e-4)
         assert_allclose(
-            analytic[:, j], numeric, atol=2e-8 * max(1.0, np.abs(numeric).max()), err_msg=name
+            analytic[:, j],
+            numeric,
+            atol=2e-8 * max(1.0, np.abs(numeric).max()),
+            err_msg=name,
         )
 
 
@@ -102,10 +113,14 @@ def test_sphere_centre_bias_against_the_outline_of_a_cone() -> None:
     middle = np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e]) + outline.mean(axis=0)
     model = BeadModel(centre[None], np.array(radius))
     point = cone.project_points(centre[None], SHAPE)
-    problem = build_problem(point, model, poses, free=("dO_x",), shape=SHAPE, centre=Centre.OUTLINE)
+    problem = build_problem(
+        point, model, poses, free=("dO_x",), shape=SHAPE, centre=Centre.OUTLINE
+    )
     shadow = problem.residuals(problem.start)[0][0, 0]
     assert np.linalg.norm(shadow - point[0, 0]) > 0.01
-    assert_allclose(shadow, middle, atol=2e-4 * np.linalg.norm(shadow - point[0, 0]) + 1e-6)
+    assert_allclose(
+        shadow, middle, atol=2e-4 * np.linalg.norm(shadow - point[0, 0]) + 1e-6
+    )
 
 
 def test_the_two_readings_convert_exactly() -> None:
@@ -134,7 +149,12 @@ def test_bad_arguments_are_named() -> None:
         build_problem(tracks[:3], model, poses, free=("dO_x",), shape=SHAPE)
     with pytest.raises(TwinError, match="positive definite"):
         build_problem(
-            tracks, model, poses, free=("dO_x",), shape=SHAPE, covariances=np.zeros((4, 3, 2, 2))
+            tracks,
+            model,
+            poses,
+            free=("dO_x",),
+            shape=SHAPE,
+            covariances=np.zeros((4, 3, 2, 2)),
         )
 
 

@@ -32,7 +32,8 @@ def test_what_moves_is_found_and_what_does_not_is_not(kind: str) -> None:
 
 @pytest.mark.slow
 def test_a_drift_that_breaks_off_is_no_turn_of_the_table() -> None:
-    """Errors over sigmas of tau_z, of deviations: drifts level at the ends made them 2.6, 1.9."""
+    """Errors over sigmas of tau_z, of deviations: drifts level at the ends made them 2.6,
+    1.9."""
     rows = [study.one(seed, "spot", images=False) for seed in range(1, 6)]
     place = study.SIX.index("tau_z")
     assert np.sqrt(np.mean([r["pulls"][place] ** 2 for r in rows])) < 2.0
@@ -74,9 +75,14 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
             for size, amplitudes in zip(sizes, model.spectrum(i, pick), strict=True):
                 bends = np.diff(np.eye(size), 2, axis=0)
                 waves = pick[1]
-                stiff = (2 * np.sin(np.pi * waves / (2 * size))) ** 2 if waves < size else np.inf
+                stiff = (
+                    (2 * np.sin(np.pi * waves / (2 * size))) ** 2
+                    if waves < size
+                    else np.inf
+                )
                 blocks.append(
-                    amplitudes[0] * linalg.inv(np.eye(size) + (bends.T @ bends) / stiff**2)
+                    amplitudes[0]
+                    * linalg.inv(np.eye(size) + (bends.T @ bends) / stiff**2)
                 )
             k = linalg.block_diag(*blocks)
             variance += z @ k @ z.T
@@ -100,9 +106,18 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
                 if label >= 0:
                     change[label, here] += 1.0 / len(here)
         covariance = rest / freedom * change @ joint @ change.T
-        return value - 0.5 * freedom * np.log(rest), change @ found, covariance, rest / freedom
+        return (
+            value - 0.5 * freedom * np.log(rest),
+            change @ found,
+            covariance,
+            rest / freedom,
+        )
 
-    choices = [((1.0, 1.0), (0.1, 4.0)), ((10.0, 4.0), (0.3, math.inf)), ((3.0, 16.0), (30.0, 4.0))]
+    choices = [
+        ((1.0, 1.0), (0.1, 4.0)),
+        ((10.0, 4.0), (0.3, math.inf)),
+        ((3.0, 16.0), (30.0, 4.0)),
+    ]
     ours = [model.likelihood(choice) for choice in choices]
     theirs = [dense(choice)[0] for choice in choices]
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
@@ -120,14 +135,18 @@ def test_a_motion_goes_into_poses_and_documents() -> None:
     rng = np.random.default_rng(4)
     poses = scenario("G1", 9)[0]
     values = rng.normal(size=(9, len(MOVABLE)))
-    motion = Motion(MOVABLE, values, np.abs(values), tuple(rng.random(len(MOVABLE)).tolist()))
+    motion = Motion(
+        MOVABLE, values, np.abs(values), tuple(rng.random(len(MOVABLE)).tolist())
+    )
     moved = motion.applied(poses)
     d = dict(zip(MOVABLE, values.T, strict=True))
     # The thesis's x is across, y upwards, z along the beam.
     for part, name in (("axis", "dO"), ("detector", "dD"), ("source", "dS")):
         off = getattr(moved, part) - getattr(poses, part)
         along = d.get(f"{name}_z", np.zeros(9))
-        np.testing.assert_allclose(off, np.stack([d[f"{name}_x"], along, d[f"{name}_y"]], 1))
+        np.testing.assert_allclose(
+            off, np.stack([d[f"{name}_x"], along, d[f"{name}_y"]], 1)
+        )
     np.testing.assert_allclose(moved.angle - poses.angle, d["alpha"])
     back = motion.applied(moved, -1.0)
     np.testing.assert_allclose(back.axis, poses.axis)
@@ -141,7 +160,9 @@ def test_a_motion_goes_into_poses_and_documents() -> None:
 
 
 def test_what_is_no_motion_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match="'tau_x' cannot differ from frame to frame"):
+    with pytest.raises(
+        UnknownNameError, match="'tau_x' cannot differ from frame to frame"
+    ):
         CalibrationRequest(per_frame=("tau_x",))
     values = np.ones((3, 1))
     motion = Motion(("dO_x",), values, values, (9.0,))
@@ -154,7 +175,10 @@ def test_what_is_no_motion_is_refused() -> None:
         ({"dO_x": {**good, "values": [1, None, 2]}}, "not a number a frame"),
         ({"dO_x": {**good, "values": ["a"]}}, "motion of dO_x"),
         ({"dO_x": {"values": [1]}}, "motion of dO_x"),
-        ({"dO_x": good, "dO_y": {**good, "values": [1], "sigmas": [1]}}, "different numbers"),
+        (
+            {"dO_x": good, "dO_y": {**good, "values": [1], "sigmas": [1]}},
+            "different numbers",
+        ),
     ):
         with pytest.raises(TwinError, match=said):
             Motion.from_dict(bad)

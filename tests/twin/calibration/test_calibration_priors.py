@@ -38,11 +38,15 @@ def tracks(seed: int = 1, **offsets: float):  # type: ignore[no-untyped-def]
 def test_a_detector_aside_is_no_confident_error() -> None:
     """A detector 0.6 mm aside moved dO_x by 341 um at a stated 0.2 um."""
     seen = tracks(dD_x=0.6)
-    exact = estimate_geometry(seen, BEADS, poses(), shape=SHAPE).certificate.estimates["dO_x"]
+    exact = estimate_geometry(seen, BEADS, poses(), shape=SHAPE).certificate.estimates[
+        "dO_x"
+    ]
     assert abs(exact.value - 0.5) > 100 * exact.sigma
     fit = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=PRIORS)
     found = fit.certificate.estimates["dO_x"]
-    assert abs(found.value - 0.5) < 3 * found.sigma  # 0.6 is 2.4 standard deviations of the prior
+    assert (
+        abs(found.value - 0.5) < 3 * found.sigma
+    )  # 0.6 is 2.4 standard deviations of the prior
     assert 0.1 < found.sigma < 0.3
     assert found.images < 0.002
     assert next(iter(found.priors)) == "dD_x"
@@ -65,10 +69,13 @@ def test_the_measurement_that_is_named_tells_more() -> None:
 
 def test_where_the_images_say_nothing_the_estimate_is_todays_plus_the_prior() -> None:
     """Schmidt's consider analysis: with dD_x alone unknown, the values stay and the covariance
-    grows by sensitivity times width. The sensitivity is measured by refitting with dD_x moved."""
+    grows by sensitivity times width. The sensitivity is measured by refitting with dD_x
+    moved."""
     seen = tracks()
     today = estimate_geometry(seen, BEADS, poses(), shape=SHAPE)
-    with_prior = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors={"dD_x": 1e-3})
+    with_prior = estimate_geometry(
+        seen, BEADS, poses(), shape=SHAPE, priors={"dD_x": 1e-3}
+    )
     moved = []
     for shift in (-0.5, 0.5):
         aside = poses()
@@ -132,7 +139,10 @@ def test_a_bound_makes_a_direction_not_identifiable() -> None:
 def test_widths_come_from_profile_machine_and_request() -> None:
     machine, profile = builtin_machine(), builtin_profile("thesis")
     assert prior_widths(machine, profile) == ASSUMED | machine.priors
-    assert prior_widths(None, profile.model_copy(update={"priors": {"dD_x": 0.0}}))["dD_x"] == 0.0
+    assert (
+        prior_widths(None, profile.model_copy(update={"priors": {"dD_x": 0.0}}))["dD_x"]
+        == 0.0
+    )
     assert set(exact()) - set(exact(("dD_x",))) == {"dD_x"}
     with pytest.raises(TwinError, match=r"allowed: 0 \(exactly known\) or more"):
         CalibrationRequest(priors={"dD_x": -1.0})
@@ -145,7 +155,8 @@ def test_widths_come_from_profile_machine_and_request() -> None:
 
 
 def test_a_turn_of_everything_about_the_source_is_named() -> None:
-    """Two placements that share nothing of the stage's place: dD_x was +- 22 mm, identifiable."""
+    """Two placements that share nothing of the stage's place: dD_x was +- 22 mm,
+    identifiable."""
     seen = np.concatenate([pixels(BEADS, ANGLES, sod, SIX) for sod in (SOD, 450.0)])
     seen += NOISE_PX * np.random.default_rng(1).normal(size=seen.shape)
     both = Poses.concatenate([poses(), poses(450.0)])
@@ -159,14 +170,17 @@ def test_a_turn_of_everything_about_the_source_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("off", "told"), [(0.0, ""), (0.5, ""), (1.0, "widened"), (2.0, "refused"), (4.0, "refused")]
+    ("off", "told"),
+    [(0.0, ""), (0.5, ""), (1.0, "widened"), (2.0, "refused"), (4.0, "refused")],
 )
 def test_priors_that_are_too_narrow_are_widened_or_refused(off: float, told: str) -> None:
     """The images say SDD to 0.2 mm, and its prior is 0.1 mm wide."""
     seen = pixels(BEADS, ANGLES, SOD, SIX | {"dD_z": off})
     seen = seen + NOISE_PX / 5 * np.random.default_rng(2).normal(size=seen.shape)
     priors = loosened(PRIORS | {"dD_z": 0.1})
-    judged = judge_priors(estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=priors))
+    judged = judge_priors(
+        estimate_geometry(seen, BEADS, poses(), shape=SHAPE, priors=priors)
+    )
     assert (judged.factor > 1.0) == (told == "widened")
     assert (judged.finding is not None) == (told == "refused")
     if judged.finding is not None:
@@ -177,6 +191,8 @@ def test_priors_that_are_too_narrow_are_widened_or_refused(off: float, told: str
 def test_exact_positions_are_no_reason_to_refuse(noise: float) -> None:
     exact_tracks = pixels(BEADS, ANGLES, SOD, SIX)
     seen = exact_tracks + noise * np.random.default_rng(2).normal(size=exact_tracks.shape)
-    fit = estimate_geometry(seen, load_phantom("lego"), poses(), shape=SHAPE, priors=ASSUMED)
+    fit = estimate_geometry(
+        seen, load_phantom("lego"), poses(), shape=SHAPE, priors=ASSUMED
+    )
     assert fit.identifiable
     assert all(abs(fit.values[n] - v) < 1e-4 for n, v in SIX.items())

@@ -1,5 +1,6 @@
-"""A gap between tiles is told by both ends of rays: steps of drawn profiles, and natural objects
-of tests/studies/natural_objects.py, whose renderer shares nothing with what is tested."""
+"""A gap between tiles is told by both ends of rays: steps of drawn profiles, and natural
+objects of tests/studies/natural_objects.py, whose renderer shares nothing with what is
+tested."""
 
 from __future__ import annotations
 
@@ -14,7 +15,9 @@ def profile(shift: np.ndarray, sigma: float, columns: int = 80) -> Profile:
     """Make a profile of bins of 5 columns each, all of which tell as much."""
     radius = np.arange(columns) + 0.5
     place = np.arange(columns) // 5
-    return Profile.of(radius, np.ones(columns), place, shift, np.full(len(shift), sigma), 1.5)
+    return Profile.of(
+        radius, np.ones(columns), place, shift, np.full(len(shift), sigma), 1.5
+    )
 
 
 def test_steps_are_told_and_what_bends_or_scatters_is_not() -> None:
@@ -24,7 +27,10 @@ def test_steps_are_told_and_what_bends_or_scatters_is_not() -> None:
     for _ in range(20):
         sigma = rng.uniform(0.01, 0.1)
         scatter = rng.normal(0, sigma * rng.choice([1, 3]), 16)
-        bent = rng.uniform(-0.3, 0.3) * middle / 80 + rng.uniform(-0.3, 0.3) * (middle / 80) ** 2
+        bent = (
+            rng.uniform(-0.3, 0.3) * middle / 80
+            + rng.uniform(-0.3, 0.3) * (middle / 80) ** 2
+        )
         lump = rng.uniform(-1, 1) * np.exp(-np.square((middle - rng.uniform(20, 60)) / 6))
         for shape in (0.0, bent, lump):
             assert not profile(scatter + shape, sigma).best().significant

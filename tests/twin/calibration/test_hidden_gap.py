@@ -1,4 +1,5 @@
-"""A gap beside the axis is told, excluded, or left in the sigma, by what single frames show of it.
+"""A gap beside the axis is told, excluded, or left in the sigma, by what single frames show of
+it.
 
 Frames of streaks that pass all columns, written out here, with and without a gap.
 """
@@ -17,7 +18,8 @@ FRAMES, ROWS, COLUMNS = 90, 16, 72
 def streaks(
     rng: np.random.Generator, half_width: float, first: int, gap: float
 ) -> list[np.ndarray]:
-    """Frames of bodies that pass all columns, from column `first` on sampled `gap` further on."""
+    """Frames of bodies that pass all columns, from column `first` on sampled `gap` further
+    on."""
     at = np.arange(COLUMNS) + gap * (np.arange(COLUMNS) >= first)
     out = []
     start = rng.uniform(0, 3 * COLUMNS, (ROWS, 9, 1))

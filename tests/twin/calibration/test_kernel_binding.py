@@ -31,8 +31,8 @@ UNUSED = (1, 1)  # frame, bead
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Poses without any symmetry, all seventeen offsets, beads, a distorted panel, and observations
-    nearby."""
+    """Poses without any symmetry, all seventeen offsets, beads, a distorted panel, and
+    observations nearby."""
 
     poses: Poses
     offsets: Offsets
@@ -55,10 +55,15 @@ def case(seed: int) -> Case:
         u=[0.9, 0.2, -0.3] + 0.1 * noise[3],
         v=[-0.2, 0.3, -1.1] + 0.1 * noise[4],
         angle=rng.uniform(-9.0, 9.0, FRAMES),
-        mount=np.random.default_rng([seed, 1]).uniform(-6.0, 6.0, (FRAMES, 3)) * [1.0, 1.0, 0.0],
+        mount=np.random.default_rng([seed, 1]).uniform(-6.0, 6.0, (FRAMES, 3))
+        * [1.0, 1.0, 0.0],
     )
     values = rng.uniform(0.1, 0.4, len(NAMES)) * rng.choice([-1.0, 1.0], len(NAMES))
-    lengths = [i for i, name in enumerate(NAMES) if name[0] in "dt" and not name.startswith("det")]
+    lengths = [
+        i
+        for i, name in enumerate(NAMES)
+        if name[0] in "dt" and not name.startswith("det")
+    ]
     values[lengths] *= 20.0
     values[-1] = 1.0 + 0.1 * values[-1]
     case = Case(
@@ -92,7 +97,8 @@ def expected(case: Case, x: np.ndarray | None = None) -> np.ndarray:
     # The foot of the perpendicular: the projection of any point straight ahead of the source.
     foot = np.stack(
         [
-            cone[i : i + 1].project_points((cone.source + normal)[i : i + 1], SHAPE)[0, 0] - middle
+            cone[i : i + 1].project_points((cone.source + normal)[i : i + 1], SHAPE)[0, 0]
+            - middle
             for i in range(FRAMES)
         ]
     )
@@ -141,7 +147,9 @@ def reference(case: Case) -> Reference:
     used = np.ones_like(length, dtype=bool)
     used[UNUSED] = False
     weight = np.where(used, np.minimum(1.0, HUBER / length), 0.0)
-    cost = np.where(length <= HUBER, 0.5 * length**2, HUBER * (length - 0.5 * HUBER))[used].sum()
+    cost = np.where(length <= HUBER, 0.5 * length**2, HUBER * (length - 0.5 * HUBER))[
+        used
+    ].sum()
     return Reference(
         case, predicted, np.where(used[..., None, None], rows, 0.0),
         np.where(used, length, -1.0), float(cost),
@@ -187,7 +195,9 @@ def check(kernels: object, want: Reference) -> None:
         assert_allclose(cost, want.cost, rtol=1e-9)
         if mode == 2:
             scale = np.abs(want.rows).max(axis=(0, 1, 2))
-            assert_allclose(jac.reshape(want.rows.shape) / scale, want.rows / scale, atol=1e-8)
+            assert_allclose(
+                jac.reshape(want.rows.shape) / scale, want.rows / scale, atol=1e-8
+            )
         else:
             scale = np.sqrt(np.diag(want.hess))
             assert_allclose(grad / scale, want.grad / scale, atol=1e-7)
@@ -207,8 +217,9 @@ OPPOSITE = {ast.Add: ast.Sub, ast.Sub: ast.Add}
 def flips(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
     """Every sign in the geometry of the kernel: (its line, the node that has it).
 
-    A sign is a + or -, a minus before a value, or an offset `p[NAME]` that is added without one.
-    Arithmetic of indices (inside brackets and `range`) has none, nor has a cosine's argument.
+    A sign is a + or -, a minus before a value, or an offset `p[NAME]` that is added without
+    one. Arithmetic of indices (inside brackets and `range`) has none, nor has a cosine's
+    argument.
     """
 
     def walk(node: ast.AST) -> Iterator[ast.AST]:
@@ -217,7 +228,11 @@ def flips(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("range", "math.cos"):
             return  # a cosine does not see the sign of its argument
         yield node
-        children = [node.value] if isinstance(node, ast.Subscript) else ast.iter_child_nodes(node)
+        children = (
+            [node.value]
+            if isinstance(node, ast.Subscript)
+            else ast.iter_child_nodes(node)
+        )
         for child in children:
             yield from walk(child)
 
@@ -225,7 +240,9 @@ def flips(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
         if isinstance(function, ast.FunctionDef) and function.name in FUNCTIONS:
             for node in walk(function):
                 operator = type(getattr(node, "op", None))
-                offset = isinstance(node, ast.Subscript) and ast.unparse(node.value) == "p"
+                offset = (
+                    isinstance(node, ast.Subscript) and ast.unparse(node.value) == "p"
+                )
                 if operator in (ast.Add, ast.Sub, ast.USub) or offset:
                     yield ast.unparse(node), node
 

@@ -17,7 +17,12 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.detection import detect_beads
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.panel import Border, Panel, PanelModel
@@ -56,7 +61,9 @@ def test_an_image_is_straightened(seed: int) -> None:
     row, column = np.mgrid[:90, :120].astype(float)
 
     def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.sin(0.21 * x + 0.5) * np.cos(0.17 * y) + 0.3 * np.sin(0.1 * x - 0.13 * y)
+        return np.sin(0.21 * x + 0.5) * np.cos(0.17 * y) + 0.3 * np.sin(
+            0.1 * x - 0.13 * y
+        )
 
     d = panel.shift(np.stack([column, row], axis=-1))
     seen = pattern(column - d[..., 0], row - d[..., 1]).astype(np.float32)
@@ -71,7 +78,13 @@ def test_the_document_comes_back_and_what_is_none_is_refused() -> None:
     again = Panel.from_json(json.loads(json.dumps(panel.to_json())))
     place = np.array([[12.0, 30.0], [100.0, 80.0]])
     assert again.shift(place) == pytest.approx(panel.shift(place), abs=0)
-    for spoilt in ({}, {"shape": [90]}, {**panel.to_json(), "coefficients": {}}, [], None):
+    for spoilt in (
+        {},
+        {"shape": [90]},
+        {**panel.to_json(), "coefficients": {}},
+        [],
+        None,
+    ):
         with pytest.raises(TwinError, match="panel's distortion cannot be read"):
             Panel.from_json(spoilt)  # type: ignore[arg-type]
     with pytest.raises(TwinError, match="distortion is of those"):
@@ -80,10 +93,13 @@ def test_the_document_comes_back_and_what_is_none_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_barrel_in_the_images_is_found_and_undone() -> None:
-    """Images of a renderer of its own are warped; the map then puts the spots where they were. Of a
-    phantom that is known exactly: five beads do not tell a barrel from a strain of .1 %."""
+    """Images of a renderer of its own are warped; the map then puts the spots where they were.
+    Of a phantom that is known exactly: five beads do not tell a barrel from a strain of .1
+    %."""
     rng = np.random.default_rng(3)
-    beads = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
+    beads = np.array(
+        [[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]]
+    )
     angles, sod = 15.0 * np.arange(24), 420.0
     truth = {"dO_x": 1.2, "dO_y": -0.7, "dO_z": 3.0, "alpha": 20.0, "det_pitch": 0.2}
     images = radiographs(rng, beads, angles, sod, truth)
@@ -91,7 +107,8 @@ def test_a_barrel_in_the_images_is_found_and_undone() -> None:
     x, y = (column - 477.5) / 305, (row - 379.5) / 305
     bulge = 0.8 * (x * x + y * y)
     bent = [
-        cv2.remap(image, column - bulge * x, row - bulge * y, cv2.INTER_CUBIC) for image in images
+        cv2.remap(image, column - bulge * x, row - bulge * y, cv2.INTER_CUBIC)
+        for image in images
     ]
     poses = Poses.upright([0, 0, 0], [0, sod, 0], [0, SDD, 0], PIXEL, np.radians(angles))
     model = BeadModel(beads, np.full(5, 1.0))
@@ -108,7 +125,9 @@ def test_a_barrel_in_the_images_is_found_and_undone() -> None:
     for image, ideal in zip(bent, pixels(beads, angles, sod, truth), strict=True):
         for some, shown in ((straight, panel.undistorted(image)), (before, image)):
             spots = detect_beads(shown, radius_px=(5, 30)).centers
-            some.append(spots[np.linalg.norm(spots[:, None] - ideal, axis=2).argmin(axis=0)])
+            some.append(
+                spots[np.linalg.norm(spots[:, None] - ideal, axis=2).argmin(axis=0)]
+            )
     ideal = pixels(beads, angles, sod, truth).reshape(-1, 2)
     # Shift, turn, scale and perspective belong to the geometry.
     u, v = ((ideal - [477.5, 379.5]) / 305).T
@@ -130,7 +149,9 @@ def test_a_barrel_in_the_images_is_found_and_undone() -> None:
 
 def test_lag_that_is_seen_is_of_the_panel() -> None:
     poses = Poses.upright([0, 0, 0], [0, 600, 0], [0, 1059, 0], 0.15, np.zeros(1))
-    scans = tuple(Scan(ArrayFrames([np.zeros(SMALL, np.float32)], SMALL), poses) for _ in range(3))
+    scans = tuple(
+        Scan(ArrayFrames([np.zeros(SMALL, np.float32)], SMALL), poses) for _ in range(3)
+    )
     model = BeadModel(np.zeros((1, 3)), np.ones(1))
     found = Calibration(None, (), (), (), (), scans, model)
     assert found.panel is None
@@ -148,7 +169,8 @@ def test_lag_that_is_seen_is_of_the_panel() -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("width", [0.3, 0.9, 1.7])
 def test_a_gap_is_filled_from_the_lines_beside_it(axis: int, width: float) -> None:
-    """A ramp, of which the gap hides a part, is a ramp again, but where the kernel sees both."""
+    """A ramp, of which the gap hides a part, is a ramp again, but where the kernel sees
+    both."""
     first = 40
     panel = dataclasses.replace(
         Panel.flat(SMALL), model=PanelModel(0.0, SMALL, (Border(axis, 39.5),))
@@ -158,7 +180,9 @@ def test_a_gap_is_filled_from_the_lines_beside_it(axis: int, width: float) -> No
     panel = dataclasses.replace(panel, coefficients=(*panel.coefficients, *shift))
     place = np.arange(SMALL[1 - axis], dtype=np.float32)
     line = place + width * (place >= first)
-    image = np.broadcast_to(line if axis == 0 else line[:, None], SMALL).astype(np.float32)
+    image = np.broadcast_to(line if axis == 0 else line[:, None], SMALL).astype(
+        np.float32
+    )
     straight = panel.undistorted(image)
     whole = np.broadcast_to(place if axis == 0 else place[:, None], SMALL)
     inner = np.abs(straight - whole)[5:-5, 5:-5]
@@ -179,7 +203,9 @@ def test_a_gap_between_tiles_is_one_border_that_parts_the_same_marks(seed: int) 
     axis, at, gap = int(rng.integers(2)), rng.uniform(150, 320), rng.uniform(0.6, 2.0)
     seen = places + rng.normal(size=places.shape) * 0.02
     seen[..., axis] -= np.where(places[..., axis] > at, gap, 0.0)
-    marks = [(i, str(k), *seen[i, k].tolist(), 0.02) for i, k in np.ndindex(seen.shape[:2])]
+    marks = [
+        (i, str(k), *seen[i, k].tolist(), 0.02) for i, k in np.ndindex(seen.shape[:2])
+    ]
     found = calibrate_marks(None, "lego", geometry=scan, markers=marks).document
     estimates = found["parameters"].values()
     assert max(abs(e["value"]) / e["sigma"] for e in estimates if e["sigma"]) < 4.0

@@ -12,7 +12,12 @@ import pytest
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import (
+    Calibration,
+    CalibrationRequest,
+    Scan,
+    calibrate,
+)
 from flexdt.twin.geometry.poses import Poses
 
 ANGLES = 15.0 * np.arange(24)
@@ -31,11 +36,17 @@ def scanned(
     beads = own.spread(rng, 8.0)
     truth = {n: float(rng.uniform(-r, r)) for n, r in own.REACH.items()}
     images = []
-    for clean in own.radiographs(rng, beads, ANGLES, SOD, truth, radius * cast, attenuation):
-        light = cv2.GaussianBlur(np.exp(-clean.astype(float)), (0, 0), blur[0], sigmaY=blur[1])
+    for clean in own.radiographs(
+        rng, beads, ANGLES, SOD, truth, radius * cast, attenuation
+    ):
+        light = cv2.GaussianBlur(
+            np.exp(-clean.astype(float)), (0, 0), blur[0], sigmaY=blur[1]
+        )
         counts = np.maximum(rng.poisson(photons * light), 0.5)
         images.append(-np.log(counts / photons).astype(np.float32))
-    poses = Poses.upright([0, 0, 0], [0, SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(ANGLES))
+    poses = Poses.upright(
+        [0, 0, 0], [0, SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(ANGLES)
+    )
     scan = Scan(ArrayFrames(images, own.SHAPE), poses)
     model = BeadModel(beads, np.full(len(beads), radius))
     return calibrate([scan], model, CalibrationRequest()), truth
@@ -88,7 +99,9 @@ def test_beads_of_another_size_are_still_refused(
 
 @pytest.mark.slow
 @pytest.mark.campaign
-def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_of_beam_and_detector_mislead_nobody(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     kinds = "spectrum_aluminium,blurred_one_way,scattered_light,radial,larger_balls"
     assert beam_faults.main(["--each", "1", "--kinds", kinds]) == 0
     told = capsys.readouterr().out

@@ -20,7 +20,13 @@ from flexdt.twin.geometry.poses import Poses
 
 BEADS = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
 SHAPE = (760, 956)
-SAID = ("phantom_strained", "exposure_arc", "panel_distorted", "bead_tolerance", "causes_open")
+SAID = (
+    "phantom_strained",
+    "exposure_arc",
+    "panel_distorted",
+    "bead_tolerance",
+    "causes_open",
+)
 
 
 def upright(frames: int, shift: float = 0.0) -> Poses:
@@ -39,7 +45,11 @@ def test_a_strained_phantom_is_estimated_with_its_shape() -> None:
         shape=SHAPE, strain=(1e3, 1e3),
     )  # fmt: skip
     strain = dict(
-        zip(STRAINS, fit.solution.x[fit.problem.layout.strain_columns].tolist(), strict=True)
+        zip(
+            STRAINS,
+            fit.solution.x[fit.problem.layout.strain_columns].tolist(),
+            strict=True,
+        )
     )
     for i, j in np.ndindex(3, 3):
         term = "xyz"[i] + "xyz"[j]
@@ -64,12 +74,16 @@ def test_the_mean_of_an_arc_is_that_of_its_positions(frames: int) -> None:
     x = problem.start
     x[problem.layout.arc_column] = share**2
     assert problem.residuals(x)[0] == pytest.approx(mean, abs=0.3 / frames**2 * 12)
-    assert np.abs(problem.residuals(problem.start)[0] - mean).max() > 20 * 0.3 / frames**2 * 12
+    assert (
+        np.abs(problem.residuals(problem.start)[0] - mean).max()
+        > 20 * 0.3 / frames**2 * 12
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_evidence_differs_as_densities_do(seed: int) -> None:
-    """Of two models with proper priors alone: the normal densities of the values, written out."""
+    """Of two models with proper priors alone: the normal densities of the values, written
+    out."""
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(60, 7))
     values = rows[:, :3] @ rng.normal(size=3) + 0.4 * rng.normal(size=60)
@@ -102,7 +116,8 @@ def test_evidence_differs_as_densities_do(seed: int) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_tile_has_a_least_width(axis: int) -> None:
-    """A shift beyond a border is found there, but not so near the edge that no tile is there."""
+    """A shift beyond a border is found there, but not so near the edge that no tile is
+    there."""
     rng = np.random.default_rng(axis)
     places = rng.uniform([0, 0], [956, 760], size=(400, 2))
     whiten = np.tile([50.0, 0.0, 50.0], (400, 1))

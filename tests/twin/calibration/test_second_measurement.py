@@ -22,7 +22,9 @@ def rendered(count: int) -> tuple[npt.NDArray[np.float64], list[npt.NDArray[np.f
     """Some balls, and their line integrals."""
     rng = np.random.default_rng([11, count])
     beads = own.spread(rng, 8.0)[:count]
-    return beads, list(own.radiographs(rng, beads, ANGLES, own.SOD, {"dO_x": 1.0, "alpha": 12.0}))
+    return beads, list(
+        own.radiographs(rng, beads, ANGLES, own.SOD, {"dO_x": 1.0, "alpha": 12.0})
+    )
 
 
 def calibrated(count: int, saturated_at: float) -> Calibration:
@@ -48,7 +50,9 @@ def codes(found: Calibration) -> list[str]:
         pytest.param(0.5, "no_beads", marks=pytest.mark.slow),
     ],
 )
-def test_saturated_images_are_refused_with_a_reason(saturated_at: float, code: str) -> None:
+def test_saturated_images_are_refused_with_a_reason(
+    saturated_at: float, code: str
+) -> None:
     found = calibrated(5, saturated_at)
     assert not found.identifiable
     assert code in codes(found)

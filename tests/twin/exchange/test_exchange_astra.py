@@ -10,7 +10,9 @@ from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.number_tables import read_vectors_text, vectors_text
 from flexdt.twin.geometry.poses import Poses
 
-astra = pytest.importorskip("astra", reason="astra-toolbox is not installed", exc_type=ImportError)
+astra = pytest.importorskip(
+    "astra", reason="astra-toolbox is not installed", exc_type=ImportError
+)
 
 
 def test_astras_cone_is_a_geometry_for_images_upside_down() -> None:

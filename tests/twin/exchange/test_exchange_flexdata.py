@@ -22,8 +22,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 def orbit(toml: dict[str, Any], count: int) -> FloatArray:
     """The vectors flexDATA derives from its parameters without axis tilt, from its description.
 
-    Source and panel go round counter-clockwise; the panel is rolled about its normal, then yawed
-    about its own columns, then pitched about its own rows; v is upwards.
+    Source and panel go round counter-clockwise; the panel is rolled about its normal, then
+    yawed about its own columns, then pitched about its own rows; v is upwards.
     """
     first, last = toml["ang_range"]
     pixel = toml["det_pixel"]
@@ -95,6 +95,10 @@ def test_tuples_and_older_names_are_read() -> None:
     assert worst(read_flexdata(text).cone_vec.rows, scan(2).cone_vec.rows) < 1e-9
     toml = tomllib.loads(flexdata_text(scan(2)))
     total = toml["src2obj"] + toml["det2obj"]
-    lines = [line for line in flexdata_text(scan(2)).splitlines() if not line.startswith("det2obj")]
+    lines = [
+        line
+        for line in flexdata_text(scan(2)).splitlines()
+        if not line.startswith("det2obj")
+    ]
     other = "\n".join([*lines, f"src2det = {total!r}"])
     assert worst(read_flexdata(other).cone_vec.rows, scan(2).cone_vec.rows) < 1e-9

@@ -1,7 +1,7 @@
 """CIL, TIGRE and LEAP: where their own definitions put each pixel, written down once more here.
 
-`tests/studies/exchange_peers.py` runs the three programs' own code on drawn geometries; they are
-not on the package index.
+`tests/studies/exchange_peers.py` runs the three programs' own code on drawn geometries; they
+are not on the package index.
 """
 
 from __future__ import annotations
@@ -69,13 +69,16 @@ def by_leap(a: Arrays) -> Seen:
     s = (CORNERS[:, 1] - (a["numCols"] - 1) / 2) * a["pixelWidth"]
     t = (CORNERS[:, 0] - (a["numRows"] - 1) / 2) * a["pixelHeight"]
     assert len(a["sourcePositions"]) == a["numAngles"]
-    across, along = s[:, None] * a["colVectors"][:, None], t[:, None] * a["rowVectors"][:, None]
+    across, along = (
+        s[:, None] * a["colVectors"][:, None],
+        t[:, None] * a["rowVectors"][:, None],
+    )
     return a["sourcePositions"], a["moduleCenters"][:, None] + across + along
 
 
 def by_tigre(a: Arrays) -> Seen:
-    """A panel about x = 0 turns about x, y and z, goes to DSO - DSD, is offset, and turns with the
-    source about z; the volume is where the frame is, moved by offOrigin."""
+    """A panel about x = 0 turns about x, y and z, goes to DSO - DSD, is offset, and turns with
+    the source about z; the volume is where the frame is, moved by offOrigin."""
     n = len(a["angles"])
     each = {name: np.broadcast_to(a[name], (n, a[name].shape[-1]) if a[name].ndim == 2
                                   or (name[:3] != "DSO" and name != "DSD") else (n,))
@@ -88,7 +91,11 @@ def by_tigre(a: Arrays) -> Seen:
         flat = np.column_stack([np.zeros(len(CORNERS)), right, down])
         turned = Rotation.from_euler("xyz", each["rotDetector"][view]).apply(flat)
         far = each["DSD"][view] - each["DSO"][view]
-        placed = turned + [-far, each["offDetector"][view][1], each["offDetector"][view][0]]
+        placed = turned + [
+            -far,
+            each["offDetector"][view][1],
+            each["offDetector"][view][0],
+        ]
         about = Rotation.from_euler("z", a["angles"][view])
         moved = each["offOrigin"][view][::-1]
         sources.append(about.apply([each["DSO"][view], 0, 0]) - moved)
@@ -96,7 +103,9 @@ def by_tigre(a: Arrays) -> Seen:
     return np.array(sources), np.array(pixels)
 
 
-PEERS: dict[str, tuple[Callable[..., Any], Callable[..., ScanGeometry], Callable[..., Seen]]] = {
+PEERS: dict[
+    str, tuple[Callable[..., Any], Callable[..., ScanGeometry], Callable[..., Seen]]
+] = {
     "cil": (cil_arrays, read_cil, by_cil),
     "tigre": (tigre_arrays, read_tigre, by_tigre),
     "leap": (leap_arrays, read_leap, by_leap),
@@ -118,8 +127,8 @@ def test_pixels_are_where_the_peer_says_and_come_back(peer: str, seed: int) -> N
 
 
 def test_a_circle_is_written_once() -> None:
-    """TIGRE's weights of FDK read offsets that hold for all views; the circle's has no turn left
-    but the rows' sense."""
+    """TIGRE's weights of FDK read offsets that hold for all views; the circle's has no turn
+    left but the rows' sense."""
     turn = fx.ConeVec.circular(
         sod=600, sdd=1059, angles=7, shape=SHAPE, pixel=0.15, offset=(3, 1), height=2
     )
@@ -150,14 +159,18 @@ def test_what_cannot_be_held_is_refused_with_the_figure(peer: str) -> None:
         write(changed({(2, 9): 0.1}))
     rows = STILL.cone_vec.rows.copy()
     rows[3, 6:12] *= 1.01
-    with pytest.raises(ExchangeError, match=r"one pixel size; its change in view 3 is 0\.01"):
+    with pytest.raises(
+        ExchangeError, match=r"one pixel size; its change in view 3 is 0\.01"
+    ):
         write(ScanGeometry(fx.ConeVec(rows), SHAPE))
     with pytest.raises(ExchangeError, match="shape, which is unknown"):
         write(ScanGeometry(STILL.cone_vec))
 
 
 def test_tigre_refuses_what_its_angles_cannot_hold() -> None:
-    flat = fx.ConeVec.from_vectors([0, 0, 500.0], [2.0, -4, -300], [0.6, 0.8, 0], [0.8, -0.6, 0])
+    flat = fx.ConeVec.from_vectors(
+        [0, 0, 500.0], [2.0, -4, -300], [0.6, 0.8, 0], [0.8, -0.6, 0]
+    )
     with pytest.raises(ExchangeError, match=r"lie flat; .* in view 0 is 1; "):
         tigre_arrays(ScanGeometry(flat, SHAPE))
     behind = fx.ConeVec.circular(sod=600, sdd=1059, angles=3, shape=SHAPE, pixel=0.15)
@@ -208,13 +221,17 @@ def stand(monkeypatch: pytest.MonkeyPatch, name: str, **members: Any) -> None:
         setattr(sys.modules[name], member, value)
 
 
-TURN = fx.ConeVec.circular(sod=600, sdd=1059, angles=5, shape=SHAPE, pixel=0.15, tilts=(1, 2, 3))
+TURN = fx.ConeVec.circular(
+    sod=600, sdd=1059, angles=5, shape=SHAPE, pixel=0.15, tilts=(1, 2, 3)
+)
 GRID = fx.Grid((4, 5, 6), 0.5, (1.0, 2.0, 3.0))
 
 
 def test_objects_of_cil(monkeypatch: pytest.MonkeyPatch) -> None:
     made = Standing()
-    factory = SimpleNamespace(create_Cone3D_Flex=lambda *a: made.calls.update(poses=a) or made)
+    factory = SimpleNamespace(
+        create_Cone3D_Flex=lambda *a: made.calls.update(poses=a) or made
+    )
     stand(monkeypatch, "cil.framework", AcquisitionGeometry=factory)
     assert TURN.to_cil() is made
     assert worst(made.calls["poses"][0], TURN.source) == 0.0

@@ -42,7 +42,9 @@ def changed(column: int, by: float, view: int = 2) -> ScanGeometry:
 
 
 def test_flexdata_refuses_what_it_cannot_state() -> None:
-    uneven = ScanGeometry(some_poses(np.random.default_rng(2), even=False).cone_vec(), SHAPE)
+    uneven = ScanGeometry(
+        some_poses(np.random.default_rng(2), even=False).cone_vec(), SHAPE
+    )
     with pytest.raises(ExchangeError, match="no list of angles"):
         flexdata_text(uneven)
     with pytest.raises(ExchangeError, match=r"one circle .* in view 2"):
@@ -73,7 +75,9 @@ def test_rtk_refuses_skew_and_changing_pixels() -> None:
 
 
 def test_rtk_holds_a_panel_that_lies_flat() -> None:
-    flat = ConeVec.from_vectors([3.0, 1, 500], [2.0, -4, -300], [0.6, 0.8, 0], [0.8, -0.6, 0])
+    flat = ConeVec.from_vectors(
+        [3.0, 1, 500], [2.0, -4, -300], [0.6, 0.8, 0], [0.8, -0.6, 0]
+    )
     one = ScanGeometry(flat, SHAPE)
     assert worst(read_rtk(rtk_text(one), (1.0, 1.0)).cone_vec.rows, flat.rows) < 1e-9
 
@@ -106,7 +110,9 @@ def test_bad_vectors(text: str, says: str) -> None:
         read_vectors_text(text, "x")
 
 
-@pytest.mark.parametrize("array", [np.zeros((3, 11)), np.zeros(12), np.array([["a"] * 12])])
+@pytest.mark.parametrize(
+    "array", [np.zeros((3, 11)), np.zeros(12), np.array([["a"] * 12])]
+)
 def test_bad_arrays(array: np.ndarray[Any, Any]) -> None:
     with pytest.raises(ExchangeError, match=r"\(n, 12\)"):
         read_vectors_array(array)

@@ -72,7 +72,9 @@ def test_flexdata_keeps_any_circle_in_equal_steps(seed: int) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(seed=SEEDS)
-def test_from_cone_vec_gives_the_geometry_and_stands_still_where_it_does(seed: int) -> None:
+def test_from_cone_vec_gives_the_geometry_and_stands_still_where_it_does(
+    seed: int,
+) -> None:
     rng = np.random.default_rng(seed)
     true = some_poses(rng)
     poses = Poses.from_cone_vec(true.cone_vec())
@@ -91,7 +93,10 @@ def test_correction_parameters_keep_their_meaning() -> None:
     imported = Poses.from_cone_vec(true.cone_vec())
     for _ in range(5):
         parameters = some_parameters(rng)
-        assert worst(imported.cone_vec(parameters).rows, true.cone_vec(parameters).rows) < SAME
+        assert (
+            worst(imported.cone_vec(parameters).rows, true.cone_vec(parameters).rows)
+            < SAME
+        )
 
 
 @settings(max_examples=40, deadline=None)

@@ -89,7 +89,8 @@ def chiral_volume() -> Volume:
 
 
 def test_its_joseph_projector_sees_a_chiral_phantom_as_ours_does(rtk: Rtk) -> None:
-    """Tilted and shifted panel, axis and source; wrong signs or mirrors would move the blobs."""
+    """Tilted and shifted panel, axis and source; wrong signs or mirrors would move the
+    blobs."""
     poses = Poses(
         np.array([[3.0, 0, 18]]), np.array([[1.0, 600, 20]]), np.array([[2.0, 1050, 22]]),
         np.array([[PITCH, 0, 0]]), np.array([[0, 0, -PITCH]]), np.array([0.2, 1.1, 2.9, 4, 5.8]),

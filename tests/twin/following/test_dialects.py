@@ -1,4 +1,5 @@
-"""Message servers that differ: every fault is told in time, and a healthy machine is left alone."""
+"""Message servers that differ: every fault is told in time, and a healthy machine is left
+alone."""
 
 from __future__ import annotations
 
@@ -31,14 +32,18 @@ def test_there_are_ten_dialects_and_every_fault_and_slip_is_drawn() -> None:
 
 @each
 @pytest.mark.daily(3)
-def test_every_fault_is_told_within_a_second_and_nothing_else_is(dialect: Dialect) -> None:
+def test_every_fault_is_told_within_a_second_and_nothing_else_is(
+    dialect: Dialect,
+) -> None:
     for seed in range(DRAWN):
         assert missed(conversation(dialect, seed)) == [], f"seed {seed}"
 
 
 @each
 @pytest.mark.daily(2)
-def test_healthy_traffic_raises_no_error_and_at_most_one_warning(dialect: Dialect) -> None:
+def test_healthy_traffic_raises_no_error_and_at_most_one_warning(
+    dialect: Dialect,
+) -> None:
     messages = sorted(healthy(dialect, 1, 3600.0 * HOURS), key=lambda message: message[0])
     listener = Listener().hear(messages)
     assert [a for a in listener.alarms if a.severity == "error"] == []
@@ -53,7 +58,9 @@ def test_healthy_traffic_raises_no_error_and_at_most_one_warning(dialect: Dialec
 
 @each
 @pytest.mark.daily(5)
-def test_a_listener_that_does_not_read_for_seconds_finds_no_fault(dialect: Dialect) -> None:
+def test_a_listener_that_does_not_read_for_seconds_finds_no_fault(
+    dialect: Dialect,
+) -> None:
     rng = random.Random(dialect.name)
     stalls, at = [], 0.0
     while at < 900.0:
@@ -75,7 +82,9 @@ def session() -> tuple[FollowSession, list[Alarm]]:
     return FollowSession(follower, alarms.append, clock=lambda: 0.0), alarms
 
 
-def say(made: FollowSession, at: float, words: str, what: str = "", **more: object) -> None:
+def say(
+    made: FollowSession, at: float, words: str, what: str = "", **more: object
+) -> None:
     component, command, arg1 = words.split("|")
     told: dict[str, object] = {"component": component, "command": command, "arg1": arg1,
                                "reply type": what, "UUID": 5}  # fmt: skip

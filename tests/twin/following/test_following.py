@@ -18,7 +18,12 @@ from flexdt.twin.collision.convex_pieces import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Mirror
-from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile, profile_of
+from flexdt.twin.machine.description import (
+    Machine,
+    builtin_machine,
+    builtin_profile,
+    profile_of,
+)
 from flexdt.twin.script import parse_script
 from flexdt.twin.script.executed_log import read_log
 from flexdt.twin.script.log_fit import fit_machine
@@ -79,7 +84,12 @@ def _stamp(seconds: float) -> str:
 
 def motor(name: str, target: float, machine: Machine = FLEXRAY, **more: float) -> Motor:
     axis = machine.axes[name]
-    values = {"start": axis.home, "speed": axis.speed, "acceleration": axis.acceleration, **more}
+    values = {
+        "start": axis.home,
+        "speed": axis.speed,
+        "acceleration": axis.acceleration,
+        **more,
+    }
     return Motor(name, target=target, **values)
 
 
@@ -109,7 +119,9 @@ def test_the_recorded_scan_is_mirrored_and_its_record_fits_the_same_machine() ->
     assert ours.timing.move_s == pytest.approx(theirs.timing.move_s, abs=0.002)
 
 
-def test_the_recorded_scan_on_a_machine_with_other_limits_is_alarmed_at_its_first_reply() -> None:
+def test_the_recorded_scan_on_a_machine_with_other_limits_is_alarmed_at_its_first_reply() -> (
+    None
+):
     lines, _ = read_log(LOG)
     axis = UNITOM.axes["tra_obj"].model_copy(update={"upper": 400.0})
     wrong = UNITOM.model_copy(update={"axes": {**UNITOM.axes, "tra_obj": axis}})
@@ -124,7 +136,9 @@ def test_the_recorded_scan_on_a_machine_with_other_limits_is_alarmed_at_its_firs
 # -- faults, each on a machine of the test's own ---------------------------------------------
 
 
-def test_a_sound_machine_raises_no_error(rng_moves: Callable[[int], Iterator[Timed]]) -> None:
+def test_a_sound_machine_raises_no_error(
+    rng_moves: Callable[[int], Iterator[Timed]],
+) -> None:
     listener = Listener(follower()).hear(rng_moves(40))
     assert listener.errors == []
     assert listener.mirror.raised == len(listener.alarms)
@@ -142,7 +156,10 @@ def rng_moves() -> Callable[[int], Iterator[Timed]]:
             axis = FLEXRAY.axes[name]
             low, high = max(axis.lower, -400.0) + 1.0, min(axis.upper, 900.0) - 1.0
             made = motor(
-                name, rng.uniform(low, high), start=places[name], delay_s=rng.uniform(0, 0.2)
+                name,
+                rng.uniform(low, high),
+                start=places[name],
+                delay_s=rng.uniform(0, 0.2),
             )
             yield from made.messages(key, at)
             at += made.duration_s + 1.0
@@ -155,7 +172,9 @@ def rng_moves() -> Callable[[int], Iterator[Timed]]:
 def test_a_motor_of_another_speed_is_alarmed_within_two_feedbacks(factor: float) -> None:
     axis = FLEXRAY.axes["mag_obj"]
     moved = motor(
-        "mag_obj", axis.home + (300.0 if axis.home < 500 else -300.0), speed=axis.speed * factor
+        "mag_obj",
+        axis.home + (300.0 if axis.home < 500 else -300.0),
+        speed=axis.speed * factor,
     )
     listener = Listener(follower()).hear(moved.messages(1, 5.0))
     kind = "slow" if factor < 1 else "fast"
@@ -176,7 +195,9 @@ def _delay(moved: Motor, speed: float, time: float) -> float:
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (
-            (middle, high) if abs(nominal.position(middle) - moved.start) < way else (low, middle)
+            (middle, high)
+            if abs(nominal.position(middle) - moved.start) < way
+            else (low, middle)
         )
     return time - low
 
@@ -236,7 +257,9 @@ def test_a_motor_that_moved_by_itself_and_one_that_is_refused() -> None:
 
 
 @pytest.mark.parametrize("asked", ["Z", "z"])
-def test_motors_in_capitals_are_followed_and_one_that_there_is_not_is_told(asked: str) -> None:
+def test_motors_in_capitals_are_followed_and_one_that_there_is_not_is_told(
+    asked: str,
+) -> None:
     cabinet = builtin_machine("xyzr_cabinet")
     script = parse_script("z move absolute 250 ACK\nX move absolute 5 ACK")
     moved = replace(motor("Z", 250.0, cabinet), name=asked)
@@ -294,7 +317,9 @@ def test_a_late_script_and_a_command_that_is_not_in_it() -> None:
 
 def test_the_rest_of_the_script_is_checked_from_where_the_machine_really_is() -> None:
     pieces = convex_pieces(load_phantom("lego").mesh(around=True))
-    script = parse_script("scanner\tpause\t10\t\tACK\t\t\nmag_det\tmove absolute\t400\t\tACK\t\t\n")
+    script = parse_script(
+        "scanner\tpause\t10\t\tACK\t\t\nmag_det\tmove absolute\t400\t\tACK\t\t\n"
+    )
     follow = follower(script=script, collision=collision_check(pieces))
     home = Mirror.of(FLEXRAY)
     free = home.with_axis("mag_obj", position=150.0, heard_s=0.0)

@@ -55,7 +55,11 @@ def test_degrees_given_as_radians(angles):
 
 def test_turns_and_golden_steps_are_right_in_radians():
     golden = np.pi * (3 - np.sqrt(5))
-    for angles in (golden * np.arange(150), golden * np.arange(777), np.linspace(0, 60, 3000)):
+    for angles in (
+        golden * np.arange(150),
+        golden * np.arange(777),
+        np.linspace(0, 60, 3000),
+    ):
         assert not list(radian_findings(angles))
 
 
@@ -82,7 +86,9 @@ def test_laminography_is_sent_to_an_iterative_method(inclined):
     source = level.source + [0, 0, -height]
     towards = -source / np.linalg.norm(source, axis=1, keepdims=True)
     right = level.u / np.linalg.norm(level.u, axis=1, keepdims=True)
-    tilted = ConeVec.from_vectors(source, 100 * towards, right, np.cross(towards, right), SHAPE)
+    tilted = ConeVec.from_vectors(
+        source, 100 * towards, right, np.cross(towards, right), SHAPE
+    )
     found = examine(Operation.FDK, tilted, SHAPE, grid=np.array([[-4.0] * 3, [4.0] * 3]))
     assert kinds(found) == ["laminography"]
     assert (found[0].severity is Severity.REFUSAL) == (inclined > 20)
@@ -96,7 +102,9 @@ def test_laminography_is_sent_to_an_iterative_method(inclined):
      (50, 1e-10, 0.1), (1e-12, 1e-10, 0.1), (np.nan, 100, 0.1), (50, np.inf, 0.1)],
 )  # fmt: skip
 def test_impossible_distances(sod, sdd, pixel):
-    assert [one.severity for one in distance_findings(sod, sdd, pixel)] == [Severity.REFUSAL]
+    assert [one.severity for one in distance_findings(sod, sdd, pixel)] == [
+        Severity.REFUSAL
+    ]
 
 
 def test_pixels_of_another_unit():

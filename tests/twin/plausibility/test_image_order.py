@@ -42,7 +42,9 @@ def test_order(kind):
 )  # fmt: skip
 def test_two_files_of_one_number_are_named(names):
     found = ordered(names).findings
-    assert [(one.kind, one.severity) for one in found] == [("duplicate", Severity.REFUSAL)]
+    assert [(one.kind, one.severity) for one in found] == [
+        ("duplicate", Severity.REFUSAL)
+    ]
     assert sum(name in found[0].cause for name in names) == 2
 
 

@@ -1,5 +1,5 @@
-"""A second, independent implementation: exact Siddon in NumPy, double precision, every crossing of
-every ray computed on its own and sorted. Slow and plain; shares nothing with the kernels.
+"""A second, independent implementation: exact Siddon in NumPy, double precision, every crossing
+of every ray computed on its own and sorted. Slow and plain; shares nothing with the kernels.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from flexdt.twin.projection import operators as walks
 
 
 def _siddon(data, voxel, center, cone_vec, shape, pixels=None):
-    """Line integrals (n, rows, cols) in double precision, or (n, len(pixels)) for chosen pixels.
+    """Line integrals (n, rows, cols) in double precision, or (n, len(pixels)) for chosen
+    pixels.
 
     data (nz, ny, nx); voxel, center (x, y, z) [mm]; pixels: (k, 2) (row, column).
     """
@@ -54,19 +55,25 @@ def _ray(data, voxel, low, counts, start, end):
     t = np.sort(np.concatenate(crossings))
     middle = start + 0.5 * (t[1:] + t[:-1])[:, None] * d
     index = np.clip(np.floor((middle - low) / voxel).astype(int), 0, counts - 1)
-    return float(np.sum(np.diff(t) * data[index[:, 2], index[:, 1], index[:, 0]])) * float(
-        np.linalg.norm(d)
-    )
+    return float(
+        np.sum(np.diff(t) * data[index[:, 2], index[:, 1], index[:, 0]])
+    ) * float(np.linalg.norm(d))
 
 
-def _circle(n, sod, sdd, pitch, *, roll=0.0, pitch_tilt=0.0, yaw=0.0, start=0.0, height=0.0):
+def _circle(
+    n, sod, sdd, pitch, *, roll=0.0, pitch_tilt=0.0, yaw=0.0, start=0.0, height=0.0
+):
     """n views on a circle, object frame; tilts [rad] about normal, u and v of the detector;
     source `height` above the object and the detector as far below as to see its centre."""
     angles = start + 2 * np.pi * np.arange(n) / n
     rows = []
     for angle in angles:
         c, s = np.cos(angle), np.sin(angle)
-        across, beam, up = np.array([c, s, 0]), np.array([-s, c, 0]), np.array([0, 0, 1.0])
+        across, beam, up = (
+            np.array([c, s, 0]),
+            np.array([-s, c, 0]),
+            np.array([0, 0, 1.0]),
+        )
         u, v = across, -up
         u = np.cos(yaw) * u + np.sin(yaw) * beam
         normal = np.cross(u, v)
@@ -102,8 +109,11 @@ def one_thread_only() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def walk(request, monkeypatch) -> None:
     """Fans along z, as large problems are walked, however small the tests' are; or, given
-    indirectly, along another axis (an index into ORDERS), ray by ray (NO_FANS) or as chosen (None).
+    indirectly, along another axis (an index into ORDERS), ray by ray (NO_FANS) or as chosen
+    (None).
     """
     wanted = getattr(request, "param", 0)
     if wanted is not None:
-        monkeypatch.setattr(walks, "level_axes", lambda rays, *_: np.full(len(rays), wanted))
+        monkeypatch.setattr(
+            walks, "level_axes", lambda rays, *_: np.full(len(rays), wanted)
+        )

@@ -47,7 +47,9 @@ def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
     ahead = [sys.executable, "-P", "-m", "flexdt.runtime.compile_ahead"]
     groups = len(compile_ahead.GROUPS)
     for last in (f"flexdt: compiled {groups} of {groups} ", ""):
-        done = subprocess.run(ahead, env=environment, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ahead, env=environment, capture_output=True, text=True, check=True
+        )
         assert ["", *done.stdout.splitlines()][-1].startswith(last)
     assert done.stdout == ""
     users = [sys.executable, "-P", "-c", USERS]
@@ -85,7 +87,9 @@ def test_who_waits_for_one_kernel_is_told_which(
     monkeypatch.setattr(progress_lines, "SILENT_S", 0.01)
     assert compiling.serial(sum_of_squares, cache=False)(4) == 14
     told = [record.getMessage() for record in caplog.records]
-    assert any(line.startswith("flexdt: still compiling sum_of_squares (") for line in told), told
+    assert any(
+        line.startswith("flexdt: still compiling sum_of_squares (") for line in told
+    ), told
 
 
 def test_a_kernel_that_has_code_in_its_callers_only_is_refused_to_python() -> None:

@@ -1,4 +1,5 @@
-"""A process that has used kernels is forked: its children compute the same bits, or are told."""
+"""A process that has used kernels is forked: its children compute the same bits, or are
+told."""
 
 from __future__ import annotations
 
@@ -123,7 +124,10 @@ FOLDERS = ("twin", "phantoms", "runtime", "clients", "server")
 
 def decorators(function: ast.FunctionDef) -> set[str]:
     """Names of a function's decorators, called or not."""
-    plain = [each.func if isinstance(each, ast.Call) else each for each in function.decorator_list]
+    plain = [
+        each.func if isinstance(each, ast.Call) else each
+        for each in function.decorator_list
+    ]
     return {each.id for each in plain if isinstance(each, ast.Name)}
 
 
@@ -134,11 +138,20 @@ def test_every_parallel_loop_is_compiled_by_the_one_decorator() -> None:
         if "numba" not in text:
             continue
         tree = ast.parse(text)
-        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for function in (
+            node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)
+        ):
             inner = {
-                n for f in function.body if isinstance(f, ast.FunctionDef) for n in ast.walk(f)
+                n
+                for f in function.body
+                if isinstance(f, ast.FunctionDef)
+                for n in ast.walk(f)
             }
-            names = {n.id for n in ast.walk(function) if isinstance(n, ast.Name) and n not in inner}
+            names = {
+                n.id
+                for n in ast.walk(function)
+                if isinstance(n, ast.Name) and n not in inner
+            }
             if "prange" in names:
                 seen += 1
                 assert decorators(function) == {"parallel"}, f"{file}: {function.name}"

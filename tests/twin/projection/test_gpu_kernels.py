@@ -32,7 +32,9 @@ def found() -> dict[str, str | None]:
     root = str(Path(__file__).parents[3])
     environment = {**os.environ, "PYTHONPATH": root}
     command = [sys.executable, str(ASSUMPTIONS)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -70,7 +72,9 @@ DAILY = (
 
 
 @pytest.mark.parametrize(("kind", "count", "most", "seed"), DAILY)
-def test_drawn_geometries_are_exact_and_touch_nothing_outside(kind, count, most, seed) -> None:
+def test_drawn_geometries_are_exact_and_touch_nothing_outside(
+    kind, count, most, seed
+) -> None:
     run_simulated(DRAWN, kind, str(count), str(most), str(seed))
 
 
@@ -96,7 +100,8 @@ def behind(starts: np.ndarray, ends: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 
 
 def test_the_reference_is_that_of_the_other_tests(siddon) -> None:
-    """Two implementations in double precision, of sorted crossings, agree to its last digits."""
+    """Two implementations in double precision, of sorted crossings, agree to its last
+    digits."""
     for number, kind in enumerate(KINDS):
         case = drawn_case(np.random.default_rng([5, number]), kind, 7)
         geometry = ConeVec(case.rows)
@@ -105,7 +110,9 @@ def test_the_reference_is_that_of_the_other_tests(siddon) -> None:
         starts, ends = ray_ends(case.rows, case.shape)
         ends = behind(starts, ends, grid)
         found = line_integrals(grid, case.data, starts, ends)
-        np.testing.assert_allclose(found, wanted.ravel(), rtol=0, atol=1e-11 * wanted.max())
+        np.testing.assert_allclose(
+            found, wanted.ravel(), rtol=0, atol=1e-11 * wanted.max()
+        )
         back = spread_back(grid, case.values, starts, ends)
         both = np.vdot(back, case.data.astype(float)), np.vdot(found, case.values.ravel())
         assert abs(both[0] - both[1]) < 1e-11 * both[1], kind
@@ -134,6 +141,11 @@ def test_tests_pass_on_a_machine_with_a_device(name) -> None:
     options = ["-p", "device_stand_in", "-p", "no:cacheprovider", "-m", "not slow", "-q"]
     command = [sys.executable, "-m", "pytest", *options, str(tests / name)]
     done = subprocess.run(
-        command, env=environment, cwd=tests.parent, capture_output=True, text=True, check=False
+        command,
+        env=environment,
+        cwd=tests.parent,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout

@@ -37,7 +37,10 @@ def norm2(p):
 TURN = np.array(turned()).T
 OCTAHEDRON = ConvexPolyhedron(
     tuple(
-        tuple(np.array([i, j, k]) / np.sqrt(3)) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)
+        tuple(np.array([i, j, k]) / np.sqrt(3))
+        for i in (-1, 1)
+        for j in (-1, 1)
+        for k in (-1, 1)
     ),
     (1.0,) * 8,
 )
@@ -49,9 +52,9 @@ INSIDE = {
     ),
     "box": (
         Box((0.3, 0.2, -0.1), (1.0, 2.0, 1.5), turned()),
-        lambda p: (np.abs((p - [0.3, 0.2, -0.1]) @ np.array(turned()).T) < [0.5, 1.0, 0.75]).all(
-            -1
-        ),
+        lambda p: (
+            np.abs((p - [0.3, 0.2, -0.1]) @ np.array(turned()).T) < [0.5, 1.0, 0.75]
+        ).all(-1),
     ),
     "cylinder": (
         Cylinder((0.1, 0.0, 0.2), 0.7, 1.8, turned()[1]),
@@ -63,7 +66,10 @@ INSIDE = {
     "ellipsoid": (
         Ellipsoid((0.1, 0.0, 0.2), (0.5, 1.2, 0.9), turned()),
         lambda p: (
-            np.sum(((p - [0.1, 0, 0.2]) @ np.array(turned()).T / [0.5, 1.2, 0.9]) ** 2, -1) < 1
+            np.sum(
+                ((p - [0.1, 0, 0.2]) @ np.array(turned()).T / [0.5, 1.2, 0.9]) ** 2, -1
+            )
+            < 1
         ),
     ),
     "polyhedron": (
@@ -74,7 +80,9 @@ INSIDE = {
 
 
 @pytest.mark.parametrize("name", INSIDE)
-@pytest.mark.parametrize("tilt", [{}, {"roll": 0.5, "pitch_tilt": 0.3, "yaw": 0.2, "height": 1.0}])
+@pytest.mark.parametrize(
+    "tilt", [{}, {"roll": 0.5, "pitch_tilt": 0.3, "yaw": 0.2, "height": 1.0}]
+)
 def test_chords_agree_with_points_counted_inside(name, tilt, circle) -> None:
     shape, inside = INSIDE[name]
     geometry = circle(3, 8.0, 16.0, 0.2, start=0.3, **tilt)
@@ -90,7 +98,10 @@ def test_chords_agree_with_points_counted_inside(name, tilt, circle) -> None:
             points = source + t[:, None, None] * ray[r]
             counted = inside(points).sum(0) * 0.4 / steps * length[r]
             # Two ends, each within half a step.
-            assert np.abs(counted - got[view, r]).max() < 1.01 * 0.4 / steps * length[r].max()
+            assert (
+                np.abs(counted - got[view, r]).max()
+                < 1.01 * 0.4 / steps * length[r].max()
+            )
     assert (got > 0).any(axis=(1, 2)).all()
 
 
@@ -115,7 +126,9 @@ def test_culling_loses_no_pixel(name, circle, monkeypatch) -> None:
     shape, _ = INSIDE[name]
     geometry = circle(7, 5.0, 16.0, 0.3, start=0.1, roll=0.3, pitch_tilt=-0.4)
     culled = project_scene(one(shape), geometry, SHAPE)
-    everything = np.broadcast_to([0, SHAPE[0], 0, SHAPE[1]], (7, 1, 4)).astype(np.int64).copy()
+    everything = (
+        np.broadcast_to([0, SHAPE[0], 0, SHAPE[1]], (7, 1, 4)).astype(np.int64).copy()
+    )
     monkeypatch.setattr(module, "shadows", lambda *_: everything)
     assert np.array_equal(culled, project_scene(one(shape), geometry, SHAPE))
 

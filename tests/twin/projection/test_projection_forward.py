@@ -61,9 +61,13 @@ def test_forward_of_one_voxel_is_its_chord(circle) -> None:
 def test_rays_begin_at_the_source_and_run_through_the_pixel() -> None:
     # Source in the middle of the volume: half the box; the panel there: all of it.
     volume = Volume(np.ones((5, 10, 5), np.float32), 1.0)
-    inside = ConeVec.from_vectors((0.1, 0, 0.1), (0.1, 30, 0.1), (0.1, 0, 0), (0, 0, -0.1))
+    inside = ConeVec.from_vectors(
+        (0.1, 0, 0.1), (0.1, 30, 0.1), (0.1, 0, 0), (0, 0, -0.1)
+    )
     assert forward(volume, inside, (1, 1))[0, 0, 0] == pytest.approx(5.0, rel=1e-6)
-    short = ConeVec.from_vectors((0.1, -30, 0.1), (0.1, 2, 0.1), (0.1, 0, 0), (0, 0, -0.1))
+    short = ConeVec.from_vectors(
+        (0.1, -30, 0.1), (0.1, 2, 0.1), (0.1, 0, 0), (0, 0, -0.1)
+    )
     assert forward(volume, short, (1, 1))[0, 0, 0] == pytest.approx(10.0, rel=1e-6)
 
 
@@ -74,7 +78,8 @@ def test_z_contiguous_data_give_the_same_image_without_a_copy(circle) -> None:
     volume = Volume(turned, 0.1)
     assert np.shares_memory(volume.layout.flat, turned)
     assert np.array_equal(
-        forward(volume, geometry, (20, 24)), forward(Volume(data, 0.1), geometry, (20, 24))
+        forward(volume, geometry, (20, 24)),
+        forward(Volume(data, 0.1), geometry, (20, 24)),
     )
 
 
@@ -108,7 +113,9 @@ def test_out_is_filled_and_returned(circle) -> None:
 @pytest.mark.parametrize("name", GEOMETRIES)
 def test_back_is_the_adjoint_of_forward(name, circle) -> None:
     geometry = circle(3, 20.0, 40.0, 0.23, **GEOMETRIES[name])
-    volume = Volume(rng(3).random((31, 23, 18), dtype=np.float32), (0.1, 0.17, 0.06), (0.1, 0, 0))
+    volume = Volume(
+        rng(3).random((31, 23, 18), dtype=np.float32), (0.1, 0.17, 0.06), (0.1, 0, 0)
+    )
     y = rng(4).random((3, 27, 33), dtype=np.float32)
     ax = forward(volume, geometry, (27, 33)).astype(np.float64)
     aty = back(y, geometry, volume)
@@ -142,9 +149,18 @@ SOUND = [0, -9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2]
 DEGENERATE = {
     "u is zero": ([0, -9, 0, 0, 9, 0, 0, 0, 0, 0, 0, -0.2], "do not span"),
     "v is zero": ([0, -9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, 0], "do not span"),
-    "u is parallel to v": ([0, -9, 0, 0, 9, 0, 0.2, 0.1, 0, -0.4, -0.2, 0], "do not span"),
-    "the source in the plane": ([5, 9, 1, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2], "detector's plane"),
-    "the source in the middle": ([0, 9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2], "detector's plane"),
+    "u is parallel to v": (
+        [0, -9, 0, 0, 9, 0, 0.2, 0.1, 0, -0.4, -0.2, 0],
+        "do not span",
+    ),
+    "the source in the plane": (
+        [5, 9, 1, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2],
+        "detector's plane",
+    ),
+    "the source in the middle": (
+        [0, 9, 0, 0, 9, 0, 0.2, 0, 0, 0, 0, -0.2],
+        "detector's plane",
+    ),
     "not a number": ([0, -9, 0, 0, 9, 0, 0.2, np.nan, 0, 0, 0, -0.2], "not finite"),
     "no end": ([0, -9, 0, 0, np.inf, 0, 0.2, 0, 0, 0, 0, -0.2], "not finite"),
     "beyond all numbers": ([0, -9, 0, 0, 9, 0, 1e300, 0, 0, 0, 0, -0.2], "do not span"),
@@ -176,7 +192,10 @@ def test_rays_of_a_geometry_reach_its_pixels(circle) -> None:
     geometry = circle(3, 9.0, 18.0, 0.3, roll=0.3, pitch_tilt=0.2, start=0.4)
     source, first, u, v = np.split(geometry.rays((4, 5)), 4, axis=1)
     assert np.array_equal(source, geometry.source)
-    for (r, c), ends in (((0, 0), source + first), ((3, 2), source + first + 2 * u + 3 * v)):
+    for (r, c), ends in (
+        ((0, 0), source + first),
+        ((3, 2), source + first + 2 * u + 3 * v),
+    ):
         assert np.allclose(ends, geometry.pixel_centers((4, 5))[:, r, c], atol=1e-12)
 
 
@@ -190,7 +209,9 @@ def test_volume_refuses_what_is_no_volume() -> None:
 
 
 def test_voxel_centres_are_object_frame_positions() -> None:
-    x, y, z = Volume(np.zeros((2, 3, 4), np.float32), (1.0, 2.0, 4.0), (10.0, 20.0, 30.0)).centers()
+    x, y, z = Volume(
+        np.zeros((2, 3, 4), np.float32), (1.0, 2.0, 4.0), (10.0, 20.0, 30.0)
+    ).centers()
     assert x.tolist() == [8.5, 9.5, 10.5, 11.5]
     assert y.tolist() == [18.0, 20.0, 22.0]
     assert z.tolist() == [28.0, 32.0]

@@ -28,7 +28,9 @@ def torch():
 
 @pytest.fixture(scope="module")
 def scan(circle):
-    return circle(3, 20, 40, 1.3, roll=0.1, pitch_tilt=0.05, yaw=-0.07, start=0.2, height=1.0)
+    return circle(
+        3, 20, 40, 1.3, roll=0.1, pitch_tilt=0.05, yaw=-0.07, start=0.2, height=1.0
+    )
 
 
 @pytest.fixture
@@ -56,15 +58,21 @@ def test_torch_gradients_of_a_loss(torch, siddon, operator, scan):
     rows = torch.tensor(scan.rows, requires_grad=True)
     residual = operator.torch()(voxels, rows) - torch.tensor(data)
     loss = 0.5 * (residual**2).sum()
-    assert float(loss.detach()) == pytest.approx(loss_of(siddon, x, scan.rows, data), rel=1e-6)
+    assert float(loss.detach()) == pytest.approx(
+        loss_of(siddon, x, scan.rows, data), rel=1e-6
+    )
     loss.backward()
     by_voxels, by_rows = voxels.grad.numpy(), rows.grad.numpy()
     for index in [(0, 1, 2), (1, 2, 0), (1, 0, 3)]:
         wanted = slope(lambda v: loss_of(siddon, v, scan.rows, data), x, index, 1e-4)
-        assert by_voxels[index] == pytest.approx(wanted, abs=1e-5 * np.abs(by_voxels).max())
+        assert by_voxels[index] == pytest.approx(
+            wanted, abs=1e-5 * np.abs(by_voxels).max()
+        )
     for index in [(0, 1), (1, 4), (2, 8), (0, 9), (2, 5)]:
         wanted = slope(lambda r: loss_of(siddon, x, r, data), scan.rows, index, 1e-6)
-        assert by_rows[index] == pytest.approx(wanted, rel=1e-3, abs=1e-5 * np.abs(by_rows).max())
+        assert by_rows[index] == pytest.approx(
+            wanted, rel=1e-3, abs=1e-5 * np.abs(by_rows).max()
+        )
 
 
 def test_torch_gradients_of_the_transpose(torch, siddon, operator, scan):
@@ -75,15 +83,21 @@ def test_torch_gradients_of_the_transpose(torch, siddon, operator, scan):
     images = torch.tensor(y, requires_grad=True)
     (operator.torch().T(images, rows) * torch.tensor(w)).sum().backward()
     wanted = siddon(w, LIKE.voxel_xyz, LIKE.center_mm, scan, SHAPE)
-    np.testing.assert_allclose(images.grad.numpy(), wanted, atol=1e-5 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        images.grad.numpy(), wanted, atol=1e-5 * np.abs(wanted).max()
+    )
 
     def product(r: np.ndarray) -> float:
-        return float(np.vdot(siddon(w, LIKE.voxel_xyz, LIKE.center_mm, ConeVec(r), SHAPE), y))
+        return float(
+            np.vdot(siddon(w, LIKE.voxel_xyz, LIKE.center_mm, ConeVec(r), SHAPE), y)
+        )
 
     scale = float(rows.grad.abs().max())
     for index in [(0, 0), (1, 3), (2, 11)]:
         wanted = slope(product, scan.rows, index, 1e-6)
-        assert float(rows.grad[index]) == pytest.approx(wanted, rel=1e-3, abs=1e-5 * scale)
+        assert float(rows.grad[index]) == pytest.approx(
+            wanted, rel=1e-3, abs=1e-5 * scale
+        )
 
 
 @pytest.mark.usefixtures("on_processor")
@@ -98,7 +112,9 @@ def test_torch_batches_types_and_errors(torch, operator, scan):
         for k in range(3):
             assert np.array_equal(np.from_dlpack(images[i, k]), operator @ x[i, k])
     assert np.array_equal((operator @ torch.tensor(x[0, 0])).numpy(), operator @ x[0, 0])
-    assert np.array_equal((operator.T @ images[0, 0]).numpy(), operator.T @ images[0, 0].numpy())
+    assert np.array_equal(
+        (operator.T @ images[0, 0]).numpy(), operator.T @ images[0, 0].numpy()
+    )
     assert project(x[0, :0]).shape == (0, *operator.image_shape)
     # all of the batch shares one geometry, whose derivative is the sum
     rows = torch.tensor(scan.rows, requires_grad=True)
@@ -243,7 +259,9 @@ def test_odl_solvers(siddon, operator, scan):
     by_hand = np.zeros(24)
     for _ in range(3):
         by_hand += omega * matrix.T @ (data.ravel() - matrix @ by_hand)
-    np.testing.assert_allclose(x.asarray().ravel(), by_hand, atol=1e-5 * np.abs(by_hand).max())
+    np.testing.assert_allclose(
+        x.asarray().ravel(), by_hand, atol=1e-5 * np.abs(by_hand).max()
+    )
 
 
 @pytest.mark.filterwarnings("default")  # its own
@@ -262,7 +280,9 @@ def test_cil_itself(scan):
     solver = CGLS(initial=start, operator=pair, data=data)
     solver.run(5, verbose=0)
     ours = cgls(images, scan, LIKE, iterations=5).data
-    np.testing.assert_allclose(solver.solution.as_array(), ours, atol=1e-3 * np.abs(ours).max())
+    np.testing.assert_allclose(
+        solver.solution.as_array(), ours, atol=1e-3 * np.abs(ours).max()
+    )
 
 
 @pytest.mark.parametrize("views", [3, 1])
@@ -282,4 +302,6 @@ def test_cil_by_its_documented_interface(monkeypatch, scan, views):
     assert pair.direct(x).dot(y) == pytest.approx(pair.adjoint(y).dot(x), rel=1e-5)
     given = images.allocate(None)
     assert pair.direct(x, out=given) is given
-    assert np.array_equal(given.as_array().reshape(operator.image_shape), operator @ x.as_array())
+    assert np.array_equal(
+        given.as_array().reshape(operator.image_shape), operator @ x.as_array()
+    )

@@ -18,7 +18,9 @@ from flexdt.twin.projection.volume import blank_layout
 from tests.support.device_simulator import run_simulated
 
 FOUND = gpu.availability()
-needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUND.reason}")
+needs_gpu = pytest.mark.skipif(
+    not FOUND.present, reason=f"no CUDA device: {FOUND.reason}"
+)
 
 SIMULATED = """
 import numpy as np
@@ -174,10 +176,14 @@ assert inside > 30, inside
 
 @pytest.mark.slow
 def test_compiled_kernels_keep_their_budget() -> None:
-    if not importlib.util.find_spec("numba_cuda") or not importlib.util.find_spec("nvidia"):
+    if not importlib.util.find_spec("numba_cuda") or not importlib.util.find_spec(
+        "nvidia"
+    ):
         pytest.skip("numba-cuda or ptxas is not installed: see tests/studies/gpu_code.py")
     study = Path(__file__).parents[2] / "studies" / "gpu_code.py"
-    done = subprocess.run([sys.executable, study], capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        [sys.executable, study], capture_output=True, text=True, timeout=900
+    )
     if done.returncode == 3:
         pytest.skip(done.stdout)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -335,7 +341,9 @@ def test_there_is_no_volume_on_a_device_that_is_not_there() -> None:
     with pytest.raises(NotBuiltError, match="mps"):
         volume.to("mps")
     if not FOUND.present:
-        with pytest.raises(NotBuiltError, match=r"no CUDA driver|numba finds no|does not answer"):
+        with pytest.raises(
+            NotBuiltError, match=r"no CUDA driver|numba finds no|does not answer"
+        ):
             volume.to("cuda")
 
 

@@ -1,5 +1,5 @@
-"""Derivatives with respect to the geometry, against finite differences of a double-precision Siddon
-that shares nothing with the kernels, and against formulas.
+"""Derivatives with respect to the geometry, against finite differences of a double-precision
+Siddon that shares nothing with the kernels, and against formulas.
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ STEP_MM = 1e-6
 def volume_of(rng) -> Volume:
     """Random voxels, a third of them empty, of unequal edges, off the origin."""
     data = rng.uniform(0.1, 1.0, (5, 6, 7)) * (rng.uniform(size=(5, 6, 7)) < 0.7)
-    return Volume(data.astype(np.float32), (0.5, 0.7, 0.6), tuple(rng.normal(size=3) * 0.5))
+    return Volume(
+        data.astype(np.float32), (0.5, 0.7, 0.6), tuple(rng.normal(size=3) * 0.5)
+    )
 
 
 def tilted(rng, circle):
     roll, pitch, yaw = rng.normal(size=3) * 0.3
-    return circle(2, 25, 45, 0.9, roll=roll, pitch_tilt=pitch, yaw=yaw, start=rng.uniform(0, 6))
+    return circle(
+        2, 25, 45, 0.9, roll=roll, pitch_tilt=pitch, yaw=yaw, start=rng.uniform(0, 6)
+    )
 
 
 def off_centre(rng, circle):
@@ -90,7 +94,9 @@ def test_derivatives_are_those_of_the_reference(kind, siddon, circle):
         weights[:, *at] = rng.normal(size=(len(cone_vec), len(pixels)))
         found = geometry_gradient(volume, cone_vec, weights)
         np.testing.assert_allclose(
-            found, np.einsum("np,npk->nk", weights[:, *at], wanted), atol=1e-6 * scale.max() * 12
+            found,
+            np.einsum("np,npk->nk", weights[:, *at], wanted),
+            atol=1e-6 * scale.max() * 12,
         )
 
 

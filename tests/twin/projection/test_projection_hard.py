@@ -1,4 +1,5 @@
-"""Cases nobody tuned for: each against the double-precision reference, and forward against back."""
+"""Cases nobody tuned for: each against the double-precision reference, and forward against
+back."""
 
 from __future__ import annotations
 
@@ -45,7 +46,13 @@ CASES = {
         (2, 20.0, 40.0, 0.3),
         {"roll": 1.5708},
     ),
-    "1 mm from the volume": ((20, 24, 22), 0.5, (0, 0, 0), (3, 8.2, 40.0, 3.0), {"start": 0.05}),
+    "1 mm from the volume": (
+        (20, 24, 22),
+        0.5,
+        (0, 0, 0),
+        (3, 8.2, 40.0, 3.0),
+        {"start": 0.05},
+    ),
     "1 mm from the volume, tilted": (
         (20, 24, 22),
         0.5,
@@ -69,8 +76,20 @@ CASES = {
         {"roll": 0.01, "height": 30.0, "start": 0.2},
     ),
     "flat in x": ((50, 60, 1), 0.1, (0.013, 0, 0), (5, 20.0, 40.0, 0.3), {"roll": 0.01}),
-    "long in z": ((300, 3, 4), 0.1, (0, 0, 0), (2, 20.0, 40.0, 0.3), {"roll": 0.02, "start": 0.3}),
-    "long in y": ((4, 200, 3), 0.1, (0, 0, 0), (3, 20.0, 40.0, 0.1), {"roll": 0.02, "start": 0.01}),
+    "long in z": (
+        (300, 3, 4),
+        0.1,
+        (0, 0, 0),
+        (2, 20.0, 40.0, 0.3),
+        {"roll": 0.02, "start": 0.3},
+    ),
+    "long in y": (
+        (4, 200, 3),
+        0.1,
+        (0, 0, 0),
+        (3, 20.0, 40.0, 0.1),
+        {"roll": 0.02, "start": 0.01},
+    ),
     "pixels finer than voxels": (
         (20, 20, 20),
         0.4,
@@ -121,7 +140,9 @@ def test_hard_cases_are_exact_forward_and_back(name, siddon, circle) -> None:
     volume, geometry = build(name, circle)
     got = forward(volume, geometry, SHAPE)
     pixels = [(r, c) for r in range(0, SHAPE[0], 3) for c in range(r % 2, SHAPE[1], 2)]
-    exact = siddon(volume.data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels)
+    exact = siddon(
+        volume.data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels
+    )
     chosen = got[:, [r for r, _ in pixels], [c for _, c in pixels]]
     assert (exact > 0).sum() > 20
     assert np.abs(chosen - exact).max() < WORST * exact.max()
@@ -140,12 +161,16 @@ OTHER_TILTS = [
 
 @pytest.mark.parametrize("tilt", OTHER_TILTS)
 @pytest.mark.parametrize("degrees", [60, 89.9, 90, 135, 180, 270])
-def test_rolled_detectors_are_exact_forward_and_back(degrees, tilt, siddon, circle) -> None:
+def test_rolled_detectors_are_exact_forward_and_back(
+    degrees, tilt, siddon, circle
+) -> None:
     volume = Volume(random((31, 23, 18)), (0.1, 0.17, 0.06), (0.12, -0.07, 0.31))
     geometry = circle(3, 20.0, 40.0, 0.23, start=0.3, roll=np.radians(degrees), **tilt)
     got = forward(volume, geometry, SHAPE)
     pixels = [(r, c) for r in range(0, SHAPE[0], 3) for c in range(r % 2, SHAPE[1], 2)]
-    exact = siddon(volume.data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels)
+    exact = siddon(
+        volume.data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels
+    )
     chosen = got[:, [r for r, _ in pixels], [c for _, c in pixels]]
     assert np.abs(chosen - exact).max() < 3e-6 * exact.max()
     y = random(got.shape, 1)
@@ -158,7 +183,9 @@ def test_rolled_detectors_are_exact_forward_and_back(degrees, tilt, siddon, circ
 def test_rays_travel_in_fans_whatever_the_roll(tilt, circle) -> None:
     volume = Volume(random((31, 23, 18)), 0.1)
     for degrees in np.arange(0, 360.1, 7.5):
-        geometry = circle(3, 60.0, 100.0, 0.23, start=0.3, roll=np.radians(degrees), **tilt)
+        geometry = circle(
+            3, 60.0, 100.0, 0.23, start=0.3, roll=np.radians(degrees), **tilt
+        )
         views = voxel_rays(geometry, volume.layout, SHAPE)
         for some, turned in runs(views, SHAPE):
             plan = (
@@ -169,7 +196,9 @@ def test_rays_travel_in_fans_whatever_the_roll(tilt, circle) -> None:
             assert plan.alone.tolist() == [], degrees
             # On its side, columns are taken for rows.
             if abs(abs(np.sin(np.radians(degrees))) - np.sqrt(0.5)) > 0.15:
-                assert turned == (abs(np.sin(np.radians(degrees))) > np.sqrt(0.5)), degrees
+                assert turned == (abs(np.sin(np.radians(degrees))) > np.sqrt(0.5)), (
+                    degrees
+                )
 
 
 @pytest.mark.usefixtures("on_processor")
@@ -180,7 +209,9 @@ def test_views_on_either_side_in_one_call_equal_single_calls(circle, monkeypatch
         for degrees in (0, 90, 20, 100, 80)
     ]
     geometry = ConeVec(np.concatenate(parts))
-    monkeypatch.setattr(sides, "ROOM", 3 * 4 * SHAPE[0] * SHAPE[1])  # three images at a time
+    monkeypatch.setattr(
+        sides, "ROOM", 3 * 4 * SHAPE[0] * SHAPE[1]
+    )  # three images at a time
     found = list(runs(voxel_rays(geometry, volume.layout, SHAPE), SHAPE))
     assert [(some.start, some.stop, turned) for some, turned in found] == [
         (0, 2, False), (2, 4, True), (4, 6, False), (6, 9, True), (9, 10, True),
@@ -193,7 +224,8 @@ def test_views_on_either_side_in_one_call_equal_single_calls(circle, monkeypatch
     out[...] = np.nan
     together = back(y, geometry, volume, out).data
     one_by_one = sum(
-        back(y[i : i + 1], geometry[i], volume).data.astype(np.float64) for i in range(len(y))
+        back(y[i : i + 1], geometry[i], volume).data.astype(np.float64)
+        for i in range(len(y))
     )
     np.testing.assert_allclose(together, one_by_one, rtol=0, atol=2e-6 * one_by_one.max())
 
@@ -202,7 +234,9 @@ def test_a_level_detector_on_its_side_gives_the_turned_image(circle) -> None:
     # Exactly level: every row is a fan, and the image is that of the upright detector, turned.
     volume = Volume(random((31, 23, 18)), 0.1)
     upright = circle(3, 20.0, 40.0, 0.23, start=0.3)
-    on_side = ConeVec.from_vectors(upright.source, upright.detector, upright.v, -upright.u)
+    on_side = ConeVec.from_vectors(
+        upright.source, upright.detector, upright.v, -upright.u
+    )
     views = voxel_rays(on_side, volume.layout, SHAPE)
     assert lying(views, SHAPE).all()
     plan = plan_fans(exchanged(views), volume.layout.counts, SHAPE[::-1])
@@ -210,7 +244,9 @@ def test_a_level_detector_on_its_side_gives_the_turned_image(circle) -> None:
     image = forward(volume, on_side, SHAPE)
     again = forward(volume, upright, SHAPE[::-1])
     # First in rounding only: pixels are counted from another corner.
-    assert np.allclose(image, again[:, :, ::-1].transpose(0, 2, 1), atol=1e-6 * again.max())
+    assert np.allclose(
+        image, again[:, :, ::-1].transpose(0, 2, 1), atol=1e-6 * again.max()
+    )
 
 
 @pytest.mark.parametrize("source", [(0.02, -0.5, 0.1), (0.3, 0.2, -0.4)])
@@ -220,23 +256,34 @@ def test_source_inside_the_volume(source, siddon) -> None:
     got = forward(volume, geometry, SHAPE)
     pixels = [(r, c) for r in range(0, 41, 4) for c in range(0, 37, 3)]
     exact = siddon(volume.data, (0.1,) * 3, (0, 0, 0), geometry, SHAPE, pixels)
-    assert np.abs(got[0, [p[0] for p in pixels], [p[1] for p in pixels]] - exact).max() < 1e-5
+    assert (
+        np.abs(got[0, [p[0] for p in pixels], [p[1] for p in pixels]] - exact).max()
+        < 1e-5
+    )
 
 
 def test_z_seen_end_on_travels_alone_and_is_exact(siddon) -> None:
     volume = Volume(random((20, 22, 24)), 0.1)
-    geometry = ConeVec.from_vectors((0.03, 0.02, 9), (0, 0, -9), (0.2, 0.01, 0), (0, 0.2, 0.01))
-    plan = plan_fans(voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE)
+    geometry = ConeVec.from_vectors(
+        (0.03, 0.02, 9), (0, 0, -9), (0.2, 0.01, 0), (0, 0.2, 0.01)
+    )
+    plan = plan_fans(
+        voxel_rays(geometry, volume.layout, SHAPE), volume.layout.counts, SHAPE
+    )
     assert plan.alone.tolist() == [0]
     assert len(plan.jobs) == 0
     got = forward(volume, geometry, SHAPE)
     pixels = [(r, c) for r in range(0, 41, 4) for c in range(0, 37, 3)]
     exact = siddon(volume.data, (0.1,) * 3, (0, 0, 0), geometry, SHAPE, pixels)
-    assert np.abs(got[0, [p[0] for p in pixels], [p[1] for p in pixels]] - exact).max() < 1e-5
+    assert (
+        np.abs(got[0, [p[0] for p in pixels], [p[1] for p in pixels]] - exact).max()
+        < 1e-5
+    )
 
 
 @pytest.mark.parametrize(
-    "name", ["60 degree cone, tilted", "45 degree tilts", "long in y", "rolled a quarter turn"]
+    "name",
+    ["60 degree cone, tilted", "45 degree tilts", "long in y", "rolled a quarter turn"],
 )
 def test_fans_cover_every_pixel_once(name, circle) -> None:
     volume, geometry = build(name, circle)
@@ -263,7 +310,9 @@ def test_a_thousand_views_in_one_call_equal_single_calls(circle) -> None:
         assert np.array_equal(many[i], forward(volume, geometry[i], (8, 9))[0])
 
 
-@pytest.mark.skipif(numba.get_num_threads() < 2, reason="one core: there is no other number")
+@pytest.mark.skipif(
+    numba.get_num_threads() < 2, reason="one core: there is no other number"
+)
 @pytest.mark.usefixtures("on_processor")
 def test_result_does_not_depend_on_the_number_of_threads(circle) -> None:
     volume, geometry = build("60 degree cone, tilted", circle)
@@ -284,7 +333,9 @@ def test_a_ray_in_voxel_planes_takes_a_neighbour(circle) -> None:
     assert min(abs(exactly - 4 * a) for a in (1, 2, 4, 8)) < 1e-4
     # Turned, rounding lets it change sides on the way, but no more than that.
     for start in (np.pi / 2, np.pi, 3 * np.pi / 2):
-        value = forward(Volume(data, 1.0), circle(1, 50.0, 100.0, 0.5, start=start), (3, 3))
+        value = forward(
+            Volume(data, 1.0), circle(1, 50.0, 100.0, 0.5, start=start), (3, 3)
+        )
         assert 4 * 1 - 1e-4 < value[0, 1, 1] < 4 * 8 + 1e-4
 
 
@@ -294,9 +345,12 @@ AXES = {"x, y, z": (0, 1, 2), "y, z, x": (1, 2, 0), "z, x, y": (2, 0, 1)}
 @pytest.mark.daily(12)
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("axes", AXES)
-def test_a_sheet_of_rays_in_a_voxel_plane_stays_between_its_neighbours(axes, seed) -> None:
-    """The detector is turned about its normal; where rays lie in a plane between voxels, rounding
-    decides the side, slab by slab at worst: never less than the lesser neighbours all the way.
+def test_a_sheet_of_rays_in_a_voxel_plane_stays_between_its_neighbours(
+    axes, seed
+) -> None:
+    """The detector is turned about its normal; where rays lie in a plane between voxels,
+    rounding decides the side, slab by slab at worst: never less than the lesser neighbours all
+    the way.
     """
     draw = np.random.default_rng(seed)
     order = list(AXES[axes])
@@ -304,7 +358,10 @@ def test_a_sheet_of_rays_in_a_voxel_plane_stays_between_its_neighbours(axes, see
     voxel = float(draw.choice([0.1, 0.25, 1.0]))
     data = draw.random((n, 24, n), dtype=np.float32)
     roll = np.radians(draw.choice([0, 45, -45, 90, 135, 30]))
-    u, v = np.array([np.cos(roll), 0, np.sin(roll)]), np.array([np.sin(roll), 0, -np.cos(roll)])
+    u, v = (
+        np.array([np.cos(roll), 0, np.sin(roll)]),
+        np.array([np.sin(roll), 0, -np.cos(roll)]),
+    )
     size = n * voxel
     # The sheet lies in the plane x = 0 between the two middle voxels.
     rows = np.array([[0, -3 * size, 0], [0, 3 * size, 0], u * size / 24, v * size / 24])
@@ -354,5 +411,7 @@ def test_empty_columns_and_gaps_inside_the_box(tilt, siddon, circle) -> None:
     geometry = circle(4, 20.0, 40.0, 0.2, start=0.3, **tilt)
     pixels = [(r, c) for r in range(0, 41, 3) for c in range(r % 2, 37, 2)]
     exact = siddon(data, volume.voxel_xyz, volume.center_mm, geometry, SHAPE, pixels)
-    got = forward(volume, geometry, SHAPE)[:, [r for r, _ in pixels], [c for _, c in pixels]]
+    got = forward(volume, geometry, SHAPE)[
+        :, [r for r, _ in pixels], [c for _, c in pixels]
+    ]
     assert np.abs(got - exact).max() < WORST * exact.max()

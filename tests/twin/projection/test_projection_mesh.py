@@ -23,7 +23,9 @@ def scene(shape) -> Scene:
     return Scene((Solid(shape, "abs", 1.0),))
 
 
-@pytest.mark.parametrize("tilt", [{}, {"roll": 0.4, "pitch_tilt": 0.3, "yaw": 0.2, "height": 2.0}])
+@pytest.mark.parametrize(
+    "tilt", [{}, {"roll": 0.4, "pitch_tilt": 0.3, "yaw": 0.2, "height": 2.0}]
+)
 def test_a_box_of_triangles_is_the_analytic_box(tilt, circle) -> None:
     turn = rotation_about((1, 2, 3), 0.8)
     box = trimesh.creation.box((1.0, 2.0, 1.5))
@@ -31,7 +33,9 @@ def test_a_box_of_triangles_is_the_analytic_box(tilt, circle) -> None:
     geometry = circle(5, 8.0, 16.0, 0.08, start=0.2, **tilt)
     got = project_mesh(TriangleMesh(vertices, box.faces), geometry, SHAPE)
     axes = tuple(map(tuple, turn.T))
-    exact = project_scene(scene(Box((0.2, 0.1, -0.3), (1.0, 2.0, 1.5), axes)), geometry, SHAPE)
+    exact = project_scene(
+        scene(Box((0.2, 0.1, -0.3), (1.0, 2.0, 1.5), axes)), geometry, SHAPE
+    )
     assert exact.max() > 1
     # Pixels within rounding of the silhouette may fall on either side.
     assert np.abs(got - exact).max() < 1e-6
@@ -41,7 +45,10 @@ def test_an_icosphere_is_the_polyhedron_of_its_own_planes(circle) -> None:
     ball = trimesh.creation.icosphere(subdivisions=1)
     planes = ConvexPolyhedron(
         tuple(map(tuple, ball.face_normals)),
-        tuple(float(n @ t[0]) for n, t in zip(ball.face_normals, ball.triangles, strict=True)),
+        tuple(
+            float(n @ t[0])
+            for n, t in zip(ball.face_normals, ball.triangles, strict=True)
+        ),
     )
     geometry = circle(2, 8.0, 16.0, 0.05, start=0.3)
     got = project_mesh(as_mesh(ball), geometry, SHAPE)
@@ -49,9 +56,12 @@ def test_an_icosphere_is_the_polyhedron_of_its_own_planes(circle) -> None:
 
 
 def test_rays_through_edges_and_vertices_count_once(circle) -> None:
-    # Axis-aligned views of a subdivided cube: whole rows of pixels lie on its edges and vertices.
+    # Axis-aligned views of a subdivided cube: whole rows of pixels lie on its edges and
+    # vertices.
     box = trimesh.creation.box((2.0, 2.0, 2.0)).subdivide().subdivide()
-    geometry = ConeVec.from_vectors((0, -1e6, 0), (0, 1e6, 0), (0.25, 0, 0), (0, 0, -0.25))
+    geometry = ConeVec.from_vectors(
+        (0, -1e6, 0), (0, 1e6, 0), (0.25, 0, 0), (0, 0, -0.25)
+    )
     got = project_mesh(as_mesh(box), geometry, (15, 15))
     # Magnification 2: pixels within 2 of the centre, in steps of 1/4, see the cube.
     inside = np.abs(np.arange(15) - 7) * 0.25 < 1.99
@@ -68,7 +78,9 @@ def test_a_body_with_a_cavity_and_two_bodies(circle) -> None:
     difference = project_mesh(as_mesh(outer), geometry, SHAPE) - project_mesh(
         as_mesh(inner), geometry, SHAPE
     )
-    assert np.allclose(project_mesh(as_mesh(hollow), geometry, SHAPE), difference, atol=1e-6)
+    assert np.allclose(
+        project_mesh(as_mesh(hollow), geometry, SHAPE), difference, atol=1e-6
+    )
 
 
 def test_mean_path_is_the_volume_of_a_concave_body() -> None:
@@ -89,7 +101,9 @@ def test_source_inside_and_detector_inside() -> None:
     box = as_mesh(trimesh.creation.box((2.0, 2.0, 2.0)))
     inside = ConeVec.from_vectors((0.1, 0, 0.1), (0.1, 9, 0.1), (0.1, 0, 0), (0, 0, -0.1))
     assert project_mesh(box, inside, (3, 3))[0, 1, 1] == pytest.approx(1.0, abs=1e-6)
-    short = ConeVec.from_vectors((0.1, -9, 0.1), (0.1, 0.5, 0.1), (0.1, 0, 0), (0, 0, -0.1))
+    short = ConeVec.from_vectors(
+        (0.1, -9, 0.1), (0.1, 0.5, 0.1), (0.1, 0, 0), (0, 0, -0.1)
+    )
     assert project_mesh(box, short, (3, 3))[0, 1, 1] == pytest.approx(2.0, abs=1e-6)
     behind = ConeVec.from_vectors((0.1, 5, 0.1), (0.1, 9, 0.1), (0.1, 0, 0), (0, 0, -0.1))
     assert not project_mesh(box, behind, (3, 3)).any()

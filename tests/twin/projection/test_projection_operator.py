@@ -1,5 +1,5 @@
-"""The operator against an explicit matrix, whose entries an independent Siddon computes, in numpy,
-SciPy and what hands out memory by DLPack.
+"""The operator against an explicit matrix, whose entries an independent Siddon computes, in
+numpy, SciPy and what hands out memory by DLPack.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ def matrix_of(siddon, scan) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scan(circle):
-    return circle(5, 20, 40, 1.3, roll=0.1, pitch_tilt=0.05, yaw=-0.07, start=0.2, height=1.0)
+    return circle(
+        5, 20, 40, 1.3, roll=0.1, pitch_tilt=0.05, yaw=-0.07, start=0.2, height=1.0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,8 @@ def test_operator_and_transpose_are_the_matrix(operator, matrix):
     assert np.array_equal(operator.T.T @ LIKE.like(x), image)
     spread += 1.0  # a result belongs to the caller
     assert (
-        repr(operator) == "<Operator: 2 x 3 x 4 voxels to 5 views of 5 x 6 pixels (rows x columns)>"
+        repr(operator)
+        == "<Operator: 2 x 3 x 4 voxels to 5 views of 5 x 6 pixels (rows x columns)>"
     )
     assert repr(operator.T) == repr(operator) + ".T"
 
@@ -93,9 +96,13 @@ def test_derivatives_are_those_of_the_functions(operator, siddon, scan):
     x, change = rng.uniform(size=(2, 3, 4)), rng.normal(size=(5, 12))
     weights = rng.normal(size=operator.image_shape)
     grid = (x, LIKE.voxel_xyz, LIKE.center_mm)
-    high, low = (siddon(*grid, type(scan)(scan.rows + s * change), SHAPE) for s in (1e-6, -1e-6))
+    high, low = (
+        siddon(*grid, type(scan)(scan.rows + s * change), SHAPE) for s in (1e-6, -1e-6)
+    )
     slope = (high - low) / 2e-6
-    np.testing.assert_allclose(operator.change(x, change), slope, atol=1e-3 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        operator.change(x, change), slope, atol=1e-3 * np.abs(slope).max()
+    )
     found = float(np.vdot(operator.gradient(LIKE.like(x), weights), change))
     assert found == pytest.approx(float(np.vdot(weights, slope)), rel=1e-3)
 

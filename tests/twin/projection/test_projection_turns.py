@@ -1,4 +1,5 @@
-"""The adjoint's order of work: who writes at the same time never meets, memory may be reused."""
+"""The adjoint's order of work: who writes at the same time never meets, memory may be
+reused."""
 
 from __future__ import annotations
 
@@ -23,7 +24,10 @@ GEOMETRIES = {
     "level": ((3, 60.0, 90.0, 0.14), {}),
     "tilted": ((3, 60.0, 90.0, 0.14), {"roll": 0.05, "pitch_tilt": 0.04, "yaw": 0.1}),
     "on its side": ((3, 60.0, 90.0, 0.14), {"roll": np.pi / 2}),
-    "on its side, tilted": ((3, 60.0, 90.0, 0.14), {"roll": 1.5, "pitch_tilt": 0.04, "yaw": 0.1}),
+    "on its side, tilted": (
+        (3, 60.0, 90.0, 0.14),
+        {"roll": 1.5, "pitch_tilt": 0.04, "yaw": 0.1},
+    ),
     "fine pixels": ((2, 60.0, 90.0, 0.05), {"roll": 0.01}),
     "close": ((2, 9.0, 30.0, 0.4), {"roll": 0.01}),
     "very close": ((2, 5.6, 30.0, 0.6), {}),
@@ -51,7 +55,9 @@ def test_every_job_is_done_once_and_units_at_work_share_no_voxel_column(
     name, workers, circle
 ) -> None:
     args, options = GEOMETRIES[name]
-    box, views, shape, plan, turns = planned(circle(*args, **options), shape_of(name), workers)
+    box, views, shape, plan, turns = planned(
+        circle(*args, **options), shape_of(name), workers
+    )
     jobs = [job for a, b in turns.units.tolist() for job in range(a, b)]
     assert sorted(jobs) == list(range(len(plan.jobs)))
     units = [unit for a, b in turns.turns.tolist() for unit in range(a, b)]
@@ -86,7 +92,9 @@ def test_wide_views_are_shared_out_by_units_and_narrow_ones_by_height(circle) ->
 
 END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (0.1, 0, 0), (0, 0.1, 0))
 """Rays that travel alone."""
-INSIDE = ConeVec.from_vectors((0.2, -0.3, 0.1), (0, 9, 0), (0.1, 0, 0.01), (0.02, 0, -0.1))
+INSIDE = ConeVec.from_vectors(
+    (0.2, -0.3, 0.1), (0, 9, 0), (0.1, 0, 0.01), (0.02, 0, -0.1)
+)
 """The source inside the volume: fans whose rays go one by one."""
 
 
@@ -110,10 +118,14 @@ def test_back_into_old_memory_gives_the_same(name, circle) -> None:
     assert not out.any()
 
 
-@pytest.mark.skipif(numba.get_num_threads() < 2, reason="one core: there is no other number")
+@pytest.mark.skipif(
+    numba.get_num_threads() < 2, reason="one core: there is no other number"
+)
 def test_the_number_of_threads_does_not_matter(circle) -> None:
     before = numba.get_num_threads()
-    volume = Volume(np.random.default_rng(2).random(GRID.shape, dtype=np.float32), GRID.voxel_mm)
+    volume = Volume(
+        np.random.default_rng(2).random(GRID.shape, dtype=np.float32), GRID.voxel_mm
+    )
     for name in ("level", "tilted"):
         args, options = GEOMETRIES[name]
         geometry = circle(*args, **options)

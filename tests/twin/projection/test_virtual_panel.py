@@ -1,4 +1,5 @@
-"""A panel before or inside the object cuts no ray: chords in closed form, whatever the panel."""
+"""A panel before or inside the object cuts no ray: chords in closed form, whatever the
+panel."""
 
 import numpy as np
 import pytest
@@ -21,7 +22,9 @@ def drawn(seed: int) -> tuple[ConeVec, float]:
     far = ConeVec.circular(sod=sod, sdd=2 * sod, angles=45, shape=SHAPE, pixel=sod / 100)
     part = rng.uniform(0.1, 0.53)
     beam = far.detector - far.source
-    near = ConeVec.from_vectors(far.source, far.source + part * beam, part * far.u, part * far.v)
+    near = ConeVec.from_vectors(
+        far.source, far.source + part * beam, part * far.u, part * far.v
+    )
     return near.with_shape(SHAPE), sod
 
 
@@ -75,6 +78,8 @@ def test_back_is_the_adjoint_of_forward():
 
 def test_panels_behind_the_object_stay():
     scan = ConeVec.circular(sod=100, sdd=200, angles=5, shape=SHAPE, pixel=1)
-    corners = np.array([[x, y, z] for x in (-9, 9) for y in (-9, 9) for z in (-9, 9)], float)
+    corners = np.array(
+        [[x, y, z] for x in (-9, 9) for y in (-9, 9) for z in (-9, 9)], float
+    )
     assert run_through(scan, corners) is scan
     assert (stretches(scan, 12 * corners) > 1).all()

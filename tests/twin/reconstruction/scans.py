@@ -40,14 +40,20 @@ def circle(
     and detector against the rotation axis; repeat: the last view has the angle `span_deg`;
     angles: of the views [rad], instead of even ones over the span.
     """
-    roll = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
-    pitch = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    roll = np.array(
+        [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
+    )
+    pitch = np.array(
+        [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+    )
     panel = turn(yaw) @ pitch @ roll * pixel
     parts = [[axis, -sod, 0], [axis + aside, sdd - sod, 0], panel[:, 0], -panel[:, 2]]
     if angles is None:
         angles = np.deg2rad(np.linspace(0, span_deg, n, endpoint=repeat))
     angles = angles * sense
-    return ConeVec(np.array([np.concatenate([turn(a) @ p for p in parts]) for a in angles]))
+    return ConeVec(
+        np.array([np.concatenate([turn(a) @ p for p in parts]) for a in angles])
+    )
 
 
 def ball(geometry: ConeVec, shape: tuple[int, int]) -> np.ndarray:
@@ -56,8 +62,8 @@ def ball(geometry: ConeVec, shape: tuple[int, int]) -> np.ndarray:
 
 
 def measure(volume) -> tuple[float, np.ndarray]:
-    """Mean attenuation well inside the ball relative to the truth, and the error of its centre of
-    mass in voxels.
+    """Mean attenuation well inside the ball relative to the truth, and the error of its centre
+    of mass in voxels.
     """
     nz, ny, nx = volume.shape
     size, centre = volume.voxel_mm, np.array(volume.center_mm)
@@ -79,8 +85,8 @@ def measure(volume) -> tuple[float, np.ndarray]:
 def lengths(geometry: ConeVec, shape: tuple[int, int], grid) -> np.ndarray:
     """Length of each ray in each voxel of a grid [mm], (n * rows * cols, nz * ny * nx).
 
-    A ray meets a box between the last of the near and the first of the far faces, one voxel at a
-    time: nothing of the projectors is used.
+    A ray meets a box between the last of the near and the first of the far faces, one voxel at
+    a time: nothing of the projectors is used.
     """
     rows, cols = shape
     c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
@@ -91,7 +97,9 @@ def lengths(geometry: ConeVec, shape: tuple[int, int], grid) -> np.ndarray:
     out = []
     for row in geometry.rows:
         source, panel, u, v = row.reshape(4, 3)
-        ray = (panel + c[None, :, None] * u + r[:, None, None] * v - source).reshape(-1, 1, 3)
+        ray = (panel + c[None, :, None] * u + r[:, None, None] * v - source).reshape(
+            -1, 1, 3
+        )
         with np.errstate(divide="ignore"):
             one, other = ((centers + side * half - source) / ray for side in (-1, 1))
         near = np.minimum(one, other).max(axis=2)

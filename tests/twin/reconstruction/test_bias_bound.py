@@ -1,4 +1,5 @@
-"""A volume's bias bound beside the truth: scans drawn, and projected, by the study's own code."""
+"""A volume's bias bound beside the truth: scans drawn, and projected, by the study's own
+code."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ SHAPE = (24, 48)
 @pytest.mark.parametrize("count", [3, 24])
 @pytest.mark.campaign(1)
 def test_even_regions_are_within_the_bound(count: int) -> None:
-    """As the study asks of its hundreds: all but one of fifty, of scans that chose no constant."""
+    """As the study asks of its hundreds: all but one of fifty, of scans that chose no
+    constant."""
     excess = []
     for number in range(count):
         found = bias_bound.judged(bias_bound.drawn(7, number))
@@ -102,7 +104,10 @@ def test_what_no_data_cover_is_nan_and_what_was_not_asked_for_is_none() -> None:
     assert (np.isnan(volume.bias_bound) == np.isnan(volume.data)).all()
     assert np.isnan(volume.bias_bound).any()
     assert volume.like(np.zeros(volume.shape)).bias_bound is None
-    assert fdk_parts(lambda: [images], scan, SHAPE, Grid((5, 24, 24), 1.0)).bias_bound is None
+    assert (
+        fdk_parts(lambda: [images], scan, SHAPE, Grid((5, 24, 24), 1.0)).bias_bound
+        is None
+    )
 
 
 def test_images_on_their_side_have_the_same_bound() -> None:
@@ -170,9 +175,13 @@ def test_few_views_of_one_row_are_warned_of() -> None:
 def test_a_light_body_with_dense_pins_is_what_is_judged() -> None:
     """A pin of forty times its attenuation made all of the body air."""
     scan = scan_of(np.arange(30) * 12.0)
-    body = bias_bound.Solid("cylinder", np.zeros(3), np.array([16.0, 16.0, 9.0]), 0.0, 0.005)
+    body = bias_bound.Solid(
+        "cylinder", np.zeros(3), np.array([16.0, 16.0, 9.0]), 0.0, 0.005
+    )
     pins = [
-        bias_bound.Solid("cylinder", np.array([x, 5.0, 0.0]), np.array([1.2, 1.2, 9.0]), 0.0, 0.2)
+        bias_bound.Solid(
+            "cylinder", np.array([x, 5.0, 0.0]), np.array([1.2, 1.2, 9.0]), 0.0, 0.2
+        )
         for x in (-8.0, 8.0)
     ]
     images = bias_bound.Scan("", scan, SHAPE, [body, *pins], 0.0, 0.0, 0).images()
@@ -197,15 +206,19 @@ def test_a_rod_that_shades_the_edges_in_few_views_is_cut_off() -> None:
     assert 0 < (images[::5, 12, 0] > 0.0).sum() <= 2
     with pytest.warns(UserWarning, match="beyond the panel's sides"):
         volume = fdk(images, scan, Grid((3, 30, 30), 1.0))
-    assert 0.03 < volume.data[1, 10:20, 10:20].mean() / 0.02 - 1.0 < 0.1  # 7.7 % if nothing is done
+    assert (
+        0.03 < volume.data[1, 10:20, 10:20].mean() / 0.02 - 1.0 < 0.1
+    )  # 7.7 % if nothing is done
 
 
 def test_what_no_image_shows_is_said_with_the_figures() -> None:
-    """A shell beyond the panel looks much like a wider body, whose values are right: a thick one of
-    three times the attenuation makes all values a quarter too low."""
+    """A shell beyond the panel looks much like a wider body, whose values are right: a thick
+    one of three times the attenuation makes all values a quarter too low."""
     shell = [upright(31.0, 0.06), upright(25.0, -0.04)]
     scan, images = turned(*shell)
-    with pytest.warns(UserWarning, match="denser shell out there makes every value too low"):
+    with pytest.warns(
+        UserWarning, match="denser shell out there makes every value too low"
+    ):
         volume = fdk(images, scan, Grid((3, 30, 30), 1.0))
     assert volume.data[1, 10:20, 10:20].mean() / 0.02 == pytest.approx(0.73, abs=0.02)
     scan, images = turned(upright(32.0, 0.02))

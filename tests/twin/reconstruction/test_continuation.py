@@ -1,4 +1,5 @@
-"""Rows continued beyond the panel's edges, beside path lengths ray by ray in double precision."""
+"""Rows continued beyond the panel's edges, beside path lengths ray by ray in double
+precision."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
 from flexdt.twin.reconstruction.kernels.truncation_kernels import fit_prism
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
-"""Of the largest value: a pixel is rounded once, and the panel's means are of float32 images."""
+"""Of the largest value: a pixel is rounded once, and the panel's means are of float32
+images."""
 
 
 def drawn_prism(rng: np.random.Generator) -> Prism:
@@ -45,7 +47,9 @@ def path(prism: Prism | None, source: FloatArray, pixel: FloatArray) -> float:
 class Reference:
     """The continuation of one view's rows, pixel by pixel, from the text of `Truncation`."""
 
-    def __init__(self, found: Truncation, row: FloatArray, size: tuple[int, int], before: int):
+    def __init__(
+        self, found: Truncation, row: FloatArray, size: tuple[int, int], before: int
+    ):
         self.found, (self.cols, self.wide), self.before = found, size, before
         self.source, self.panel, self.u, self.v = row.reshape(4, 3)
 
@@ -62,16 +66,23 @@ class Reference:
 
     def model(self, r: float, c: float, middle_row: float) -> float:
         """What the prisms attenuate on the way to a pixel, c from the panel's first column."""
-        pixel = self.panel + (c - (self.cols - 1) / 2) * self.u + (r - middle_row) * self.v
+        pixel = (
+            self.panel + (c - (self.cols - 1) / 2) * self.u + (r - middle_row) * self.v
+        )
         prisms = self.found.prisms
-        return sum(part * path(prisms[k], self.source, pixel) for k, part in self.bands(r))
+        return sum(
+            part * path(prisms[k], self.source, pixel) for k, part in self.bands(r)
+        )
 
     def row(self, line: FloatArray, r: float, middle_row: float) -> FloatArray:
         """A widened row."""
         edge = max(1, self.cols // 48)
         cut = sum(part * bool(self.found.cut_off[k]) for k, part in self.bands(r))
         sides = (range(edge), range(self.cols - edge, self.cols))
-        rest = [np.mean([line[c] - self.model(r, c, middle_row) for c in side]) for side in sides]
+        rest = [
+            np.mean([line[c] - self.model(r, c, middle_row) for c in side])
+            for side in sides
+        ]
         out = np.empty(self.wide)
         for at in range(self.wide):
             c = at - self.before
@@ -85,13 +96,17 @@ class Reference:
         return out
 
 
-def drawn(seed: int) -> tuple[Truncation, ConeVec, Float32Array, tuple[int, int, int, int]]:
+def drawn(
+    seed: int,
+) -> tuple[Truncation, ConeVec, Float32Array, tuple[int, int, int, int]]:
     """A truncation, two views, their images, and rows and columns that are asked for."""
     rng = np.random.default_rng([20261127, seed])
     rows, cols = int(rng.integers(1, 14)), int(rng.integers(2, 110))
     bands = int(rng.integers(1, min(rows, 4) + 1))
     cut_off = rng.random(bands) < 0.8
-    prisms = tuple(drawn_prism(rng) if cut and rng.random() < 0.7 else None for cut in cut_off)
+    prisms = tuple(
+        drawn_prism(rng) if cut and rng.random() < 0.7 else None for cut in cut_off
+    )
     middles = np.sort(rng.uniform(0.0, rows - 1.0, bands))
     found = Truncation(middles, prisms, cut_off, fade=float(rng.choice([0.5, 1.0])))
     scan = ConeVec.circular(
@@ -104,7 +119,10 @@ def drawn(seed: int) -> tuple[Truncation, ConeVec, Float32Array, tuple[int, int,
 
 
 def widened(
-    found: Truncation, scan: ConeVec, images: Float32Array, asked: tuple[int, int, int, int]
+    found: Truncation,
+    scan: ConeVec,
+    images: Float32Array,
+    asked: tuple[int, int, int, int],
 ) -> Float32Array:
     """As FDK widens these rows."""
     first, last, before, after = asked
@@ -174,7 +192,11 @@ def test_the_fit_costs_no_more_than_scipys(seed: int) -> None:
     rays = 300.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     seen = prism.integrals(source[:, None], rays)
     ball = np.abs(np.sin(angle) * source[:, :1] - np.cos(angle) * source[:, 1:] - 3.0)
-    seen = seen + 0.05 * np.sqrt(np.maximum(16.0 - ball**2, 0.0)) + rng.normal(0, 1e-3, ball.shape)
+    seen = (
+        seen
+        + 0.05 * np.sqrt(np.maximum(16.0 - ball**2, 0.0))
+        + rng.normal(0, 1e-3, ball.shape)
+    )
     usual = float(np.median(seen))
     middle = np.array([0.0, 0.0, 0.0, 0.0, 0.0, math.log(usual / field)])
     limit = np.array([2.0, 2.0, math.log(4.0), math.log(4.0), 2.0, 3.0 * math.log(4.0)])
@@ -185,7 +207,9 @@ def test_the_fit_costs_no_more_than_scipys(seed: int) -> None:
 
     ours, theirs = [], []
     for r in (1.1, 1.5, 2.2):
-        start = np.array([0, 0, -math.log(r), -math.log(r), 0, math.log(usual / (1.5 * r * field))])
+        start = np.array(
+            [0, 0, -math.log(r), -math.log(r), 0, math.log(usual / (1.5 * r * field))]
+        )
         found = least_squares(
             rest, start, bounds=(low, high), loss="cauchy", f_scale=scale, max_nfev=60
         )
@@ -193,9 +217,18 @@ def test_the_fit_costs_no_more_than_scipys(seed: int) -> None:
         x = start.copy()
         ours.append(
             fit_prism(
-                source / field, rays / field, np.full(ball.shape, 300.0), seen, low, high, scale, x
+                source / field,
+                rays / field,
+                np.full(ball.shape, 300.0),
+                seen,
+                low,
+                high,
+                scale,
+                x,
             )
         )
         assert ((low <= x) & (x <= high)).all()
-        assert ours[-1] == pytest.approx(0.5 * scale**2 * np.log1p((rest(x) / scale) ** 2).sum())
+        assert ours[-1] == pytest.approx(
+            0.5 * scale**2 * np.log1p((rest(x) / scale) ** 2).sum()
+        )
     assert min(ours) <= min(theirs) * (1.0 + 1e-6)

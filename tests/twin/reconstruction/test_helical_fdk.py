@@ -1,4 +1,5 @@
-"""FDK of helices: exact path lengths of long random objects, and shares judged by projection."""
+"""FDK of helices: exact path lengths of long random objects, and shares judged by
+projection."""
 
 from __future__ import annotations
 
@@ -26,7 +27,13 @@ def helix(part: float, views: int = 180, turns: float = 4.0, **more: object) -> 
     """So much of the steepest rise."""
     angles = np.linspace(0.0, 360.0 * turns, int(views * turns), endpoint=False)
     return ConeVec.helical(
-        sod=SOD, sdd=SDD, angles=angles, rise=part * STEEPEST, pixel=PITCH, shape=SHAPE, **more
+        sod=SOD,
+        sdd=SDD,
+        angles=angles,
+        rise=part * STEEPEST,
+        pixel=PITCH,
+        shape=SHAPE,
+        **more,
     )  # type: ignore[arg-type]
 
 
@@ -55,14 +62,20 @@ def errors(parts: list[tuple[np.ndarray, np.ndarray, float]], scan: ConeVec, z: 
     for place, axes, mu in parts:
         where = np.stack(np.broadcast_arrays(x, y, z), -1) - place
         truth += mu * (((where / axes) ** 2).sum(-1) <= 1.0)
-        grown, shrunk = axes + 2.5 * grid.voxel_mm, np.maximum(axes - 2.5 * grid.voxel_mm, 1e-3)
-        even &= (((where / grown) ** 2).sum(-1) > 1) | (((where / shrunk) ** 2).sum(-1) < 1)
+        grown, shrunk = (
+            axes + 2.5 * grid.voxel_mm,
+            np.maximum(axes - 2.5 * grid.voxel_mm, 1e-3),
+        )
+        even &= (((where / grown) ** 2).sum(-1) > 1) | (
+            ((where / shrunk) ** 2).sum(-1) < 1
+        )
     return ((fdk(images, scan, grid.blank(), errors=False).data[0] - truth) / MU)[even]
 
 
 @pytest.mark.slow
 def test_long_objects_come_back_from_any_helix() -> None:
-    """Up and down, clockwise or not, panels aside and tilted, beside a circle round the layer."""
+    """Up and down, clockwise or not, panels aside and tilted, beside a circle round the
+    layer."""
     rng = np.random.default_rng(7)
     for case in range(6):
         parts, z = column(rng), float(rng.uniform(-0.4, 0.4)) * STEEPEST
@@ -74,7 +87,9 @@ def test_long_objects_come_back_from_any_helix() -> None:
             more = {"tilts": (1.0, -0.5, 2.0)}
         scan = helix(part, **more)
         if case >= 3:  # the same turns the other way
-            scan = ConeVec(scan.rows * np.tile([-1.0, 1.0, 1.0], 4) * np.repeat([1, 1, -1, 1], 3))
+            scan = ConeVec(
+                scan.rows * np.tile([-1.0, 1.0, 1.0], 4) * np.repeat([1, 1, -1, 1], 3)
+            )
         if case % 2:  # listed in any order
             scan = scan[rng.permutation(len(scan))]
         circle = ConeVec.circular(
@@ -86,21 +101,28 @@ def test_long_objects_come_back_from_any_helix() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_helix_with_a_gap_is_refused_and_a_slow_drift_with_one_is_a_circle(seed: int) -> None:
-    """A gap of a helix was bridged without a word, and 0.2 mm of drift made a circle a helix."""
+def test_a_helix_with_a_gap_is_refused_and_a_slow_drift_with_one_is_a_circle(
+    seed: int,
+) -> None:
+    """A gap of a helix was bridged without a word, and 0.2 mm of drift made a circle a
+    helix."""
     rng = np.random.default_rng(seed)
     scan = helix(0.5)
     first, width = rng.uniform(0.2, 0.6) * len(scan), rng.uniform(0.08, 0.4) * 180
     left = np.abs(np.arange(len(scan)) - first) > width / 2
     with pytest.raises(GeometryError, match="no gap of angles"):
         circle_of(scan[rng.permutation(np.flatnonzero(left))])
-    turn = ConeVec.circular(sod=SOD, sdd=SDD, angles=180, pixel=PITCH, shape=SHAPE, height=0.0)  # type: ignore[arg-type]
+    turn = ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=180, pixel=PITCH, shape=SHAPE, height=0.0
+    )  # type: ignore[arg-type]
     for rise in (0.5e-3, 3e-3):
         rows = turn.rows.copy()
         rows[:, 2::3][:, :2] += np.linspace(0.0, rise * SOD, 180)[:, None]
         there = np.delete(np.arange(180), np.arange(60, 60 + int(rng.integers(15, 50))))
         parts = column(rng)
-        seen, whole = (errors(parts, ConeVec(rows[some]), 0.0) for some in (there, slice(None)))
+        seen, whole = (
+            errors(parts, ConeVec(rows[some]), 0.0) for some in (there, slice(None))
+        )
         assert abs(seen.mean()) < abs(whole.mean()) + 0.002
         assert seen.std() < 1.3 * whole.std() + 0.002
 
@@ -145,11 +167,14 @@ def test_shares_of_a_point_add_up_to_one() -> None:
 
 def test_slabs_are_the_whole() -> None:
     scan = helix(0.4, 40, 3.0)
-    images = np.random.default_rng(1).normal(1.0, 0.1, (len(scan), *SHAPE)).astype(np.float32)
+    images = (
+        np.random.default_rng(1).normal(1.0, 0.1, (len(scan), *SHAPE)).astype(np.float32)
+    )
     grid = Grid((48, 20, 24), 1.0)
     whole = fdk_parts(lambda: [images], scan, SHAPE, grid).data
     slabs = [
-        fdk_parts(lambda: [images], scan, SHAPE, grid.slab(k, k + 16)).data for k in (0, 16, 32)
+        fdk_parts(lambda: [images], scan, SHAPE, grid.slab(k, k + 16)).data
+        for k in (0, 16, 32)
     ]
     assert np.abs(np.concatenate(slabs) - whole).max() < 1e-5 * np.abs(whole).max()
 
@@ -177,7 +202,9 @@ def test_too_steep_a_helix_is_refused_with_what_is_allowed() -> None:
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
-def test_layers_that_some_sides_do_not_see_are_nan_and_the_others_right(part: float) -> None:
+def test_layers_that_some_sides_do_not_see_are_nan_and_the_others_right(
+    part: float,
+) -> None:
     """Of the whole field of view: at its ends up to 86 % was missing without a word."""
     scan = helix(part, 90, 2.5)
     solid = Solid(Ellipsoid((2.0, -3.0, 0.0), (0.6 * FIELD, 0.5 * FIELD, 1e5)), "a", MU)
@@ -194,7 +221,9 @@ def test_layers_that_some_sides_do_not_see_are_nan_and_the_others_right(part: fl
 
 def test_an_object_wider_than_the_panel_is_said() -> None:
     scan = helix(0.5, 40)
-    body = Scene((Solid(Ellipsoid((0.0, 0.0, 0.0), (2 * FIELD, 2 * FIELD, 1e5)), "a", MU),))
+    body = Scene(
+        (Solid(Ellipsoid((0.0, 0.0, 0.0), (2 * FIELD, 2 * FIELD, 1e5)), "a", MU),)
+    )
     with pytest.warns(UserWarning, match="beyond the panel's sides"):
         fdk(project_scene(body, scan, SHAPE), scan, Grid((1, 8, 8), 4.0).blank())
 
@@ -204,7 +233,9 @@ def test_a_grid_of_any_size_is_refused_before_anything_is_allocated(tmp_path) ->
     data = fx.simulate(fx.Volume(np.full((8, 8, 8), 0.01, np.float32), 2.0), scan)
     for shape in ((10**6, 10**6, 10**6), (1, 10**7, 10**7)):
         with pytest.raises(LimitError, match="GiB"):
-            reconstruct_dataset(data, tmp_path / "v.tif", VolumeRequest(shape=shape, voxel_mm=1.0))
+            reconstruct_dataset(
+                data, tmp_path / "v.tif", VolumeRequest(shape=shape, voxel_mm=1.0)
+            )
         with pytest.raises(LimitError, match="GiB"):
             data.reconstruct("fdk", voxel=1.0, shape=shape)
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,7 @@
 """Images that do not belong to their geometry are named; right ones, made difficult, are not.
 
-Objects are projected along rays of the study's own code, which shares nothing with the projectors.
+Objects are projected along rays of the study's own code, which shares nothing with the
+projectors.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ def looked_at(kind: str, aside: float = 0.0) -> Bias:
     change, names = {**misfits.WRONG, **dict.fromkeys(misfits.RIGHT, (None, None))}[kind]
     change = change or misfits.RIGHT[kind]
     images, geometry = change(scan.images(), scan.geometry, np.random.default_rng(3))
-    case = misfits.Case(kind, np.ascontiguousarray(images, np.float32), geometry, scan, names)
+    case = misfits.Case(
+        kind, np.ascontiguousarray(images, np.float32), geometry, scan, names
+    )
     bias = misfits.looked_at(case)
     assert bias is not None
     return bias
@@ -61,7 +64,9 @@ def looked_at(kind: str, aside: float = 0.0) -> Bias:
     ],
 )
 @pytest.mark.daily(4)
-def test_what_contradicts_is_named_and_no_accuracy_is_claimed(kind: str, aside: float) -> None:
+def test_what_contradicts_is_named_and_no_accuracy_is_claimed(
+    kind: str, aside: float
+) -> None:
     bias = looked_at(kind, aside)
     assert bias.contradiction is not None
     assert misfits.WRONG[kind][1] & set(bias.contradiction.kinds)
@@ -69,7 +74,9 @@ def test_what_contradicts_is_named_and_no_accuracy_is_claimed(kind: str, aside: 
     assert bias.accuracy(grid) is None
     assert bias.bound(grid.blank()) is None
     (told,) = bias_warnings(bias, grid)
-    assert told.startswith("no accuracy is claimed: images and geometry contradict each other")
+    assert told.startswith(
+        "no accuracy is claimed: images and geometry contradict each other"
+    )
 
 
 def test_the_offset_is_right_within_half_a_pixel() -> None:
@@ -97,20 +104,28 @@ def test_motion_is_no_offset() -> None:
 
 def test_volumes_of_voxels_that_hold_no_region_claim_nothing() -> None:
     scan = brick()
-    with pytest.warns(UserWarning, match="accuracy is not known: voxels of 30 mm are too large"):
+    with pytest.warns(
+        UserWarning, match="accuracy is not known: voxels of 30 mm are too large"
+    ):
         volume = fdk(scan.images(), scan.geometry, Grid((1, 1, 1), 30.0))
     assert volume.accuracy is None
 
 
 @pytest.mark.parametrize("kind", ["flats that disagree", "falling beam"])
 def test_an_open_beam_that_is_not_the_flat_is_no_truncation(kind: str) -> None:
-    """A flat that is 1.25 times as bright as the scan's beam, and a beam that falls by a fifth: the
-    bound holds, and says why."""
+    """A flat that is 1.25 times as bright as the scan's beam, and a beam that falls by a fifth:
+    the bound holds, and says why."""
     scan = brick()
     images = scan.images()
-    when = np.linspace(0.0, 1.0, len(images)) if kind == "falling beam" else np.ones(len(images))
+    when = (
+        np.linspace(0.0, 1.0, len(images))
+        if kind == "falling beam"
+        else np.ones(len(images))
+    )
     images = images + np.float32(np.log(1.25)) * when[:, None, None].astype(np.float32)
-    with pytest.warns(UserWarning, match="an open beam beside the object that is not the flat"):
+    with pytest.warns(
+        UserWarning, match="an open beam beside the object that is not the flat"
+    ):
         volume = fdk(images, scan.geometry, Grid((16, 30, 30), 1.0))
     uniform = slice(6, 10), slice(14, 19), slice(13, 17)
     assert volume.bias_bound is not None

@@ -1,7 +1,7 @@
 """A volume's sigma beside the spread of many volumes, with images and noise of this file's own.
 
-Spheres by their chords, Poisson noise, flat images of a few exposures, pixels of unlike gain and a
-panel that blurs. Geometries are drawn.
+Spheres by their chords, Poisson noise, flat images of a few exposures, pixels of unlike gain
+and a panel that blurs. Geometries are drawn.
 """
 
 from __future__ import annotations
@@ -44,9 +44,13 @@ class Drawn:
         ]
         return cls(
             views=int(rng.integers(150, 241)),
-            arc_deg=360.0 if aside or rng.random() < 0.6 else float(rng.uniform(205.0, 300.0)),
+            arc_deg=360.0
+            if aside or rng.random() < 0.6
+            else float(rng.uniform(205.0, 300.0)),
             aside=aside,
-            tilts=tuple(float(t) for t in rng.choice([0.0, 1.0]) * rng.uniform(-1.0, 1.0, 3)),
+            tilts=tuple(
+                float(t) for t in rng.choice([0.0, 1.0]) * rng.uniform(-1.0, 1.0, 3)
+            ),
             counts=float(10.0 ** rng.uniform(3.0, 4.5)),
             flats=int(rng.choice([1, 4, 40])),
             blur_px=float(rng.choice([0.0, rng.uniform(0.3, 0.6)])),
@@ -97,7 +101,9 @@ def ratios(scan: Drawn) -> list[float]:
     volumes, sigmas = [], []
     for seed in range(SEEDS):
         images = exposed(scan, clean, np.random.default_rng(seed))
-        volume = fdk_parts(lambda images=images: [images], geometry, (72, 80), grid, errors=True)
+        volume = fdk_parts(
+            lambda images=images: [images], geometry, (72, 80), grid, errors=True
+        )
         volumes.append(volume.data)
         if seed < 2:
             assert volume.sigma is not None
@@ -135,7 +141,11 @@ def test_the_order_of_views_does_not_matter() -> None:
     grid, sigmas = Grid((20, 24, 24), 0.8), []
     for chosen in (np.arange(len(images)), order):
         volume = fdk_parts(
-            lambda chosen=chosen: [images[chosen]], geometry[chosen], (72, 80), grid, errors=True
+            lambda chosen=chosen: [images[chosen]],
+            geometry[chosen],
+            (72, 80),
+            grid,
+            errors=True,
         )
         sigmas.append(volume.sigma)
     assert sigmas[0] is not None
@@ -165,5 +175,7 @@ def test_few_rows_have_a_sigma_or_none(rows: int) -> None:
     rng = np.random.default_rng(rows)
     scan = ConeVec.circular(sod=200, sdd=350, angles=60, shape=(rows, 80), pixel=0.6)
     images = rng.normal(0.0, 0.01, (60, rows, 80)).astype(np.float32)
-    volume = fdk_parts(lambda: [images], scan, (rows, 80), Grid((rows, 24, 24), 0.8), errors=True)
+    volume = fdk_parts(
+        lambda: [images], scan, (rows, 80), Grid((rows, 24, 24), 0.8), errors=True
+    )
     assert volume.sigma is None or np.isfinite(volume.sigma).any()

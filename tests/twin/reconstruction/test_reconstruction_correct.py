@@ -16,7 +16,8 @@ ALUMINIUM = Substance.of("aluminium", "Al", 2.7)
 
 
 def test_hardening_is_undone():
-    """Independent of the correction's table: a finer sum over the spectrum at other thicknesses."""
+    """Independent of the correction's table: a finer sum over the spectrum at other
+    thicknesses."""
     signal, _ = weights_of(Chain(Detector()), 90.0)
     thickness = np.array([0.0, 0.37, 1.9, 7.3, 23.0])
     measured = -np.log(
@@ -27,11 +28,15 @@ def test_hardening_is_undone():
     np.testing.assert_allclose(correct(measured), thickness * mu, rtol=2e-3, atol=1e-5)
     small = correct(np.array([-0.001, 0.001], np.float32))
     assert small[0] == pytest.approx(-small[1], rel=0.02)
-    assert correct(np.array([30.0], np.float32))[0] > correct(np.array([20.0], np.float32))[0]
+    assert (
+        correct(np.array([30.0], np.float32))[0]
+        > correct(np.array([20.0], np.float32))[0]
+    )
 
 
 def test_rings_go_and_the_object_stays():
-    """No two of the wrong columns are as far from the axis, where they would be the object's."""
+    """No two of the wrong columns are as far from the axis, where they would be the
+    object's."""
     scan = circle(120)
     clean = ball(scan, (40, 130))
     wrong = np.zeros((40, 130), np.float32)

@@ -120,7 +120,8 @@ def test_a_panel_turned_any_way_gives_the_same_ball(degrees):
 @pytest.mark.filterwarnings("ignore:.*layers of the grid lie")
 @pytest.mark.parametrize("degrees", [90.0, 270.0])
 def test_a_panel_on_its_side_loses_nothing(degrees):
-    """Long and narrow: 60 x 130 pixels that lie as 130 x 60 on their side are the same image."""
+    """Long and narrow: 60 x 130 pixels that lie as 130 x 60 on their side are the same
+    image."""
     plain = circle(60, aside=8.0)
     wanted = plain_fdk(ball(plain, (60, 130)), plain, LIKE).data
     scan = rolled(plain, degrees)
@@ -172,11 +173,15 @@ def ellipses(parts: list[Ellipse], scan: ConeVec, shape: tuple[int, int]) -> np.
     rows, cols = shape
     out = np.zeros((len(scan), rows, cols), np.float32)
     c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
-    for image, (source, centre, u, v) in zip(out, scan.rows.reshape(-1, 4, 3), strict=True):
+    for image, (source, centre, u, v) in zip(
+        out, scan.rows.reshape(-1, 4, 3), strict=True
+    ):
         ray = centre + c[None, :, None] * u + r[:, None, None] * v - source
         length = np.linalg.norm(ray, axis=-1)
         for x, y, a, b, angle, mu in parts:
-            own = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            own = np.array(
+                [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+            )
             start = own @ (source[:2] - (x, y)) / (a, b)
             way = ray[..., :2] @ own.T / (a, b)
             p, q, s = (way**2).sum(-1), way @ start, start @ start - 1.0
@@ -203,7 +208,8 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
         sod, rows = rng.uniform(110.0, 400.0), int(rng.integers(24, 50))
         scan = circle(96, span, pixel=1.6, sod=sod, sdd=2 * sod)
         scan = ConeVec(
-            scan.rows + np.array([0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0]) * rng.uniform(-9, 9)
+            scan.rows
+            + np.array([0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0]) * rng.uniform(-9, 9)
         )
         parts = [(*rng.uniform(-6, 6, 2), *rng.uniform(8, 16, 2), 1.0, 0.02)]
         size = 1.6 * rng.uniform(0.8, 1.2)
@@ -226,7 +232,8 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
 
 
 def test_a_narrow_overlap_leaves_no_mark_on_the_axis():
-    """A panel moved aside sees few columns beyond the axis, which falls anywhere between two."""
+    """A panel moved aside sees few columns beyond the axis, which falls anywhere between
+    two."""
     rng = np.random.default_rng(31)
     for overlap in [1.01, *np.exp(rng.uniform(np.log(1.0), np.log(24.0), 5))]:
         scan = circle(240, pixel=1.0, aside=64.0 - overlap, sod=300.0, sdd=600.0)
@@ -234,19 +241,33 @@ def test_a_narrow_overlap_leaves_no_mark_on_the_axis():
         parts = [(0.2 * field, -0.1 * field, 0.5 * field, 0.6 * field, 0.4, 0.02)]
         data = ellipses(parts, scan, (4, 128))
         found = plain_fdk(data, scan, Grid((1, 9, 9), 0.5).blank()).data[0]
-        assert np.abs(found / 0.02 - 1.0).max() < 0.04  # -160 to 210 % unless sampled alike
+        assert (
+            np.abs(found / 0.02 - 1.0).max() < 0.04
+        )  # -160 to 210 % unless sampled alike
 
 
 @pytest.mark.parametrize(
     ("shift", "yaw"),
-    [(0.0, 0.3), (0.02, 0.0), (0.02, -0.7), (-0.15, 0.3), (0.5, -0.7), (-0.7, 0.3), (0.95, 0.0)],
+    [
+        (0.0, 0.3),
+        (0.02, 0.0),
+        (0.02, -0.7),
+        (-0.15, 0.3),
+        (0.5, -0.7),
+        (-0.7, 0.3),
+        (0.95, 0.0),
+    ],
 )
 def test_a_detector_moved_aside_brings_no_bias(shift, yaw):
-    """Objects out to 0.95 of the field of view, which is nearly twice as wide as the panel's."""
+    """Objects out to 0.95 of the field of view, which is nearly twice as wide as the
+    panel's."""
     scan = circle(240, pixel=0.8, aside=shift * 64.0, yaw=yaw, sod=300.0, sdd=600.0)
     widest = max(reach(fan_angles(circle_of(scan), scan, 160)))
     radius = 0.95 * 300.0 * np.sin(widest)
-    parts = [(0.0, 0.0, radius, radius, 0.0, 0.02), (0.4 * radius, 0.1, 4.0, 3.0, 0.5, 0.01)]
+    parts = [
+        (0.0, 0.0, radius, radius, 0.0, 0.02),
+        (0.4 * radius, 0.1, 4.0, 3.0, 0.5, 0.01),
+    ]
     at = np.linspace(-radius, radius, 81)
     size = float(at[1] - at[0])
     data = ellipses(parts, scan, (4, 160))
@@ -265,17 +286,25 @@ def test_objects_wider_than_the_panel_come_out_even():
     middle = np.abs(np.hypot(at[:, None], at) / field - 0.5) < 0.1
     for _ in range(4):
         half = field * rng.uniform(1.05, 2.0), field * rng.uniform(0.8, 2.0)
-        parts = [(*(field * rng.uniform(-0.2, 0.2, 2)), *half, rng.uniform(0.0, 3.0), 0.02)]
+        parts = [
+            (*(field * rng.uniform(-0.2, 0.2, 2)), *half, rng.uniform(0.0, 3.0), 0.02)
+        ]
         for _ in range(rng.integers(0, 5)):
             axes = field * rng.uniform(0.05, 0.25, 2)
             place = field * rng.uniform(-0.6, 0.6, 2)
             parts.append((*place, *axes, 0.0, 0.02 * rng.uniform(-0.8, 2.0)))
         data = ellipses(parts, scan, (4, 80))
-        found = plain_fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()).data[0]
+        found = plain_fdk(
+            data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()
+        ).data[0]
         truth, even = layer_of(parts, at)
-        assert float((found - truth)[even & middle].mean()) / 0.02 == pytest.approx(0.0, abs=0.03)
+        assert float((found - truth)[even & middle].mean()) / 0.02 == pytest.approx(
+            0.0, abs=0.03
+        )
         lost, away = np.isnan(found), np.hypot(at[:, None], at) / field
-        assert lost[away > 1.03].all()  # of what lies there, lines of some directions are unknown
+        assert lost[
+            away > 1.03
+        ].all()  # of what lies there, lines of some directions are unknown
         assert not lost[away < 0.97].any()
 
 
@@ -285,7 +314,10 @@ def with_four_dense_things(seed: int, field: float) -> list[Ellipse]:
     half = field * rng.uniform(1.05, 2.0), field * rng.uniform(0.8, 2.0)
     parts = [(*(field * rng.uniform(-0.2, 0.2, 2)), *half, rng.uniform(0.0, 3.0), 0.02)]
     for _ in range(4):
-        axes, place = field * rng.uniform(0.05, 0.25, 2), field * rng.uniform(-0.6, 0.6, 2)
+        axes, place = (
+            field * rng.uniform(0.05, 0.25, 2),
+            field * rng.uniform(-0.6, 0.6, 2),
+        )
         parts.append((*place, *axes, 0.0, 0.02 * rng.uniform(0.6, 2.0)))
     return parts
 
@@ -293,7 +325,8 @@ def with_four_dense_things(seed: int, field: float) -> list[Ellipse]:
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", [0, 2, 4, 11])
 def test_dense_things_do_not_pull_the_outline_unsaid(seed):
-    """Seeds 4 and 11 are hard: most rays meet something dense, and no quarter of them is clean."""
+    """Seeds 4 and 11 are hard: most rays meet something dense, and no quarter of them is
+    clean."""
     scan = circle(60, pixel=1.6, sod=300.0, sdd=600.0)
     field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
     at = np.linspace(-field, field, 61)
@@ -334,7 +367,10 @@ def test_what_lies_beyond_the_panel_is_warned_of_and_in_the_bound() -> None:
         even = np.abs(np.hypot(x, y) / field - 0.5) < 0.1
         solids = [Solid(shape, "a", 0.02)]
         for _ in range(seed):
-            (px, py), radius = field * rng.uniform(-0.5, 0.5, 2), field * rng.uniform(0.1, 0.3)
+            (px, py), radius = (
+                field * rng.uniform(-0.5, 0.5, 2),
+                field * rng.uniform(0.1, 0.3),
+            )
             solids.append(Solid(Cylinder((px, py, 0.0), radius, 400.0), "void", -0.02))
             even &= np.hypot(x - px, y - py) > radius + 3.0
         data = project_scene(Scene(tuple(solids)), scan, (2, 80))
@@ -342,7 +378,9 @@ def test_what_lies_beyond_the_panel_is_warned_of_and_in_the_bound() -> None:
             warnings.simplefilter("always")
             volume = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank())
         assert volume.bias_bound is not None
-        mean, bound = (each[0][even].mean() / 0.02 for each in (volume.data, volume.bias_bound))
+        mean, bound = (
+            each[0][even].mean() / 0.02 for each in (volume.data, volume.bias_bound)
+        )
         within.append(abs(mean - 1.0) < bound)
         assert abs(mean - 1.0) < 0.01 or said, (corners, seed)
     assert sum(within) >= 11  # of 12: two ways to continue rows may agree, and be wrong
@@ -358,7 +396,10 @@ def test_a_ball_wider_than_the_panel_comes_out_even():
     noisy = data + np.random.default_rng(1).normal(0.0, 0.01, data.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = fdk(noisy, scan, Grid((1, 41, 41), float(at[1] - at[0])).blank()).data[0] / 0.02
+        found = (
+            fdk(noisy, scan, Grid((1, 41, 41), float(at[1] - at[0])).blank()).data[0]
+            / 0.02
+        )
     assert found[inside].mean() == pytest.approx(1.0, abs=0.01)
 
 
@@ -368,7 +409,8 @@ def test_a_ball_wider_than_the_panel_comes_out_even():
 def test_a_thin_jacket_that_is_cut_off_is_as_dense_as_a_wider_panel_finds(
     core: float, noise: float
 ) -> None:
-    """At the edges it is 3 % of what its dense core attenuates: it was 44 % too dense, unsaid."""
+    """At the edges it is 3 % of what its dense core attenuates: it was 44 % too dense,
+    unsaid."""
     scan = circle(120, pixel=1.6, sod=300.0, sdd=600.0)
     field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
     parts: list[Ellipse] = [
@@ -391,7 +433,8 @@ def test_a_thin_jacket_that_is_cut_off_is_as_dense_as_a_wider_panel_finds(
 @pytest.mark.parametrize("drift", [-0.05, 0.02, 0.05])
 @pytest.mark.daily(2)
 def test_a_flat_that_drifted_is_no_object(drift: float) -> None:
-    """It adds a little everywhere; an object that the panel sees whole stays right, and unsaid."""
+    """It adds a little everywhere; an object that the panel sees whole stays right, and
+    unsaid."""
     scan = circle(120, pixel=0.8, sod=300.0, sdd=600.0)
     data = ellipses([(3.0, -2.0, 12.0, 9.0, 0.4, 0.1)], scan, (8, 160))
     data += np.random.default_rng(2).normal(drift, 0.01, data.shape).astype(np.float32)
@@ -407,8 +450,8 @@ def test_a_flat_that_drifted_is_no_object(drift: float) -> None:
 @pytest.mark.parametrize("blur", [0.0, 0.7])
 @pytest.mark.campaign(1)
 def test_noise_at_the_edges_is_no_truncation(blur):
-    """Boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000 photons a pixel;
-    and boxes that do not fit, in the same noise."""
+    """Boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000 photons a
+    pixel; and boxes that do not fit, in the same noise."""
     rng = np.random.default_rng(11)
     for case in range(40):
         views, (rows, cols) = int(rng.integers(12, 80)), rng.integers(16, 90, 2)
@@ -416,10 +459,16 @@ def test_noise_at_the_edges_is_no_truncation(blur):
         photons = 10.0 ** rng.uniform(2.3, 4.3)
         for wide, cut_off in ((0.6, False), (1.3, True))[: 1 + (case % 8 == 0)]:
             t = rng.uniform(0.0, np.pi)
-            axes = (np.cos(t), np.sin(t), 0.0), (-np.sin(t), np.cos(t), 0.0), (0.0, 0.0, 1.0)
+            axes = (
+                (np.cos(t), np.sin(t), 0.0),
+                (-np.sin(t), np.cos(t), 0.0),
+                (0.0, 0.0, 1.0),
+            )
             box = Box((0, 0, 0), (wide * 63.0, wide * 63.0, 12.0), axes)
             clean = project_scene(Scene((Solid(box, "a", 0.02),)), scan, (rows, cols))
-            blurred = gaussian_filter(rng.poisson(photons * np.exp(-clean)) * 1.0, (0, blur, blur))
+            blurred = gaussian_filter(
+                rng.poisson(photons * np.exp(-clean)) * 1.0, (0, blur, blur)
+            )
             data = -np.log(np.maximum(blurred, 1.0) / photons)
             found = truncation_of(lambda view, data=data: data[view], scan, (rows, cols))
             assert (found is not None) == cut_off, (views, rows, cols, photons, wide)
@@ -429,7 +478,9 @@ def test_noise_at_the_edges_is_no_truncation(blur):
 def test_an_outline_that_is_not_understood_is_said():
     scan = circle(60, pixel=3.2, sod=300.0, sdd=600.0)
     arms = Box((0, -25, 0), (160.0, 30.0, 99.0)), Box((-25, 50, 0), (30.0, 120.0, 99.0))
-    data = project_scene(Scene(tuple(Solid(arm, "a", 0.02) for arm in arms)), scan, (4, 40))
+    data = project_scene(
+        Scene(tuple(Solid(arm, "a", 0.02) for arm in arms)), scan, (4, 40)
+    )
     with pytest.warns(UserWarning, match="beyond the panel's sides"):
         fdk(data, scan, Grid((1, 8, 8), 4.0).blank())
 
@@ -446,7 +497,10 @@ def test_half_a_dead_panel_ends_in_a_volume_and_a_warning():
 
 def test_a_row_of_detectors_is_a_panel():
     """A single row, and a single column, which no filter can do anything with."""
-    scan, row = circle(120, pixel=1.0, sod=300.0, sdd=600.0), Cylinder((4, -3, 0), 9.0, 50.0)
+    scan, row = (
+        circle(120, pixel=1.0, sod=300.0, sdd=600.0),
+        Cylinder((4, -3, 0), 9.0, 50.0),
+    )
     data = project_scene(Scene((Solid(row, "a", 0.02),)), scan, (1, 80))
     found = plain_fdk(data, scan, Grid((1, 61, 61), 0.5).blank()).data[0]
     x, y = np.meshgrid(*[np.linspace(-15.0, 15.0, 61)] * 2)
@@ -459,14 +513,18 @@ def test_a_row_of_detectors_is_a_panel():
 @pytest.mark.parametrize("columns", [40, 150])
 def test_a_fan_beam_slice_is_a_plain_loops(columns):
     """One with weights, filter and backprojection of its own; 150 are several registers."""
-    assert fan_beam.main(["--views", "90", "--columns", str(columns), "--rounds", "1"]) == 0
+    assert (
+        fan_beam.main(["--views", "90", "--columns", str(columns), "--rounds", "1"]) == 0
+    )
 
 
 @pytest.mark.parametrize(("cycles", "kept"), [(0.1, 0.995), (0.25, 0.97), (0.33, 0.9)])
 def test_resampling_keeps_fine_detail(cycles, kept):
     """A wave of so many cycles a pixel, half a pixel aside; cubic keeps 1.00, 0.88 and 0.70."""
     scan = circle(1)
-    aside = ConeVec.from_vectors(scan.source, scan.detector + 0.5 * scan.u, scan.u, scan.v)
+    aside = ConeVec.from_vectors(
+        scan.source, scan.detector + 0.5 * scan.u, scan.u, scan.v
+    )
     c = np.arange(64)
     wave = np.cos(2 * np.pi * cycles * c).astype(np.float32)
     found = rectified(np.tile(wave, (1, 8, 1)), scan, aside)[0, 4, 8:-8]
@@ -514,7 +572,8 @@ def test_angles_stand_for_what_lies_between_them():
 
 
 def covering(rng: np.random.Generator) -> np.ndarray:
-    """Angles [deg] of views in any order: parts of turns, with gaps that have views behind them."""
+    """Angles [deg] of views in any order: parts of turns, with gaps that have views behind
+    them."""
     angles = np.arange(0.0, rng.uniform(365.0, 1500.0), 360.0 / rng.integers(241, 400))
     first, width = rng.uniform(0.0, 360.0), rng.uniform(0.0, 120.0)
     angles = angles[(angles - first) % 360.0 > width]
@@ -533,7 +592,9 @@ def test_opposite_rays_share_one_line(seed: int) -> None:
     info = circle_of(scan)
     table, fan = redundancy(info, scan, cols), fan_angles(info, scan, cols)
     shared = 0
-    for view, col in zip(rng.integers(0, len(scan), 60), rng.integers(0, cols, 60), strict=True):
+    for view, col in zip(
+        rng.integers(0, len(scan), 60), rng.integers(0, cols, 60), strict=True
+    ):
         source, ray = scan.source[view, :2], _ray(scan, view, col, cols)
         away = scan.source[:, :2] - source
         off = np.abs(away[:, 0] * ray[1] - away[:, 1] * ray[0])
@@ -553,18 +614,24 @@ def test_opposite_rays_share_one_line(seed: int) -> None:
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_what_the_views_cover_decides_and_not_their_order(seed: int) -> None:
-    """Gaps were looked for at the ends of the list: one in its middle was +6.5 %, and a part of a
-    second turn was refused. Any order, any turn to any view, and doubled views change nothing."""
+    """Gaps were looked for at the ends of the list: one in its middle was +6.5 %, and a part of
+    a second turn was refused. Any order, any turn to any view, and doubled views change
+    nothing."""
     rng = np.random.default_rng(seed)
     angles = covering(rng)
     radius = 25.0
-    parts = [(0.0, 0.0, radius, radius, 0.0, 0.02), (9.0, 2.0, 4.0, 3.0, rng.uniform(0, 3), 0.01)]
+    parts = [
+        (0.0, 0.0, radius, radius, 0.0, 0.02),
+        (9.0, 2.0, 4.0, 3.0, rng.uniform(0, 3), 0.01),
+    ]
     at = np.linspace(-radius, radius, 61)
     truth, even = layer_of(parts, at)
     inside = even & (np.hypot(at[:, None], at) < 0.85 * radius)
 
     def found(degrees: np.ndarray) -> np.ndarray:
-        scan = circle(len(degrees), pixel=0.8, sod=300.0, sdd=600.0, angles=np.deg2rad(degrees))
+        scan = circle(
+            len(degrees), pixel=0.8, sod=300.0, sdd=600.0, angles=np.deg2rad(degrees)
+        )
         like = Grid((1, 61, 61), float(at[1] - at[0])).blank()
         return np.asarray(plain_fdk(ellipses(parts, scan, (4, 160)), scan, like).data[0])
 
@@ -581,7 +648,8 @@ def test_what_the_views_cover_decides_and_not_their_order(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_lines_that_no_view_sees_are_an_error(seed: int) -> None:
-    """Gaps of 30 deg opposite each other, wherever the list begins: streaks of a third, unsaid."""
+    """Gaps of 30 deg opposite each other, wherever the list begins: streaks of a third,
+    unsaid."""
     first = np.random.default_rng(seed).uniform(0.0, 360.0)
     angles = np.arange(0.0, 360.0)
     angles = angles[((angles - first) % 180.0 > 30.0)]
@@ -600,7 +668,9 @@ def test_offset_weights_share_the_overlap():
     scan = circle(90, aside=20.0)
     info = circle_of(scan)
     weight, angle = redundancy(info, scan, 130)[0], fan_angles(info, scan, 130)[0]
-    mirrored = np.interp(-angle, np.sort(angle), weight[np.argsort(angle)], left=0.0, right=0.0)
+    mirrored = np.interp(
+        -angle, np.sort(angle), weight[np.argsort(angle)], left=0.0, right=0.0
+    )
     np.testing.assert_allclose(weight + mirrored, 1.0, atol=2e-3)
     assert weight.min() < 0.01
     assert weight.max() == 1.0
@@ -615,7 +685,9 @@ def test_ramp_filter_is_the_ramp():
     assert got[200] == pytest.approx(2 * np.sqrt(2 * np.pi) * sigma / (4 * np.pi**2 * sigma**2),
                                      rel=2e-3)  # fmt: skip
     n = np.arange(-400, 401)
-    kernel = np.where(n % 2 == 0, 0.0, -1.0 / np.maximum(np.pi * np.abs(n) * pitch, 1e-9) ** 2)
+    kernel = np.where(
+        n % 2 == 0, 0.0, -1.0 / np.maximum(np.pi * np.abs(n) * pitch, 1e-9) ** 2
+    )
     kernel[400] = 0.25 / pitch**2
     direct = np.convolve(row, kernel, "valid") * pitch
     np.testing.assert_allclose(got, direct, atol=2e-5 * np.abs(direct).max())
@@ -633,7 +705,9 @@ def test_tilted_images_become_upright_ones():
     for i in range(4):
         new = level.project_points(point, SHAPE)[i, 0]
         old = homography(tilted.rows[i], level.rows[i], SHAPE, SHAPE) @ [*new, 1.0]
-        np.testing.assert_allclose(old[:2] / old[2], tilted.project_points(point, SHAPE)[i, 0])
+        np.testing.assert_allclose(
+            old[:2] / old[2], tilted.project_points(point, SHAPE)[i, 0]
+        )
     got = rectified(ball(tilted, SHAPE), tilted, level)
     wanted = ball(level, SHAPE)
     inner = np.s_[:, 8:-8, 8:-8]
@@ -643,7 +717,10 @@ def test_tilted_images_become_upright_ones():
 def edge_width(volume: Volume) -> float:
     """Standard deviation of the Gaussian that blurs the ball's surface [voxels]."""
     z, y, x = np.meshgrid(*(volume.centers()[i] for i in (2, 1, 0)), indexing="ij")
-    away = np.sqrt((x - CENTRE[0]) ** 2 + (y - CENTRE[1]) ** 2 + (z - CENTRE[2]) ** 2) - RADIUS
+    away = (
+        np.sqrt((x - CENTRE[0]) ** 2 + (y - CENTRE[1]) ** 2 + (z - CENTRE[2]) ** 2)
+        - RADIUS
+    )
     near = np.abs(away) < 3 * volume.voxel_mm
     found, _ = curve_fit(
         lambda at, low, high, sigma: low + (high - low) * ndtr(-at / sigma),
@@ -686,8 +763,8 @@ def test_field_of_view():
 
 @pytest.mark.parametrize("tilt", [{}, {"axis_tilt_x": 3.0}, {"axis_tilt_z": 3.0}])
 def test_a_tilted_rotation_axis_costs_nothing(tilt):
-    """In the object's frame the axis is z whatever its tilt in the room: rows of the upright panel,
-    along which the filter runs, are perpendicular to the axis as seen by the panel.
+    """In the object's frame the axis is z whatever its tilt in the room: rows of the upright
+    panel, along which the filter runs, are perpendicular to the axis as seen by the panel.
     """
     angle = np.linspace(0.0, 2 * np.pi, 240, endpoint=False)
     poses = Poses([0, -600, 0], [0, 0, 0], [0, 459, 0], [0.6, 0, 0], [0, 0, -0.6], angle)
@@ -698,7 +775,10 @@ def test_a_tilted_rotation_axis_costs_nothing(tilt):
     assert found == pytest.approx(1.0, abs=0.002)
     assert np.abs(centre).max() < 0.03
     z, y, x = np.meshgrid(*(LIKE.centers()[i] for i in (2, 1, 0)), indexing="ij")
-    away = np.sqrt((x - CENTRE[0]) ** 2 + (y - CENTRE[1]) ** 2 + (z - CENTRE[2]) ** 2) - RADIUS
+    away = (
+        np.sqrt((x - CENTRE[0]) ** 2 + (y - CENTRE[1]) ** 2 + (z - CENTRE[2]) ** 2)
+        - RADIUS
+    )
     # A filter along other lines smears the ball into its surroundings.
     assert np.abs(volume.data[(away > 1.6) & (away < 6.0)]).mean() < 0.004 * MU
 
@@ -721,7 +801,10 @@ np.savez(sys.argv[1], forward=images, back=back(images, scan, like).data,
          fdk=fdk(images, scan, like, errors=False).data,
          sirt=sirt(images, scan, like, iterations=3).data)
 """
-    lesser = {"usual": {}, "plain": {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""}}
+    lesser = {
+        "usual": {},
+        "plain": {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""},
+    }
     if binding.get_host_cpu_features().get("avx2", False):
         lesser["avx2"] = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma"}
     found = {}
@@ -737,14 +820,17 @@ np.savez(sys.argv[1], forward=images, back=back(images, scan, like).data,
     for name in lesser:
         for what, usual in found["usual"].items():
             assert np.nanmax(np.abs(usual)) > 0
-            apart = np.nanmax(np.abs(found[name][what] - usual)) / np.nanmax(np.abs(usual))
+            apart = np.nanmax(np.abs(found[name][what] - usual)) / np.nanmax(
+                np.abs(usual)
+            )
             print(f"{name}, {what}: apart by {apart:.1e} of the largest")
             assert apart < 2e-6
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> None:
-    """Two turns side by side gave 0.53 to 0.68 of a cylinder's attenuation; jitter is harmless."""
+    """Two turns side by side gave 0.53 to 0.68 of a cylinder's attenuation; jitter is
+    harmless."""
     rng = np.random.default_rng(seed)
     cylinder = Scene((Solid(Cylinder((0.0, 0.0, 0.0), 12.0, 60.0), "water", 0.02),))
     shape = (20, 64)
@@ -755,7 +841,9 @@ def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> N
             c, s = np.cos(a), np.sin(a)
             u = np.array([c, s, 0.0])
             centre = np.array([-400 * s, 400 * c, 0.0]) + shift * u
-            rows.append(np.concatenate([[600 * s, -600 * c, 0.0], centre, u, [0, 0, -1.0]]))
+            rows.append(
+                np.concatenate([[600 * s, -600 * c, 0.0], centre, u, [0, 0, -1.0]])
+            )
         return ConeVec(np.array(rows))
 
     steady = scan(rng.uniform(-2.0, 2.0, 181))
@@ -763,13 +851,17 @@ def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> N
     made = plain_fdk(project_scene(cylinder, steady, shape), steady, like)
     assert made.data[1, 10:20, 10:20].mean() == pytest.approx(0.02, rel=0.01)
     aside = float(rng.uniform(8.0, 40.0))
-    tiled = ConeVec(np.concatenate([scan(np.full(90, k * aside)).rows for k in (-0.5, 0.5)]))
+    tiled = ConeVec(
+        np.concatenate([scan(np.full(90, k * aside)).rows for k in (-0.5, 0.5)])
+    )
     with pytest.raises(GeometryError, match="columns sideways between the views"):
         plain_fdk(np.zeros((180, *shape), np.float32), tiled, like)
 
 
 @pytest.mark.parametrize(
-    "pitch", [np.tile([1.0, 1.1], 90), np.linspace(1.0, 1.3, 180)], ids=["alternating", "growing"]
+    "pitch",
+    [np.tile([1.0, 1.1], 90), np.linspace(1.0, 1.3, 180)],
+    ids=["alternating", "growing"],
 )
 def test_pitch_may_change_from_view_to_view(pitch: np.ndarray) -> None:
     """The first of 32 views stood for all: +5.0 and +1.7 %."""
@@ -788,10 +880,13 @@ def test_pitch_may_change_from_view_to_view(pitch: np.ndarray) -> None:
 def test_less_than_a_turn_does_not_tell_what_lies_beyond_a_near_edge(
     degrees: float, told: bool
 ) -> None:
-    """A ball that the panel, moved to one side, cuts off in some views. Opposite ones make up for
-    it if there is a whole turn, otherwise a warning says so, however few views are looked at."""
+    """A ball that the panel, moved to one side, cuts off in some views. Opposite ones make up
+    for it if there is a whole turn, otherwise a warning says so, however few views are looked
+    at."""
     angles = np.arange(0.0, degrees, 1.0)
-    scan = ConeVec.circular(sod=300.0, sdd=450.0, angles=angles, shape=(12, 90), pixel=1.0)
+    scan = ConeVec.circular(
+        sod=300.0, sdd=450.0, angles=angles, shape=(12, 90), pixel=1.0
+    )
     rows = scan.rows.copy()
     rows[:, 3:6] += 18.0 * rows[:, 6:9]
     middle, radius = np.array([12.0, -9.0, 0.0]), 10.0
@@ -802,10 +897,16 @@ def test_less_than_a_turn_does_not_tell_what_lies_beyond_a_near_edge(
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     source = rows[:, None, None, 0:3] - middle
     along = (rays * source).sum(axis=-1)
-    chords = 2.0 * np.sqrt(np.maximum(along**2 - (source**2).sum(axis=-1) + radius**2, 0.0))
+    chords = 2.0 * np.sqrt(
+        np.maximum(along**2 - (source**2).sum(axis=-1) + radius**2, 0.0)
+    )
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        made = fdk((0.02 * chords).astype(np.float32), ConeVec(rows), Grid((1, 9, 9), 1.0, middle))
+        made = fdk(
+            (0.02 * chords).astype(np.float32),
+            ConeVec(rows),
+            Grid((1, 9, 9), 1.0, middle),
+        )
     assert bool(found) == told
     assert told or made.data.mean() == pytest.approx(0.02, rel=0.005)
 
@@ -839,7 +940,9 @@ def test_a_small_ball_beyond_a_near_edge_counts_where_it_was_seen(
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("value", [0.0, 1.0, 11.09])
-def test_images_without_an_edge_have_no_outline_to_fit(value: float, noise: float) -> None:
+def test_images_without_an_edge_have_no_outline_to_fit(
+    value: float, noise: float
+) -> None:
     """Black images took up to 95 s, for fits of outlines that nothing in them tells."""
     scan = ConeVec.circular(sod=200.0, sdd=300.0, angles=60, shape=(16, 48), pixel=1.0)
     images = value * np.ones((60, 16, 48), np.float32)

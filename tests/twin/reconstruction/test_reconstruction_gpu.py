@@ -1,4 +1,5 @@
-"""FDK and iterative methods on a CUDA device: in numba's simulator, and on a device if at hand."""
+"""FDK and iterative methods on a CUDA device: in numba's simulator, and on a device if at
+hand."""
 
 from __future__ import annotations
 
@@ -316,9 +317,13 @@ def test_device_agrees_with_the_processor(monkeypatch) -> None:
     assert device_takes(like, (120, 130))
     device = fdk(images, scan, like)
     assert device.accuracy is not None
-    monkeypatch.setattr(gpu, "availability", lambda: gpu.Availability(False, "switched off"))
+    monkeypatch.setattr(
+        gpu, "availability", lambda: gpu.Availability(False, "switched off")
+    )
     processor = fdk(images, scan, like)
-    assert np.abs(device.data - processor.data).max() < 1e-4 * np.abs(processor.data).max()
+    assert (
+        np.abs(device.data - processor.data).max() < 1e-4 * np.abs(processor.data).max()
+    )
     found, centre = measure(device)
     assert found == pytest.approx(1.0, abs=0.01)
     assert np.abs(centre).max() < 0.1

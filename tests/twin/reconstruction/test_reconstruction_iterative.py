@@ -1,4 +1,5 @@
-"""Iterative methods: residuals, exactness on small problems solved by linear algebra, geometry."""
+"""Iterative methods: residuals, exactness on small problems solved by linear algebra,
+geometry."""
 
 from __future__ import annotations
 
@@ -53,8 +54,9 @@ def test_cgls_solves_least_squares():
     matrix = np.array(columns, np.float64).T
     data = np.random.default_rng(1).normal(size=(7, 9, 9)).astype(np.float32)
     wanted = np.linalg.lstsq(matrix, data.ravel().astype(float), rcond=None)[0]
-    # Far more iterations than unknowns, and a residual as large as the data: rounding of gradients
-    # must not add up. 27 sums of some 60 lengths, each rounded by 2^-24, times a condition of 3.4.
+    # Far more iterations than unknowns, and a residual as large as the data: rounding of
+    # gradients must not add up. 27 sums of some 60 lengths, each rounded by 2^-24, times a
+    # condition of 3.4.
     rounding = 60 * 2.0**-24 * np.linalg.cond(matrix)
     got = cgls(data, scan, like, iterations=60).data.ravel()
     np.testing.assert_allclose(got, wanted, rtol=0, atol=rounding * np.abs(wanted).max())
@@ -72,11 +74,14 @@ def test_cgls_solves_least_squares():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_cgls_stays_at_least_squares_however_the_transpose_rounds(seed, monkeypatch):
-    """As on a device, whose sums differ at every call: far beyond convergence, nothing grows."""
+    """As on a device, whose sums differ at every call: far beyond convergence, nothing
+    grows."""
     draw = np.random.default_rng(seed)
     like, scan = Grid((3, 3, 3), 4.0).blank(), circle(7, pixel=3.0)
     unit = np.eye(27, dtype=np.float32).reshape(27, 3, 3, 3)
-    matrix = np.array([forward(Volume(u, 4.0), scan, (9, 9)).ravel() for u in unit], float).T
+    matrix = np.array(
+        [forward(Volume(u, 4.0), scan, (9, 9)).ravel() for u in unit], float
+    ).T
     data = draw.normal(size=(7, 9, 9)).astype(np.float32)
     wanted = np.linalg.lstsq(matrix, data.ravel().astype(float), rcond=None)[0]
 
@@ -99,7 +104,9 @@ def test_weights_solve_weighted_least_squares():
     rng = np.random.default_rng(4)
     like, scan, shape = Grid((3, 3, 3), 4.0).blank(), circle(8, pixel=3.0), (9, 9)
     unit = np.eye(27, dtype=np.float32).reshape(27, 3, 3, 3)
-    matrix = np.array([forward(Volume(u, 4.0), scan, shape).ravel() for u in unit], float).T
+    matrix = np.array(
+        [forward(Volume(u, 4.0), scan, shape).ravel() for u in unit], float
+    ).T
     true = rng.uniform(0.01, 0.05, 27)
     variances = 10.0 ** rng.uniform(-4, -1, matrix.shape[0])
     data = matrix @ true + rng.normal(0.0, np.sqrt(variances))
@@ -122,7 +129,9 @@ def test_weighted_iterations_end_at_the_noise(images, method):
     variances = 10.0 ** rng.uniform(-5, -3, images.shape)
     noisy = (images + rng.normal(0.0, np.sqrt(variances))).astype(np.float32)
     steps = []
-    found = method(noisy, SCAN, LIKE, iterations=200, variances=variances, watch=steps.append)
+    found = method(
+        noisy, SCAN, LIKE, iterations=200, variances=variances, watch=steps.append
+    )
     assert 2 < len(steps) < 200
 
     def left(volume):
@@ -131,7 +140,8 @@ def test_weighted_iterations_end_at_the_noise(images, method):
     assert left(found) <= 1.0
     assert (
         method is sart
-        or left(method(noisy, SCAN, LIKE, iterations=len(steps) - 2, variances=variances)) > 1.0
+        or left(method(noisy, SCAN, LIKE, iterations=len(steps) - 2, variances=variances))
+        > 1.0
     )
     for wrong in (variances[1:], 0.0 * variances, -variances):
         with pytest.raises(GeometryError, match="above 0 for each line integral"):
@@ -157,8 +167,12 @@ def ball_at(rows):
 def test_start_and_positivity(images):
     few = sirt(images, SCAN, LIKE, iterations=3)
     more = sirt(images, SCAN, LIKE, iterations=2, start=few)
-    np.testing.assert_allclose(more.data, sirt(images, SCAN, LIKE, iterations=5).data, atol=1e-6)
-    noisy = images + np.random.default_rng(0).normal(0, 0.05, images.shape).astype(np.float32)
+    np.testing.assert_allclose(
+        more.data, sirt(images, SCAN, LIKE, iterations=5).data, atol=1e-6
+    )
+    noisy = images + np.random.default_rng(0).normal(0, 0.05, images.shape).astype(
+        np.float32
+    )
     assert sirt(noisy, SCAN, LIKE, iterations=3).data.min() < -1e-4
     assert sirt(noisy, SCAN, LIKE, iterations=3, nonnegative=True).data.min() == 0.0
     positive = em(noisy, SCAN, LIKE, iterations=3).data

@@ -1,5 +1,5 @@
-"""Total variation: the cost of the minimum against an independent solver, the way there, and what
-it is for.
+"""Total variation: the cost of the minimum against an independent solver, the way there, and
+what it is for.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def small():
-    """The matrix of a small problem, noisy data, and the strength that a weight of 1e-2 means."""
+    """The matrix of a small problem, noisy data, and the strength that a weight of 1e-2
+    means."""
     operator = Operator(SCAN, LIKE, SHAPE)
     size = int(np.prod(LIKE.shape))
     units = np.eye(size, dtype=np.float32).reshape(-1, *LIKE.shape)
@@ -43,7 +44,9 @@ def small():
     rng = np.random.default_rng(1)
     x = np.zeros(LIKE.shape)
     x[1:3, 1:4, 2:5] = 0.05
-    data = (matrix @ x.ravel()).reshape(operator.image_shape) + rng.normal(size=(5, *SHAPE)) * 0.05
+    data = (matrix @ x.ravel()).reshape(operator.image_shape) + rng.normal(
+        size=(5, *SHAPE)
+    ) * 0.05
     return matrix, data, 1e-2 * (matrix.T @ data.ravel()).max()
 
 
@@ -84,7 +87,13 @@ def test_the_minimum_is_that_of_another_solver(small):
     assert upper - lower < 2e-3 * upper
     for subsets in (1, 3):
         found = minimise_tv(
-            small[1], SCAN, LIKE, weight=1e-2, iterations=300, tolerance=1e-6, subsets=subsets
+            small[1],
+            SCAN,
+            LIKE,
+            weight=1e-2,
+            iterations=300,
+            tolerance=1e-6,
+            subsets=subsets,
         )
         mine = cost(small, found.volume.data.astype(np.float64))[0]
         assert mine == pytest.approx(found.costs[-1], rel=1e-5)
@@ -133,7 +142,9 @@ def test_costs_never_rise_and_the_rule_ends_it(small, subsets):
     assert len(seen) == found.iterations < 100
     gains = -np.diff(found.costs)[-3:] / np.array(found.costs[-3:])
     assert (gains <= 1e-3).all()
-    assert repr(found).startswith(f"<Minimised: converged after {found.iterations} iterations")
+    assert repr(found).startswith(
+        f"<Minimised: converged after {found.iterations} iterations"
+    )
     short = minimise_tv(small[1], SCAN, LIKE, subsets=subsets, iterations=4)
     assert not short.converged
     assert short.iterations == 4
@@ -141,7 +152,9 @@ def test_costs_never_rise_and_the_rule_ends_it(small, subsets):
 
 def test_a_warm_start_begins_where_the_other_ended(small):
     first = minimise_tv(small[1], SCAN, LIKE, iterations=15, tolerance=0)
-    second = minimise_tv(small[1], SCAN, LIKE, iterations=15, tolerance=0, start=first.volume)
+    second = minimise_tv(
+        small[1], SCAN, LIKE, iterations=15, tolerance=0, start=first.volume
+    )
     assert second.costs[0] == pytest.approx(first.costs[-1], rel=1e-6)
     assert second.costs[-1] < first.costs[-1]
 
@@ -161,7 +174,9 @@ def test_masks_and_signs(small):
 
 def test_few_noisy_views_of_few_materials():
     """What it is for: 20 views of an object of few materials (the study `tv_weights.py`)."""
-    spec = importlib.util.spec_from_file_location("tv_weights", EXAMPLES / "tv_weights.py")
+    spec = importlib.util.spec_from_file_location(
+        "tv_weights", EXAMPLES / "tv_weights.py"
+    )
     study = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(study)
     study.WEIGHTS = (0.01,)

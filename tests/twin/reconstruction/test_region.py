@@ -12,7 +12,10 @@ from flexdt.twin.reconstruction.linear_system import LinearSystem
 from tests.twin.reconstruction.scans import circle, lengths
 
 SCAN, SHAPE = circle(9, pixel=2.1), (7, 11)
-FINE, COARSE = Grid((3, 4, 5), 1.5, (2.0, -1.0, 0.5)), Grid((4, 6, 5), 3.1, (1.0, 0.0, 0.0))
+FINE, COARSE = (
+    Grid((3, 4, 5), 1.5, (2.0, -1.0, 0.5)),
+    Grid((4, 6, 5), 3.1, (1.0, 0.0, 0.0)),
+)
 
 
 class Lattice:
@@ -28,7 +31,8 @@ class Lattice:
 @pytest.fixture(scope="module")
 def both():
     """The surroundings' grid by hand, and the matrix of the region and all around it."""
-    # 7.5 x 6 x 4.5 mm hold 2, 2 and 1 voxels of 3.1 mm; from the region's faces on, out to COARSE.
+    # 7.5 x 6 x 4.5 mm hold 2, 2 and 1 voxels of 3.1 mm; from the region's faces on, out to
+    # COARSE.
     counts, edges = (5, 8, 5), (3.75, 3.0, 4.5)
     low = (-1.75 - 2 * 3.75, -4.0 - 2 * 3.0, -1.75 - 1 * 4.5)
     counts = tuple(
@@ -65,7 +69,9 @@ def test_grids_fill_space_once(both, images):
     rng = np.random.default_rng(0)
     x = rng.normal(size=system.first(None).shape).astype(np.float32)
     y = rng.normal(size=images[0].shape).astype(np.float32)
-    assert np.vdot(system.project(x), y) == pytest.approx(np.vdot(x, system.spread(y)), rel=1e-4)
+    assert np.vdot(system.project(x), y) == pytest.approx(
+        np.vdot(x, system.spread(y)), rel=1e-4
+    )
 
 
 def by_hand(matrix, data, iterations, parts=((slice(None)),), relaxation=1.0):

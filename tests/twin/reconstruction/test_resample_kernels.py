@@ -1,4 +1,5 @@
-"""Columns mixed and resampled by registers of 16, of 8 and one by one, beside NumPy and each other.
+"""Columns mixed and resampled by registers of 16, of 8 and one by one, beside NumPy and each
+other.
 
 Each way is compiled in a process of its own, for a processor that has no other.
 """
@@ -109,7 +110,9 @@ def test_every_way_is_numpys_and_the_others(ways: list[int], tmp_path: Path) -> 
         wanted, lines, given["cases"], strict=True
     ):
         places = start + np.arange(int(count)) * step
-        row[int(first) : int(first + count)] += np.interp(places, np.arange(line.size), line)
+        row[int(first) : int(first + count)] += np.interp(
+            places, np.arange(line.size), line
+        )
     # Beside the whole columns the same in two parts, that registers of any length end at.
     parts = cut(given, 48)
     both = {k: np.concatenate([given[k], parts[0][k]]) for k in given}

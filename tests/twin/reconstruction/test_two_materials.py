@@ -48,7 +48,9 @@ def test_line_integrals_are_the_sum_over_the_spectrum(drawn):
     assert not air.any()
     thin = BOTH.line_integrals(np.array([[0.06], [0.0]], np.float32))[1]
     assert limit == pytest.approx(float(thin[0]), rel=0.01)
-    seen, more = BOTH.line_integrals(np.array([[-1e6, 1e6, -5.0], [1e6, 1e6, 1.0]], np.float32))
+    seen, more = BOTH.line_integrals(
+        np.array([[-1e6, 1e6, -5.0], [1e6, 1e6, 1.0]], np.float32)
+    )
     assert np.isfinite(seen).all()
     assert (more > 0.0).all()  # a step in the wrong direction diverges
 
@@ -62,7 +64,9 @@ def test_it_finds_the_truth_of_one_energy(drawn):
     one = sart(hardening(PMMA, KV, KEV)(images), SCAN, GRID, **options).data
     none = sart(images, SCAN, GRID, **options).data
     pmma = truth == truth[truth > 0].min()
-    errors = [float(np.abs(v - truth)[pmma].mean()) / BOTH.mu[0] for v in (two, one, none)]
+    errors = [
+        float(np.abs(v - truth)[pmma].mean()) / BOTH.mu[0] for v in (two, one, none)
+    ]
     assert errors[0] < 0.02
     assert errors[1] > 0.2
     assert errors[2] > 0.4
@@ -80,7 +84,10 @@ def test_iterations_are_those_of_the_explicit_matrix(drawn):
         paths = np.stack([matrix @ (x * ~dense), matrix @ (x * dense)], 1) / BOTH.mu
         seen = polychromatic(paths)
         more = np.divide(
-            paths @ BOTH.mu, seen, out=np.full(len(seen), more_of_air()), where=seen > 1e-9
+            paths @ BOTH.mu,
+            seen,
+            out=np.full(len(seen), more_of_air()),
+            where=seen > 1e-9,
         )
         x += c * (matrix.T @ (r * more * (images.ravel() - seen)))
     found = sirt(images, SCAN, GRID, iterations=12, hardening=BOTH).data.ravel()
@@ -118,7 +125,8 @@ def test_noise_ends_it_and_what_is_refused(drawn):
 @pytest.mark.parametrize("energy", [30.0, 85.0])
 @pytest.mark.daily(1)
 def test_metal_that_looks_thin_at_first_is_found(energy):
-    """At low energies metal attenuates several times as much as it seems to before it is known."""
+    """At low energies metal attenuates several times as much as it seems to before it is
+    known."""
     scan, grid, shape = circle(24, pixel=0.9), Grid((1, 12, 12), 0.5), (1, 24)
     both = Polychromatic.of((STEEL, PMMA), KV, energy)
     truth = np.zeros(grid.shape)

@@ -16,7 +16,9 @@ def by_scipy(nodes: Volume, grid: Volume) -> np.ndarray:
         np.interp(places, known, np.arange(len(known)))
         for places, known in zip(grid.centers()[::-1], nodes.centers()[::-1], strict=True)
     ]
-    return map_coordinates(nodes.data.astype(float), np.meshgrid(*at, indexing="ij"), order=1)
+    return map_coordinates(
+        nodes.data.astype(float), np.meshgrid(*at, indexing="ij"), order=1
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -24,11 +26,14 @@ def test_interpolation_is_that_of_scipy(seed: int) -> None:
     random = np.random.default_rng(seed)
     data = random.random(tuple(random.integers(1, 9, 3)), dtype=np.float32)
     if seed % 2:
-        data[random.random(data.shape) < 0.1] = np.nan  # layers that some sides do not see
+        data[random.random(data.shape) < 0.1] = (
+            np.nan
+        )  # layers that some sides do not see
     center = tuple(random.uniform(-1, 1, 3))
     nodes = Volume(data, float(random.uniform(0.5, 3)), center_mm=center)
     grid = Volume(
-        np.zeros(tuple(random.integers(1, 40, 3)), np.float32), float(random.uniform(0.1, 1))
+        np.zeros(tuple(random.integers(1, 40, 3)), np.float32),
+        float(random.uniform(0.1, 1)),
     )
     found, wanted = interpolated(nodes, grid), by_scipy(nodes, grid)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(wanted))

@@ -5,7 +5,12 @@ from collections.abc import Callable
 
 import pytest
 
-from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_profile,
+)
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
 
 Planner = Callable[..., ScanPlan]

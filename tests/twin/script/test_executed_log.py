@@ -68,7 +68,9 @@ def blank() -> Machine:
     """The UniTOM XL without anything that the log tells."""
     machine = builtin_machine("unitom_xl")
     wrong = {"lower": -1e4, "upper": 1e4, "max_speed": 500.0, "max_acceleration": 500.0}
-    axes = {n: a.model_copy(update={**wrong, "source": ""}) for n, a in machine.axes.items()}
+    axes = {
+        n: a.model_copy(update={**wrong, "source": ""}) for n, a in machine.axes.items()
+    }
     return machine.model_copy(update={"axes": axes, "timing": Timing(source="assumed")})
 
 
@@ -77,7 +79,9 @@ def fitted(log: tuple[Executed, ...], blank: Machine) -> Fit:
     return fit_machine([log], blank, "measured: log")
 
 
-def test_every_line_is_read_with_its_time_moment_and_reply(log: tuple[Executed, ...]) -> None:
+def test_every_line_is_read_with_its_time_moment_and_reply(
+    log: tuple[Executed, ...],
+) -> None:
     assert [x.line for x in log] == list(range(1, 58))
     assert sum(x.own_s for x in log) == pytest.approx(146.132)
     assert log[0].sent_s == pytest.approx(9 * 3600 + 34 * 60 + 16.183)
@@ -105,7 +109,12 @@ def test_errors_of_the_fit_and_cross_validated(fitted: Fit) -> None:
     assert fitted.cross_validated_s <= 12.0
     assert fitted.cross_validated_s > errors
     document = fitted.to_dict()
-    assert document["single"] == ["xrayon", "xray_ready", "write_settings", "xrayoff_again"]
+    assert document["single"] == [
+        "xrayon",
+        "xray_ready",
+        "write_settings",
+        "xrayoff_again",
+    ]
     assert fitted.frame_period_s == (pytest.approx(36.079 / 1440),)
     assert fitted.machine.timing.move_standing_s == pytest.approx(0.2485)
 
@@ -138,7 +147,9 @@ def test_ranges_of_steps_and_of_the_total(fitted: Fit) -> None:
     document = check_script(SCRIPT.read_bytes(), fitted.machine, profile).to_dict()
     assert (document["p5_s"], document["p95_s"]) == (low, high)
     flexray = builtin_machine()
-    assumed = check_script("tube xrayon ACK", flexray, builtin_profile(flexray.default_profile))
+    assumed = check_script(
+        "tube xrayon ACK", flexray, builtin_profile(flexray.default_profile)
+    )
     assert assumed.to_dict()["p5_s"] is None
 
 
@@ -155,7 +166,12 @@ def line(own: str = "5", reply: bytes = b"", moment: str = "09:00:00.000") -> by
 
 def motor(*, upper: float = 90.0, copy: float = 90.0, target: float = 10.0) -> bytes:
     values = [10.0, target, 5.0, 0.0, 6.0, upper, -90.0, 1.0, 50.0, 1.0, 60.0, *[0.0] * 6]
-    return struct.pack(">17d", *values) + bytes(7) + struct.pack(">2d", copy, -90.0) + bytes(90)
+    return (
+        struct.pack(">17d", *values)
+        + bytes(7)
+        + struct.pack(">2d", copy, -90.0)
+        + bytes(90)
+    )
 
 
 @pytest.mark.parametrize(
@@ -170,8 +186,18 @@ def motor(*, upper: float = 90.0, copy: float = 90.0, target: float = 10.0) -> b
         (line(moment="24:00:00.000"), 1, "error", "no time of day"),
         (line(moment="23:60:00.000"), 1, "error", "no time of day"),
         (line(moment="23:59:60.000"), 1, "error", "no time of day"),
-        (line(reply=motor(upper=1.1e9, copy=1.1e9)), 1, "warning", "17 big-endian doubles"),
-        (line(reply=motor(upper=float("inf"), copy=float("inf"))), 1, "warning", "17 big-endian"),
+        (
+            line(reply=motor(upper=1.1e9, copy=1.1e9)),
+            1,
+            "warning",
+            "17 big-endian doubles",
+        ),
+        (
+            line(reply=motor(upper=float("inf"), copy=float("inf"))),
+            1,
+            "warning",
+            "17 big-endian",
+        ),
         (b"tube\txrayoff\t09:00:00.000\r\n", 1, "error", "3 columns, or no wait"),
         (line(reply=motor())[:-20] + b"\t09:00:00.000\r\n", 1, "warning", ""),
         (line(reply=motor(copy=80.0)), 1, "warning", "limits twice"),
@@ -186,14 +212,20 @@ def test_what_does_not_hold_is_said_with_its_line(
     if not said:
         assert all(p.line == number for p in problems)
         return
-    assert [(p.line, p.severity) for p in problems if said in p.message] == [(number, severity)]
+    assert [(p.line, p.severity) for p in problems if said in p.message] == [
+        (number, severity)
+    ]
 
 
 def test_a_sound_reply_is_decoded() -> None:
     (found,), problems = read_log(line(reply=motor()))
     assert problems == ()
     assert found.motor is not None
-    assert (found.motor.lower, found.motor.upper, found.motor.max_speed) == (-90.0, 90.0, 50.0)
+    assert (found.motor.lower, found.motor.upper, found.motor.max_speed) == (
+        -90.0,
+        90.0,
+        50.0,
+    )
 
 
 @settings(max_examples=200, deadline=None)
@@ -223,12 +255,18 @@ PLACE = st.floats(-1e9, 1e9)
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(PLACE, min_size=17, max_size=17), st.tuples(RATE, RATE, RATE, RATE), st.data())
+@given(
+    st.lists(PLACE, min_size=17, max_size=17),
+    st.tuples(RATE, RATE, RATE, RATE),
+    st.data(),
+)
 def test_a_reply_is_decoded_from_its_own_bytes_or_not_at_all(
     values: list[float], rates: tuple[float, ...], data: st.DataObject
 ) -> None:
     """0 position, 1 target, 2 speed, 4 acceleration, 5 upper, 6 lower, 8 and 10 the maxima."""
-    lower, upper = sorted(data.draw(st.tuples(PLACE, PLACE).filter(lambda x: x[0] != x[1])))
+    lower, upper = sorted(
+        data.draw(st.tuples(PLACE, PLACE).filter(lambda x: x[0] != x[1]))
+    )
     assume(upper - lower > 1e-6)
     values[0] = data.draw(st.floats(lower - 1, upper + 1))
     (speed, max_speed), (acceleration, most) = sorted(rates[:2]), sorted(rates[2:])
@@ -241,7 +279,9 @@ def test_a_reply_is_decoded_from_its_own_bytes_or_not_at_all(
     raw = struct.pack(">17d", *values) + bytes(7) + struct.pack(">2d", *copy)
     assume(max(raw) >= 0x80)
     assume(all(abs(values[i]) <= 1e9 for i in (0, 1)) or wrong is not None)
-    expected = MotorReply(values[0], values[1], speed, acceleration, lower, upper, max_speed, most)
+    expected = MotorReply(
+        values[0], values[1], speed, acceleration, lower, upper, max_speed, most
+    )
     assert motor_reply(raw) == (expected if wrong is None else None), wrong
     assert motor_reply(raw[:-1]) is None
 
@@ -300,9 +340,14 @@ def test_a_reply_that_was_saved_as_plain_text_is_none(upper: float, text: bool) 
 def test_a_reply_is_about_its_own_move(
     asked: float, target: float, position: float, near: bool
 ) -> None:
-    """The target to a thousandth of itself and a micrometre, the position to a millimetre more."""
-    reply = motor(target=target).replace(struct.pack(">d", 10.0), struct.pack(">d", position), 1)
-    (found,), problems = read_log(line(reply=reply).replace(b"\t10\t", f"\t{asked:g}\t".encode()))
+    """The target to a thousandth of itself and a micrometre, the position to a millimetre
+    more."""
+    reply = motor(target=target).replace(
+        struct.pack(">d", 10.0), struct.pack(">d", position), 1
+    )
+    (found,), problems = read_log(
+        line(reply=reply).replace(b"\t10\t", f"\t{asked:g}\t".encode())
+    )
     assert (found.motor is not None, [p.code for p in problems]) == (
         near,
         [] if near else ["reply"],
@@ -312,7 +357,9 @@ def test_a_reply_is_about_its_own_move(
 def drawn_log(rng: np.random.Generator, slower: float) -> tuple[Executed, ...]:
     """Commands that only take the time of their kind, in another order each time."""
     words = [("tube\tset kV\t80", 0.2), ("camera\tset exposure\t100", 0.7)] * 6
-    words += [("scanner\tpause\t250", 0.05)] * 6 + [("scanner\twrite settings file\t", 1.0)]
+    words += [("scanner\tpause\t250", 0.05)] * 6 + [
+        ("scanner\twrite settings file\t", 1.0)
+    ]
     data = b""
     for i in rng.permutation(len(words)):
         text, typical = words[i]
@@ -348,7 +395,10 @@ def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine
         shifts.append(later / math.sqrt(1 + 1 / half))
     shift = float(np.mean(shifts))
     agreed = max(0.0, 1.0 - (stats.sem(shifts) / shift) ** 2) * shift * 4 / 3
-    scales = {kind: np.abs(y - middles[kind]).sum() / (len(y) - 0.5) for kind, y in logs_of.items()}
+    scales = {
+        kind: np.abs(y - middles[kind]).sum() / (len(y) - 0.5)
+        for kind, y in logs_of.items()
+    }
     common = np.mean(list(scales.values()))
     timing = fit.machine.timing
     assert timing.drift == pytest.approx(math.exp(abs(shift) * 4 / 3) - 1, abs=1e-4)
@@ -361,7 +411,9 @@ def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine
         high = math.exp(high + beyond + max(agreed, 0.0)) - 0.003
         spread = timing.spread[kind]
         assert timing.seconds(kind) == pytest.approx(middle, abs=1e-4)
-        assert (spread.p5_s, spread.p95_s) == pytest.approx((max(low, 0.0), high), abs=2e-4)
+        assert (spread.p5_s, spread.p95_s) == pytest.approx(
+            (max(low, 0.0), high), abs=2e-4
+        )
         assert spread.p5_s <= low + 1e-12
         assert spread.p95_s >= high - 1e-12
         assert spread.n == len(found)
@@ -401,7 +453,9 @@ def test_damaged_logs_never_raise_and_never_shift_a_limit_unsaid() -> None:
         assert all(p.line >= 1 and p.message for p in problems)
         if lines and not any(p.severity == "error" for p in problems):
             found = fit_machine([lines], base, "damaged").machine
-            assert {n: found.axes[n].upper for n in LIMITS} == {n: v[1] for n, v in LIMITS.items()}
+            assert {n: found.axes[n].upper for n in LIMITS} == {
+                n: v[1] for n, v in LIMITS.items()
+            }
 
 
 def test_fit_writes_a_file_that_is_accepted_and_keeps_the_rest(
@@ -409,7 +463,19 @@ def test_fit_writes_a_file_that_is_accepted_and_keeps_the_rest(
 ) -> None:
     out = tmp_path / "mine.toml"
     assert (
-        run(["machine", "fit", str(LOG), "--base", "unitom_xl", "--out", str(out), "--json"]) == 0
+        run(
+            [
+                "machine",
+                "fit",
+                str(LOG),
+                "--base",
+                "unitom_xl",
+                "--out",
+                str(out),
+                "--json",
+            ]
+        )
+        == 0
     )
     document = json.loads(capsys.readouterr().out)
     for name, values in LIMITS.items():
@@ -420,7 +486,13 @@ def test_fit_writes_a_file_that_is_accepted_and_keeps_the_rest(
     assert set(document["timing"]["set_camera"]) == {"median_s", "p5_s", "p95_s", "n"}
     assert document["sum_abs_error_s"] <= 8.5 < document["total_s"]
     made, shipped = parse_machine(out.read_text()), builtin_machine("unitom_xl")
-    times = out.read_text().split("[timing]")[1].split("[timing.spread]")[0].strip().splitlines()
+    times = (
+        out.read_text()
+        .split("[timing]")[1]
+        .split("[timing.spread]")[0]
+        .strip()
+        .splitlines()
+    )
     for row in times:
         kind = row.split(" = ")[0].removesuffix("_s")
         told = "measured, log" if kind in (*document["timing"], "drift") else "assumed"
@@ -447,14 +519,19 @@ def test_against_says_line_real_predicted_error_worst_first(
     assert len(rows) == 57
     errors = [abs(row["error_s"]) for row in rows]
     assert errors == sorted(errors, reverse=True)
-    assert all(row["real_s"] - row["predicted_s"] == pytest.approx(row["error_s"]) for row in rows)
+    assert all(
+        row["real_s"] - row["predicted_s"] == pytest.approx(row["error_s"])
+        for row in rows
+    )
     assert document["sum_abs_error_s"] == pytest.approx(sum(errors))
     assert document["total_real_s"] == pytest.approx(146.132)
     assert page.read_text().count("<tr>") == 58
     assert run(words) == 0
     text = capsys.readouterr().out
     assert text.startswith("line  real [s]  predicted [s]")
-    inside = sum(row["p5_s"] - 1e-9 <= row["real_s"] <= row["p95_s"] + 1e-9 for row in rows)
+    inside = sum(
+        row["p5_s"] - 1e-9 <= row["real_s"] <= row["p95_s"] + 1e-9 for row in rows
+    )
     assert f"in their 90 % range:  {inside} of 57 lines" in text
     assert "where an axis stood before its first move, a log does not say" in text
     assert run(["check", str(LOG), "--against", str(LOG), "--machine", "unitom_xl"]) == 0
@@ -466,7 +543,10 @@ def test_a_log_of_another_script_and_files_that_are_no_logs(
     other = tmp_path / "other.txt"
     other.write_bytes(SCRIPT.read_bytes().replace(b"13.000000", b"14.000000", 1))
     assert run(["check", str(other), "--against", str(LOG)]) == 1
-    assert "line 14: 'tra_obj to 14' is 'tra_obj to 13' in the log" in capsys.readouterr().err
+    assert (
+        "line 14: 'tra_obj to 14' is 'tra_obj to 13' in the log"
+        in capsys.readouterr().err
+    )
     out = tmp_path / "out.toml"
     assert run(["machine", "fit", str(SCRIPT), "--out", str(out)]) == 1
     assert "no line of an executed script" in capsys.readouterr().err
@@ -489,7 +569,8 @@ def test_a_log_of_another_machine_is_said_with_its_axes(
     assert run([*words, "--machine", "flexray"]) == 0
     other = capsys.readouterr()
     assert (
-        "ver_tube goes from -62 to 1000 in the log, from 0 to 379 on machine flexray" in other.err
+        "ver_tube goes from -62 to 1000 in the log, from 0 to 379 on machine flexray"
+        in other.err
     )
     axes = [p["message"].split()[0] for p in json.loads(other.out)["problems"]]
     assert sorted(axes) == sorted(LIMITS)
@@ -506,7 +587,9 @@ def test_a_log_of_another_machine_is_said_with_its_axes(
 
 def test_predictions_do_not_see_the_log(log: tuple[Executed, ...], fitted: Fit) -> None:
     """Times of the log changed: what is predicted on a given machine stays as it is."""
-    slow = tuple(Executed(x.command, 2.0 * x.own_s, x.sent_s, x.reply, x.motor) for x in log)
+    slow = tuple(
+        Executed(x.command, 2.0 * x.own_s, x.sent_s, x.reply, x.motor) for x in log
+    )
     before, after = (LogComparison.of(x, fitted.machine) for x in (log, slow))
     assert [r.predicted_s for r in before.rows] == [r.predicted_s for r in after.rows]
     assert after.total_real_s == pytest.approx(2.0 * before.total_real_s)

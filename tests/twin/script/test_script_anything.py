@@ -1,4 +1,5 @@
-"""Whatever comes in: reading raises nothing but ScriptError, and every plan keeps its promises."""
+"""Whatever comes in: reading raises nothing but ScriptError, and every plan keeps its
+promises."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ COMMANDS = [f"{n} {v}" for n, table in FIXED.items() for v in table] + [
 ]
 number = st.one_of(
     st.floats(-1e3, 1e3).map(lambda x: f"{x:.6f}"),
-    st.sampled_from(["0", "1", "-0.0", "1e9", "-1e9", "1e-9", "1e300", "nan", "x", "0.000001"]),
+    st.sampled_from(
+        ["0", "1", "-0.0", "1e9", "-1e9", "1e-9", "1e300", "nan", "x", "0.000001"]
+    ),
 )
 argument = st.one_of(
     number,
@@ -52,7 +55,10 @@ script_like = st.lists(line, max_size=25).flatmap(
 
 
 anything = st.one_of(
-    st.text(), st.binary(), script_like, script_like.map(lambda s: s.encode("utf-8", "replace"))
+    st.text(),
+    st.binary(),
+    script_like,
+    script_like.map(lambda s: s.encode("utf-8", "replace")),
 )
 
 

@@ -12,7 +12,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from smooth_rule import smooth_scan
 
-from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_profile,
+)
 from flexdt.twin.script import (
     CheckReport,
     Clearance,
@@ -65,7 +70,9 @@ def test_document_has_the_interface_s_shape(flexray: Machine, profile: Profile) 
     starts = [s["start_s"] for s in document["steps"]]
     assert starts == sorted(starts)
     assert {"line", "start_s", "duration_s", "what"} <= set(document["steps"][0])
-    assert document["duration_s"] == pytest.approx(document["computed_s"] + document["assumed_s"])
+    assert document["duration_s"] == pytest.approx(
+        document["computed_s"] + document["assumed_s"]
+    )
 
 
 def test_optics_and_dose_by_hand(flexray: Machine, profile: Profile) -> None:
@@ -91,7 +98,8 @@ def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -
         {"left": 0, "right": 0, "top": 0, "bottom": 0}
     )
     assert whole.problems == ()
-    # A cylinder of radius 40 at 500 mm: its tangents meet the panel at 1000 tan(asin(40 / 500)).
+    # A cylinder of radius 40 at 500 mm: its tangents meet the panel at 1000 tan(asin(40 /
+    # 500)).
     wide = report(flexray, profile, sample=SampleSize(80.0, 20.0))
     edge = 1000 * math.tan(math.asin(40 / 500)) / 0.1496
     cut = wide.optics[0].truncation
@@ -105,7 +113,9 @@ def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -
     assert cut is not None
     source, panel = 20.0, 20.0
     bottom = source + (20.0 - 30.0 - source) * 1000 / 460
-    assert cut["bottom"] == pytest.approx((panel - 380 * 0.1496 - bottom) / 0.1496, abs=1e-3)
+    assert cut["bottom"] == pytest.approx(
+        (panel - 380 * 0.1496 - bottom) / 0.1496, abs=1e-3
+    )
     assert cut["top"] == pytest.approx(cut["bottom"])  # at home the beam meets the middle
 
 
@@ -121,15 +131,24 @@ WHOLLY_ABOVE_THE_BEAM = {
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(PLACES, min_size=1, max_size=3), st.floats(1, 60), st.none() | st.floats(0.2, 90))
+@given(
+    st.lists(PLACES, min_size=1, max_size=3),
+    st.floats(1, 60),
+    st.none() | st.floats(0.2, 90),
+)
 @example([WHOLLY_ABOVE_THE_BEAM], 60.0, 20.0)
 def test_the_sample_s_projection_is_that_of_its_cylinder(
     places: list[dict[str, float]], radius: float, high: float | None
 ) -> None:
-    """Points of a cylinder through a pinhole, with the zero offsets of the published profile."""
+    """Points of a cylinder through a pinhole, with the zero offsets of the published
+    profile."""
     flexray = builtin_machine()
     profile = builtin_profile("cwi-2023-08-21")
-    lines = ["camera take image ACK", "camera take image ACK", "camera save image di0.tif ACK"]
+    lines = [
+        "camera take image ACK",
+        "camera take image ACK",
+        "camera save image di0.tif ACK",
+    ]
     for i, place in enumerate(places):
         lines += [f"{motor} move absolute {x:.6f} ACK" for motor, x in place.items()]
         lines += ["camera take image ACK", f"camera save image s_{i}.tif ACK"]
@@ -152,18 +171,28 @@ def test_the_sample_s_projection_is_that_of_its_cylinder(
         left, right, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
         cut.append([-0.5 - left, right - 955.5, -0.5 - top, bottom - 759.5])
         shown.append(right > -0.5 and left < 955.5 and bottom > -0.5 and top < 759.5)
-        middle = (place["tra_obj"] - 0.5405) * sdd / sod + place["tra_det"] - 24.1215 - 16 * 0.0748
+        middle = (
+            (place["tra_obj"] - 0.5405) * sdd / sod
+            + place["tra_det"]
+            - 24.1215
+            - 16 * 0.0748
+        )
         half = 956 / 2 * 0.1496 - abs(middle)
         axes.append(middle / 0.1496 + 477.5)
         sides.append(
-            "left of" if right < -0.5 else "right of" if left > 955.5 else "above or below"
+            "left of"
+            if right < -0.5
+            else "right of"
+            if left > 955.5
+            else "above or below"
         )
         fields.append(2 * sod * math.sin(math.atan(max(half, 0.0) / sdd)))
     names = ("left", "right", "top", "bottom")[: 2 if high is None else 4]
     worst = np.maximum(np.max(cut, axis=0), 0.0)
     assert optics.truncation is not None
     assert dict(optics.truncation) == {
-        name: pytest.approx(px, abs=0.3, rel=1e-3) for name, px in zip(names, worst, strict=False)
+        name: pytest.approx(px, abs=0.3, rel=1e-3)
+        for name, px in zip(names, worst, strict=False)
     }
     assert optics.turn_field_mm == pytest.approx(min(fields), abs=1e-5)
     everywhere = np.min(cut, axis=0)[: len(names)]
@@ -174,7 +203,9 @@ def test_the_sample_s_projection_is_that_of_its_cylinder(
     assert ("truncated" in said) == (any(shown) and bool((everywhere > 0.5).any()))
     if "truncated" in said:
         parts = [name for name, px in zip(names, everywhere, strict=True) if px > 0.5]
-        assert [name for name in names if f"{name} by" in said["truncated"].message] == parts
+        assert [
+            name for name in names if f"{name} by" in said["truncated"].message
+        ] == parts
     if not all(shown):
         first, more = shown.index(False), shown.count(False) - 1
         message = said["sample_out_of_beam"].message
@@ -182,7 +213,9 @@ def test_the_sample_s_projection_is_that_of_its_cylinder(
         assert (f"(and at {more} more lines)" in message) == (more > 0)
 
 
-def test_a_source_within_the_sample_has_a_report_too(flexray: Machine, profile: Profile) -> None:
+def test_a_source_within_the_sample_has_a_report_too(
+    flexray: Machine, profile: Profile
+) -> None:
     made = report(flexray, profile, sample=SampleSize(1200.0, 50.0))
     json.dumps(made.to_dict(), allow_nan=False)
 
@@ -205,7 +238,9 @@ def test_tiles_make_up_for_each_other(flexray: Machine, profile: Profile) -> Non
     left, right = ("tra_det move absolute 75 ACK", "tra_det move absolute -25 ACK")
     tiled = "\n".join([*head, left, *tail[:-1], right, *shot])
     start = StartState.of(flexray)
-    assert check_script(tiled, flexray, profile, start=start, sample=sample).problems == ()
+    assert (
+        check_script(tiled, flexray, profile, start=start, sample=sample).problems == ()
+    )
     single = "\n".join([*head, left, *tail])
     made = check_script(single, flexray, profile, start=start, sample=sample)
     assert [p.code for p in made.problems] == ["truncated"]
@@ -226,11 +261,15 @@ def test_syntax_and_plan_errors_come_together(flexray: Machine, profile: Profile
     assert [s.line for s in made.plan.steps] == [2, 4]
 
 
-def test_collisions_come_from_the_function_handed_in(flexray: Machine, profile: Profile) -> None:
+def test_collisions_come_from_the_function_handed_in(
+    flexray: Machine, profile: Profile
+) -> None:
     seen: list[object] = []
     hit = Collision(10, 4.5, ("sample", "source"), {"mag_obj": 80.0})
 
-    def find(plan: ScanPlan, m: Machine, p: Profile, sample: SampleSize | None) -> Clearance:
+    def find(
+        plan: ScanPlan, m: Machine, p: Profile, sample: SampleSize | None
+    ) -> Clearance:
         seen.extend([plan, m, p, sample])
         return Clearance((hit,), 0.5, ("sample", "source"), ((0.0, 30.0), (4.5, 0.5)))
 
@@ -242,7 +281,12 @@ def test_collisions_come_from_the_function_handed_in(flexray: Machine, profile: 
     ]
     document = made.to_dict()
     assert document["collisions"] == [
-        {"line": 10, "time_s": 4.5, "pair": ["sample", "source"], "last_free": {"mag_obj": 80.0}}
+        {
+            "line": 10,
+            "time_s": 4.5,
+            "pair": ["sample", "source"],
+            "last_free": {"mag_obj": 80.0},
+        }
     ]
     assert document["min_clearance_mm"] == 0.5
     page = html_report(made, "a<b>.txt")
@@ -251,7 +295,9 @@ def test_collisions_come_from_the_function_handed_in(flexray: Machine, profile: 
 
 
 @pytest.mark.parametrize("beyond", [-0.02, 0.02])
-@pytest.mark.parametrize(("across", "sense"), [(True, 1), (True, -1), (False, 1), (False, -1)])
+@pytest.mark.parametrize(
+    ("across", "sense"), [(True, 1), (True, -1), (False, 1), (False, -1)]
+)
 def test_an_axis_is_in_the_beam_as_far_as_the_edge_of_the_last_pixel(
     flexray: Machine, profile: Profile, across: bool, sense: int, beyond: float
 ) -> None:
@@ -272,13 +318,17 @@ def test_an_axis_is_in_the_beam_as_far_as_the_edge_of_the_last_pixel(
 
 def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> None:
     pause = "scanner pause 3724000 ACK"
-    made = check_script("\n".join([*LINES, pause]), flexray, profile, sample=SampleSize(20.0))
+    made = check_script(
+        "\n".join([*LINES, pause]), flexray, profile, sample=SampleSize(20.0)
+    )
     facts = dict(summary(made))
     seconds = round(made.plan.duration_s) - 3600
     assert facts["duration"].startswith(f"1 h {seconds // 60} min {seconds % 60} s (")
     assert facts["  truncation"] == "none"
     assert facts["collisions"] == "not checked"
-    assert repr(made).startswith("<CheckReport: ok, 0 collisions, of <ScanPlan on flexray: ")
+    assert repr(made).startswith(
+        "<CheckReport: ok, 0 collisions, of <ScanPlan on flexray: "
+    )
     assert "<details>" in html_report(made)
     wide = report(flexray, profile, sample=SampleSize(80.0))
     assert dict(summary(wide))["  truncation"] == (
@@ -286,7 +336,9 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
     )
     assert dict(summary(wide))["duration"].startswith("0 min ")
     free = Clearance((), 12.5, ("sample", "source"), ((0.0, 12.5),))
-    hit = Clearance((Collision(10, 4.5, ("sample", "source"), {}),), 0.5, ("sample", "source"))
+    hit = Clearance(
+        (Collision(10, 4.5, ("sample", "source"), {}),), 0.5, ("sample", "source")
+    )
     stay = "none; parts in relative motion stay 12.50 mm apart (sample and source)"
     for found, text, ok in ((free, stay, True), (hit, "1", False)):
         checked = report(flexray, profile, collision=lambda *_, found=found: found)
@@ -363,7 +415,11 @@ def test_start_and_stage_are_told_in_every_form(
     document = made.to_dict()
     facts = dict(summary(made))
     assert facts["sample"] == ("none" if known else "none (empty stage assumed)")
-    told = "ver_tube=26.2917, " if known else "the machine's home, assumed: ver_tube=26.2917, "
+    told = (
+        "ver_tube=26.2917, "
+        if known
+        else "the machine's home, assumed: ver_tube=26.2917, "
+    )
     assert facts["start"].startswith(told)
     assert document["summary"] == {"sample": facts["sample"], "start": facts["start"]}
     assert document["start"] == {
@@ -372,7 +428,9 @@ def test_start_and_stage_are_told_in_every_form(
     page = html_report(made)
     assert f"<dt>sample</dt><dd>{facts['sample']}</dd>" in page
     assert "<dt>start</dt><dd>" in page
-    stage = check_script("\n".join(LINES), flexray, profile, sample=SampleSize(20.0, 30.0, "mine"))
+    stage = check_script(
+        "\n".join(LINES), flexray, profile, sample=SampleSize(20.0, 30.0, "mine")
+    )
     assert dict(summary(stage))["sample"] == "20 mm across, 30 mm high (mine)"
 
 
@@ -383,9 +441,9 @@ def test_poses_are_checked_alike(flexray: Machine, profile: Profile) -> None:
     assert made.plan.frames == 2
 
 
-# A scan of 1440 frames on a UniTOM XL, in the scanner's own form: our own script with the figures
-# of a published one whose settings file says when it was written (9:35:51) and when the scan
-# stopped (9:36:42.7): 51.2 s, to half a second.
+# A scan of 1440 frames on a UniTOM XL, in the scanner's own form: our own script with the
+# figures of a published one whose settings file says when it was written (9:35:51) and when the
+# scan stopped (9:36:42.7): 51.2 s, to half a second.
 def unitom_lines() -> list[bytes]:
     rule = smooth_scan(1440, 0.025018499, 1, 22.5)
     rows = [
@@ -402,7 +460,15 @@ def unitom_lines() -> list[bytes]:
         ("camera", "set number of averages", "1", "", "ACK"),
         ("scanner", "write settings file", "", "", "ACK"),
         ("rot_obj", "move absolute", f"{rule.end:.6f}", "0.000000", "POS"),
-        ("camera", "take and save image sequence", "E:\\x\\scan_", "0", "ACK", "", "36027"),
+        (
+            "camera",
+            "take and save image sequence",
+            "E:\\x\\scan_",
+            "0",
+            "ACK",
+            "",
+            "36027",
+        ),
         ("rot_obj", "set speed", "45.0000000000", "", "ACK", "180000"),
         ("rot_obj", "set acceleration", "45.000000", "", "ACK"),
         ("tube", "xrayoff", "", "", "ACK"),
@@ -428,12 +494,16 @@ def test_unitom_timing_from_the_settings_file_to_the_end() -> None:
     commands = sum(s.assumed_s for s in plan.steps[written.step :])
     assert commands < 0.12 * predicted
     sequence = next(s for s in plan.steps if "sequence" in s.what)
-    assert sequence.computed_s == pytest.approx(36.027, abs=2e-3)  # as the scanner expected
+    assert sequence.computed_s == pytest.approx(
+        36.027, abs=2e-3
+    )  # as the scanner expected
 
 
 def test_unitom_geometry_is_the_published_scan_s() -> None:
     machine = builtin_machine("unitom_xl")
-    made = check_script(b"".join(unitom_lines()), machine, builtin_profile(machine.default_profile))
+    made = check_script(
+        b"".join(unitom_lines()), machine, builtin_profile(machine.default_profile)
+    )
     (optics,) = made.optics
     assert optics.shape == (948, 960)
     assert optics.sod_mm[0] == pytest.approx(149.99997, abs=1e-6)

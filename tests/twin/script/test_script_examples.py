@@ -18,7 +18,9 @@ LEGO = SampleSize(float(np.hypot(24.0, 16.0)), 49.8)
 
 
 @pytest.fixture
-def check(flexray: Machine, profile: Profile, request: pytest.FixtureRequest) -> CheckReport:
+def check(
+    flexray: Machine, profile: Profile, request: pytest.FixtureRequest
+) -> CheckReport:
     data = (FOLDER / f"{request.param}.txt").read_bytes()
     return check_script(data, flexray, profile, sample=LEGO)
 
@@ -34,7 +36,9 @@ def check(flexray: Machine, profile: Profile, request: pytest.FixtureRequest) ->
     ],
     indirect=["check"],
 )
-def test_examples_check_without_a_word(check: CheckReport, frames: int, steps: float) -> None:
+def test_examples_check_without_a_word(
+    check: CheckReport, frames: int, steps: float
+) -> None:
     assert check.problems == ()
     assert check.plan.frames == frames
     angles = check.plan.image_positions["rot_obj"][[e.kind == "projection"
@@ -49,7 +53,9 @@ def test_examples_check_without_a_word(check: CheckReport, frames: int, steps: f
 
 
 @pytest.mark.parametrize("check", ["lego-fly-360"], indirect=True)
-def test_the_demo_s_script(check: CheckReport, flexray: Machine, profile: Profile) -> None:
+def test_the_demo_s_script(
+    check: CheckReport, flexray: Machine, profile: Profile
+) -> None:
     plan = check.plan
     assert all(e.camera.shape == (760, 956) for e in plan.exposures)
     (optics,) = check.optics

@@ -1,4 +1,5 @@
-"""The smooth-scan rule: published figures, images at i * 360 / (N - 1), and what is inferred."""
+"""The smooth-scan rule: published figures, images at i * 360 / (N - 1), and what is
+inferred."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ def listing(flexray: Machine, profile: Profile) -> ScanPlan:
 
 def test_published_run_ups() -> None:
     # Listing 1: ten averages, 22.5 deg/s2, its own speed.
-    assert -run_up(0.12566897, 22.5, 10 * 0.099998199) == pytest.approx(-0.503018, abs=1e-4)
+    assert -run_up(0.12566897, 22.5, 10 * 0.099998199) == pytest.approx(
+        -0.503018, abs=1e-4
+    )
     # The UniTOM sample: 1440 frames of 25.018499 ms; start and end as in its script.
     sample = smooth_scan(1440, 0.025018499, 1, 22.5)
     assert sample.start == pytest.approx(-3.222728, abs=1e-4)
@@ -65,7 +68,11 @@ def test_listing_1_plan(listing: ScanPlan) -> None:
 def test_image_i_lies_at_i_360_over_n_minus_1_exactly_when_the_motor_is_there(
     planned: Planner, frames: int
 ) -> None:
-    rule = smooth_scan(frames, 0.05, 2, 22.5) if frames > 10 else smooth_scan(frames, 5.0, 2, 22.5)
+    rule = (
+        smooth_scan(frames, 0.05, 2, 22.5)
+        if frames > 10
+        else smooth_scan(frames, 5.0, 2, 22.5)
+    )
     exposure = rule.period_s / 2 * 1000
     plan = planned(
         *fly_lines(exposure, 2, frames),
@@ -100,7 +107,9 @@ def fly_lines(exposure_ms: float, averages: int, frames: int) -> list[str]:
     ]
 
 
-def fly(planned: Planner, lines: list[str], speed: float, start: float, end: float) -> ScanPlan:
+def fly(
+    planned: Planner, lines: list[str], speed: float, start: float, end: float
+) -> ScanPlan:
     return planned(
         *lines,
         f"rot_obj move absolute {start:.6f} ACK",
@@ -116,7 +125,9 @@ def test_what_is_unsaid_is_inferred(
     planned: Planner, averages: int, frames: int, unsaid: set[str]
 ) -> None:
     rule = smooth_scan(frames, 0.1, averages, 22.5)
-    lines = [x for x in fly_lines(100, averages, frames) if not any(u in x for u in unsaid)]
+    lines = [
+        x for x in fly_lines(100, averages, frames) if not any(u in x for u in unsaid)
+    ]
     plan = fly(planned, lines, rule.speed, rule.start, rule.end)
     last = plan.exposures[-1]
     assert (plan.frames, last.averages) == (frames, averages)
@@ -134,7 +145,9 @@ def test_a_scan_within_a_degree_of_whole_turns_is_one_of_them(
     assert plan.frames == frames
 
 
-def test_without_a_rule_to_infer_from_the_documented_default_is_taken(planned: Planner) -> None:
+def test_without_a_rule_to_infer_from_the_documented_default_is_taken(
+    planned: Planner,
+) -> None:
     lines = [x for x in fly_lines(100, 1, 1) if "number" not in x]
     plan = planned(*lines, "camera take and save image sequence scan_ 0 ACK")
     assert [(p.code, p.severity) for p in plan.problems] == [
@@ -169,7 +182,8 @@ def test_averages_follow_from_the_frames_before_the_run_up(planned: Planner) -> 
 
 
 @pytest.mark.parametrize(
-    ("ratio", "averages"), [(3.05, 3), (2.95, 3), (3.07, 1), (2.93, 1), (0.99, 1), (0.4, 1)]
+    ("ratio", "averages"),
+    [(3.05, 3), (2.95, 3), (3.07, 1), (2.93, 1), (0.99, 1), (0.4, 1)],
 )
 def test_averages_are_a_whole_number_within_two_percent_or_not_inferred(
     planned: Planner, ratio: float, averages: int
@@ -183,8 +197,13 @@ def test_averages_are_a_whole_number_within_two_percent_or_not_inferred(
 def test_averages_that_are_inferred_hold_for_previews_too(planned: Planner) -> None:
     rule = smooth_scan(361, 0.1, 3, 22.5)
     lines = [x for x in fly_lines(100, 3, 361) if "averages" not in x]
-    plan = fly(planned, [*lines, "camera take image ACK"], rule.speed, rule.start, rule.end)
-    assert [(g.kind, g.camera.averages) for g in plan.groups] == [("preview", 3), ("projection", 3)]
+    plan = fly(
+        planned, [*lines, "camera take image ACK"], rule.speed, rule.start, rule.end
+    )
+    assert [(g.kind, g.camera.averages) for g in plan.groups] == [
+        ("preview", 3),
+        ("projection", 3),
+    ]
 
 
 def test_half_a_turn_lies_where_the_motor_is(planned: Planner) -> None:
@@ -206,7 +225,9 @@ def test_a_short_run_up_and_an_early_end_are_named(planned: Planner) -> None:
     assert early.exposures[-1].positions["rot_obj"] == 355.0
 
 
-@pytest.mark.parametrize(("pause", "late"), [("50", 1), ("0.0000011", 1), ("0.0000009", 0)])
+@pytest.mark.parametrize(
+    ("pause", "late"), [("50", 1), ("0.0000011", 1), ("0.0000009", 0)]
+)
 def test_commands_between_trigger_and_sequence_delay_it(
     planned: Planner, pause: str, late: int
 ) -> None:

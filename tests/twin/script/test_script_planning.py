@@ -34,8 +34,9 @@ from flexdt.twin.script import (
 from flexdt.twin.script.planning.plan_values import SampleSize
 from tests.twin.script.conftest import Planner
 
-# FleX-ray, linear axes: 50 mm/s, 50 mm/s2; so a move of d >= 50 mm takes d / 50 + 1 s, a shorter
-# one 2 sqrt(d / 50) s. Homes: tra_obj 0, mag_obj 600, ver_tube 26.2917, ver_det 20, rot_obj 0.
+# FleX-ray, linear axes: 50 mm/s, 50 mm/s2; so a move of d >= 50 mm takes d / 50 + 1 s, a
+# shorter one 2 sqrt(d / 50) s. Homes: tra_obj 0, mag_obj 600, ver_tube 26.2917, ver_det 20,
+# rot_obj 0.
 QUIET = [
     "tube set kV 90 ACK",
     "tube set power 50 ACK",
@@ -55,7 +56,9 @@ def test_moves_take_the_trapezoid_s_time(planned: Planner) -> None:
     plan = planned("tra_obj move absolute 100 ACK", "mag_obj move absolute 608 ACK")
     long, short = plan.steps
     assert (long.start_s, long.duration_s, long.holds_s) == pytest.approx((0.0, 3.0, 3.0))
-    assert (short.start_s, short.duration_s) == pytest.approx((3.0, 2 * math.sqrt(8 / 50)))
+    assert (short.start_s, short.duration_s) == pytest.approx(
+        (3.0, 2 * math.sqrt(8 / 50))
+    )
     assert plan.duration_s == pytest.approx(3.0 + 0.8)
     assert plan.assumed_s == 0.0
     # Accelerating for 1 s covers 25 mm; at 1.5 s the axis has cruised half a second.
@@ -66,7 +69,9 @@ def test_moves_take_the_trapezoid_s_time(planned: Planner) -> None:
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.randoms(use_true_random=False), st.sampled_from(["tra_obj", "X", "Mag_x", "Rot"]))
+@given(
+    st.randoms(use_true_random=False), st.sampled_from(["tra_obj", "X", "Mag_x", "Rot"])
+)
 def test_an_axis_may_be_written_in_any_case(rng: random.Random, name: str) -> None:
     text = builtin_machine_text("flexray").replace("tra_obj", name)
     asked = "".join(rng.choice((letter.upper(), letter.lower())) for letter in name)
@@ -173,25 +178,37 @@ def test_virtual_axis_moves_source_and_detector_in_step(planned: Planner) -> Non
     assert plan.steps[1].duration_s == pytest.approx(up / 10 + 10 / 50)
 
 
-def test_limits_clamp_with_a_warning_or_reject(flexray: Machine, profile: Profile) -> None:
-    script = parse_script("mag_det move absolute 1000 ACK\nmag_det move absolute 1060 ACK")
+def test_limits_clamp_with_a_warning_or_reject(
+    flexray: Machine, profile: Profile
+) -> None:
+    script = parse_script(
+        "mag_det move absolute 1000 ACK\nmag_det move absolute 1060 ACK"
+    )
     plan = plan_script(script, flexray, profile)
     assert codes(plan) == [("warning", "limit_clamped", 2)]
     assert "1060" in plan.warnings[0].message
     assert "1059" in plan.warnings[0].message
     assert plan.positions(1e6)["mag_det"] == 1059.0
     strict = flexray.model_copy(update={"on_limit": "reject"})
-    plan = plan_script(script, strict, profile)  # 1 mm beyond is within the arrival tolerance
+    plan = plan_script(
+        script, strict, profile
+    )  # 1 mm beyond is within the arrival tolerance
     assert codes(plan) == [("warning", "limit_clamped", 2)]
-    beyond = parse_script("mag_det move absolute 1000 ACK\nmag_det move absolute 1060.1 ACK")
+    beyond = parse_script(
+        "mag_det move absolute 1000 ACK\nmag_det move absolute 1060.1 ACK"
+    )
     plan = plan_script(beyond, strict, profile)
     assert codes(plan) == [("error", "limit", 2)]
     assert len(plan.steps) == 2
-    assert codes(plan_script(beyond, flexray, profile)) == [("warning", "limit_clamped", 2)]
+    assert codes(plan_script(beyond, flexray, profile)) == [
+        ("warning", "limit_clamped", 2)
+    ]
 
 
 def test_a_clamped_virtual_axis_keeps_its_motors_in_step(planned: Planner) -> None:
-    plan = planned("ver_obj move absolute 400 ACK")  # asks ver_tube for -20, ver_det for as much
+    plan = planned(
+        "ver_obj move absolute 400 ACK"
+    )  # asks ver_tube for -20, ver_det for as much
     end = plan.positions(plan.duration_s)
     # ver_det may go down to 4: 16 mm, and ver_tube no farther.
     assert end["ver_det"] == pytest.approx(4.0)
@@ -238,7 +255,14 @@ def test_assumed_times_come_from_the_machine_and_not_from_the_bound_in_column_7(
         "tube xrayoff ACK",
     )
     assert [s.assumed_s for s in plan.steps] == pytest.approx(
-        [timing.xrayon_s, timing.xray_ready_s, timing.set_camera_s, 0.0, timing.xrayoff_s, 0.0]
+        [
+            timing.xrayon_s,
+            timing.xray_ready_s,
+            timing.set_camera_s,
+            0.0,
+            timing.xrayoff_s,
+            0.0,
+        ]
     )
     assert plan.steps[2].assumed_from == "flexray timing"
     assert plan.steps[0].assumed_from == "flexray timing"
@@ -249,7 +273,9 @@ def test_assumed_times_come_from_the_machine_and_not_from_the_bound_in_column_7(
     assert on.end_s == pytest.approx(plan.steps[4].start_s)
 
 
-def test_settings_of_a_tube_that_is_on_part_its_time(flexray: Machine, planned: Planner) -> None:
+def test_settings_of_a_tube_that_is_on_part_its_time(
+    flexray: Machine, planned: Planner
+) -> None:
     """Two settings at one moment make no interval between them."""
     still = Timing(source="none", xrayon_s=2.0)
     plan = plan_script(
@@ -262,7 +288,9 @@ def test_settings_of_a_tube_that_is_on_part_its_time(flexray: Machine, planned: 
     ]  # fmt: skip
 
 
-def test_x_rays_are_ready_without_waiting_when_a_pause_has_passed(planned: Planner) -> None:
+def test_x_rays_are_ready_without_waiting_when_a_pause_has_passed(
+    planned: Planner,
+) -> None:
     plan = planned(
         "tube xrayon ACK",
         "scanner pause 60000 ACK",
@@ -317,7 +345,9 @@ def test_images_kinds_names_and_settings(planned: Planner) -> None:
         ("\\\\server\\share\\a.tiff", "a.tiff"),
     ],
 )
-def test_files_stay_in_the_data_set_s_folder(planned: Planner, path: str, name: str) -> None:
+def test_files_stay_in_the_data_set_s_folder(
+    planned: Planner, path: str, name: str
+) -> None:
     plan = planned("camera take image ACK", f"camera save image {path} ACK")
     assert plan.exposures[0].file == name
 
@@ -352,17 +382,23 @@ def test_warnings_about_images(planned: Planner) -> None:
 
 
 def test_settings_left_unsaid_are_named(planned: Planner) -> None:
-    plan = planned("tube xrayon ACK", "camera take image ACK", "camera save image scan_0.tif ACK")
-    assert [c[1] for c in codes(plan)] == ["default_assumed"] * 3 + ["averages_unsaid"] + [
-        "default_assumed"
-    ] * 2
+    plan = planned(
+        "tube xrayon ACK", "camera take image ACK", "camera save image scan_0.tif ACK"
+    )
+    assert [c[1] for c in codes(plan)] == ["default_assumed"] * 3 + [
+        "averages_unsaid"
+    ] + ["default_assumed"] * 2
     text = " ".join(p.message for p in plan.problems)
     for what in ("mode", "exposure", "ROI", "averages", "voltage", "power"):
         assert what in text
 
 
 def test_step_and_shoot_images_are_where_the_stage_stopped(planned: Planner) -> None:
-    dark = ["camera take image ACK", "camera take image ACK", "camera save image di0.tif ACK"]
+    dark = [
+        "camera take image ACK",
+        "camera take image ACK",
+        "camera save image di0.tif ACK",
+    ]
     lines = [*QUIET, "rot_obj move absolute 7 ACK", *dark, "tube xrayon ACK"]
     for i in range(24):
         lines += [
@@ -413,11 +449,15 @@ def test_settings_file_has_the_moment_s_readings(planned: Planner) -> None:
     assert plan.settings.time_s == plan.steps[2].start_s
 
 
-@pytest.mark.parametrize(("before", "on"), [([], None), (["on"], True), (["on", "off"], False)])
+@pytest.mark.parametrize(
+    ("before", "on"), [([], None), (["on"], True), (["on", "off"], False)]
+)
 def test_settings_file_says_whether_x_rays_are_on_once_that_is_known(
     planned: Planner, before: list[str], on: bool | None
 ) -> None:
-    plan = planned(*(f"tube xray{k} ACK" for k in before), "scanner write settings file ACK")
+    plan = planned(
+        *(f"tube xray{k} ACK" for k in before), "scanner write settings file ACK"
+    )
     assert plan.settings is not None
     assert plan.settings.xrays_on is on
 
@@ -429,7 +469,10 @@ def test_start_state_is_where_the_plan_begins(flexray: Machine, profile: Profile
         20.0, True,
     )  # fmt: skip
     plan = plan_script(
-        parse_script("tra_obj move absolute 0 ACK\ntube xrayon ACK"), flexray, profile, start=start
+        parse_script("tra_obj move absolute 0 ACK\ntube xrayon ACK"),
+        flexray,
+        profile,
+        start=start,
     )
     assert plan.steps[0].duration_s == pytest.approx(3.0)
     assert plan.steps[1].holds_s == 0.0
@@ -438,7 +481,9 @@ def test_start_state_is_where_the_plan_begins(flexray: Machine, profile: Profile
 
 
 def test_streamed_poses(flexray: Machine, profile: Profile) -> None:
-    poses = [{"rot_obj": 30.0 * i, "tra_obj": float(i)} for i in range(4)] + [{"rot_obj": 0.0}]
+    poses = [{"rot_obj": 30.0 * i, "tra_obj": float(i)} for i in range(4)] + [
+        {"rot_obj": 0.0}
+    ]
     plan = plan_poses(poses, flexray, profile, 250.0)
     assert codes(plan) == []
     dark, flat, *images = plan.exposures
@@ -450,7 +495,10 @@ def test_streamed_poses(flexray: Machine, profile: Profile) -> None:
     assert [e.line for e in images] == [1, 2, 3, 4, 5]
     with pytest.raises(UnknownNameError, match="rot_obj"):
         plan_poses([{"rotation": 1.0}], flexray, profile)
-    assert codes(plan_poses([{"mag_obj": 2000.0}], flexray, profile))[0][1] == "limit_clamped"
+    assert (
+        codes(plan_poses([{"mag_obj": 2000.0}], flexray, profile))[0][1]
+        == "limit_clamped"
+    )
 
 
 def test_a_script_without_projections_has_no_poses(planned: Planner) -> None:
@@ -491,7 +539,8 @@ def test_a_geared_virtual_axis_moves_at_the_pace_of_its_slowest_motor(
     )
     text = (
         "ver_tube move absolute 150 no wait\nver_det move absolute 150 ACK\n"
-        "ver_tube set speed 7 ACK\nver_tube set acceleration 5 ACK\nver_obj move absolute {} ACK"
+        "ver_tube set speed 7 ACK\nver_tube set acceleration 5 ACK\nver_obj move "
+        "absolute {} ACK"
     )
     there = 379.998  # any reading; the way is what counts
     plan = plan_script(parse_script(text.format(there)), geared, profile_of(geared))
@@ -507,7 +556,9 @@ def test_a_geared_virtual_axis_moves_at_the_pace_of_its_slowest_motor(
     assert last.duration_s == pytest.approx(expected)
     for t in np.linspace(last.start_s, plan.duration_s, 30).tolist():
         now = plan.positions(t)
-        gone = [(now[n] - begin[n]) / f for n, f in (("ver_tube", tube), ("ver_det", panel))]
+        gone = [
+            (now[n] - begin[n]) / f for n, f in (("ver_tube", tube), ("ver_det", panel))
+        ]
         assert gone[0] == pytest.approx(gone[1], abs=1e-9)
 
 
@@ -518,7 +569,8 @@ def test_a_rate_of_a_geared_virtual_axis_is_shared_out() -> None:
         "moves = { ver_tube = -2.0, ver_det = -0.5 }\n"
     )
     text = (
-        "ver_obj set speed 3 ACK\nver_obj set acceleration 4 ACK\nscanner write settings file ACK"
+        "ver_obj set speed 3 ACK\nver_obj set acceleration 4 ACK\nscanner write settings "
+        "file ACK"
     )
     plan = plan_script(parse_script(text), geared, profile_of(geared))
     assert plan.settings is not None
@@ -540,7 +592,11 @@ def test_the_cylinder_about_a_box_holds_its_corners_at_every_angle(
     widest = highest = 0.0
     for rz in np.radians(np.arange(0.0, 360.0, 0.5)):
         turned = corners
-        for axis, angle in ((0, math.radians(tilts[0])), (1, math.radians(tilts[1])), (2, rz)):
+        for axis, angle in (
+            (0, math.radians(tilts[0])),
+            (1, math.radians(tilts[1])),
+            (2, rz),
+        ):
             turned = turned @ rotation_about(np.eye(3)[axis], float(angle)).T
         turned = turned + at
         widest = max(widest, float(np.hypot(turned[:, 0], turned[:, 1]).max()))
@@ -549,7 +605,9 @@ def test_the_cylinder_about_a_box_holds_its_corners_at_every_angle(
     assert found.diameter_mm >= 2 * widest - 1e-9
     assert found.height_mm >= 2 * highest - 1e-9
     if tilted:  # then it holds the ball about the box
-        assert found.diameter_mm == pytest.approx(np.linalg.norm(size) + 2 * math.hypot(*at[:2]))
+        assert found.diameter_mm == pytest.approx(
+            np.linalg.norm(size) + 2 * math.hypot(*at[:2])
+        )
         assert found.height_mm == pytest.approx(np.linalg.norm(size) + 2 * abs(at[2]))
     else:
         assert found.diameter_mm == pytest.approx(2 * widest, rel=1e-4)

@@ -1,7 +1,8 @@
-"""Trajectories as data sets: the plan is that of a script with the same steps, the flat is empty.
+"""Trajectories as data sets: the plan is that of a script with the same steps, the flat is
+empty.
 
-The script is written here line by line; where the sample's shadow falls is computed here, from the
-motors and the machine file's figures.
+The script is written here line by line; where the sample's shadow falls is computed here, from
+the motors and the machine file's figures.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from flexdt.twin.script.planning.plan_values import Exposure, SampleSize
 SEEDS = range(12)
 
 
-def drawn(rng: np.random.Generator, machine: Machine) -> tuple[list[dict[str, float]], StartState]:
+def drawn(
+    rng: np.random.Generator, machine: Machine
+) -> tuple[list[dict[str, float]], StartState]:
     """Poses of some motors, and a start with another camera."""
     around = {
         n: (float(rng.uniform(a.lower, a.upper)), (a.upper - a.lower) * 0.01)
@@ -36,7 +39,10 @@ def drawn(rng: np.random.Generator, machine: Machine) -> tuple[list[dict[str, fl
         if rng.random() < 0.5 or a.kind == "rotation"
     }
     poses = [
-        {n: round(float(at + rng.uniform(0, width)), 3) for n, (at, width) in around.items()}
+        {
+            n: round(float(at + rng.uniform(0, width)), 3)
+            for n, (at, width) in around.items()
+        }
         for _ in range(int(rng.integers(1, 5)))
     ]
     for n in around:
@@ -49,9 +55,12 @@ def drawn(rng: np.random.Generator, machine: Machine) -> tuple[list[dict[str, fl
 
 
 def written(
-    poses: Sequence[Mapping[str, float]], start: StartState, away: Mapping[str, float] | None
+    poses: Sequence[Mapping[str, float]],
+    start: StartState,
+    away: Mapping[str, float] | None,
 ) -> str:
-    """The script that somebody would write who wants these images; `away` is where the flat is."""
+    """The script that somebody would write who wants these images; `away` is where the flat
+    is."""
     camera = start.camera
     lines = [
         f"camera\tset mode\t{camera.mode}\t\tACK",
@@ -66,18 +75,25 @@ def written(
     def go(pose: Mapping[str, float], *, all_of_them: bool) -> None:
         moved = {n: x for n, x in pose.items() if all_of_them or x != here[n]}
         if len(moved) > 1:
-            lines.extend(f"{n}\tmove absolute\t{x!r}\t\tno wait" for n, x in moved.items())
+            lines.extend(
+                f"{n}\tmove absolute\t{x!r}\t\tno wait" for n, x in moved.items()
+            )
         lines.extend(f"{n}\tmove absolute\t{x!r}\t\tACK" for n, x in moved.items())
         here.update(moved)
 
     def image(name: str) -> None:
-        lines.extend(["camera\ttake image\t\t\tACK", f"camera\tsave image\tE:\\a\\{name}\t\tACK"])
+        lines.extend(
+            ["camera\ttake image\t\t\tACK", f"camera\tsave image\tE:\\a\\{name}\t\tACK"]
+        )
 
     if away is not None:
         go(away, all_of_them=False)
     lines += ["tube\txrayoff\t\t\tACK", "camera\tset number of averages\t10\t\tACK"]
     image("di000000.tif")
-    lines += ["tube\txrayon\t\t\tACK", "tube\tREPEAT UNTIL TRUE status_XReady_get\t\t\tACK"]
+    lines += [
+        "tube\txrayon\t\t\tACK",
+        "tube\tREPEAT UNTIL TRUE status_XReady_get\t\t\tACK",
+    ]
     if away is not None:
         image("io000000.tif")
     lines.append(f"camera\tset number of averages\t{camera.averages}\t\tACK")
@@ -112,13 +128,16 @@ def test_the_plan_is_that_of_a_script_with_the_same_steps(seed: int) -> None:
         assert plan.settings == script.settings
         assert plan.trajectories == script.trajectories
         expected = {(p.code, p.message) for p in script.problems}
-        assert {(p.code, p.message) for p in plan.problems if p.code != "no_flat"} == expected
+        assert {
+            (p.code, p.message) for p in plan.problems if p.code != "no_flat"
+        } == expected
         assert any(p.code == "no_flat" for p in plan.warnings) != flat
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_sample_casts_no_shadow_into_the_flat(seed: int) -> None:
-    """On the FleX-ray: every ray through the cylinder that holds the sample misses the image."""
+    """On the FleX-ray: every ray through the cylinder that holds the sample misses the
+    image."""
     rng = np.random.default_rng(5000 + seed)
     machine = builtin_machine("flexray")
     profile = profile_of(machine)
@@ -132,7 +151,9 @@ def test_the_sample_casts_no_shadow_into_the_flat(seed: int) -> None:
         "tra_obj": float(rng.uniform(-20, 20)),
         "tra_det": 25.3 + float(rng.uniform(-10, 10)),
     }
-    plan = plan_poses([first, {"rot_obj": 5.0}], machine, profile, start=start, sample=size)
+    plan = plan_poses(
+        [first, {"rot_obj": 5.0}], machine, profile, start=start, sample=size
+    )
     [flat] = [e for e in plan.exposures if e.kind == "flat"]
     at = flat.positions
     assert {n: x for n, x in at.items() if n != "tra_obj"} == {
@@ -153,13 +174,23 @@ def test_the_sample_casts_no_shadow_into_the_flat(seed: int) -> None:
 
 
 def test_a_flat_where_it_was_asked_for(flexray: Machine, profile: Profile) -> None:
-    poses, flat = [{"rot_obj": 10.0}, {"rot_obj": 20.0}], {"tra_obj": 150.0, "mag_obj": 500.0}
+    poses, flat = (
+        [{"rot_obj": 10.0}, {"rot_obj": 20.0}],
+        {"tra_obj": 150.0, "mag_obj": 500.0},
+    )
     start = StartState.of(flexray)
     plan = plan_poses(poses, flexray, profile, start=start, flat=flat)
     dark, taken, *images = plan.exposures
     assert dark.positions == taken.positions == {**start.positions, **flat}
-    assert [e.positions for e in images] == [{**start.positions, **pose} for pose in poses]
-    assert [e.kind for e in plan.exposures] == ["dark", "flat", "projection", "projection"]
+    assert [e.positions for e in images] == [
+        {**start.positions, **pose} for pose in poses
+    ]
+    assert [e.kind for e in plan.exposures] == [
+        "dark",
+        "flat",
+        "projection",
+        "projection",
+    ]
     assert [e.xrays_on for e in plan.exposures] == [False, True, True, True]
 
     clamped = plan_poses(poses, flexray, profile, flat={"tra_obj": 900.0})
@@ -168,7 +199,9 @@ def test_a_flat_where_it_was_asked_for(flexray: Machine, profile: Profile) -> No
         plan_poses(poses, flexray, profile, flat={"rotation": 1.0})
 
 
-def test_the_path_to_the_flat_is_the_one_that_is_free(flexray: Machine, profile: Profile) -> None:
+def test_the_path_to_the_flat_is_the_one_that_is_free(
+    flexray: Machine, profile: Profile
+) -> None:
     """The first side that `route` reaches; its moves one after the other, there and back."""
     asked: list[dict[str, float]] = []
 
@@ -199,8 +232,12 @@ def test_the_path_to_the_flat_is_the_one_that_is_free(flexray: Machine, profile:
 
 def test_a_machine_that_cannot_move_its_sample_aside_says_so() -> None:
     machine = parse_machine('base = "micro_ct"\n')
-    kept = {q: f for q, f in machine.geometry.items() if q not in ("object_x", "object_z")}
+    kept = {
+        q: f for q, f in machine.geometry.items() if q not in ("object_x", "object_z")
+    }
     still = machine.model_copy(update={"geometry": kept})
-    with pytest.raises(LimitError, match="no motor that takes the sample out of the beam"):
+    with pytest.raises(
+        LimitError, match="no motor that takes the sample out of the beam"
+    ):
         plan_poses([{"R": 1.0}], still, profile_of(still))
     assert plan_poses([{"R": 1.0}], still, profile_of(still), flat=False).frames == 1

@@ -68,7 +68,11 @@ def test_every_command_reads_alike_in_both_forms(
     for command in (from_tabs, from_spaces):
         assert type(command) is type_
         assert command.wait is Wait.ACK
-        assert (command.line, command.timeout_ms, command.expected_ms) == (1, 2000.0, 150.0)
+        assert (command.line, command.timeout_ms, command.expected_ms) == (
+            1,
+            2000.0,
+            150.0,
+        )
         for name, value in values.items():
             assert getattr(command, name) == value
 
@@ -78,8 +82,13 @@ def test_triggered_move_and_sequence_have_two_arguments() -> None:
     assert move == c.MoveAbsolute(
         line=1, wait=Wait.POS, component="rot_obj", target=363.2, trigger=0.0
     )
-    assert one("rot_obj      move                absolute          363.2 0.000000  POS") == move
-    sequence = one(tabbed("camera", "take and save image sequence", "E:\\a b\\scan_", "7", "ACK"))
+    assert (
+        one("rot_obj      move                absolute          363.2 0.000000  POS")
+        == move
+    )
+    sequence = one(
+        tabbed("camera", "take and save image sequence", "E:\\a b\\scan_", "7", "ACK")
+    )
     assert sequence == c.TakeSequence(line=1, prefix="E:\\a b\\scan_", first=7)
     assert one("camera   take and save image sequence E:\\a b\\scan_ 7  ACK") == sequence
 
@@ -88,7 +97,9 @@ BLANKS = st.text(" \ufeff", max_size=3)
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.sampled_from(EVERY_COMMAND), st.lists(BLANKS, min_size=16, max_size=16), st.data())
+@given(
+    st.sampled_from(EVERY_COMMAND), st.lists(BLANKS, min_size=16, max_size=16), st.data()
+)
 def test_a_problem_is_told_at_the_column_of_its_field(
     entry: tuple[tuple[str, ...], type[c.Command], dict[str, object]],
     blanks: list[str],
@@ -100,13 +111,19 @@ def test_a_problem_is_told_at_the_column_of_its_field(
     taken = type_ in (c.SetOutputPath, c.SaveImage, c.SetMode)
     wrong = data.draw(st.sampled_from([i for i in range(1, 8) if i != 2 or not taken]))
     cells[wrong] = "odd"
-    text = "\t".join(a + x + b for a, x, b in zip(blanks[:8], cells, blanks[8:], strict=True))
+    text = "\t".join(
+        a + x + b for a, x, b in zip(blanks[:8], cells, blanks[8:], strict=True)
+    )
     [problem, *_] = read_script("tube\txrayon\t\t\tACK\n\n" + text)[1]
     codes = ["", "unknown_command", "value", "value", "wait", "value", "value", "syntax"]
     expected = "syntax" if 1 < wrong < 4 and wrong - 1 > takes else codes[wrong]
     if type_ is c.SetRoi and wrong == 2:
         expected = "roi"
-    assert (problem.line, problem.column, problem.code) == (3, text.index("odd") + 1, expected)
+    assert (problem.line, problem.column, problem.code) == (
+        3,
+        text.index("odd") + 1,
+        expected,
+    )
 
 
 def test_a_missing_component_is_told_at_the_first_column() -> None:
@@ -117,7 +134,9 @@ def test_a_missing_component_is_told_at_the_first_column() -> None:
 def test_a_command_may_be_split_over_columns() -> None:
     """Then the whole line is read by its words."""
     found = one(b"camera\tset\texposure\t40\tACK\t1\t2")
-    assert found == c.SetExposure(line=1, exposure_ms=40.0, timeout_ms=1.0, expected_ms=2.0)
+    assert found == c.SetExposure(
+        line=1, exposure_ms=40.0, timeout_ms=1.0, expected_ms=2.0
+    )
 
 
 @settings(max_examples=100, deadline=None)
@@ -140,7 +159,9 @@ def test_what_follows_a_binary_argument_has_its_columns_too(
     assert (type(script.commands[-1]), script.commands[-1].line) == (c.XrayOn, 2)
     if wrong is None:
         bounds = (2000.0 if columns > 1 else None, 150.0 if columns > 2 else None)
-        wanted = c.SetSampleInfo(line=1, data=data, timeout_ms=bounds[0], expected_ms=bounds[1])
+        wanted = c.SetSampleInfo(
+            line=1, data=data, timeout_ms=bounds[0], expected_ms=bounds[1]
+        )
         assert (script.commands[0], found) == (wanted, ())
     else:
         behind = len(line) - line.rindex(b"odd")
@@ -158,7 +179,10 @@ def test_what_follows_a_binary_argument_has_its_columns_too(
 )  # fmt: skip
 def test_numbers_of_a_script_have_bounds(command: str, most: int) -> None:
     assert read_script(f"{command} {most} ACK")[1] == ()
-    assert [p.code for p in read_script(f"{command} {most + 1} ACK")[1]] in (["value"], ["roi"])
+    assert [p.code for p in read_script(f"{command} {most + 1} ACK")[1]] in (
+        ["value"],
+        ["roi"],
+    )
 
 
 @pytest.mark.parametrize("command", ["rot_obj set speed", "rot_obj set acceleration",
@@ -170,7 +194,9 @@ def test_rates_have_a_least_one(command: str) -> None:
 
 
 def test_a_number_with_a_comma_is_told_how_it_is_written() -> None:
-    [with_comma], [without] = (read_script(f"tube set kV {x} ACK")[1] for x in ("8,5", "8.5.1"))
+    [with_comma], [without] = (
+        read_script(f"tube set kV {x} ACK")[1] for x in ("8,5", "8.5.1")
+    )
     hint = "decimals are written with a point"
     assert (hint in with_comma.message, hint in without.message) == (True, False)
 
@@ -187,7 +213,11 @@ def test_a_free_argument_holds_spaces_without_tabs_too() -> None:
 
 def test_text_of_two_bytes_a_character_is_told() -> None:
     text = "tube\txrayon\t\t\tACK"
-    for data in (text.encode("utf-16"), text.encode("utf-16-le"), text.encode("utf-16-be")):
+    for data in (
+        text.encode("utf-16"),
+        text.encode("utf-16-le"),
+        text.encode("utf-16-be"),
+    ):
         [problem] = read_script(data)[1]
         assert (problem.line, problem.column) == (1, 1)
         assert "UTF-16" in problem.message
@@ -197,7 +227,12 @@ def test_text_of_two_bytes_a_character_is_told() -> None:
 
 @pytest.mark.parametrize(
     ("word", "wait"),
-    [("ACK", Wait.ACK), ("no wait", Wait.NO_WAIT), ("RCV", Wait.RCV), ("No  Wait", Wait.NO_WAIT)],
+    [
+        ("ACK", Wait.ACK),
+        ("no wait", Wait.NO_WAIT),
+        ("RCV", Wait.RCV),
+        ("No  Wait", Wait.NO_WAIT),
+    ],
 )
 def test_waits(word: str, wait: Wait) -> None:
     assert one(tabbed("tra_obj", "move absolute", "5", "", word)).wait is wait
@@ -235,13 +270,24 @@ def test_comments_blank_lines_and_white_space() -> None:
 
 @pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r"])
 def test_line_ends_and_byte_order_mark(end: bytes) -> None:
-    script = parse_script(b"\xef\xbb\xbf" + end.join([b"tube xrayon ACK", b"tube xrayoff ACK"]))
+    script = parse_script(
+        b"\xef\xbb\xbf" + end.join([b"tube xrayon ACK", b"tube xrayoff ACK"])
+    )
     assert [x.line for x in script.commands] == [1, 2]
 
 
 @pytest.mark.parametrize(
     "name",
-    ["sweets", "ninechars", "ten chars!", "thirteen char", "x" * 0x80, "Müller", "a\tb", "ACK"],
+    [
+        "sweets",
+        "ninechars",
+        "ten chars!",
+        "thirteen char",
+        "x" * 0x80,
+        "Müller",
+        "a\tb",
+        "ACK",
+    ],
 )
 def test_binary_sample_info_survives_whatever_bytes_it_has(name: str) -> None:
     """Lengths of 9, 10 and 13 are TAB, LF and CR; 0x80 and more is not UTF-8."""
@@ -340,9 +386,14 @@ def test_errors(text: str, code: str) -> None:
 
 
 def test_custom_components_are_allowed_with_a_warning() -> None:
-    for text in ("grid_motor wiggle 3 ACK", tabbed("grid_motor", "wiggle", "3", "", "ACK")):
+    for text in (
+        "grid_motor wiggle 3 ACK",
+        tabbed("grid_motor", "wiggle", "3", "", "ACK"),
+    ):
         script, problems = read_script(text)
-        assert [(p.severity, p.code) for p in problems] == [("warning", "custom_component")]
+        assert [(p.severity, p.code) for p in problems] == [
+            ("warning", "custom_component")
+        ]
         assert isinstance(script.commands[0], c.Custom)
     # The scanner's naming makes it a motor, whatever machine has it.
     assert isinstance(one("rot_grid move absolute 3 ACK"), c.MoveAbsolute)
@@ -356,11 +407,15 @@ def test_custom_components_are_allowed_with_a_warning() -> None:
 def test_a_wait_is_followed_by_two_numbers_at_most(tail: str, known: bool) -> None:
     """Only a line with a wait can be of a custom component."""
     script, problems = read_script(f"my_thing wiggle {tail}")
-    assert [p.code for p in problems] == ["custom_component" if known else "unknown_component"]
+    assert [p.code for p in problems] == [
+        "custom_component" if known else "unknown_component"
+    ]
     assert len(script.commands) == known
 
 
-@pytest.mark.parametrize("tail", ["ACK // go", "ACK\t5 // x", "ACK // a\tb\tc", "ACK\t// 5"])
+@pytest.mark.parametrize(
+    "tail", ["ACK // go", "ACK\t5 // x", "ACK // a\tb\tc", "ACK\t// 5"]
+)
 def test_a_comment_may_stand_from_the_column_of_the_wait_on(tail: str) -> None:
     script, problems = read_script(f"tra_obj\tmove absolute\t10\t\t{tail}")
     assert problems == ()
@@ -391,7 +446,9 @@ def test_commands_of_an_axis_that_the_twin_does_not_know_are_said() -> None:
     machine = builtin_machine("xyzr_cabinet")
     script, _ = read_script("X wiggle 3 ACK\ngrid_motor wiggle 3 ACK\n")
     found = plan_script(script, machine, profile_of(machine)).problems
-    assert [p.line for p in found if p.message.startswith("X: the twin does not know")] == [1]
+    assert [
+        p.line for p in found if p.message.startswith("X: the twin does not know")
+    ] == [1]
     assert not [p for p in found if "grid_motor: the twin" in p.message]
 
 

@@ -1,7 +1,7 @@
 """The 90 % ranges of a fitted machine, on simulated machines and by hand.
 
-The machines are those of `tests/studies/timing_ranges.py`: their logs, kinematics and times share
-no code with the fit, and the fit knows nothing of their families.
+The machines are those of `tests/studies/timing_ranges.py`: their logs, kinematics and times
+share no code with the fit, and the fit knows nothing of their families.
 """
 
 from __future__ import annotations
@@ -38,20 +38,30 @@ def test_ranges_half_as_wide_would_not_hold() -> None:
         for row in found.rows:
             assert row.p5_s is not None
             assert row.p95_s is not None
-            margin = row.p95_s - row.predicted_s if row.error_s > 0 else row.predicted_s - row.p5_s
+            margin = (
+                row.p95_s - row.predicted_s
+                if row.error_s > 0
+                else row.predicted_s - row.p5_s
+            )
             held.append(abs(row.error_s) <= 0.5 * margin + 0.0005)
     assert sum(held) < 0.8 * len(held)
 
 
-@pytest.mark.parametrize(("n", "count", "squares"), [(1, 1, 1.0), (1, 3, 6.0), (4, 4, 6.4)])
+@pytest.mark.parametrize(
+    ("n", "count", "squares"), [(1, 1, 1.0), (1, 3, 6.0), (4, 4, 6.4)]
+)
 def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> None:
     """Variances of a sum whose terms share the error of a mean, worked out by hand."""
     spread = {"xrayon": Spread(p5_s=1.0, p95_s=6.0, n=n)}
     timing = Timing(source="measured", xrayon_s=2.0, drift=0.1, spread=spread)
     rows = [LogRow(1, "on", 2.0, 2.0, None, None, "xrayon")] * count
     low, high = total_range(rows, 2.0 * count + 50.0, timing) or (0.0, 0.0)
-    assert 2.0 * count + 50.0 - low == pytest.approx(1.0 * math.sqrt(squares) + 0.2 * count)
-    assert high - 2.0 * count - 50.0 == pytest.approx(4.0 * math.sqrt(squares) + 0.2 * count)
+    assert 2.0 * count + 50.0 - low == pytest.approx(
+        1.0 * math.sqrt(squares) + 0.2 * count
+    )
+    assert high - 2.0 * count - 50.0 == pytest.approx(
+        4.0 * math.sqrt(squares) + 0.2 * count
+    )
     low, _ = total_range(rows, 0.1, timing) or (1.0, 1.0)
     assert low == 0.0  # no scan takes less than no time
 

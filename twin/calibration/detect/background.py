@@ -39,8 +39,8 @@ class Background:
         disturbed: (m,) the misfit is further from the others' than noise makes it.
         bend: (m, side, side) curvature to subtract after a plane, None if backgrounds are
             straight.
-        plane: (m, 3) line integral behind the middle of each window and its change by a pixel to
-            the right and down.
+        plane: (m, 3) line integral behind the middle of each window and its change by a pixel
+            to the right and down.
     """
 
     misfit: FloatArray
@@ -69,9 +69,13 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     curved, coefficients = _fitted(off, valid, shapes, enough)
     variance = pixel_noise(flat, edge, count * BLOCK_PX) ** 2 / BLOCK_PX**2
     gain = (straight - curved) / np.maximum(variance, 1e-12)
-    bent = bool(enough.any()) and _bends(gain[enough], curved[enough], variance[enough], valid)
+    bent = bool(enough.any()) and _bends(
+        gain[enough], curved[enough], variance[enough], valid
+    )
     free = valid.sum(axis=1) - (shapes.shape[1] if bent else 3)
-    misfit = (curved if bent else straight) / np.maximum(free, 1) / np.maximum(variance, 1e-12)
+    misfit = (
+        (curved if bent else straight) / np.maximum(free, 1) / np.maximum(variance, 1e-12)
+    )
     typical = max(float(np.median(misfit[enough])), 1.0) if enough.any() else 1.0
     ratio = np.where(enough, np.maximum(misfit / typical, 1.0), 1.0)
     limit = 1.0 + FAR_OUT * np.sqrt(2.0 / np.maximum(free, 1))
@@ -85,7 +89,10 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
 
 
 def _bends(
-    gain: FloatArray, curved: FloatArray, variance: FloatArray, valid: npt.NDArray[np.bool_]
+    gain: FloatArray,
+    curved: FloatArray,
+    variance: FloatArray,
+    valid: npt.NDArray[np.bool_],
 ) -> bool:
     """Check whether bent terms explain much in the median window, and most of its
     residuals: they do not explain edges.
@@ -111,11 +118,16 @@ def _shapes(places: FloatArray, side: int) -> FloatArray:
     t = (places - (side - 1) / 2) / (side / 2)
     y, x = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
     one = np.ones_like(x)
-    return np.stack([one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1)
+    return np.stack(
+        [one, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=1
+    )
 
 
 def _fitted(
-    off: FloatArray, valid: npt.NDArray[np.bool_], shapes: FloatArray, enough: npt.NDArray[np.bool_]
+    off: FloatArray,
+    valid: npt.NDArray[np.bool_],
+    shapes: FloatArray,
+    enough: npt.NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray]:
     """Fit polynomials to each window.
 
@@ -130,9 +142,9 @@ def _fitted(
     """
     p = shapes.shape[1]
     weight = valid.astype(np.float64)
-    gram = (weight @ (shapes[:, :, None] * shapes[:, None, :]).reshape(len(shapes), -1)).reshape(
-        -1, p, p
-    )
+    gram = (
+        weight @ (shapes[:, :, None] * shapes[:, None, :]).reshape(len(shapes), -1)
+    ).reshape(-1, p, p)
     gram += 1e-6 * np.eye(p)
     gram[~enough] = np.eye(p)
     right = off @ shapes

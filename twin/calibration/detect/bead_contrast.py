@@ -24,11 +24,14 @@ kinds."""
 
 
 def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
-    """Make a detector for the sizes and contrasts the beads' spots can have at a rough geometry."""
+    """Make a detector for the sizes and contrasts the beads' spots can have at a rough
+    geometry."""
     sizes, contrasts = model.bead_radius_mm, model.contrasts
     dark = contrasts[contrasts > 0]
     faintest = float(dark.min() / dark.max()) if len(dark) else 1.0
-    several = sizes.max() > MAX_KIND_RATIO * sizes.min() or faintest * MAX_KIND_RATIO < 1.0
+    several = (
+        sizes.max() > MAX_KIND_RATIO * sizes.min() or faintest * MAX_KIND_RATIO < 1.0
+    )
     return SpotFinder(
         radius_px=(
             0.65 * float(sizes.min() * poses.pixels_per_mm.min()),
@@ -51,7 +54,9 @@ def seen_contrasts(
         index: (n, k) which spot of a frame is which bead, -1 for none.
     """
     seen = np.full(index.shape, np.nan)
-    for frame, (found, numbers) in enumerate(zip(detections, index.tolist(), strict=True)):
+    for frame, (found, numbers) in enumerate(
+        zip(detections, index.tolist(), strict=True)
+    ):
         beads = [k for k, number in enumerate(numbers) if number >= 0]
         seen[frame, beads] = found.contrast[[numbers[k] for k in beads]]
     known = np.isfinite(seen).any(axis=0)

@@ -82,7 +82,16 @@ class Detections:
         k = len(centers)
         one = np.ones(k)
         covariances = np.multiply.outer((noise_px * one) ** 2, np.eye(2))
-        return cls(centers, covariances, radii_px * one, one, 0 * one, one.astype(bool), one, shape)
+        return cls(
+            centers,
+            covariances,
+            radii_px * one,
+            one,
+            0 * one,
+            one.astype(bool),
+            one,
+            shape,
+        )
 
 
 @dataclass(frozen=True)
@@ -183,10 +192,13 @@ def _candidates(
     if rows < 3 or cols < 3:
         return [], []
     side = 2 * math.ceil(high / factor) + 3
-    # What survives an opening by a window wider than a bead is background. The border repeats, so
-    # that a bead cut by the edge still counts as small.
+    # What survives an opening by a window wider than a bead is background. The border repeats,
+    # so that a bead cut by the edge still counts as small.
     wide = cv2.morphologyEx(
-        coarse, cv2.MORPH_OPEN, np.ones((side, side), np.uint8), borderType=cv2.BORDER_REFLECT
+        coarse,
+        cv2.MORPH_OPEN,
+        np.ones((side, side), np.uint8),
+        borderType=cv2.BORDER_REFLECT,
     )
     small = coarse - wide
     sample = small[::3, ::3].ravel()
@@ -207,7 +219,10 @@ def _candidates(
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         for contour in contours:
             left, up, width, height = cv2.boundingRect(contour)
-            if max(width, height) * factor > 2.6 * high or max(width, height) * factor < low:
+            if (
+                max(width, height) * factor > 2.6 * high
+                or max(width, height) * factor < low
+            ):
                 continue
             at_edge = left <= 0 or up <= 0 or left + width >= cols or up + height >= rows
             if not at_edge and not 0.6 <= width / height <= 1.67:
@@ -284,8 +299,8 @@ def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
 def _largest_group(
     found: list[FloatArray], same: float
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Split spots into the largest group whose contrasts and radii are alike up to a factor, among
-    equals the stronger one, and the others."""
+    """Split spots into the largest group whose contrasts and radii are alike up to a factor,
+    among equals the stronger one, and the others."""
     peaks = np.array([r[kernels.PEAK] for r in found])
     radii = np.array([r[kernels.RADIUS] for r in found])
     limit = math.log(same)
@@ -341,9 +356,19 @@ def _fitted_cut(
     result = np.zeros(kernels.RESULTS)
     window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
     kernels.fit_ball(
-        window, np.zeros((0, 0), np.uint8), x - left, y - top, radius, np.array([1.0, 0.0, 1.0]),
-        peak, BLUR_PX, 0.0, False, False, result,
-    )  # fmt: skip
+        window,
+        np.zeros((0, 0), np.uint8),
+        x - left,
+        y - top,
+        radius,
+        np.array([1.0, 0.0, 1.0]),
+        peak,
+        BLUR_PX,
+        0.0,
+        False,
+        False,
+        result,
+    )
     result[kernels.X] += left
     result[kernels.Y] += top
     if not (result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT):
@@ -357,7 +382,9 @@ def _fitted_cut(
     return result
 
 
-def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]) -> Detections:
+def _pack(
+    whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]
+) -> Detections:
     """Sort results, complete spots first and strong ones first, into `Detections`."""
     rows = np.array([*whole, *cut]).reshape(-1, kernels.RESULTS)
     flags = np.array([True] * len(whole) + [False] * len(cut), dtype=bool)

@@ -22,7 +22,9 @@ MEAN_ROUNDS = 10
 """Rounds in which the means of frames and beads are subtracted in turns; few are missing."""
 
 
-def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]) -> float:
+def fading(
+    contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
+) -> float:
     """Estimate how contrast changes with the line integral behind a bead, as a share of it.
 
     Each bead is compared with itself in other frames, and each frame's mean is

@@ -1,4 +1,5 @@
-"""Windows in the form that the compiled kernels take, and the kernels applied to all of them."""
+"""Windows in the form that the compiled kernels take, and the kernels applied to all of
+them."""
 
 from __future__ import annotations
 
@@ -53,7 +54,9 @@ def centroids(
     least = np.zeros(len(results)) if least is None else least
     for i in index:
         x, y = patches.offsets[i]
-        kernels.measure(patches.flat[i], x, y, patches.radii[i], CAP, least[i], results[i])
+        kernels.measure(
+            patches.flat[i], x, y, patches.radii[i], CAP, least[i], results[i]
+        )
     return results
 
 
@@ -77,9 +80,17 @@ def fits(
     whole = patches.windows.whole.ravel()
     for i, mask in zip(index, masks, strict=True):
         kernels.fit_ball(
-            patches.flat[i], mask, *patches.offsets[i], patches.radii[i], patches.stretch[i],
-            patches.peaks[i], *blur, whole[i], free_radius, results[i],
-        )  # fmt: skip
+            patches.flat[i],
+            mask,
+            *patches.offsets[i],
+            patches.radii[i],
+            patches.stretch[i],
+            patches.peaks[i],
+            *blur,
+            whole[i],
+            free_radius,
+            results[i],
+        )
     return results
 
 
@@ -106,8 +117,13 @@ def take(
     # Radius, peak and likeness stay those of the centroid: they judge the spot.
     lone = fitted[whole[fitted] & good]
     for place in (
-        kernels.X, kernels.Y, kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y, kernels.BIAS
-    ):  # fmt: skip
+        kernels.X,
+        kernels.Y,
+        kernels.VAR_X,
+        kernels.COV_XY,
+        kernels.VAR_Y,
+        kernels.BIAS,
+    ):
         results[lone, place] = fits[lone, place]
     return np.asarray(fitted[~whole[fitted] | good])
 
@@ -117,7 +133,9 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
     the expected one, scaled like the others.
     """
     shape = patches.windows.whole.shape
-    seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(shape)
+    seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(
+        shape
+    )
     given = patches.peaks.reshape(shape)[0]
     out = np.full(len(given), np.nan)
     for bead in range(len(out)):

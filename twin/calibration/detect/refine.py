@@ -1,10 +1,10 @@
 """The second measurement: every bead is measured again where the first fit predicts it.
 
-Once a rough fit exists, the position of every bead is known to a fraction of a pixel. Each one is
-measured again in a window there, after subtracting the phantom's own body (bricks, cuboid),
-rendered at that geometry and blurred as the images are. An edge of the body behind a bead then no
-longer shifts its centroid, touching spots are separated, spots cut by the image's edge are fitted,
-and no bead is missed.
+Once a rough fit exists, the position of every bead is known to a fraction of a pixel. Each one
+is measured again in a window there, after subtracting the phantom's own body (bricks, cuboid),
+rendered at that geometry and blurred as the images are. An edge of the body behind a bead then
+no longer shifts its centroid, touching spots are separated, spots cut by the image's edge are
+fitted, and no bead is missed.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ FIT_NOISE = 0.008
 """Noise of the line integrals above which complete spots are fitted too: a fit weighs
 photons as they count, and halves the error of a centroid there (measured)."""
 FIT_BLUR_PX = 0.4
-"""Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015 px."""
+"""Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015
+px."""
 FEW_WINDOWS = 600
 """Up to so many windows the body is rendered with 3 x 3 rays a pixel, else 2 x 2."""
 FADING_FRAMES = 60
@@ -72,7 +73,8 @@ MAX_MISFIT = 10.0
 MAX_LOST_SHARE = 0.3
 """Largest share of the spots left out because of their background."""
 MIN_EDGE = 0.04
-"""Height of a body's edge (line integral) at a bead's rim from which its centroid is preferred."""
+"""Height of a body's edge (line integral) at a bead's rim from which its centroid is
+preferred."""
 SAMPLING_PX = 0.0005
 """Error that depends on a spot's place in the pixel grid and is left after the correction by
 rendered spots: images of other rays a pixel, blur estimated (measured without noise)."""
@@ -125,8 +127,8 @@ def measure_beads(
         model: the beads.
         contrast: line integral through the middle of a bead, one or (k,), as detected.
         scene: the phantom's solids; all but beads are subtracted. None: only planes are.
-        draft: leave out the correction by rendered beads, which takes most of the time and needs a
-            geometry that is right to a few hundredths of a pixel.
+        draft: leave out the correction by rendered beads, which takes most of the time and
+            needs a geometry that is right to a few hundredths of a pixel.
     """
     n, k = windows.corner.shape[:2]
     side = windows.side
@@ -201,11 +203,13 @@ def _measured(
             patches = replace(patches, flat=patches.flat - behind.bend)
         patches = _evened(patches, behind, body)
     results = centroids(patches, patches.entire)
-    patches = replace(patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale)
+    patches = replace(
+        patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale
+    )
     fitted = np.flatnonzero((windows.share > MIN_SHARE) & ~windows.whole)
     if ring_noise(results, patches.entire) > FIT_NOISE and sharp.blur >= FIT_BLUR_PX:
-        # Start where the centroid is; it stays where the fit fails, and where an edge of the body
-        # touches the rim, which a fit relies on.
+        # Start where the centroid is; it stays where the fit fails, and where an edge of the
+        # body touches the rim, which a fit relies on.
         good = patches.entire[results[patches.entire, kernels.OK] > 0]
         if body is not None:
             good = good[~edged(body, windows, MIN_EDGE).ravel()[good]]
@@ -221,7 +225,9 @@ def _measured(
         model = replace(patches, flat=alone)
         expected = centroids(model, patches.entire, results[:, kernels.NOISE])
         taken = taken[results[taken, kernels.OK] > 0]
-        expected[taken] = fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[taken]
+        expected[taken] = fits(model, taken, blur, False, masks[np.isin(fitted, taken)])[
+            taken
+        ]
         sure = (results[:, kernels.OK] > 0) & (expected[:, kernels.OK] > 0)
         error = expected[:, [kernels.X, kernels.Y]] - patches.offsets
         sure &= np.hypot(error[:, 0], error[:, 1]) < LARGEST_PX
@@ -280,7 +286,9 @@ def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> 
         results[worst, kernels.OK] = 0.0
 
 
-def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp) -> Refined:
+def _accept(
+    results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp
+) -> Refined:
     """Keep the results that pass the checks of place, size, contrast and likeness.
 
     Args:
@@ -297,7 +305,10 @@ def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: 
     good &= np.where(
         whole,
         (results[..., kernels.SCORE] > 0.9)
-        & (np.abs(np.log(np.maximum(results[..., kernels.RADIUS], 1e-9) / windows.radii)) < 0.2)
+        & (
+            np.abs(np.log(np.maximum(results[..., kernels.RADIUS], 1e-9) / windows.radii))
+            < 0.2
+        )
         & (np.abs(np.log(np.maximum(peak, 1e-9) / contrast)) < math.log(1.6)),
         results[..., kernels.NOISE] < MISFIT,
     )

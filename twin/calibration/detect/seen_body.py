@@ -29,8 +29,8 @@ from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Shap
 BODY_SAMPLE = 24
 """Windows that are looked at."""
 LEAST_BODY = 0.3
-"""Attenuation of a seen body over the described one below which the body is not this one: one that
-is absent, turned or elsewhere has 0.01 to 0.03, one of half the attenuation 0.5."""
+"""Attenuation of a seen body over the described one below which the body is not this one: one
+that is absent, turned or elsewhere has 0.01 to 0.03, one of half the attenuation 0.5."""
 PRIOR_MM = 0.5
 """Standard deviation of a body's place about its description [mm]; fixes directions
 without an edge."""
@@ -58,7 +58,11 @@ class SeenBody:
         """Return the body's solids with the estimated place and attenuation."""
         return Scene(
             tuple(
-                Solid(_shifted(s.shape, self.shift_mm), s.material, self.factor * s.mu_per_mm)
+                Solid(
+                    _shifted(s.shape, self.shift_mm),
+                    s.material,
+                    self.factor * s.mu_per_mm,
+                )
                 for s in described.solids
             )
         )
@@ -110,11 +114,15 @@ def see_body(
         image = (blurred_windows(image, blur) if blur > 0 else image)[:, 0]
         here = _levelled(np.asarray(image), ring)
         if turn == 0:
-            power, push = np.einsum("mp,mp->m", here, here), np.einsum("mp,mp->m", here, seen)
+            power, push = (
+                np.einsum("mp,mp->m", here, here),
+                np.einsum("mp,mp->m", here, seen),
+            )
             telling = power > 1e-6 * dof
             if not telling.any():
                 return SeenBody(1.0)
-            # One foreign object in a ring must not decide, so the median over the windows is taken.
+            # One foreign object in a ring must not decide, so the median over the windows is
+            # taken.
             factor = _weighted_median(push[telling] / power[telling], power[telling])
             if factor < LEAST_BODY:
                 return SeenBody(0.0)
@@ -163,7 +171,9 @@ def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArr
     """Subtract the mean from the values in each ring; 0 elsewhere, (m, side * side)."""
     inside = np.where(ring, values, 0.0).astype(np.float64)
     mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)
-    return np.asarray(np.where(ring, inside - mean[:, None, None], 0.0).reshape(len(ring), -1))
+    return np.asarray(
+        np.where(ring, inside - mean[:, None, None], 0.0).reshape(len(ring), -1)
+    )
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
@@ -175,7 +185,9 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
     if isinstance(shape, ConvexPolyhedron):
-        offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(shift)
+        offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(
+            shift
+        )
         return replace(shape, offsets=tuple(offsets.tolist()))
     x, y, z = (math.fsum(pair) for pair in zip(shape.center, shift, strict=True))
     return replace(shape, center=(x, y, z))

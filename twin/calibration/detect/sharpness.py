@@ -1,7 +1,8 @@
 """Blur of the images and apparent size of the beads, estimated from the spots themselves.
 
-The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
-from rendered beads. Without complete spots the assumed values are returned, marked as not seen.
+The profile that is fitted is an approximation, so the estimate is corrected by the same
+estimate from rendered beads. Without complete spots the assumed values are returned, marked as
+not seen.
 """
 
 from __future__ import annotations
@@ -52,7 +53,10 @@ def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene
         tuple(
             Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
             for (x, y, z), r, peak in zip(
-                model.beads.tolist(), model.bead_radius_mm.tolist(), contrast.tolist(), strict=True
+                model.beads.tolist(),
+                model.bead_radius_mm.tolist(),
+                contrast.tolist(),
+                strict=True,
             )
         )
     )
@@ -86,7 +90,11 @@ class Sharp:
 
 
 def seen_sharpness(
-    sharp: Sharp, patches: Patches, sample: npt.NDArray[np.intp], cone: ConeVec, model: BeadModel
+    sharp: Sharp,
+    patches: Patches,
+    sample: npt.NDArray[np.intp],
+    cone: ConeVec,
+    model: BeadModel,
 ) -> Sharp:
     """Correct blur and size by the same estimate from rendered beads.
 
@@ -139,10 +147,14 @@ def _as_rendered(
     seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
     side, every = few.side, np.arange(len(sample))
     rendered = replace(
-        patches, flat=seen.reshape(-1, side, side), offsets=patches.offsets[sample],
-        radii=patches.radii[sample], stretch=patches.stretch[sample], peaks=patches.peaks[sample],
+        patches,
+        flat=seen.reshape(-1, side, side),
+        offsets=patches.offsets[sample],
+        radii=patches.radii[sample],
+        stretch=patches.stretch[sample],
+        peaks=patches.peaks[sample],
         windows=few,
-    )  # fmt: skip
+    )
     results = centroids(rendered, every)
     good = results[:, kernels.OK] > 0
     if not good.any():
@@ -175,7 +187,9 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
             good = sample[results[sample, kernels.OK] > 0]
             if len(good) >= 3:
                 misfit[i] = float(np.median(results[good, kernels.NOISE]))
-                scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
+                scale[i] = float(
+                    np.median(results[good, kernels.RADIUS] / patches.radii[good])
+                )
             if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
                 break
         return blurs, misfit, scale

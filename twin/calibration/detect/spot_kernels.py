@@ -17,8 +17,8 @@ X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
 RESULTS = 11
 
 PARTIAL_ERROR = 0.004
-"""Error of a partial spot's place per radius and missing share (measured: 0.007 px where a tenth
-is missing)."""
+"""Error of a partial spot's place per radius and missing share (measured: 0.007 px where a
+tenth is missing)."""
 FLOOR_PX = 0.0015
 """Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
 FIT_FLOOR_PX = 0.0025
@@ -45,10 +45,10 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
 def weight_power(noise):  # type: ignore[no-untyped-def]
     """Return the power of the line integral that weights the centroid, for its noise.
 
-    A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a centroid
-    weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square 0.0015, by
-    its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower powers (best of a scan
-    over powers and caps).
+    A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a
+    centroid weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square
+    0.0015, by its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower powers (best
+    of a scan over powers and caps).
     """
     if noise < 0.002:
         return 4.0
@@ -64,8 +64,9 @@ def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
     """Return the line integral above which the weight is constant: a bead's middle is the
     noisiest.
 
-    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3 it is of
-    no use. Below that, a share of the peak (best of the same scan); without noise no cap at all.
+    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3 it is
+    of no use. Below that, a share of the peak (best of the same scan); without noise no cap at
+    all.
     """
     limit = min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
     if noise < 0.002:
@@ -282,7 +283,9 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
             for j in range(int(x - 0.3 * radius), int(x + 0.3 * radius) + 2):
                 part = 1.0 - ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
                 if n < core.shape[0] and part > 0.3:
-                    value = plane[0] + plane[1] * (j - centre_x) + plane[2] * (i - centre_y)
+                    value = (
+                        plane[0] + plane[1] * (j - centre_x) + plane[2] * (i - centre_y)
+                    )
                     core[n] = (image[i, j] - value) / math.sqrt(part)
                     n += 1
         if n == 0:
@@ -300,7 +303,10 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
                 if d2 > reach * reach:
                     continue
                 value = (
-                    image[i, j] - plane[0] - plane[1] * (j - centre_x) - plane[2] * (i - centre_y)
+                    image[i, j]
+                    - plane[0]
+                    - plane[1] * (j - centre_x)
+                    - plane[2] * (i - centre_y)
                 )
                 w = raised(min(value, limit), power)
                 s += w
@@ -319,15 +325,30 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
         if turn == 2:
             if spread <= 0:
                 return
-            radius = min(max(math.sqrt(2.0 * spread / factor), 0.6 * radius0), 1.6 * radius0)
+            radius = min(
+                max(math.sqrt(2.0 * spread / factor), 0.6 * radius0), 1.6 * radius0
+            )
         if not (abs(x - x0) < 1.5 * radius0 and abs(y - y0) < 1.5 * radius0):
             return
         if turn >= 3 and mx * mx + my * my < 1e-7:
             break
     _variance(
-        image, x, y, 1.12 * radius + 1.5, limit, noise, power, plane, centre_x, centre_y, s, result
+        image,
+        x,
+        y,
+        1.12 * radius + 1.5,
+        limit,
+        noise,
+        power,
+        plane,
+        centre_x,
+        centre_y,
+        s,
+        result,
     )
-    result[SCORE] = _likeness(image, x, y, radius, peak, limit, noise, plane, centre_x, centre_y)
+    result[SCORE] = _likeness(
+        image, x, y, radius, peak, limit, noise, plane, centre_x, centre_y
+    )
     result[X], result[Y], result[RADIUS] = x, y, radius
     result[PEAK], result[NOISE], result[BIAS] = peak, noise, factor
     result[OK] = 1.0
@@ -390,7 +411,9 @@ def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ig
     for i in range(max(0, int(y - reach)), min(rows, int(y + reach) + 2)):
         for j in range(max(0, int(x - reach)), min(cols, int(x + reach) + 2)):
             d2 = ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
-            a = min(image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy), limit)
+            a = min(
+                image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy), limit
+            )
             b = min(peak * math.sqrt(max(0.0, 1.0 - d2)), limit)
             n += 1
             sa += a
@@ -463,8 +486,12 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
     side = int(2 * outer + 3)
     values = np.empty(side * side)
     n = 0
-    for i in range(max(0, math.ceil(y - outer)), min(rows - 1, math.floor(y + outer)) + 1):
-        for j in range(max(0, math.ceil(x - outer)), min(cols - 1, math.floor(x + outer)) + 1):
+    for i in range(
+        max(0, math.ceil(y - outer)), min(rows - 1, math.floor(y + outer)) + 1
+    ):
+        for j in range(
+            max(0, math.ceil(x - outer)), min(cols - 1, math.floor(x + outer)) + 1
+        ):
             if masked and mask[i, j] == 0:
                 continue
             d2 = (j - x) ** 2 + (i - y) ** 2
@@ -487,9 +514,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
         image: (rows, cols) line integrals.
         mask: (rows, cols) uint8, 0 where a pixel must not be used; or (0, 0): all may.
         x0, y0: start [px]; the centre may be outside the image.
-        radius: minor semi-axis of the spot [px]; peak: line integral that is seen in its middle.
-        stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
-            minor one.
+        radius: minor semi-axis of the spot [px]; peak: line integral that is seen in its
+            middle.
+        stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to
+            the minor one.
         blur: standard deviation of the image's blur [px].
         veil: part of the light about the spot that the ball does not take away however thick it
             is: scattered light, or high energies.
@@ -541,7 +569,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 dx, dy = col - x, row - y
                 along = dx * stretch[0] + dy * stretch[1]
                 # Distance in the ellipse's own measure, and minus its gradient.
-                d = math.sqrt(max(dx * dx + dy * dy - flatten * along * along, 0.0)) / scale
+                d = (
+                    math.sqrt(max(dx * dx + dy * dy - flatten * along * along, 0.0))
+                    / scale
+                )
                 if d > reach - 1.0:
                     continue
                 dx = (dx - flatten * along * stretch[0]) / (scale * scale)
@@ -563,8 +594,8 @@ def fit_ball(  # type: ignore[no-untyped-def]
                     used += 1
                 if d < 1e-6:
                     continue
-                # d(expected)/dp = -expected dL/dp; dL/dx = -rise dx/d; the residual is seen less
-                # expected, so its derivative has the other sign.
+                # d(expected)/dp = -expected dL/dp; dL/dx = -rise dx/d; the residual is seen
+                # less expected, so its derivative has the other sign.
                 pull = expected / root
                 j[0], j[1] = -pull * rise * dx / d, -pull * rise * dy / d
                 j[2] = pull
@@ -594,7 +625,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
             return
         if length < 1e-4:
             break
-    inverse, unit = np.zeros((2, 4)), np.zeros((2, 4))  # its first two rows are all that is used
+    inverse, unit = (
+        np.zeros((2, 4)),
+        np.zeros((2, 4)),
+    )  # its first two rows are all that is used
     for a in range(2):
         unit[a, a] = 1.0
         solve(h, unit[a], inverse[a])

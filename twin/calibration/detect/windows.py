@@ -63,7 +63,9 @@ class Windows:
     def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
         """Select the windows of m (frame, bead) pairs, as if of m frames with one bead each."""
 
-        arrays: dict[str, Any] = {n: a for n, a in vars(self).items() if n not in ("side", "shape")}
+        arrays: dict[str, Any] = {
+            n: a for n, a in vars(self).items() if n not in ("side", "shape")
+        }
         return replace(self, **{n: a[frames, beads][:, None] for n, a in arrays.items()})
 
 
@@ -91,7 +93,9 @@ def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Win
     touch &= ~np.eye(len(model), dtype=bool)
     crowded = touch.any(axis=2)
     room = (1.15 * major + 2.5)[..., None]
-    inside = ((predicted > room) & (predicted < np.array([cols, rows]) - 1 - room)).all(axis=2)
+    inside = ((predicted > room) & (predicted < np.array([cols, rows]) - 1 - room)).all(
+        axis=2
+    )
     return Windows(
         corner, side, predicted, minor, stretch, share, crowded, inside & ~crowded, shape
     )
@@ -203,10 +207,14 @@ def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
     sides = np.pad(np.where(dead, np.float32(np.nan), image), 1, constant_values=np.nan)
     inner = sides[1:-1, 1:-1]
     for _ in range((WIDEST_DEAD + 1) // 2):
-        around = np.stack([sides[:-2, 1:-1], sides[2:, 1:-1], sides[1:-1, :-2], sides[1:-1, 2:]])
+        around = np.stack(
+            [sides[:-2, 1:-1], sides[2:, 1:-1], sides[1:-1, :-2], sides[1:-1, 2:]]
+        )
         there = np.isfinite(around)
         fill = dead & np.isnan(inner) & there.any(axis=0)
-        inner[fill] = np.where(there, around, 0.0).sum(axis=0)[fill] / there.sum(axis=0)[fill]
+        inner[fill] = (
+            np.where(there, around, 0.0).sum(axis=0)[fill] / there.sum(axis=0)[fill]
+        )
     return np.ascontiguousarray(inner)
 
 
@@ -223,7 +231,9 @@ def _is_bead(solid: Solid, model: BeadModel) -> bool:
     return bool(gap[k] < 0.5 * model.bead_radius_mm[k])
 
 
-def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1) -> Float32Array:
+def render_windows(
+    scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1
+) -> Float32Array:
     """Render line integrals of a scene in every window, (n, k, side, side).
 
     Args:
@@ -235,10 +245,14 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1)
     """
     if fine == 1:
         return _window_rays(scene, cone, windows, (0.0, 0.0))
-    return np.asarray(-np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32)
+    return np.asarray(
+        -np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32
+    )
 
 
-def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int) -> Float32Array:
+def window_intensities(
+    scene: Scene, cone: ConeVec, windows: Windows, fine: int
+) -> Float32Array:
     """Render the transmitted share of the open beam in every window, averaged over fine x
     fine rays a pixel, (n, k, side, side).
     """
@@ -259,7 +273,9 @@ def lattice(fine: int) -> list[tuple[float, float]]:
     out = []
     for m in range(n):
         across, down = divmod(m, fine)
-        out.append(((m + 0.5) / n - 0.5, (down * fine + fine - 1 - across + 0.5) / n - 0.5))
+        out.append(
+            ((m + 0.5) / n - 0.5, (down * fine + fine - 1 - across + 0.5) / n - 0.5)
+        )
     return out
 
 
@@ -270,9 +286,16 @@ def _window_rays(
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
-    at = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2 + np.array(place)
+    at = (
+        windows.corner
+        + (side - 1) / 2
+        - (np.array([cols, rows]) - 1) / 2
+        + np.array(place)
+    )
     detector = (
-        cone.detector[:, None] + at[..., :1] * cone.u[:, None] + at[..., 1:] * cone.v[:, None]
+        cone.detector[:, None]
+        + at[..., :1] * cone.u[:, None]
+        + at[..., 1:] * cone.v[:, None]
     )
     source, u, v = (np.repeat(part, k, axis=0) for part in (cone.source, cone.u, cone.v))
     near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
@@ -294,13 +317,17 @@ def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.b
     np.maximum(bend[..., 2:-2], across, out=bend[..., 2:-2])
     reach = (windows.radii * windows.stretch[..., 2] + 2.5)[..., None, None]
     found = np.empty(body.shape[:2], np.bool_)
-    for i, at in enumerate(windows.corner):  # distances of one frame at a time: they are float64
+    for i, at in enumerate(
+        windows.corner
+    ):  # distances of one frame at a time: they are float64
         near = distances2(at, windows.side, windows.predicted[i]) < reach[i] ** 2
         found[i] = (bend[i] * near).max(axis=(1, 2)) > step
     return found
 
 
-def distances2(corner: npt.NDArray[np.int64], side: int, places: FloatArray) -> FloatArray:
+def distances2(
+    corner: npt.NDArray[np.int64], side: int, places: FloatArray
+) -> FloatArray:
     """Compute squared distances of the pixels of windows from a place each, (..., side,
     side) [px^2].
 
@@ -355,7 +382,14 @@ def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
     """Estimate the noise of each window's pixels from neighbours in a few rows at its top
     and bottom, (m,).
     """
-    rows = [edge, edge + 3, edge + 6, edge + width - 7, edge + width - 4, edge + width - 1]
+    rows = [
+        edge,
+        edge + 3,
+        edge + 6,
+        edge + width - 7,
+        edge + width - 4,
+        edge + width - 1,
+    ]
     strips = flat[:, rows, edge : edge + width]
     steps = np.abs(np.diff(strips, axis=2)).reshape(len(flat), -1)
     good = np.isfinite(steps).all(axis=1)

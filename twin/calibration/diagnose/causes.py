@@ -154,11 +154,15 @@ class Candidates:
         self.fit, self.known, self.borders = fit, known, tuple(borders)
         self.count = problem.layout.parameter_count
         everything, there = _with_every_column(problem, x, panel_of(fit, borders))
-        rows = everything.jacobian(there, problem.seen)[np.repeat(problem.seen.ravel(), 2)]
+        rows = everything.jacobian(there, problem.seen)[
+            np.repeat(problem.seen.ravel(), 2)
+        ]
         left = problem.whitened(x)[problem.seen]
         lengths = np.linalg.norm(left, axis=1)
         self.noise = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, known.floor)
-        bounded = np.minimum(1.0, OUTLIER_SIGMAS * self.noise / np.maximum(lengths, 1e-12))
+        bounded = np.minimum(
+            1.0, OUTLIER_SIGMAS * self.noise / np.maximum(lengths, 1e-12)
+        )
         share = np.repeat(bounded, 2)[:, None]
         motion = [rows_of for name in self._moving() for rows_of in self._motion(name)]
         table = np.concatenate([rows, *motion], axis=1) * share
@@ -186,7 +190,10 @@ class Candidates:
         slope = derivative(problem, self.fit, name, problem.seen).reshape(n, 2 * k)
         place = (np.arange(n) + 0.5) / n
         seen = np.repeat(problem.seen.ravel(), 2)
-        shapes = [place - 0.5, *(np.cos(math.pi * wave * place) for wave in range(1, WAVES))]
+        shapes = [
+            place - 0.5,
+            *(np.cos(math.pi * wave * place) for wave in range(1, WAVES)),
+        ]
         for shape in shapes:
             column = (slope * shape[:, None]).ravel()[seen]
             yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
@@ -209,7 +216,9 @@ class Candidates:
                 size = float(np.ptp(everything.model.beads, axis=0).max())
                 said = known.bead_tolerance_mm or 0.0
                 widths = tuple(w for s in BEAD_SHARES if (w := s * size) > 1.5 * said)
-                columns = tuple(range(layout.bead_columns.start, layout.bead_columns.stop))
+                columns = tuple(
+                    range(layout.bead_columns.start, layout.bead_columns.stop)
+                )
                 out.append(Cause("beads", columns, widths, always=said))
         out += _arc(layout.arc_column, known.arc)
         panel = everything.panel
@@ -221,7 +230,9 @@ class Candidates:
             for i, border in enumerate(panel.borders):
                 at = first + bent + 2 * i
                 chance = LOG_CHANCE - math.log(sum(panel.shape))
-                out.append(Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance))
+                out.append(
+                    Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance)
+                )
         first = len(layout.names)
         for name in self._moving():
             columns = tuple(range(first, first + WAVES))
@@ -278,7 +289,9 @@ class Candidates:
         for single in ranked:
             tops.setdefault(int(np.flatnonzero(single)[0]), single)
         likely = [
-            s for s in tops.values() if self.evidence(s) > self.evidence(nothing) - math.log(10.0)
+            s
+            for s in tops.values()
+            if self.evidence(s) > self.evidence(nothing) - math.log(10.0)
         ]
         starts = [nothing, *likely[:3]] if likely else [nothing]
         if not likely:
@@ -360,14 +373,23 @@ class Candidates:
         predicted = problem.residuals(self.fit.solution.x)[0][problem.seen]
         widths = np.concatenate(
             [np.full(self.count, np.inf)]
-            + [np.full(len(c.columns), w) for c, p in zip(self.causes, choice, strict=True)
-               if c.columns and (w := p or c.always) > 0]
-        )  # fmt: skip
+            + [
+                np.full(len(c.columns), w)
+                for c, p in zip(self.causes, choice, strict=True)
+                if c.columns and (w := p or c.always) > 0
+            ]
+        )
         widths[: self.count] = problem.prior_sigma[: self.count]
         return likely_border(
-            self.rows[:, model.columns], self.values, widths, model.noise,
-            predicted, problem.whiten[problem.seen], shape, self.borders,
-        )  # fmt: skip
+            self.rows[:, model.columns],
+            self.values,
+            widths,
+            model.noise,
+            predicted,
+            problem.whiten[problem.seen],
+            shape,
+            self.borders,
+        )
 
 
 def _arc(column: int, share: float | None) -> list[Cause]:
@@ -384,7 +406,9 @@ def _arc(column: int, share: float | None) -> list[Cause]:
     return [Cause("arc", (column,), (ARC_TOLERANCE * share**2,), STATED_LOG_CHANCE)]
 
 
-def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[FitResult, Found]:
+def explained_by_causes(
+    fit: FitResult, known: Known, refit: Refit
+) -> tuple[FitResult, Found]:
     """Fit with the most likely causes as columns, and average sigmas over those left open.
 
     Args:
@@ -417,14 +441,17 @@ def explained_by_causes(fit: FitResult, known: Known, refit: Refit) -> tuple[Fit
             return first, Found()
         fit = better
     odds = candidates.odds()
-    moves = any(p for c, p in zip(candidates.causes, choice, strict=True) if c.name in MOTIONS)
+    moves = any(
+        p for c, p in zip(candidates.causes, choice, strict=True) if c.name in MOTIONS
+    )
     # What moves looks like other causes in part, and most of it stays in the residuals.
     if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
         return first, Found(odds)
     names = tuple(
-        c.name for c, pick in zip(candidates.causes, choice, strict=True)
+        c.name
+        for c, pick in zip(candidates.causes, choice, strict=True)
         if pick and not c.name.startswith(RIVALS)
-    )  # fmt: skip
+    )
     doubtful = tuple(
         n
         for n, o in odds.items()
@@ -460,7 +487,9 @@ def _options(
         strain, arc, bead_tolerance_mm and panel.
     """
     said = candidates.known.strain
-    strain = tuple(candidates.width(choice, n) or w for n, w in zip(SHAPES, said, strict=True))
+    strain = tuple(
+        candidates.width(choice, n) or w for n, w in zip(SHAPES, said, strict=True)
+    )
     beads = candidates.width(choice, "beads")
     bent = candidates.width(choice, "panel")
     shape = image_shape(candidates.fit)
@@ -533,14 +562,27 @@ def _with_every_column(
     strain = count + 3 * k
     arc = strain + len(STRAINS)
     layout = ColumnLayout(
-        tuple(names), old.asked, old.colmap, count, strain, arc, count, arc + 1, old.active,
+        tuple(names),
+        old.asked,
+        old.colmap,
+        count,
+        strain,
+        arc,
+        count,
+        arc + 1,
+        old.active,
         old.held,
-    )  # fmt: skip
+    )
     base = problem.spread(x)[0]
     whole = replace(
-        problem, layout=layout, panel=panel, base=base,
-        curvature=curvature(problem.poses, problem.model, base, problem.group, problem.reading),
-    )  # fmt: skip
+        problem,
+        layout=layout,
+        panel=panel,
+        base=base,
+        curvature=curvature(
+            problem.poses, problem.model, base, problem.group, problem.reading
+        ),
+    )
     there = whole.start
     places = {name: i for i, name in enumerate(names)}
     for name, value in zip(old.names, x.tolist(), strict=True):

@@ -1,8 +1,8 @@
 """Checks of the data before a fit: frames, phantom, handedness, angles.
 
-When spots and phantom disagree, possible mistakes are tried one by one and the one that explains
-the spots is reported; the data are not changed. A finding is an error where the numbers must not be
-used, and a warning where they may.
+When spots and phantom disagree, possible mistakes are tried one by one and the one that
+explains the spots is reported; the data are not changed. A finding is an error where the
+numbers must not be used, and a warning where they may.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ _STATES = {
 }
 
 
-def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) -> list[Finding]:
+def judge_frames(
+    scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder
+) -> list[Finding]:
     """Judge missing and dark frames, and frames without a spot like the `sought` ones.
 
     Args:
@@ -83,7 +85,9 @@ def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) ->
         files = sorted({look.unusable for look in some if look.unusable})
         text = f"{name}: {len(some)} of {n} frames are {what}; the others are used"
         if files:
-            more = f" (and {len(files) - MAX_SHOWN} more)" if len(files) > MAX_SHOWN else ""
+            more = (
+                f" (and {len(files) - MAX_SHOWN} more)" if len(files) > MAX_SHOWN else ""
+            )
             text += f"; unusable: {'; '.join(files[:MAX_SHOWN])}{more}"
         if some:
             out.append((error if len(some) == n else warning)(code, text))
@@ -95,7 +99,8 @@ def judge_frames(scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder) ->
                 "no_beads",
                 f"{name}: no bead was found in any of {n} frames; looked for were round spots, "
                 f"darker than what is round them, of {sought.radius_px[0]:.1f} to "
-                f"{sought.radius_px[1]:.1f} px radius: is this a bead phantom, is it in the beam, "
+                f"{sought.radius_px[1]:.1f} px radius: is this a bead phantom, is it in "
+                "the beam, "
                 f"and are geometry and pixel size right?{_of_intensities(scan, sought)}",
             )
         )
@@ -111,8 +116,10 @@ def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
     if shown < SHOWN_AT_LEAST * len(looks):
         return ""
     return (
-        f" Taken as transmissions, {shown} of {len(looks)} frames show such spots: the images hold "
-        "transmissions or counts instead of line integrals; give a flat image, which transmissions "
+        f" Taken as transmissions, {shown} of {len(looks)} frames show such spots: the "
+        "images hold "
+        "transmissions or counts instead of line integrals; give a flat image, which "
+        "transmissions "
         "have as ones, or -ln of the images"
     )
 
@@ -135,7 +142,9 @@ def judge_emptiness(
         radii = [look.detections.radii_px for look in anything if len(look.detections)]
         if len(radii) < 0.5 * len(anything) or not radii:
             continue
-        expected = float(np.median(model.bead_radius_mm) * np.median(scan.poses.pixels_per_mm))
+        expected = float(
+            np.median(model.bead_radius_mm) * np.median(scan.poses.pixels_per_mm)
+        )
         seen = float(np.median(np.concatenate(radii)))
         out.append(
             error(
@@ -196,7 +205,8 @@ def explain_identification(
                 )
             return warning(
                 "bead_displaced",
-                f"{whose} where it should be, and in each frame {rest:.1f} spots are no bead: it "
+                f"{whose} where it should be, and in each frame {rest:.1f} spots are no "
+                "bead: it "
                 "is elsewhere, or lost; the others are used",
             )
         if _convincing(found):
@@ -223,7 +233,8 @@ def explain_identification(
     radius = float(np.median(np.concatenate([d.radii_px for d in detections])))
     if abs(math.log(radius / expected)) > math.log(OTHER_SIZE):
         why += (
-            f"; their radius is {radius:.1f} px instead of {expected:.1f}: other pixels or beads?"
+            f"; their radius is {radius:.1f} px instead of {expected:.1f}: other pixels "
+            "or beads?"
         )
     return error(
         "wrong_phantom",
@@ -251,7 +262,9 @@ def _without_bad_frames(found: Identification) -> Identification:
     bad = (seen > 0) & (seen <= 0.7 * usual)
     if not bad.any() or bad.sum() > 0.2 * len(seen):
         return found
-    return replace(found, index=np.where(bad[:, None], -1, found.index), rms_px=found.typical_px)
+    return replace(
+        found, index=np.where(bad[:, None], -1, found.index), rms_px=found.typical_px
+    )
 
 
 def _missing(found: Identification) -> list[int]:
@@ -311,30 +324,60 @@ def _alternative(
     """
     n, k = len(poses), len(model)
     trials: list[tuple[str, str, dict[str, Any]]] = []
-    for factor, true, said in ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ():
-        turned = replace(poses, angle=poses.angle[0] + factor * (poses.angle - poses.angle[0]))
+    for factor, true, said in (
+        ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ()
+    ):
+        turned = replace(
+            poses, angle=poses.angle[0] + factor * (poses.angle - poses.angle[0])
+        )
         text = (
-            f"the angles are off by a factor {factor:.5f}: the frames turn by 360 / {true}, not "
+            f"the angles are off by a factor {factor:.5f}: the frames turn by 360 / "
+            f"{true}, not "
             f"360 / {said} (endpoint error)"
         )
         trials.append(("angle_endpoint", text, {"poses": turned}))
     across, along = (_flipped(detections, axis) for axis in (0, 1))
     trials += [
-        ("mirrored_phantom", "the phantom is the mirror image of its model",
-         {"model": model.mirrored()}),
-        ("angle_reversed", "the stage turns the other way than the angles say: negate the angles "
-         "of the settings or of the geometry", {"poses": replace(poses, angle=-poses.angle)}),
-        ("image_mirrored", "the images are mirrored left to right", {"detections": across}),
+        (
+            "mirrored_phantom",
+            "the phantom is the mirror image of its model",
+            {"model": model.mirrored()},
+        ),
+        (
+            "angle_reversed",
+            "the stage turns the other way than the angles say: negate the angles "
+            "of the settings or of the geometry",
+            {"poses": replace(poses, angle=-poses.angle)},
+        ),
+        (
+            "image_mirrored",
+            "the images are mirrored left to right",
+            {"detections": across},
+        ),
         ("image_upside_down", "the images are upside down", {"detections": along}),
-        ("image_turned", "the images are upside down and mirrored: turned by 180 deg",
-         {"detections": _flipped(across, 1)}),
-        ("phantom_upside_down", "the phantom stands on its head", {"model": model.turned_over()}),
-        ("not_turning", "the object does not turn although the angles say so",
-         {"poses": replace(poses, angle=np.zeros(n))}),
-    ]  # fmt: skip
+        (
+            "image_turned",
+            "the images are upside down and mirrored: turned by 180 deg",
+            {"detections": _flipped(across, 1)},
+        ),
+        (
+            "phantom_upside_down",
+            "the phantom stands on its head",
+            {"model": model.turned_over()},
+        ),
+        (
+            "not_turning",
+            "the object does not turn although the angles say so",
+            {"poses": replace(poses, angle=np.zeros(n))},
+        ),
+    ]
     for j in range(k if 4 < k <= MOST_LEFT_OUT else 0):
-        others = BeadModel(np.delete(model.beads, j, 0), np.delete(model.bead_radius_mm, j))
-        text = f"without bead {j} the others fit: it is not where the phantom's model has it"
+        others = BeadModel(
+            np.delete(model.beads, j, 0), np.delete(model.bead_radius_mm, j)
+        )
+        text = (
+            f"without bead {j} the others fit: it is not where the phantom's model has it"
+        )
         trials.append(("bead_displaced", text, {"model": others}))
     given: dict[str, Any] = {"detections": detections, "model": model, "poses": poses}
     best: tuple[float, float, str, str] | None = None
@@ -347,8 +390,9 @@ def _alternative(
             or other.rms_px < 0.3 * found.rms_px
             or (other.explained > found.explained + 0.2)
         )
-        # A mistake that explains all spots comes before one that fits most of them more closely:
-        # four of the LEGO phantom's five beads are a helix, which turns round into itself.
+        # A mistake that explains all spots comes before one that fits most of them more
+        # closely: four of the LEGO phantom's five beads are a helix, which turns round into
+        #     itself.
         off = (round(1.0 - other.explained, 1), other.rms_px)
         if _convincing(other) and better and (best is None or off < best[:2]):
             best = (*off, code, text)
@@ -364,7 +408,9 @@ def _alternative(
     )
 
 
-def _in_motion(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
+def _in_motion(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
+) -> Finding | None:
     """Check whether the spots are those of the phantom, up to a motion.
 
     Args:
@@ -388,14 +434,22 @@ def _in_motion(detections: Sequence[Detections], model: BeadModel, poses: Poses)
     def fitted(motion: MotionFit | None = None) -> FitResult:
         moved = here if motion is None else motion.motions[0].applied(here)
         return estimate_geometry(
-            found.tracks, model, moved, shape=shape, start=still, centre=found.bias,
-            priors=ASSUMED, bound=math.inf,
-        )  # fmt: skip
+            found.tracks,
+            model,
+            moved,
+            shape=shape,
+            start=still,
+            centre=found.bias,
+            priors=ASSUMED,
+            bound=math.inf,
+        )
 
     return moving(fitted(), fitted)
 
 
-def _in_parts(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
+def _in_parts(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
+) -> Finding | None:
     """Check whether the first or the last frames alone fit the phantom; if both do, name
     the change.
 
@@ -407,7 +461,10 @@ def _in_parts(detections: Sequence[Detections], model: BeadModel, poses: Poses) 
     n = len(poses)
     ends: dict[str, tuple[slice, Offsets]] = {}
     for share in (2, 3, 4):
-        for end, part in (("first", slice(0, n // share)), ("last", slice(n - n // share, n))):
+        for end, part in (
+            ("first", slice(0, n // share)),
+            ("last", slice(n - n // share, n)),
+        ):
             own = attempt(detections[part], model, poses[part])
             if own is not None and _convincing(own):
                 ends.setdefault(end, (part, own.parameters))
@@ -435,7 +492,9 @@ def _in_parts(detections: Sequence[Detections], model: BeadModel, poses: Poses) 
     )
 
 
-def _other_turn(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
+def _other_turn(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
+) -> Finding | None:
     """Check whether the stage turns by another angle than stated, from neighbouring frames.
 
     Args:
@@ -457,13 +516,17 @@ def _other_turn(detections: Sequence[Detections], model: BeadModel, poses: Poses
         return None
     return error(
         "angle_turn",
-        f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times as far as "
-        f"the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} deg from the first "
+        f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times as "
+        "far as "
+        f"the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} deg from "
+        "the first "
         "to the last frame",
     )
 
 
-def _one_by_one(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
+def _one_by_one(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
+) -> Finding | None:
     """Check whether frames fit the phantom one by one, though not together.
 
     Args:
@@ -482,6 +545,7 @@ def _one_by_one(detections: Sequence[Detections], model: BeadModel, poses: Poses
         return None
     return error(
         "frame_numbers",
-        f"{good} of {len(chosen)} frames that were tried fit the phantom each by itself, together "
+        f"{good} of {len(chosen)} frames that were tried fit the phantom each by itself, "
+        "together "
         "they do not: the frames are in another order, or their angles are wrong",
     )

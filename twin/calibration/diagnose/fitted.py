@@ -1,7 +1,8 @@
-"""Checks of the data after a fit: bead sizes, positions, frame angles, bead displacements, drifts.
+"""Checks of the data after a fit: bead sizes, positions, frame angles, bead displacements,
+drifts.
 
-Possible explanations of the residuals are tried one by one and the one that fits is reported; the
-data are not changed. Checks that need no fit are in `diagnose.data`.
+Possible explanations of the residuals are tried one by one and the one that fits is reported;
+the data are not changed. Checks that need no fit are in `diagnose.data`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,14 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS, to_edge
 
 OF_RESIDUALS = frozenset(
-    ("drift", "vibration", "bead_errors", "bead_displaced", "too_many_outliers", "bead_tolerance")
+    (
+        "drift",
+        "vibration",
+        "bead_errors",
+        "bead_displaced",
+        "too_many_outliers",
+        "bead_tolerance",
+    )
 )
 """Codes of findings about residuals: they hold for that fit alone."""
 MISFIT_PX = 0.10
@@ -52,8 +60,8 @@ MAX_BODY_MM = 0.3
 """Shift of the body from its description from which it is reported [mm]."""
 PLAUSIBLE_SHARE = 0.12
 """Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
-scaled together with its beads looks like the right one at another distance, so that this offset is
-its only sign."""
+scaled together with its beads looks like the right one at another distance, so that this offset
+is its only sign."""
 ALIKE_MOTION: Final = {
     "dO_x": "the source moves aside, the other way",
     "dO_y": "the source moves up or down, the other way",
@@ -72,15 +80,17 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a
     repeated image.
 
-    Either most of a frame's spots are far from every prediction, or most of its positions had to
-    be left out of the fit.
+    Either most of a frame's spots are far from every prediction, or most of its positions had
+    to be left out of the fit.
 
     Args:
         fit: to all frames.
         looks: spots and state of each frame of each scan.
     """
     detections = [
-        nothing(look.detections.shape) if look.state is FrameState.REPEATED else look.detections
+        nothing(look.detections.shape)
+        if look.state is FrameState.REPEATED
+        else look.detections
         for some in looks
         for look in some
     ]
@@ -188,8 +198,10 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
 def _other_size(ratio: float) -> Finding:
     return error(
         "bead_size",
-        f"the shadows are {100 * abs(ratio - 1):.0f} % {'larger' if ratio > 1 else 'smaller'} than "
-        "those that the phantom's beads cast at the fitted geometry: beads of another size, or a "
+        f"the shadows are {100 * abs(ratio - 1):.0f} % "
+        f"{'larger' if ratio > 1 else 'smaller'} than "
+        "those that the phantom's beads cast at the fitted geometry: beads of another "
+        "size, or a "
         "phantom of another scale",
     )
 
@@ -221,8 +233,10 @@ def judge_lag(lag: Lag) -> Finding:
     return warning(
         "lag",
         f"the camera still shows {100 * lag.part:.2g} % of the frame "
-        "before: it was taken out of what was measured here; a volume is blurred by it along the "
-        "turn, but with the correction reconstruct takes it out, of scans with as long exposures "
+        "before: it was taken out of what was measured here; a volume is blurred by it "
+        "along the "
+        "turn, but with the correction reconstruct takes it out, of scans with as long "
+        "exposures "
         "and pauses",
     )
 
@@ -267,7 +281,8 @@ def explain_residuals(
     # What else the residuals show has no meaning where no cause explains them.
     explained = moving(plain, lambda motion: refit(motion=motion)) or error(
         "misfit",
-        f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is looked for "
+        f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
+        "looked for "
         "explains them: check that nothing is loose, or let frames differ, --per-frame "
         "dO_x,dO_y,alpha",
     )
@@ -287,7 +302,9 @@ def _drifts(fit: FitResult) -> list[Finding]:
     for drift in certificate.drifts[:1]:
         estimate = certificate.estimates.get(drift.column)
         unit = "" if estimate is None else estimate.unit
-        how = "during the scan" if drift.step_at is None else f"near frame {drift.step_at}"
+        how = (
+            "during the scan" if drift.step_at is None else f"near frame {drift.step_at}"
+        )
         out.append(
             warning(
                 "drift",
@@ -297,12 +314,19 @@ def _drifts(fit: FitResult) -> list[Finding]:
             )
         )
     for there, code, what in (
-        (certificate.shared, "vibration",
-         "the beads of a frame err together (vibration or angle jitter)"),
-        (certificate.turning, "bead_errors",
-         "single beads err in a way that repeats as the object turns (bead positions, background, "
-         "distortion)"),
-    ):  # fmt: skip
+        (
+            certificate.shared,
+            "vibration",
+            "the beads of a frame err together (vibration or angle jitter)",
+        ),
+        (
+            certificate.turning,
+            "bead_errors",
+            "single beads err in a way that repeats as the object turns (bead positions, "
+            "background, "
+            "distortion)",
+        ),
+    ):
         if there:
             out.append(warning(code, f"{what}: the intervals allow for it"))
     return out
@@ -311,7 +335,9 @@ def _drifts(fit: FitResult) -> list[Finding]:
 def _looks_alike(column: str) -> str:
     """Return words on other motions that look like a change of a parameter."""
     name = column.split("@")[0]
-    return f" (or {ALIKE_MOTION[name]}, which looks alike)" if name in ALIKE_MOTION else ""
+    return (
+        f" (or {ALIKE_MOTION[name]}, which looks alike)" if name in ALIKE_MOTION else ""
+    )
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
@@ -356,7 +382,8 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
             known = f": the steps are {text} (endpoint error)"
     return error(
         "angle_endpoint" if known else "angle_scale",
-        f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct them, or free "
+        f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct "
+        "them, or free "
         "angle_scale",
     )
 
@@ -401,7 +428,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         off = np.array([to_edge(name, v) for v in curve - np.median(curve)])
         return error(
             "angles_wrong",
-            f"the frames' angles differ from the stated ones by {np.std(off):.3f} deg rms (up to "
+            f"the frames' angles differ from the stated ones by {np.std(off):.3f} deg "
+            "rms (up to "
             f"{np.abs(off).max():.3f})",
         )
     code = "vibration" if how.startswith("from frame") else "drift"
@@ -422,7 +450,8 @@ def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
             "missing there, or their numbers are wrong"
         )
     return "angle_step", (
-        f"the object turns by {turn_deg:+.3f} deg too far: it slipped, or frames are missing there"
+        f"the object turns by {turn_deg:+.3f} deg too far: it slipped, or frames are "
+        "missing there"
     )
 
 

@@ -1,9 +1,9 @@
 """Checks whether parameters that are not estimated freely agree with the data.
 
-A main parameter that is fixed at a wrong value shifts the others, and free bead positions can hide
-that: the residuals look right and the answer is wrong. So it is compared with a fit in which it is
-free. The others have priors, and are compared with those. The request itself is not changed; the
-finding names the parameters that should be free.
+A main parameter that is fixed at a wrong value shifts the others, and free bead positions can
+hide that: the residuals look right and the answer is wrong. So it is compared with a fit in
+which it is free. The others have priors, and are compared with those. The request itself is not
+changed; the finding names the parameters that should be free.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.geometry.offsets import to_edge
 
 HELD_SIGMAS: Final = 5.0
-"""How far, in standard deviations, the data may have a fixed parameter from where it is fixed."""
+"""How far, in standard deviations, the data may have a fixed parameter from where it is
+fixed."""
 DOUBT_SIGMAS: Final = 2.3
 """Sigmas beyond which the intervals of free parameters contain the change by fixed ones."""
 LOOSE_FACTOR: Final = 10.0
@@ -55,7 +56,11 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
     if not free.identifiable:
         return {}
     names = list(free.certificate.estimates)
-    some = [n for n in held if n in names and math.isfinite(free.sigmas[n]) and free.sigmas[n] > 0]
+    some = [
+        n
+        for n in held
+        if n in names and math.isfinite(free.sigmas[n]) and free.sigmas[n] > 0
+    ]
     if not some:
         return {}
     at = [names.index(n) for n in some]
@@ -63,7 +68,9 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
     square = float(off @ np.linalg.solve(free.covariance[np.ix_(at, at)], off))
     freedom = free.certificate.dof
     alone = [abs(o) / free.sigmas[n] for n, o in zip(some, off.tolist(), strict=True)]
-    scores = {n: _deviate_of(ratio, freedom) for n, ratio in zip(some, alone, strict=True)}
+    scores = {
+        n: _deviate_of(ratio, freedom) for n, ratio in zip(some, alone, strict=True)
+    }
     return scores | {"": _deviate(_chance(square, len(some), freedom))}
 
 
@@ -82,11 +89,14 @@ def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
     single = sorted((n for n in scores if n), key=lambda n: -scores[n])
     named = [n for n in single if scores[n] > HELD_SIGMAS] or single[:1]
     listed = "; ".join(
-        f"{n} is held at {held[n]:g} {e.unit}, the data say {e.value:.4g} +- {e.sigma:.1g} {e.unit}"
+        f"{n} is held at {held[n]:g} {e.unit}, the data say {e.value:.4g} +- "
+        f"{e.sigma:.1g} {e.unit}"
         for n in named
         for e in (free.certificate.estimates[n],)
     )
-    return error("held_parameter", f"{listed}: free {', '.join(named)} too, or hold it where it is")
+    return error(
+        "held_parameter", f"{listed}: free {', '.join(named)} too, or hold it where it is"
+    )
 
 
 @dataclass(frozen=True)
@@ -106,12 +116,16 @@ class PriorsJudged:
     causes: tuple[str, ...] = ()
 
 
-def loosened(priors: Mapping[str, float], factor: float = LOOSE_FACTOR) -> dict[str, float]:
+def loosened(
+    priors: Mapping[str, float], factor: float = LOOSE_FACTOR
+) -> dict[str, float]:
     """Widen priors by a factor."""
     return {name: width * factor for name, width in priors.items()}
 
 
-def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) -> Finding | None:
+def judge_exact(
+    fit: FitResult, freed: FitResult, exact: Mapping[str, float]
+) -> Finding | None:
     """Judge the dependence on values stated as exact that the images cannot check.
 
     Args:
@@ -138,7 +152,9 @@ def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) ->
     }
     own = {n: after[n].prior or math.inf for n in exact if n in after}
     causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
-    causes |= dict.fromkeys(n for n, prior in own.items() if MIN_GROWTH * after[n].sigma > prior)
+    causes |= dict.fromkeys(
+        n for n, prior in own.items() if MIN_GROWTH * after[n].sigma > prior
+    )
     if not causes:
         return None
     worst = sorted(growth, key=lambda n: -growth[n])[:3] or list(causes)
@@ -149,7 +165,8 @@ def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) ->
     said = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
     return warning(
         "held_unchecked",
-        f"{said} is taken as exact, and the images cannot tell whether it is: with the usual prior "
+        f"{said} is taken as exact, and the images cannot tell whether it is: with the "
+        "usual prior "
         f"sigmas grow: {listed}; give prior 0 only to what was measured",
     )
 
@@ -161,15 +178,17 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
         exact: parameters that the request states as exact; their priors in `loose` are
             the usual ones.
         loose: the fit with `loosened` priors. (In a fit with the priors themselves, strong ones
-            that are wrong leave residuals with structure, which widens the sigmas until nothing is
-            contradicted.)
+            that are wrong leave residuals with structure, which widens the sigmas until nothing
+            is contradicted.)
 
     In units of its loose prior an estimate of covariance C moves from the prior's centre
     by K = 1 - C times the error of the parameter, and by noise of covariance C K.
     Directions that the images determine less than the loose prior are left out.
     """
     c = loose.certificate
-    known = [(i, n, e) for i, (n, e) in enumerate(c.estimates.items()) if e.prior is not None]
+    known = [
+        (i, n, e) for i, (n, e) in enumerate(c.estimates.items()) if e.prior is not None
+    ]
     if not loose.identifiable or not known or not np.isfinite(c.covariance).all():
         return PriorsJudged(None, 1.0)
     at, names, found = map(list, zip(*known, strict=True))
@@ -177,7 +196,9 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     centres = zip(names, loose.problem.prior_mean[at].tolist(), strict=True)
     means = np.array([to_edge(name.split("@")[0], mean) for name, mean in centres])
     moved = (np.array([e.value for e in found]) - means) / width
-    values, vectors = np.linalg.eigh(c.covariance[np.ix_(at, at)] / np.outer(width, width))
+    values, vectors = np.linalg.eigh(
+        c.covariance[np.ix_(at, at)] / np.outer(width, width)
+    )
     values = np.maximum(values, 1e-8)  # exact positions know some directions to rounding
     some = values < 1.0 - MIN_VARIANCE_DROP
     if not some.any():
@@ -190,8 +211,8 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     sigmas = np.array([e.sigma for e in found])
     ratios = np.abs(moved) / np.sqrt(1.0 / LOOSE_FACTOR**2 + sigmas**2 / width**2)
     scores = np.array([_deviate_of(ratio, c.dof) for ratio in ratios.tolist()])
-    # The images alone, as a quadratic of curvature A and gradient y, and what they and all priors
-    # but one would say of that one.
+    # The images alone, as a quadratic of curvature A and gradient y, and what they and all
+    # priors but one would say of that one.
     weight = np.where(some, 1.0 / values - 1.0, 0.0)
     curvature = (vectors * weight) @ vectors.T
     gradient = np.where(some, 1.0 / values, 0.0)
@@ -204,12 +225,19 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
         without = np.linalg.inv(curvature + np.diag(priors))
         gains.append(float(y @ (without - everything) @ y))
         alone.append(
-            (float((without @ y)[j] * width[j]), float(np.sqrt(max(without[j, j], 0.0)) * width[j]))
+            (
+                float((without @ y)[j] * width[j]),
+                float(np.sqrt(max(without[j, j], 0.0)) * width[j]),
+            )
         )
     order = np.argsort(gains)[::-1].tolist()
     best = gains[order[0]]
     enough = best > DOUBT_SIGMAS**2
-    likely = [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)] if enough else []
+    likely = (
+        [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)]
+        if enough
+        else []
+    )
     if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
         factor = math.sqrt(square / count) if chance < NARROW_CHANCE else 1.0
         return PriorsJudged(None, factor, tuple(names[i] for i in likely))
@@ -217,16 +245,24 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     causes = tuple(names[i] for i in likely)
     texts = [
         f"{names[i]} is known as {means[i]:g} "
-        + ("exactly" if names[i] in exact else f"+- {width[i] / LOOSE_FACTOR:g} {found[i].unit}")
+        + (
+            "exactly"
+            if names[i] in exact
+            else f"+- {width[i] / LOOSE_FACTOR:g} {found[i].unit}"
+        )
         + f", the images say {means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {found[i].unit}"
         for i in likely
     ]
     if "dD_z" in causes:
         texts.append(
-            _other_pixels(loose, means[names.index("dD_z")] + alone[names.index("dD_z")][0])
+            _other_pixels(
+                loose, means[names.index("dD_z")] + alone[names.index("dD_z")][0]
+            )
         )
     # One of them alone would take up what is another's.
-    text = f"{'; or '.join(texts)}: free {', '.join(causes)} too, or give the prior it has"
+    text = (
+        f"{'; or '.join(texts)}: free {', '.join(causes)} too, or give the prior it has"
+    )
     return PriorsJudged(error("held_parameter", text), 1.0, causes)
 
 
@@ -236,7 +272,8 @@ def _other_pixels(fit: FitResult, dD_z: float) -> str:
     pixel = float(np.median(np.linalg.norm(poses.u, axis=1)))
     sdd = float(np.median(poses.sdd))
     return (
-        f"the pixels are {pixel * sdd / (sdd + dD_z):.4g} mm wide instead of {pixel:.4g} mm, which "
+        f"the pixels are {pixel * sdd / (sdd + dD_z):.4g} mm wide instead of {pixel:.4g} "
+        "mm, which "
         "looks alike"
     )
 
@@ -265,10 +302,13 @@ def doubtful(
 
 def narrow_priors(judged: PriorsJudged) -> Finding:
     """Make the finding that the priors are widened by the factor of `judged`."""
-    cause = f"; {' or '.join(judged.causes)} alone would explain it" if judged.causes else ""
+    cause = (
+        f"; {' or '.join(judged.causes)} alone would explain it" if judged.causes else ""
+    )
     return warning(
         "priors_narrow",
-        f"the images have detector and axis {judged.factor:.1f} times as far from where they are "
+        f"the images have detector and axis {judged.factor:.1f} times as far from where "
+        "they are "
         f"known to be as their priors say{cause}: all priors are widened by that factor",
     )
 

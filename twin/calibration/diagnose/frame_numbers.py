@@ -86,15 +86,19 @@ class FrameNumbers:
             )
             return warning(
                 "frames_inconsistent",
-                f"{name}: in {len(again)} of {len(self.shift)} frames the shadows are not where "
+                f"{name}: in {len(again)} of {len(self.shift)} frames the shadows are "
+                "not where "
                 f"the others put them: {said}; those frames are not used",
             )
         settled = self._settled
         changes = np.flatnonzero(np.diff(settled)) + 1
         said = "; ".join(
-            _change(int(i), int(settled[i] - settled[i - 1])) for i in changes[:MAX_SHOWN].tolist()
+            _change(int(i), int(settled[i] - settled[i - 1]))
+            for i in changes[:MAX_SHOWN].tolist()
         )
-        more = "" if len(changes) <= MAX_SHOWN else f" (and {len(changes) - MAX_SHOWN} more)"
+        more = (
+            "" if len(changes) <= MAX_SHOWN else f" (and {len(changes) - MAX_SHOWN} more)"
+        )
         return error(
             "frame_numbers",
             f"{name}: {said}{more}: the frames' angles are those of other frames; number them "
@@ -160,7 +164,9 @@ def _angles(angle: FloatArray, shift: int) -> FloatArray:
     n = len(angle)
     first, last = angle[1] - angle[0], angle[-1] - angle[-2]
     beyond = np.arange(1, MOST_SHIFT + 1)
-    whole = np.concatenate([angle[0] - first * beyond[::-1], angle, angle[-1] + last * beyond])
+    whole = np.concatenate(
+        [angle[0] - first * beyond[::-1], angle, angle[-1] + last * beyond]
+    )
     return np.asarray(whole[MOST_SHIFT + shift : MOST_SHIFT + shift + n])
 
 

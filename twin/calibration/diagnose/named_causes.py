@@ -34,7 +34,8 @@ TERMS: Final[dict[str, dict[str, float]]] = {
 }
 """Words on a strain -> its weights of STRAINS."""
 PARTS: Final[dict[str, FloatArray]] = {
-    name: np.array([terms.get(term, 0.0) for term in STRAINS]) for name, terms in TERMS.items()
+    name: np.array([terms.get(term, 0.0) for term in STRAINS])
+    for name, terms in TERMS.items()
 }
 
 
@@ -61,7 +62,9 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
     if strained is not None:  # It is said which rivals it has.
         doubtful = [n for n in doubtful if n not in SHAPES and n not in SHAPE_LIKE_CAUSES]
     if doubtful:
-        rivals = dict.fromkeys(CAUSE_WORDS.get(n, f"a {n}") for n in [*doubtful, *found.open])
+        rivals = dict.fromkeys(
+            CAUSE_WORDS.get(n, f"a {n}") for n in [*doubtful, *found.open]
+        )
         said = " or ".join(rivals)
         out.append(
             warning(
@@ -81,23 +84,32 @@ def _strained(found: Found) -> Finding | None:
         return None
     mean, covariance = found.strain
     parts = [
-        (float(row @ mean), float(row @ mean) / max(float(np.sqrt(row @ covariance @ row)), 1e-12))
+        (
+            float(row @ mean),
+            float(row @ mean) / max(float(np.sqrt(row @ covariance @ row)), 1e-12),
+        )
         for row in PARTS.values()
     ]
     certain = {
-        n: value for n, (value, score) in zip(PARTS, parts, strict=True)
+        n: value
+        for n, (value, score) in zip(PARTS, parts, strict=True)
         if abs(score) > SIGNIFICANT
-    }  # fmt: skip
+    }
     if not certain:
         return None
     most = max(map(abs, certain.values()))
-    said = ", ".join(f"{100 * v:+.2g} % {n}" for n, v in certain.items() if abs(v) > 0.3 * most)
-    alike = [CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied]
+    said = ", ".join(
+        f"{100 * v:+.2g} % {n}" for n, v in certain.items() if abs(v) > 0.3 * most
+    )
+    alike = [
+        CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied
+    ]
     rival = f" (or there is {' or '.join(alike)}, which looks alike)" if alike else ""
     return warning(
         "phantom_strained",
         f"the phantom is not as its file says: {said}{rival}. Its shape was fitted along; how "
-        "large it is as a whole images do not tell, so lengths, dO_z and the magnification hold "
+        "large it is as a whole images do not tell, so lengths, dO_z and the "
+        "magnification hold "
         "as far as its millimetre: measure it, or give --bead-tolerance",
     )
 
@@ -109,8 +121,10 @@ def _turning(fit: FitResult) -> Finding:
     step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
     return warning(
         "exposure_arc",
-        f"the object turns while a frame is exposed, by {share * step:.2g} deg, {share:.2f} of a "
-        "step: the mean of the arc was fitted; volumes are blurred along the turn, and angles are "
+        f"the object turns while a frame is exposed, by {share * step:.2g} deg, "
+        f"{share:.2f} of a "
+        "step: the mean of the arc was fitted; volumes are blurred along the turn, and "
+        "angles are "
         "those of the middle of each exposure",
     )
 
@@ -133,11 +147,14 @@ def _distorted(fit: FitResult) -> Finding:
     row, column = np.mgrid[0 : rows - 1 : 9j, 0 : cols - 1 : 9j]
     size = float(np.abs(panel.shift(np.stack([column, row], axis=-1))).max())
     tiles = "".join(
-        f"; a tile begins at {('column', 'row')[b.axis]} {b.at:.0f}" for b in panel.model.borders
+        f"; a tile begins at {('column', 'row')[b.axis]} {b.at:.0f}"
+        for b in panel.model.borders
     )
     return warning(
         "panel_distorted",
-        f"the panel distorts its picture by up to {size:.2f} px{tiles}: this was estimated along "
-        "with the geometry, its uncertainty is in every sigma, and reconstruct undoes it with the "
+        f"the panel distorts its picture by up to {size:.2f} px{tiles}: this was "
+        "estimated along "
+        "with the geometry, its uncertainty is in every sigma, and reconstruct undoes it "
+        "with the "
         "correction",
     )

@@ -38,8 +38,8 @@ def likely_border(
         values: (2 m,) to be explained.
         widths: (c,) of the columns' priors.
         noise: standard deviation of the values.
-        places: (m, 2) predicted column and row of each position; by measured ones, a border would
-            part the positions of a bead that keeps its row by their noise.
+        places: (m, 2) predicted column and row of each position; by measured ones, a border
+            would part the positions of a bead that keeps its row by their noise.
         whiten: (m, 3) of the positions.
         shape: (rows, cols) of the image.
         known: borders found before.
@@ -71,10 +71,14 @@ def likely_border(
         bend = np.maximum(np.einsum("mii->mi", gram), 1e-12)
         unit = gram / np.sqrt(bend[:, :, None] * bend[:, None, :]) + 1e-6 * np.eye(2)
         scaled = pushed / np.sqrt(bend)
-        gain = np.einsum("mi,mi->m", scaled, np.linalg.solve(unit, scaled[..., None])[..., 0])
+        gain = np.einsum(
+            "mi,mi->m", scaled, np.linalg.solve(unit, scaled[..., None])[..., 0]
+        )
         at = places[order, axis]
         between = np.append(0.5 * (at[:-1] + at[1:]), 0.0)
-        usable = _allowed(between, shape[1 - axis], [b.at for b in known if b.axis == axis])
+        usable = _allowed(
+            between, shape[1 - axis], [b.at for b in known if b.axis == axis]
+        )
         usable[: LEAST_SIDE - 1] = False
         usable[m - LEAST_SIDE :] = False
         gain = np.where(usable, gain, -math.inf)

@@ -57,7 +57,9 @@ SOURCES = {
 """First word of a column's name that is no parameter -> its source, in words."""
 MEASUREMENT_ADVICE = {
     SOURCES["bead"]: "beads measured more exactly would tell more",
-    SOURCES["strain"]: "a measured distance of two beads, and --bead-tolerance, would tell more",
+    SOURCES[
+        "strain"
+    ]: "a measured distance of two beads, and --bead-tolerance, would tell more",
 }
 """Source that limits a sigma -> the measurement that would reduce it."""
 WEAK_CONDITION = 500.0
@@ -70,7 +72,8 @@ class Conditioning:
 
     Attributes:
         names: columns.
-        unit_covariance: (p, p) (J'J)^-1 in edge units; inf on columns touched by a null direction.
+        unit_covariance: (p, p) (J'J)^-1 in edge units; inf on columns touched by a null
+            direction.
         rank, condition: of the column-scaled Jacobian; condition is inf if rank-deficient.
         null: directions that are not determined.
         weak: directions that are determined badly.
@@ -111,8 +114,8 @@ def spectrum(
         beads: number of beads seen, for the advice.
         noise: standard deviation of the whitened residuals, for the sigmas of weak directions.
         reported: only the first `reported` columns are judged (the rest are nuisance).
-        bound: a direction known worse than this [mm, deg; 0.0025 of it in angle_scale] counts as
-            not determined.
+        bound: a direction known worse than this [mm, deg; 0.0025 of it in angle_scale] counts
+            as not determined.
     """
     unusable = bound / TOLERANCE["mm"]
     p = len(names)
@@ -146,7 +149,10 @@ def spectrum(
             continue
         if size > unusable:
             null.append(
-                replace(direction, advice=f"worse than {bound:g} mm or deg: {direction.advice}")
+                replace(
+                    direction,
+                    advice=f"worse than {bound:g} mm or deg: {direction.advice}",
+                )
             )
         elif size > 1.0 or top / s[i] > WEAK_CONDITION:
             weak.append(direction)
@@ -160,7 +166,9 @@ def spectrum(
         advice = f"worse than {bound:g} mm or deg: add a placement at another SOD, frames or beads"
         null.append(Direction(((names[worst], 1.0),), float(sigma[worst]), advice))
         rank -= 1
-    return Conditioning(tuple(names), covariance, rank, condition, tuple(null), tuple(weak))
+    return Conditioning(
+        tuple(names), covariance, rank, condition, tuple(null), tuple(weak)
+    )
 
 
 def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -187,8 +195,8 @@ class Estimate:
     Attributes:
         images: standard deviation that the noise of the images alone causes.
         priors: standard deviation that the prior of each other parameter (or "beads") causes,
-            largest first; sigma^2 is the sum of all squares. Those below a tenth of sigma are left
-            out.
+            largest first; sigma^2 is the sum of all squares. Those below a tenth of sigma are
+            left out.
         prior: standard deviation of this parameter's own prior; None: without one.
         asked: whether it was requested; otherwise it is estimated for the sake of the
             others.
@@ -227,7 +235,8 @@ class Certificate:
         rms_px: root mean square residual per coordinate.
         enlargement: factor on the covariance for residuals correlated from frame to frame.
         shared: the beads of a frame err together; the covariance allows for it.
-        turning: errors of single beads repeat as the object turns; the covariance allows for it.
+        turning: errors of single beads repeat as the object turns; the covariance allows for
+            it.
         drifts: changes of parameters during the scan that the residuals show; each parameter's
             sigma contains its own.
         residuals_px: (n, k, 2) measured minus predicted, nan where unseen.
@@ -272,10 +281,12 @@ class Certificate:
             if e.asked and e.sigma**2 > 2 * e.images**2 and e.priors:
                 sources = list(e.priors)
                 better = MEASUREMENT_ADVICE.get(
-                    sources[0], "a second placement at another SOD in the same fit would tell more"
+                    sources[0],
+                    "a second placement at another SOD in the same fit would tell more",
                 )
                 out[name] = (
-                    f"+- {e.sigma:.2g} {e.unit}, of it {e.images:.1g} from the images and the rest "
+                    f"+- {e.sigma:.2g} {e.unit}, of it {e.images:.1g} from the images "
+                    "and the rest "
                     f"from what is not known of {', '.join(sources)}: {better}"
                 )
         return out
@@ -318,7 +329,9 @@ class Certificate:
         return self.mahalanobis2(truth) <= p * float(fdtri(p, self.dof, 0.95))
 
 
-def widened(certificate: Certificate, more: FloatArray | Mapping[str, float]) -> Certificate:
+def widened(
+    certificate: Certificate, more: FloatArray | Mapping[str, float]
+) -> Certificate:
     """Add a covariance to a certificate.
 
     Args:
@@ -387,7 +400,11 @@ def certify(
     effective = max(dof / enlargement, 1.0) if dof else 1.0
     asked = problem.layout.asked
     judge = partial(
-        spectrum, beads=beads, noise=noise * math.sqrt(enlargement), reported=asked, bound=bound
+        spectrum,
+        beads=beads,
+        noise=noise * math.sqrt(enlargement),
+        reported=asked,
+        bound=bound,
     )
     spec = judge(rows, names)
     strained = range(problem.layout.bead_columns.stop, problem.layout.panel_column)
@@ -399,7 +416,11 @@ def certify(
         unit = spec.unit_covariance
         spec = replace(judge(fair, names), unit_covariance=unit)
         # Rank and condition say what the images tell of what was asked for, all else given.
-        given = [i for i in range(len(names)) if not asked <= i < reported and i not in strained]
+        given = [
+            i
+            for i in range(len(names))
+            if not asked <= i < reported and i not in strained
+        ]
         spec = _of_what_was_asked(judge(fair[:, given], [names[i] for i in given]), spec)
     factor = np.array([edge_factor(n) for n in names])
     # d(estimate) / d(prior mean), times the width of each prior
@@ -417,10 +438,16 @@ def certify(
     moving: tuple[Drift, ...] = ()
     if spec.full and noise > MAX_ROUNDING:
         left = Residuals(
-            problem, jac[keep] / factor, problem.whitened(x).ravel()[keep], keep,
-            spec.unit_covariance, noise,
-        )  # fmt: skip
-        covariance, structure, moving = _widened(left, predicted, covariance, prior, sampling_px)
+            problem,
+            jac[keep] / factor,
+            problem.whitened(x).ravel()[keep],
+            keep,
+            spec.unit_covariance,
+            noise,
+        )
+        covariance, structure, moving = _widened(
+            left, predicted, covariance, prior, sampling_px
+        )
     images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -432,10 +459,16 @@ def certify(
         half = t * float(sigma[i])
         own = float(problem.prior_sigma[i] * factor[i])
         estimates[name] = Estimate(
-            value, float(sigma[i]), value - half, value + half, unit_of(name), float(images[i]),
-            _shares(names, pull[i], float(sigma[i])), own if math.isfinite(own) else None,
+            value,
+            float(sigma[i]),
+            value - half,
+            value + half,
+            unit_of(name),
+            float(images[i]),
+            _shares(names, pull[i], float(sigma[i])),
+            own if math.isfinite(own) else None,
             i < asked,
-        )  # fmt: skip
+        )
     dropped = np.argwhere(problem.seen & ~use)
     outliers = tuple(Outlier(int(f), int(k)) for f, k in dropped)
     used_residual = residual[use]
@@ -463,7 +496,9 @@ def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning
     more columns.
     """
     rank = min(given.rank, len(given.names) - len(whole.null))
-    return replace(given, unit_covariance=whole.unit_covariance, rank=rank, null=whole.null)
+    return replace(
+        given, unit_covariance=whole.unit_covariance, rank=rank, null=whole.null
+    )
 
 
 def spread_of_residuals(
@@ -511,7 +546,9 @@ def _determined(told: FloatArray, weight: FloatArray) -> float:
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
     some = values > ROUNDING_OF_COLUMNS
-    prior_share = np.einsum("ij,i->j", vectors[:, some] ** 2, weight * scale**2) / values[some]
+    prior_share = (
+        np.einsum("ij,i->j", vectors[:, some] ** 2, weight * scale**2) / values[some]
+    )
     return float(some.sum() - prior_share.sum())
 
 
@@ -565,8 +602,8 @@ def _widened(
         covariance = covariance + np.outer(bias, bias)
         i = left.problem.layout.names.index(drift.column)
         if i < reported:
-            # Which of the values it had is the parameter's is a matter of definition: the first,
-            # or, of a drift that may not be one, the middle.
+            # Which of the values it had is the parameter's is a matter of definition: the
+            # first, or, of a drift that may not be one, the middle.
             steady = drift.score <= SIGNIFICANT and drift.step_at is None
             covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
     certain = moving if any(d.score > SIGNIFICANT for d in moving) else ()
@@ -577,7 +614,8 @@ def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
     """Compute whitened unit errors that follow a bead's place in the pixel grid, (2 n k, 4 k).
 
     An error e(x) with the pixel's period, a sin(2 pi x + theta) with theta unknown, has the
-    covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and coordinate.
+    covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and
+    coordinate.
     """
     n, k = problem.seen.shape
     phase = 2.0 * math.pi * predicted

@@ -104,9 +104,13 @@ class Table:
             volume = 2.0 * float(np.log(np.diag(factor) / scale).sum())
             volume -= float(np.log(precision[~flat]).sum())
             out = Judged(
-                at, found + there, factor, scale, math.sqrt(variance),
+                at,
+                found + there,
+                factor,
+                scale,
+                math.sqrt(variance),
                 -0.5 * (freedom_log(self._count, variance) + left / variance + volume),
-            )  # fmt: skip
+            )
             fresh = max(left / freedom, self._floor**2)
             if abs(math.log(fresh / variance)) < 0.02:
                 break

@@ -6,8 +6,8 @@ solver, and quantities that follow from its covariance.
 parameters.
 
 The solver is Levenberg-Marquardt. Its Huber stage finds the solution in spite of outliers;
-positions further than `trim` robust standard deviations are then left out and the rest is fitted by
-plain least squares, so that the covariance is that of least squares on clean data.
+positions further than `trim` robust standard deviations are then left out and the rest is
+fitted by plain least squares, so that the covariance is that of least squares on clean data.
 
 The quantities that a reconstruction needs (axis column, in-plane angle and magnification)
 are known far better than the offsets of which they are functions: offsets that trade
@@ -69,8 +69,9 @@ IN_IMAGES: Final[Mapping[str, str]] = {
     "axis_angle": "deg",
     "magnification": "1",
 }
-"""axis_column: where the image of the rotation axis crosses the detector's middle row. axis_angle:
-of that image against the detector's columns, positive where its upper end leans to the right.
+"""axis_column: where the image of the rotation axis crosses the detector's middle row.
+axis_angle: of that image against the detector's columns, positive where its upper end leans to
+    the right.
 magnification: of a short line parallel to the detector's rows, on the axis at the object's
 reference height."""
 
@@ -136,13 +137,16 @@ def solve(
         problem: the data and columns.
         solver: settings; the default is robust.
         x: start of the columns; None is the problem's own.
-        prior_noise: spread of the whitened residuals, with which the problem's priors are weighed.
+        prior_noise: spread of the whitened residuals, with which the problem's priors are
+            weighed.
     """
     how = Solver() if solver is None else solver
     value = np.array(problem.start if x is None else x, dtype=np.float64)
     use = problem.seen
     first = value
-    value, iterations, huber, converged = _levenberg(problem, value, use, how, prior_noise)
+    value, iterations, huber, converged = _levenberg(
+        problem, value, use, how, prior_noise
+    )
     for _ in range(4):
         norms = problem.residuals(value)[1]
         limit = how.trim * _spread(norms[use], len(value), how.floor_px)
@@ -152,7 +156,9 @@ def solve(
             break
         use = keep
         plain = replace(how, huber=math.inf)
-        value, more, huber, converged = _levenberg(problem, value, use, plain, prior_noise)
+        value, more, huber, converged = _levenberg(
+            problem, value, use, plain, prior_noise
+        )
         iterations += more
         if math.isinf(how.trim):
             break
@@ -178,7 +184,11 @@ def _spread(norms: FloatArray, columns: int, floor: float) -> float:
 
 
 def _levenberg(
-    p: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], how: Solver, prior_noise: float
+    p: FitProblem,
+    x: FloatArray,
+    use: npt.NDArray[np.bool_],
+    how: Solver,
+    prior_noise: float,
 ) -> tuple[FloatArray, int, float, bool]:
     """Run Levenberg-Marquardt with Marquardt's diagonal from `x`.
 
@@ -225,7 +235,9 @@ def _levenberg(
             small = math.sqrt(abs(change) / rows) < least
             there = x + step
             trial = at(there)
-            accepted = trial[0] < cost or (small and trial[0] <= cost * (1.0 + 1e-9) + 1e-24)
+            accepted = trial[0] < cost or (
+                small and trial[0] <= cost * (1.0 + 1e-9) + 1e-24
+            )
             if accepted or small:
                 break
             damping = max(damping * 10.0, 1e-4)
@@ -319,7 +331,11 @@ class FitResult:
     def panel(self) -> Panel | None:
         """The panel's distortion; None if it was not estimated."""
         model, first = self.problem.panel, self.problem.layout.panel_column
-        return None if model is None else Panel(model, tuple(self.solution.x[first:].tolist()))
+        return (
+            None
+            if model is None
+            else Panel(model, tuple(self.solution.x[first:].tolist()))
+        )
 
     @property
     def values(self) -> dict[str, float]:
@@ -383,7 +399,8 @@ def estimate_geometry(
 
     Args:
         tracks: (n, k, 2) pixels (column, row), nan where a bead was not seen.
-        phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3) [mm].
+        phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3)
+            [mm].
         geometry: nominal geometry of each of the n frames.
         free: parameters to estimate, of `geometry.offsets.NAMES`; parameters without a
             prior either stay at `start`. If source, stage and detector shifts of one
@@ -407,7 +424,8 @@ def estimate_geometry(
             known. A parameter that is not in `free` is estimated along with them. None:
             all parameters that are not free are exactly at `start` (`fit.priors` has
             widths for scanners).
-        prior_centre: the offsets those priors are centred on; None is the start of the first group.
+        prior_centre: the offsets those priors are centred on; None is the start of the first
+            group.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
         panel: terms of a distortion of the panel, estimated too; None: no distortion.
         strain: standard deviations of the phantom's stretches and shears [1], estimated too.
@@ -425,19 +443,36 @@ def estimate_geometry(
     tolerance = model.tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
     if free_beads and not tolerance > 0:
         raise TwinError(
-            "free beads need a tolerance as prior (phantom's, or bead_tolerance_mm > 0): without "
+            "free beads need a tolerance as prior (phantom's, or bead_tolerance_mm > 0): "
+            "without "
             "one, moving all beads is the same as moving the object",
             {"asked": tolerance, "allowed": "> 0"},
         )
     problem = build_problem(
-        tracks, model, geometry, free=free, shape=shape, covariances=covariances,
-        noise_px=noise_px, groups=groups, per_group=per_group, free_beads=free_beads, start=start,
-        reading=reading, centre=centre, bead_tolerance_mm=tolerance,
-        priors=require_widths(priors or {}), prior_centre=prior_centre, panel=panel,
-        strain=strain, arc=arc,
-    )  # fmt: skip
+        tracks,
+        model,
+        geometry,
+        free=free,
+        shape=shape,
+        covariances=covariances,
+        noise_px=noise_px,
+        groups=groups,
+        per_group=per_group,
+        free_beads=free_beads,
+        start=start,
+        reading=reading,
+        centre=centre,
+        bead_tolerance_mm=tolerance,
+        priors=require_widths(priors or {}),
+        prior_centre=prior_centre,
+        panel=panel,
+        strain=strain,
+        arc=arc,
+    )
     if not problem.seen.any():
-        raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})
+        raise TwinError(
+            "no bead was seen in any frame: there is nothing to fit", {"seen": 0}
+        )
     solution, noise = _solved(problem, solver)
     certificate = certify(problem, solution.x, solution.use, noise, sampling_px, bound)
     groups_at = problem.parameters(solution.x)
@@ -495,8 +530,8 @@ def require_identifiable(result: FitResult) -> FitResult:
     if not spectrum.full:
         directions = [d.text for d in spectrum.null]
         raise NotIdentifiableError(
-            f"not identifiable: {len(directions)} of {len(spectrum.names)} directions are open: "
-            + "; ".join(directions),
+            f"not identifiable: {len(directions)} of {len(spectrum.names)} directions "
+            "are open: " + "; ".join(directions),
             {
                 "asked": list(spectrum.names),
                 "rank": spectrum.rank,
@@ -516,7 +551,9 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
         iterations: of all fits together.
     """
     problem = result.problem
-    base = np.array([values_in(from_printed_reading(start, problem.reading))] * len(problem.base))
+    base = np.array(
+        [values_in(from_printed_reading(start, problem.reading))] * len(problem.base)
+    )
     begun = problem.with_base(base)
     cost = cost_at(begun, begun.start, result.solution.use)
     return replace(result, start_cost=cost, iterations=iterations)
@@ -555,7 +592,9 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     out = []
     for group in range(len(fit.group_parameters)):
         here, rows = image_slopes(fit.problem, fit.solution.x, group)
-        sigma = np.sqrt(np.maximum(np.einsum("qi,ij,qj->q", rows, fit.covariance, rows), 0.0))
+        sigma = np.sqrt(
+            np.maximum(np.einsum("qi,ij,qj->q", rows, fit.covariance, rows), 0.0)
+        )
         out.append(
             {
                 name: Estimate(v, s, v - t * s, v + t * s, unit)
@@ -567,7 +606,9 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     return tuple(out)
 
 
-def image_slopes(problem: FitProblem, x: FloatArray, group: int) -> tuple[FloatArray, FloatArray]:
+def image_slopes(
+    problem: FitProblem, x: FloatArray, group: int
+) -> tuple[FloatArray, FloatArray]:
     """Compute the quantities of IN_IMAGES, and their derivatives by the parameters.
 
     Args:
@@ -608,11 +649,15 @@ def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArr
     foot = np.array([offsets.tau_x, offsets.tau_z, 0.0])
     pixel = float(np.linalg.norm(cone.u[0]))
     along = cone.u[0] / pixel
-    points = np.array([foot + [0, 0, 5.0], foot - [0, 0, 5.0], foot + along, foot - along])
+    points = np.array(
+        [foot + [0, 0, 5.0], foot - [0, 0, 5.0], foot + along, foot - along]
+    )
     up, down, right, left = cone.project_points(points, (1, 1))[0]
     column = down[0] - down[1] * (up[0] - down[0]) / (up[1] - down[1])
     angle = math.degrees(math.atan2(up[0] - down[0], down[1] - up[1]))
-    return np.array([column + middle[0], angle, float(np.linalg.norm(right - left)) / 2 * pixel])
+    return np.array(
+        [column + middle[0], angle, float(np.linalg.norm(right - left)) / 2 * pixel]
+    )
 
 
 def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray | None]]:
@@ -636,7 +681,9 @@ def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray
     factor = np.array([edge_factor(name) for name in problem.layout.names])
     reported = problem.layout.parameter_count
     out: list[tuple[int, FloatArray | None]] = []
-    for frames in np.unique(np.ceil(n * np.arange(1, count + 1) / max(count, 1)).astype(int)):
+    for frames in np.unique(
+        np.ceil(n * np.arange(1, count + 1) / max(count, 1)).astype(int)
+    ):
         some = parts[:frames].reshape(frames * 2 * k, -1)
         told = np.einsum("mi,mj->ij", some, some) + np.diag(problem.prior_weight(noise))
         scale = np.sqrt(np.diag(told))
@@ -645,6 +692,8 @@ def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray
             values, vectors = np.linalg.eigh(told / np.outer(scale, scale))
             if values[0] > 1e-12:
                 inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
-                matrix = (noise**2 * inverse * np.outer(factor, factor))[:reported, :reported]
+                matrix = (noise**2 * inverse * np.outer(factor, factor))[
+                    :reported, :reported
+                ]
         out.append((int(frames), matrix))
     return out

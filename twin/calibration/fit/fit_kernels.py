@@ -16,9 +16,9 @@ the projection of its centre: spot = a + bias * (r / depth)^2 (a - foot), bias 1
 outline's centre, 0.8 for the chord-weighted centroid, 0 for points (calibration.md,
 "Images").
 
-All of a frame is in a matrix from beads to columns, rows and depths. Its derivatives are imaginary
-parts: where a parameter has the imaginary part h, a smooth real function has h times its slope,
-exact to rounding (Squire and Trapp, SIAM Review 40 (1998) 110).
+All of a frame is in a matrix from beads to columns, rows and depths. Its derivatives are
+imaginary parts: where a parameter has the imaginary part h, a smooth real function has h times
+its slope, exact to rounding (Squire and Trapp, SIAM Review 40 (1998) 110).
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.kernels.compiling import linked, serial
 
 PARAMETERS = 17
-# Places of the parameters in a row of `params`: the order of `offsets.NAMES`. Unity's axes are in
-# the names: _x is the world's x, _y its z, _z its y. numba compiles globals in as constants.
+# Places of the parameters in a row of `params`: the order of `offsets.NAMES`. Unity's axes are
+# in the names: _x is the world's x, _y its z, _z its y. numba compiles globals in as constants.
 DO_X, DO_Y, DO_Z, ALPHA, TAU_X, TAU_Z, DD_X, DD_Y, DD_Z, DS_X, DS_Y = range(11)
 ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
 # First columns of a row of `geometry`.
@@ -134,8 +134,8 @@ class Data(NamedTuple):
     """The data of a fit, C-contiguous; n frames, k beads.
 
     Attributes:
-        geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's x
-            and y [mm]; see `SOURCE`.
+        geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's
+            x and y [mm]; see `SOURCE`.
         group: (n,) index of each frame's parameter set.
         pivot: 1.0 or 0.0, see the module.
         radius: (k,) [mm].
@@ -184,7 +184,19 @@ def evaluate(  # type: ignore[no-untyped-def]
     Returns:
         The cost; inf if a bead is not in front of the source.
     """
-    geometry, group, pivot, radius, bias, measured, whiten, active, colmap, bead_col, terms = data
+    (
+        geometry,
+        group,
+        pivot,
+        radius,
+        bias,
+        measured,
+        whiten,
+        active,
+        colmap,
+        bead_col,
+        terms,
+    ) = data
     n_frames, n_beads = use.shape
     most = len(active) + 3
     matrix, foot = np.zeros((3, 4), np.complex128), np.zeros(3, np.complex128)
@@ -206,7 +218,10 @@ def evaluate(  # type: ignore[no-untyped-def]
                 values[i] += IMAGINARY_STEP * 1j
                 frame_matrix(values, geo, pivot, matrix, foot)
                 values[i] = values[i].real
-                slope[own], slide[own] = matrix.imag / IMAGINARY_STEP, foot.imag / IMAGINARY_STEP
+                slope[own], slide[own] = (
+                    matrix.imag / IMAGINARY_STEP,
+                    foot.imag / IMAGINARY_STEP,
+                )
                 cols[own] = colmap[group[f], i]
                 own += 1
         if bead_col >= 0:
@@ -255,8 +270,12 @@ def evaluate(  # type: ignore[no-untyped-def]
             for j in range(m):
                 d = slope[j]
                 inward = (d[2, 0] * x + d[2, 1] * y + d[2, 2] * z + d[2, 3]) / depth
-                va = (d[0, 0] * x + d[0, 1] * y + d[0, 2] * z + d[0, 3]) / depth - a * inward
-                vb = (d[1, 0] * x + d[1, 1] * y + d[1, 2] * z + d[1, 3]) / depth - e * inward
+                va = (
+                    d[0, 0] * x + d[0, 1] * y + d[0, 2] * z + d[0, 3]
+                ) / depth - a * inward
+                vb = (
+                    d[1, 0] * x + d[1, 1] * y + d[1, 2] * z + d[1, 3]
+                ) / depth - e * inward
                 da[j] = va + stretch * (va - slide[j, 0] - 2.0 * inward * (a - at[0]))
                 db[j] = vb + stretch * (vb - slide[j, 1] - 2.0 * inward * (e - at[1]))
             for i in range(len(panel)):

@@ -46,10 +46,11 @@ ONE_PERIOD: Final = 2
 """Half waves of the cosine with one period a scan."""
 MOST_PASSES: Final = 6
 BESIDE_BEAM: Final = 0.01
-"""Standard deviation of the slope of a motion along the beam against it: 6 mm in 600; assumed."""
+"""Standard deviation of the slope of a motion along the beam against it: 6 mm in 600;
+assumed."""
 MIN_EVIDENCE: Final = 6.0
-"""Gain in log likelihood from which a parameter counts as moving: white noise has it in less than
-one of a thousand fits (55 pairs of width and smoothness are tried)."""
+"""Gain in log likelihood from which a parameter counts as moving: white noise has it in less
+than one of a thousand fits (55 pairs of width and smoothness are tried)."""
 _Answer = tuple[FloatArray, FloatArray, FloatArray, float]
 """Deviations (n, p) with sigmas, the covariance that they add to the fit's columns, and
 the factor by which they take up its degrees of freedom."""
@@ -78,12 +79,17 @@ class MotionFit:
 
 
 def estimate_motion(
-    fit: FitResult, names: Sequence[str], known: MotionFit | None = None, *, search: bool = True
+    fit: FitResult,
+    names: Sequence[str],
+    known: MotionFit | None = None,
+    *,
+    search: bool = True,
 ) -> MotionFit:
     """Estimate the motion in the tracks of a fit.
 
     Args:
-        fit: parameters that are the same in all frames, with poses that hold the motion `known`.
+        fit: parameters that are the same in all frames, with poses that hold the motion
+            `known`.
         names: parameters that may move, of `geometry.motion.MOVABLE`.
         known: motion that the fit's poses hold; None: no motion.
         search: for the most likely width and smoothness; else those of `known` are taken.
@@ -108,18 +114,28 @@ def estimate_motion(
     use = _used(problem, fit)
     keep = np.repeat(use.ravel(), 2)
     frame = np.repeat(np.arange(len(group)), 2 * problem.seen.shape[1])[keep]
-    noise = max(LEAST_NOISE, fit.certificate.noise)  # in this order also where that is nan
+    noise = max(
+        LEAST_NOISE, fit.certificate.noise
+    )  # in this order also where that is nan
     residual = problem.whitened(x).ravel()[keep]
     rows = problem.jacobian(x, use)[keep]
-    motion = np.stack([derivative(problem, fit, name, use)[keep] for name in names], axis=1)
+    motion = np.stack(
+        [derivative(problem, fit, name, use)[keep] for name in names], axis=1
+    )
     if known is not None:
         held = np.concatenate([m.values for m in known.motions])
         residual = residual + np.einsum("mp,mp->m", motion, held[frame])
     indices = [NAMES.index(name) for name in names]
     model = _Mixed(
-        rows, residual, motion, frame, sizes.tolist(), problem.layout.colmap[:, indices][group],
-        problem.prior_weight(noise), problem.prior_mean - x,
-    )  # fmt: skip
+        rows,
+        residual,
+        motion,
+        frame,
+        sizes.tolist(),
+        problem.layout.colmap[:, indices][group],
+        problem.prior_weight(noise),
+        problem.prior_mean - x,
+    )
     try:
         if search or known is None:
             choice, evidence = _most_likely(model)
@@ -199,7 +215,9 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
     use = fit.solution.use
     keep = np.repeat(use.ravel(), 2)
     frame = np.repeat(np.arange(len(along)), 2 * problem.seen.shape[1])
-    aside = [along[frame] * derivative(problem, fit, name, use) for name in ("dO_x", "dO_y")]
+    aside = [
+        along[frame] * derivative(problem, fit, name, use) for name in ("dO_x", "dO_y")
+    ]
     rows = np.column_stack([problem.jacobian(x, use), *aside])[keep]
     size = len(x)
     table = Table(rows, problem.whitened(x).ravel()[keep], LEAST_NOISE)
@@ -215,7 +233,9 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
     more = free.covariance(count) - exact.covariance(count) + np.outer(off, off)
     values, vectors = np.linalg.eigh(more)
     factor = np.array([edge_factor(name) for name in problem.layout.names[:count]])
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(factor, factor))
+    return np.asarray(
+        (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(factor, factor)
+    )
 
 
 def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
@@ -253,8 +273,8 @@ class _Mixed:
     """Linear mixed model: the fit's g columns, and p parameters' deviations in n frames.
 
     The prior precision of a parameter's deviations is (1 + D'D / l^2) / v, with D the second
-    differences of frames: it has five diagonals, so everything is solved in bands. Its directions
-    are nearly cosines of the frame's number.
+    differences of frames: it has five diagonals, so everything is solved in bands. Its
+    directions are nearly cosines of the frame's number.
 
     Attributes:
         plain: (g, g) normal equations of the fit's columns, scaled, with their priors.
@@ -349,7 +369,9 @@ class _Mixed:
             assert pick is not None
             band[[0, p, 2 * p], :, a] += self._diagonals(i, pick)
         return np.asarray(
-            linalg.cholesky_banded(band.reshape(2 * p + 1, n * p), lower=True, check_finite=False)
+            linalg.cholesky_banded(
+                band.reshape(2 * p + 1, n * p), lower=True, check_finite=False
+            )
         )
 
     def _eliminated(self, choice: _Choice) -> _Eliminated:
@@ -357,18 +379,23 @@ class _Mixed:
         moving = [i for i, pick in enumerate(choice) if pick is not None]
         if not moving:
             empty = np.zeros((0, len(self.scale)))
-            return _Eliminated((), np.zeros((1, 0)), empty, empty, self.plain, self.push, 0.0)
+            return _Eliminated(
+                (), np.zeros((1, 0)), empty, empty, self.plain, self.push, 0.0
+            )
         band = self._factor(moving, choice)
         across = self.mixed[:, :, moving].transpose(0, 2, 1).reshape(-1, len(self.scale))
         pull = self.pull[:, moving].ravel()
         both = linalg.cho_solve_banded((band, True), np.column_stack([across, pull]))
         inner, alone = both[:, :-1], both[:, -1]
         return _Eliminated(
-            tuple(moving), band, across, inner,
+            tuple(moving),
+            band,
+            across,
+            inner,
             self.plain - cross(across, inner),
             self.push - np.einsum("ng,n->g", across, alone),
             float(np.sum(pull * alone)),
-        )  # fmt: skip
+        )
 
     def likelihood(self, choice: _Choice) -> float:
         """Compute the logarithm of the restricted likelihood, up to a constant."""
@@ -404,7 +431,9 @@ class _Mixed:
         if p:
             pull = self.pull[:, part.moving].ravel()
             found = linalg.cho_solve_banded((part.band, True), pull) - part.inner @ fixed
-            square = np.einsum("ng,gh,nh->n", part.inner, inverse, part.inner, optimize=True)
+            square = np.einsum(
+                "ng,gh,nh->n", part.inner, inverse, part.inner, optimize=True
+            )
             for begin in range(0, n * p, COLUMNS):
                 unit = np.eye(n * p, min(COLUMNS, n * p - begin), -begin)
                 columns = linalg.cho_solve_banded((part.band, True), unit)
@@ -425,7 +454,9 @@ class _Mixed:
             with_mean -= part.inner @ with_fixed
             of_means = np.einsum("nc,nd->cd", each, with_mean)
             values[:, part.moving] = (found - (found @ each)[mean_of]).reshape(n, p)
-            centred = square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
+            centred = (
+                square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
+            )
             # The fit's columns are then those values and the means together.
             into = np.zeros((len(self.scale), len(kinds)))
             for kind, into_column in enumerate(own.ravel()[first].tolist()):
@@ -436,7 +467,9 @@ class _Mixed:
             # What the data add to each deviation's prior is what they take of the freedom.
             told = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
             taken = float(np.sum(np.minimum(told * square, 1.0)))
-            sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(n, p)
+            sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(
+                n, p
+            )
         added = noise2 * (fixed_covariance - linalg.inv(self.plain))
         added = added / np.outer(self.scale, self.scale)
         return values, sigma, added, self.freedom / max(self.freedom - taken, 1.0)
@@ -460,7 +493,9 @@ class _Eliminated:
 
 def _stiffness(size: int, waves: float) -> float:
     """Return the eigenvalue of the second differences at which amplitudes fall."""
-    return (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2 if waves < size else math.inf
+    return (
+        (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2 if waves < size else math.inf
+    )
 
 
 def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
@@ -487,10 +522,14 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
         while True:
             around = [
                 (w, t)
-                for w, t in product(range(at[0] - 1, at[0] + 2), range(at[1] - 1, at[1] + 2))
+                for w, t in product(
+                    range(at[0] - 1, at[0] + 2), range(at[1] - 1, at[1] + 2)
+                )
                 if 0 <= w < len(WIDTHS) and 0 <= t < len(WAVES)
             ]
-            best = max(around, key=lambda one: likelihood(i, (WIDTHS[one[0]], WAVES[one[1]])))
+            best = max(
+                around, key=lambda one: likelihood(i, (WIDTHS[one[0]], WAVES[one[1]]))
+            )
             if best == at:
                 return at
             at = best
@@ -518,5 +557,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
             for pick in product(WIDTHS, WAVES)
             if pick[0] >= best[0] and likelihood(i, pick) >= top - MAX_LIKELIHOOD_LOSS
         ]
-        choice[i] = max((model.spectrum(i, pick)[0][ONE_PERIOD], pick) for pick in fair)[1]
+        choice[i] = max((model.spectrum(i, pick)[0][ONE_PERIOD], pick) for pick in fair)[
+            1
+        ]
     return tuple(choice), evidence

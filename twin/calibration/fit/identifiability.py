@@ -13,7 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
+from flexdt.twin.calibration.bead_model import (
+    BeadModel,
+    BeadPhantom,
+    bead_model,
+    spot_radii,
+)
 from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
 from flexdt.twin.calibration.fit.fit import IN_IMAGES, image_slopes
 from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known, known_strain
@@ -151,10 +156,18 @@ def identifiability(
         origin = (sizes[:, ::-1] - 1) / 2
         tracks = np.where(visible[..., None], pixels + origin[:, None], np.nan)
         problem = build_problem(
-            tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px,
-            free_beads=tolerance > 0, start=at, bead_tolerance_mm=tolerance, priors=widths,
+            tracks,
+            beads,
+            plan,
+            free=free,
+            shape=sizes,
+            noise_px=noise_px,
+            free_beads=tolerance > 0,
+            start=at,
+            bead_tolerance_mm=tolerance,
+            priors=widths,
             strain=known_strain(beads, free, priors, bead_tolerance_mm),
-        )  # fmt: skip
+        )
         return forecast(problem, bound), visible
 
     sizes = frame_shapes(shape, len(poses))
@@ -209,7 +222,9 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
     names, count = problem.layout.names, problem.layout.asked
     reported = problem.layout.parameter_count
     seen = int(problem.seen.any(axis=0).sum())
-    rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
+    rows = np.concatenate(
+        [problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)]
+    )
     spec = spectrum(rows, names, seen, reported=count, bound=bound)
     strained = problem.layout.strain_columns
     if count < reported or strained.start < strained.stop:
@@ -227,7 +242,9 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
     if np.isfinite(whole).all():
         slopes = image_slopes(problem, problem.start, 0)[1]
         variance = np.einsum("qi,ij,qj->q", slopes, whole, slopes)
-        images = dict(zip(IN_IMAGES, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True))
+        images = dict(
+            zip(IN_IMAGES, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True)
+        )
     return Forecast(sigmas, images, covariance, spec)
 
 
@@ -285,7 +302,9 @@ def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Pl
         f"{place} at SOD {sod + near:.0f} mm ({near:+.0f} mm)": with_more(beam=near),
         f"{place} at SOD {sod - near:.0f} mm ({-near:+.0f} mm)": with_more(beam=-near),
         f"{place} 20 mm to the side": with_more(20.0),
-        f"{place} 20 mm to the side and at SOD {sod + near:.0f} mm": with_more(20.0, near),
+        f"{place} 20 mm to the side and at SOD {sod + near:.0f} mm": with_more(
+            20.0, near
+        ),
         "take twice as many frames": with_more(angle=float(half)),
         "use a phantom with two beads more": (beads, poses, sizes),
     }

@@ -22,9 +22,15 @@ from flexdt.twin.geometry.offsets import UNITS
 from flexdt.twin.machine.description import Machine, Profile
 
 ASSUMED: Final[Mapping[str, float]] = {
-    "dD_x": 2.0, "dD_y": 2.0, "dD_z": 1.0, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
-    "axis_tilt_x": 0.1, "axis_tilt_z": 0.1,
-}  # fmt: skip
+    "dD_x": 2.0,
+    "dD_y": 2.0,
+    "dD_z": 1.0,
+    "det_roll": 0.3,
+    "det_pitch": 0.3,
+    "det_yaw": 0.3,
+    "axis_tilt_x": 0.1,
+    "axis_tilt_z": 0.1,
+}
 """Assumed: widths [mm, deg] for a scanner that states none of its own. Left out, so
 exactly known, are dS_x and dS_y (the source is the origin of the frame) and angle_scale
 (a turn of the stage closes on itself; wrong steps are found separately)."""

@@ -26,7 +26,8 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine
 
 Shape = tuple[int, int] | FloatArray | None
-"""Detector (rows, cols) of all frames, or (n, 2) of each; None is the default machine's camera."""
+"""Detector (rows, cols) of all frames, or (n, 2) of each; None is the default machine's
+camera."""
 
 SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
 """The thesis's active vector, eq. 5.6."""
@@ -56,8 +57,8 @@ free."""
 class Reading(enum.Enum):
     """The two readings of thesis eq. 5.4, which differ in the place of the rotation axis.
 
-    With every parameter of dO and tau free they describe the same set of geometries; the values of
-    dO_x and dO_z differ by tau_x and tau_z.
+    With every parameter of dO and tau free they describe the same set of geometries; the values
+    of dO_x and dO_z differ by tau_x and tau_z.
     """
 
     AXIS_AT_O_PLUS_TAU = "axis at O + tau"
@@ -139,7 +140,9 @@ def require_names(names: Iterable[str]) -> None:
     """
     for name in names:
         if name not in NAMES:
-            raise UnknownNameError.among(f"unknown parameter {name!r}; allowed", name, NAMES)
+            raise UnknownNameError.among(
+                f"unknown parameter {name!r}; allowed", name, NAMES
+            )
 
 
 def require_tolerance(tolerance_mm: float) -> float:
@@ -150,7 +153,8 @@ def require_tolerance(tolerance_mm: float) -> float:
     """
     if not 0.0 <= tolerance_mm < math.inf:
         raise TwinError(
-            f"bead tolerance {tolerance_mm:g} mm; allowed: 0 (beads sit where the phantom says) "
+            f"bead tolerance {tolerance_mm:g} mm; allowed: 0 (beads sit where the "
+            "phantom says) "
             "or more",
             {"asked": tolerance_mm, "allowed": ">= 0"},
         )
@@ -233,9 +237,17 @@ def layout(
     names += [f"panel {term}" for term in panel]
     active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
     return ColumnLayout(
-        tuple(names), asked, colmap, bead_column, strain_column, arc_column, count, panel_column,
-        active, tuple(held),
-    )  # fmt: skip
+        tuple(names),
+        asked,
+        colmap,
+        bead_column,
+        strain_column,
+        arc_column,
+        count,
+        panel_column,
+        active,
+        tuple(held),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +294,9 @@ class FitProblem:
         """Values of the columns at the start."""
         x = np.zeros(len(self.layout.names))
         free = self.layout.colmap >= 0
-        x[self.layout.colmap[free]] = self.base[free]  # of a shared column, the last group's
+        x[self.layout.colmap[free]] = self.base[
+            free
+        ]  # of a shared column, the last group's
         if self.layout.bead_column >= 0:
             x[self.layout.bead_columns] = self.model.beads.ravel()
         return x
@@ -292,11 +306,20 @@ class FitProblem:
         """The problem's arrays as the kernels take them."""
         p = self.poses
         return kernels.Data(
-            np.column_stack([p.source, p.axis, p.detector, p.u, p.v, p.angle, p.mount[:, :2]]),
-            self.group, self.reading.pivot, self.model.bead_radius_mm, self.bias,
-            self.measured, self.whiten, self.layout.active, self.layout.colmap,
-            self.layout.parameter_count if self._moved_beads else -1, self.shift_terms,
-        )  # fmt: skip
+            np.column_stack(
+                [p.source, p.axis, p.detector, p.u, p.v, p.angle, p.mount[:, :2]]
+            ),
+            self.group,
+            self.reading.pivot,
+            self.model.bead_radius_mm,
+            self.bias,
+            self.measured,
+            self.whiten,
+            self.layout.active,
+            self.layout.colmap,
+            self.layout.parameter_count if self._moved_beads else -1,
+            self.shift_terms,
+        )
 
     @property
     def _moved_beads(self) -> bool:
@@ -334,14 +357,19 @@ class FitProblem:
         """Return parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
         columns, own = self.layout.colmap, self.layout.bead_column
         params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])
-        beads = self.model.beads if own < 0 else x[self.layout.bead_columns].reshape(-1, 3)
+        beads = (
+            self.model.beads if own < 0 else x[self.layout.bead_columns].reshape(-1, 3)
+        )
         if self.layout.strain_column >= 0:
-            beads = beads + (self.strain_basis @ x[self.layout.strain_columns]).reshape(-1, 3)
+            beads = beads + (self.strain_basis @ x[self.layout.strain_columns]).reshape(
+                -1, 3
+            )
         return params, np.array(beads)
 
     @cached_property
     def shift_terms(self) -> FloatArray:
-        """(n, k, 2, m) shifts by a coefficient of 1 of the exposure's arc and the panel's terms."""
+        """(n, k, 2, m) shifts by a coefficient of 1 of the exposure's arc and the panel's
+        terms."""
         if self.curvature is None:
             return self.panel_terms
         return np.concatenate([self.curvature, self.panel_terms], axis=-1)
@@ -379,10 +407,13 @@ class FitProblem:
         w = self.whiten
         off = self.measured + self.origin[:, None, :] - predicted
         return np.stack(
-            [w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1], w[..., 2] * off[..., 1]], axis=-1
+            [w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1], w[..., 2] * off[..., 1]],
+            axis=-1,
         )
 
-    def jacobian(self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+    def jacobian(
+        self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
+    ) -> FloatArray:
         """Compute whitened rows d(column, row)/dx, (2 n k, columns); rows of unused
         positions are 0.
         """
@@ -397,7 +428,11 @@ class FitProblem:
         return predicted, norms, jac
 
     def evaluate(
-        self, x: FloatArray, use: npt.NDArray[np.bool_], want: int, huber: float = math.inf
+        self,
+        x: FloatArray,
+        use: npt.NDArray[np.bool_],
+        want: int,
+        huber: float = math.inf,
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Evaluate column values by `fit_kernels.evaluate`.
 
@@ -420,17 +455,28 @@ class FitProblem:
             np.zeros(size),
         )
         shifts = np.array(x[self.layout.shift_column :])
-        cost = kernels.evaluate(self.data, params, beads, shifts, use, huber, want, *written)
+        cost = kernels.evaluate(
+            self.data, params, beads, shifts, use, huber, want, *written
+        )
         if table is None or want == 0:
             return float(cost), *written
         predicted, norms, jac, hess, grad = written
         whole = hess + np.triu(hess, 1).T
-        return float(cost), predicted, norms, jac @ table, table.T @ whole @ table, grad @ table
+        return (
+            float(cost),
+            predicted,
+            norms,
+            jac @ table,
+            table.T @ whole @ table,
+            grad @ table,
+        )
 
     @property
     def pixels(self) -> FloatArray:
         """Measured positions (n, k, 2) in pixels of the image, nan where unseen."""
-        return np.where(self.seen[..., None], self.measured + self.origin[:, None, :], np.nan)
+        return np.where(
+            self.seen[..., None], self.measured + self.origin[:, None, :], np.nan
+        )
 
     def prior_weight(self, noise: float) -> FloatArray:
         """Compute the weight of each column's prior against whitened residuals of that
@@ -477,7 +523,9 @@ def build_problem(
     t = np.array(tracks, dtype=np.float64)
     n, k = len(poses), len(model)
     if t.shape != (n, k, 2):
-        raise TwinError.of_shape("tracks", t.shape, (n, k, 2), f" for {n} frames and {k} beads")
+        raise TwinError.of_shape(
+            "tracks", t.shape, (n, k, 2), f" for {n} frames and {k} beads"
+        )
     seen = np.ascontiguousarray(np.isfinite(t).all(axis=2))
     origin = (frame_shapes(shape, n)[:, ::-1] - 1) / 2
     measured = np.where(seen[:, :, None], t - origin[:, None, :], 0.0)
@@ -521,12 +569,17 @@ def build_problem(
             [mean, model.beads.ravel()[:beads], np.zeros(len(strains) + arc + len(terms))]
         ),
         prior_sigma=np.concatenate(
-            [sigma, np.full(beads, bead_tolerance_mm), strains,
-             np.full(int(arc), ARC_PRIOR), of_terms]
+            [
+                sigma,
+                np.full(beads, bead_tolerance_mm),
+                strains,
+                np.full(int(arc), ARC_PRIOR),
+                of_terms,
+            ]
         ),
         panel=panel,
         curvature=curvature(poses, model, base, group, reading) if arc else None,
-    )  # fmt: skip
+    )
 
 
 def strain_widths(strain: Strain) -> FloatArray:
@@ -536,13 +589,17 @@ def strain_widths(strain: Strain) -> FloatArray:
 
 
 def curvature(
-    poses: Poses, model: BeadModel, base: FloatArray, group: npt.NDArray[np.int64], reading: Reading
+    poses: Poses,
+    model: BeadModel,
+    base: FloatArray,
+    group: npt.NDArray[np.int64],
+    reading: Reading,
 ) -> FloatArray:
     """Compute shifts (n, k, 2, 1) [px] of the beads' mean positions by exposures of a
     full step.
 
-    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the fourth power
-    of the arc: 2e-4 px of 100 px for a step of 15 deg.
+    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the fourth
+    power of the arc: 2e-4 px of 100 px for a step of 15 deg.
 
     Args:
         poses: nominal geometry of the n frames.
@@ -563,7 +620,9 @@ def curvature(
             replace(some, angle=some.angle + turn).cone_vec(offsets)
             for turn in (ARC_ANGLE_RAD, 0.0, -ARC_ANGLE_RAD)
         )
-        ahead, here, behind = (cone.project_points(model.beads, (1, 1)) for cone in turned)
+        ahead, here, behind = (
+            cone.project_points(model.beads, (1, 1)) for cone in turned
+        )
         bent = (ahead - 2.0 * here + behind) / ARC_ANGLE_RAD**2
         out[mine, ..., 0] = bent * step**2 / 24.0
     return out
@@ -655,12 +714,16 @@ def values_in(p: Offsets) -> FloatArray:
 
 def to_printed_reading(p: Offsets, reading: Reading) -> Offsets:
     """Convert values in `reading` to the reading of `Poses.cone_vec` (the axis at O + tau)."""
-    return p if reading.pivot else replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
+    return (
+        p if reading.pivot else replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
+    )
 
 
 def from_printed_reading(p: Offsets, reading: Reading) -> Offsets:
     """Convert values in the reading of `Poses.cone_vec` to `reading`."""
-    return p if reading.pivot else replace(p, dO_x=p.dO_x + p.tau_x, dO_z=p.dO_z + p.tau_z)
+    return (
+        p if reading.pivot else replace(p, dO_x=p.dO_x + p.tau_x, dO_z=p.dO_z + p.tau_z)
+    )
 
 
 def edge_factor(column: str) -> float:

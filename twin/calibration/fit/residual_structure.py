@@ -1,9 +1,9 @@
 """Structure in residuals that white noise does not have, and its effect on the covariance.
 
 Three questions: are residuals correlated from frame to frame (slow errors), or within a frame
-(a vibration moves all beads together), and do they follow a drift or a jump of a parameter during
-the scan? Each test has a threshold that white noise passes once in some ten thousand fits, so that
-clean data keep the nominal covariance. Causes are not looked for here.
+(a vibration moves all beads together), and do they follow a drift or a jump of a parameter
+during the scan? Each test has a threshold that white noise passes once in some ten thousand
+fits, so that clean data keep the nominal covariance. Causes are not looked for here.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ HARMONICS = 3
 HINT_SIGMAS = 1.5
 """The same for a second drift once a first is found."""
 MOVING = ("dO_x", "dO_y", "dO_z", "alpha")
-"""Parameters that may change during a scan: the object's place and angle (a drift of the source or
-the detector looks like one of the object)."""
+"""Parameters that may change during a scan: the object's place and angle (a drift of the source
+or the detector looks like one of the object)."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Drift:
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute a.T @ b of two tall matrices, (m, i) and (m, j), in one thread.
 
-    These products are too small for BLAS threads, which cost more than the work and spin where the
-    cores are busy.
+    These products are too small for BLAS threads, which cost more than the work and spin where
+    the cores are busy.
     """
     return np.asarray(np.einsum("mi,mj->ij", a, b))
 
@@ -95,7 +95,12 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
 
     If none is certain, the possible ones are returned.
     """
-    problem, jacobian, residual, frame = left.problem, left.jacobian, left.values, left.frame
+    problem, jacobian, residual, frame = (
+        left.problem,
+        left.jacobian,
+        left.values,
+        left.frame,
+    )
     unit_covariance, noise = left.unit_covariance, left.noise
     found: list[Drift] = []
     suspects: list[Drift] = []
@@ -103,7 +108,9 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
     columns = [i for i, n in enumerate(names) if n.split("@")[0] in MOVING]
     if noise <= 0 or len(residual) <= len(names) + 8:
         return ()
-    clean = residual - jacobian @ (unit_covariance @ np.einsum("mp,m->p", jacobian, residual))
+    clean = residual - jacobian @ (
+        unit_covariance @ np.einsum("mp,m->p", jacobian, residual)
+    )
     for group in np.unique(problem.group):
         members = np.flatnonzero(problem.group == group)
         n = len(members)
@@ -119,7 +126,9 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
             shapes.append((int(members[at]), np.where(inside, (place >= at) - 0.5, 0.0)))
         if not columns:
             continue
-        vectors = np.stack([jacobian[:, c] * shape for c in columns for _, shape in shapes], axis=1)
+        vectors = np.stack(
+            [jacobian[:, c] * shape for c in columns for _, shape in shapes], axis=1
+        )
         absorbed = cross(jacobian, vectors)
         whole = np.einsum("mi,mi->i", vectors, vectors)
         power = whole - np.einsum("pi,pq,qi->i", absorbed, unit_covariance, absorbed)
@@ -130,13 +139,21 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
             part = slice(i * len(shapes), (i + 1) * len(shapes))
             each = np.abs(score[part])
             best = int(np.argmax(each))
-            suspect = best if each[best] > SUSPECT_STEP else 0 if each[0] > SUSPECT_SIGMAS else None
+            suspect = (
+                best
+                if each[best] > SUSPECT_STEP
+                else 0
+                if each[0] > SUSPECT_SIGMAS
+                else None
+            )
             hint = best if each[best] > HINT_SIGMAS else None
             for at, among in ((suspect, suspects), (hint, found)):
                 if at is not None:
                     size = float(push[part][at] / power[part][at])
                     bias = unit_covariance @ (absorbed[:, part][:, at] * size)
-                    among.append(Drift(names[c], size, shapes[at][0], float(each[at]), bias))
+                    among.append(
+                        Drift(names[c], size, shapes[at][0], float(each[at]), bias)
+                    )
     if not any(d.score > SIGNIFICANT for d in found):
         return tuple(suspects)
     # Where one thing moves, hints of others count too.
@@ -149,11 +166,18 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
     Returns:
         None if it is not needed.
     """
-    problem, jacobian, residual, frame = left.problem, left.jacobian, left.values, left.frame
+    problem, jacobian, residual, frame = (
+        left.problem,
+        left.jacobian,
+        left.values,
+        left.frame,
+    )
     unit_covariance, noise = left.unit_covariance, left.noise
     frames, member = np.unique(frame, return_inverse=True)
     n, p = len(frames), jacobian.shape[1]
-    fitted = int(np.isinf(problem.prior_sigma).sum())  # a prior leaves hardly a degree of freedom
+    fitted = int(
+        np.isinf(problem.prior_sigma).sum()
+    )  # a prior leaves hardly a degree of freedom
     if n < 12 or n < 2 * fitted or noise <= 0:
         return None
     names = problem.layout.names
@@ -167,7 +191,9 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
         spread = np.bincount(member, w**2, n) ** 2 - np.bincount(member, w**4, n)
         total = float(spread.sum())
         if total > 0:
-            alike = max(alike, float(together.sum()) / (noise**2 * math.sqrt(2.0 * total)))
+            alike = max(
+                alike, float(together.sum()) / (noise**2 * math.sqrt(2.0 * total))
+            )
     if alike < CLUSTER_SIGMAS:
         return None
     scores = np.zeros((n, p))
@@ -188,7 +214,12 @@ def turning_errors(left: Residuals) -> FloatArray | None:
     Returns:
         None if there are no such errors.
     """
-    problem, jacobian, residual, keep = left.problem, left.jacobian, left.values, left.keep
+    problem, jacobian, residual, keep = (
+        left.problem,
+        left.jacobian,
+        left.values,
+        left.keep,
+    )
     unit_covariance, noise = left.unit_covariance, left.noise
     n, k = problem.seen.shape
     if n < 16 or noise <= 0:
@@ -203,8 +234,8 @@ def turning_errors(left: Residuals) -> FloatArray | None:
     frames = np.flatnonzero(keep) // (2 * k)
     beads = np.flatnonzero(keep) // 2 % k
     rows = np.flatnonzero(keep) % 2
-    # A column (bead, coordinate, wave) is zero but for the rows of its bead, so all products are
-    # made bead by bead.
+    # A column (bead, coordinate, wave) is zero but for the rows of its bead, so all products
+    # are made bead by bead.
     columns = 2 * k * count
     gram = np.zeros((columns, columns))
     absorbed = np.zeros((jacobian.shape[1], columns))
@@ -280,12 +311,18 @@ def _excess(
     if rough < len(power) + math.sqrt(2.0 * len(power)):
         return None  # nothing there: the exact test need not be made
     values, directions = np.linalg.eigh(part)
-    free = values > 1e-6 * max(float(values[-1]), 1e-30) if len(values) else np.zeros(0, bool)
+    free = (
+        values > 1e-6 * max(float(values[-1]), 1e-30)
+        if len(values)
+        else np.zeros(0, bool)
+    )
     rank = int(free.sum())
     if rank == 0 or len(residual) < 3 * rank:
         return None
     inside = float(np.sum((directions[:, free].T @ push[which]) ** 2 / values[free]))
-    rest = (float(residual @ residual) - inside) / max(len(residual) - rank - parameters, 1)
+    rest = (float(residual @ residual) - inside) / max(
+        len(residual) - rank - parameters, 1
+    )
     # An energy of `rank` is expected; its chi-square tail at the level of the other tests.
     if inside / max(rest, 1e-30) < chdtri(rank, 1e-3):
         return None

@@ -87,20 +87,28 @@ def advise(names: Sequence[str], beads: int) -> str:
     """
     involved = {n.split("@")[0] for n in names}
     if beads < 2:
-        return "one bead alone fixes neither the scale nor the angle: use two or more beads"
+        return (
+            "one bead alone fixes neither the scale nor the angle: use two or more beads"
+        )
     if any(n.startswith("bead ") for n in names):
         return "measure the beads' positions, or give their tolerance as a prior"
     match involved:
         case s if s & _SOURCE and s & _OBJECT and s & _DETECTOR:
             return "a common shift of source, object and detector changes no image: hold the source"
-        case s if s & _DETECTOR and any("@" in n and n.split("@")[0] in _OBJECT for n in names):
+        case s if s & _DETECTOR and any(
+            "@" in n and n.split("@")[0] in _OBJECT for n in names
+        ):
             return (
-                "turning stages and detector together about the source changes (nearly) no image: "
+                "turning stages and detector together about the source changes (nearly) "
+                "no image: "
                 "give the detector a prior, or let the scans share dO_x, dO_y and dO_z"
             )
         case s if (
             s & {"det_roll", "axis_tilt_x", "axis_tilt_z"}
-            and len(s & {"det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z"}) > 1
+            and len(
+                s & {"det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z"}
+            )
+            > 1
         ):
             return (
                 "turning detector and axis together changes little: add placements at several "
@@ -135,7 +143,9 @@ def null_directions(
         names: of the columns.
         beads: beads seen.
     """
-    return tuple(weak_direction(vector, scale, names, np.inf, beads) for vector in _sparse(basis).T)
+    return tuple(
+        weak_direction(vector, scale, names, np.inf, beads) for vector in _sparse(basis).T
+    )
 
 
 def weak_direction(
@@ -152,11 +162,15 @@ def weak_direction(
     """
     order = np.argsort(-np.abs(vector))
     kept = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]
-    # The parameter that is most uncertain leads; prefer geometry over beads, detector over stage.
+    # The parameter that is most uncertain leads; prefer geometry over beads, detector over
+    # stage.
     change = vector / scale
     lead = max(kept, key=lambda i: abs(change[i]) / tolerance_of(names[i]))
     rest = [i for i in kept if i != lead]
-    parts = ((names[lead], 1.0), *((names[i], float(change[i] / change[lead])) for i in rest))
+    parts = (
+        (names[lead], 1.0),
+        *((names[i], float(change[i] / change[lead])) for i in rest),
+    )
     size = float(abs(change[lead]) * sigma) if np.isfinite(sigma) else np.inf
     return Direction(parts, size, advise([n for n, _ in parts], beads))
 

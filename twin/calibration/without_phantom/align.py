@@ -23,8 +23,15 @@ from flexdt.twin.calibration.without_phantom.alignment import (
     AlignEstimate,
     Alignment,
 )
-from flexdt.twin.calibration.without_phantom.circular_scan import FREE, OF_TURN, CircularScan
-from flexdt.twin.calibration.without_phantom.symmetry_plane import SymmetryPlane, find_plane
+from flexdt.twin.calibration.without_phantom.circular_scan import (
+    FREE,
+    OF_TURN,
+    CircularScan,
+)
+from flexdt.twin.calibration.without_phantom.symmetry_plane import (
+    SymmetryPlane,
+    find_plane,
+)
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn
 from flexdt.twin.calibration.without_phantom.turn_planes import TurnPlanes
 from flexdt.twin.errors import NotIdentifiableError
@@ -36,7 +43,9 @@ from flexdt.twin.geometry.poses import Poses
 P = ParamSpec("P")
 STEP_TOLD: Final = 0.2
 """From here on a step of the images is a warning [px]."""
-NEEDS_TURN: Final = "a full turn of more rows tells it; the correction keeps what was in force"
+NEEDS_TURN: Final = (
+    "a full turn of more rows tells it; the correction keeps what was in force"
+)
 
 
 def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
@@ -48,7 +57,9 @@ def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
             return find(*args, **options)
         except NotIdentifiableError as error:
             names = ("axis_column_px", "det_roll", "det_yaw", "source_row_px")
-            return Alignment(None, {}, {**dict.fromkeys(names, error.message), **UNTOLD}, (), 0)
+            return Alignment(
+                None, {}, {**dict.fromkeys(names, error.message), **UNTOLD}, (), 0
+            )
 
     return found
 
@@ -73,8 +84,8 @@ def align_turn(
         present: indices of the frames that are there.
         shape: (rows, cols) of every image.
         base: offsets in force; dO_x, det_roll, det_yaw and dD_y are replaced.
-        priors: standard deviation of each offset [mm, deg]; those of the panel and of axis_tilt_x
-            count.
+        priors: standard deviation of each offset [mm, deg]; those of the panel and of
+            axis_tilt_x count.
         random: for images of noise, which show the effect of noise.
         per_frame: whether shifts of single frames are looked for.
         panel: the distortion that is undone in the images.
@@ -89,11 +100,18 @@ def align_turn(
     corrected = plane.scan.offsets(plane.values[:OF_TURN])
     if plane.turn is None:
         refused |= dict.fromkeys(("det_roll", "source_row_px", "motion"), NEEDS_TURN)
-        return Alignment(corrected, parameters, refused, (), len(present), None, plane.panel)
+        return Alignment(
+            corrected, parameters, refused, (), len(present), None, plane.panel
+        )
     planes = TurnPlanes(
-        plane.scan.image, poses, plane.turn, plane.scan.offsets, plane.values, plane.covariance,
+        plane.scan.image,
+        poses,
+        plane.turn,
+        plane.scan.offsets,
+        plane.values,
+        plane.covariance,
         priors,
-    )  # fmt: skip
+    )
     try:
         corrected, parameters["source_row_px"] = planes.row(random)
     except NotIdentifiableError as error:
@@ -126,9 +144,13 @@ def _plane_parameters(
             value = math.degrees(plane.values[1 + i])
             parameters[name] = AlignEstimate(value, widths[i], "deg")
         else:
-            images, prior = math.degrees(plane.images_rad[i]), math.degrees(plane.priors_rad[i])
+            images, prior = (
+                math.degrees(plane.images_rad[i]),
+                math.degrees(plane.priors_rad[i]),
+            )
             refused[name] = (
-                f"the images tell it to +- {images:.2g} deg, its prior to +- {prior:.2g} deg: that "
+                f"the images tell it to +- {images:.2g} deg, its prior to +- {prior:.2g} "
+                "deg: that "
                 "is what the correction contains"
             )
     return parameters, refused
@@ -144,7 +166,8 @@ def _motion(
     """
     if turn.repeated:
         raise NotIdentifiableError(
-            f"frames {list(turn.repeated)} repeat the one before: from there on the others may be "
+            f"frames {list(turn.repeated)} repeat the one before: from there on the "
+            "others may be "
             "a step behind their angles"
         )
     return planes.motion(corrected, random)
@@ -163,14 +186,16 @@ def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]
         out.append(plane.opposite.warning)
     if plane.gap is not None:
         out.append(
-            f"{plane.gap.text}: it is closed in what is told here, its uncertainty is in the axis "
+            f"{plane.gap.text}: it is closed in what is told here, its uncertainty is in "
+            "the axis "
             "column's sigma, and reconstruct closes it with the correction"
         )
     hidden = plane.hidden
     if hidden is not None and hidden.column_px > plane.column_sigma_px / 2:
         out.append(
             "the images do not exclude that a tile of the panel begins at columns "
-            f"{hidden.first} to {hidden.last} behind a gap, which would move the axis by half of "
+            f"{hidden.first} to {hidden.last} behind a gap, which would move the axis by "
+            "half of "
             f"its width: the column's sigma contains +- {hidden.column_px:.2g} px for it; "
             "calibrate with a phantom, and give that correction"
         )
@@ -182,7 +207,8 @@ def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]
     if abs(right) > STEP_TOLD:
         out.append(
             f"after frame {turn.step_after} the images step by {right:.2f} px to the right and "
-            f"{down:.2f} px down: a jump there, or a drift over the scan; the sigmas contain half "
+            f"{down:.2f} px down: a jump there, or a drift over the scan; the sigmas "
+            "contain half "
             "of it"
         )
     return tuple(out)

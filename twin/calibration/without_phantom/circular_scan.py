@@ -1,4 +1,5 @@
-"""A circular scan, and how its geometry follows from the parameters of its plane of symmetry."""
+"""A circular scan, and how its geometry follows from the parameters of its plane of
+symmetry."""
 
 from __future__ import annotations
 
@@ -99,7 +100,10 @@ class CircularScan:
         """Return the change of the column with each parameter, (k,)."""
         steps = np.diag(0.1 * scales)
         return np.array(
-            [(self.column(values + e) - self.column(values - e)) / (2 * e.sum()) for e in steps]
+            [
+                (self.column(values + e) - self.column(values - e)) / (2 * e.sum())
+                for e in steps
+            ]
         )
 
     @property
@@ -124,7 +128,13 @@ class CircularScan:
         pitch, sdd = self.pitch_mm, self.sdd_mm
         ends = 2 * sdd / cols
         return np.array(
-            [pitch * float(self.pose.sod[0]) / sdd, 2 / rows, ends / (pitch * cols), ends, pitch]
+            [
+                pitch * float(self.pose.sod[0]) / sdd,
+                2 / rows,
+                ends / (pitch * cols),
+                ends,
+                pitch,
+            ]
         )
 
     @property
@@ -135,7 +145,9 @@ class CircularScan:
     @property
     def yaw_prior_rad(self) -> float:
         """Standard deviation of the yaw before the images [rad]."""
-        return max(math.hypot(math.radians(self.priors["det_yaw"]), self.sideways_rad), 1e-9)
+        return max(
+            math.hypot(math.radians(self.priors["det_yaw"]), self.sideways_rad), 1e-9
+        )
 
 
 def about_axis(poses: Poses, offsets: Offsets) -> ConeVec:
@@ -151,7 +163,9 @@ def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:
         NotIdentifiableError: source or panel move, so the scan is not on one circle.
     """
     chosen = np.array(present)
-    table = np.hstack([poses.source - poses.axis, poses.detector - poses.axis, poses.u, poses.v])
+    table = np.hstack(
+        [poses.source - poses.axis, poses.detector - poses.axis, poses.u, poses.v]
+    )
     table = table[chosen]
     pitch = float(np.linalg.norm(poses.u[chosen[0]]))
     moved = float(np.abs(table - table[0]).max()) / pitch

@@ -45,19 +45,22 @@ EDGE_VIEWS: Final = 8
 ROUNDS, NEAR = 4, 0.05
 """Steps towards the axis column at most, and part of a sigma that is none."""
 PER_SIGMA: Final = 3.0
-"""Distances from the axis that are read in a sigma of the smoothing, at least a column apart."""
+"""Distances from the axis that are read in a sigma of the smoothing, at least a column
+apart."""
 MAX_BINS: Final = 24
 """Largest number of bins of distances from the axis."""
 MIN_BIN_SIGMAS: Final = 2.0
 """Least width of a bin, in sigmas of the smoothing."""
 YAW_PX: Final = 0.1
-"""By so much a yaw may move the ends of the panel against its middle, beyond that in force [px]."""
+"""By so much a yaw may move the ends of the panel against its middle, beyond that in force
+[px]."""
 LEAST_BINS: Final = 8
 """One bin of so many may be left out: where a wall turns back, more is wrong than elsewhere."""
 MIN_BINS: Final = 4
 """Least number of informative bins."""
 MOST_MOVED: Final = 0.1
-"""Part of the innermost bin that a step may move, at most: without a bin inside, it is a shift."""
+"""Part of the innermost bin that a step may move, at most: without a bin inside, it is a
+shift."""
 BEYOND, BESIDE = 3, 2
 """Whole bins beyond a step, at least, and beside it that are not left out."""
 MAX_WIDTH_PX: Final = 5.0
@@ -160,7 +163,11 @@ class Profile:
         """Return the step at the radius next to one; its sigma is inf without a bin inside."""
         place = int(np.abs(self.radii - radius).argmin())
         step = self.beside_axis(radius)
-        return step if self._has_inside[place] else step._replace(sigma=math.inf, least=math.inf)
+        return (
+            step
+            if self._has_inside[place]
+            else step._replace(sigma=math.inf, least=math.inf)
+        )
 
     def beside_axis(self, radius: float) -> Step:
         """Return the step at the radius next to one, also if only the innermost bin
@@ -192,7 +199,9 @@ class Profile:
         times = float(student.isf(CHANCE / chances, max(count - dropped - 2, 1)))
         own = np.sqrt(inverse[:, 2, 2])
         table = zip(self.radii.tolist(), values[:, 2].tolist(), own.tolist(), strict=True)
-        return [Step(radius, width, one, one * times) for radius, width, one in table], rest
+        return [
+            Step(radius, width, one, one * times) for radius, width, one in table
+        ], rest
 
     def _widened(self, sigma: FloatArray, place: int) -> FloatArray:
         """Widen the standard deviations of bins until the residuals of a step at a radius
@@ -234,7 +243,11 @@ def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_])
 
 
 def _basis(
-    radius: FloatArray, weight: FloatArray, place: npt.NDArray[np.intp], at: FloatArray, soft: float
+    radius: FloatArray,
+    weight: FloatArray,
+    place: npt.NDArray[np.intp],
+    at: FloatArray,
+    soft: float,
 ) -> FloatArray:
     """Compute shares of a common shift, a yaw and of steps at radii (r,) in each bin, (r,
     m, 3).
@@ -250,7 +263,9 @@ def _basis(
     one_of /= one_of.sum(axis=1, keepdims=True)
     bent = YAW_PX * (one_of @ np.square(radius / radius[-1]))
     beyond = ndtr((radius - at[:, None]) / soft) @ one_of.T
-    return np.stack([np.ones_like(beyond), np.broadcast_to(bent, beyond.shape), beyond], axis=2)
+    return np.stack(
+        [np.ones_like(beyond), np.broadcast_to(bent, beyond.shape), beyond], axis=2
+    )
 
 
 class ConjugateRays:
@@ -258,15 +273,20 @@ class ConjugateRays:
 
     Args:
         scan: the scan on one circle.
-        band: means over groups of rows near the source's plane, (n, groups, cols), at even steps.
+        band: means over groups of rows near the source's plane, (n, groups, cols), at even
+            steps.
         rows: middle row of each group, (groups,).
         step: between views [rad].
     """
 
-    def __init__(self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float) -> None:
+    def __init__(
+        self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float
+    ) -> None:
         self.scan, self.band, self.rows, self.step = scan, band, rows, step
         self.views, self.cols = len(band), band.shape[2]
-        self.smoothing = max(1.0, self.cols / SMOOTHING, step * self.cols / MAX_VIEWS_RATIO)
+        self.smoothing = max(
+            1.0, self.cols / SMOOTHING, step * self.cols / MAX_VIEWS_RATIO
+        )
         soft = gaussian_filter1d(band, self.smoothing, axis=2, mode="nearest")
         self.splines = [
             spline_filter(np.pad(one, ((EDGE_VIEWS, EDGE_VIEWS), (0, 0)), mode="wrap"))
@@ -302,7 +322,8 @@ class ConjugateRays:
             values: parameters in the order of `circular_scan.FREE`, (k,).
 
         Returns:
-            The parameters, and the standard deviation of the column [px]; inf: too little turns.
+            The parameters, and the standard deviation of the column [px]; inf: too little
+            turns.
         """
         values = values.copy()
         slope = self.scan.slopes(values, self.scan.scales[: len(values)])[0]
@@ -329,25 +350,33 @@ class ConjugateRays:
         if len(radius) == 0:
             return None
         weight = told.sum(axis=(0, 1))
-        place = (radius / max(MIN_BIN_SIGMAS * self.smoothing, radius[-1] / MAX_BINS)).astype(
-            np.intp
-        )
+        place = (
+            radius / max(MIN_BIN_SIGMAS * self.smoothing, radius[-1] / MAX_BINS)
+        ).astype(np.intp)
         count = int(place[-1]) + 1
         of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
         moved, told = moved @ of_bin, told @ of_bin
         good = np.bincount(place, weight) > MIN_CORRELATION * np.bincount(place, power)
         shift, sigma = np.ones((2, count))
         for i in np.flatnonzero(good).tolist():
-            ways = [_left_out(*(t[..., i].sum(axis=a) for t in (moved, told))) for a in (1, 0)]
+            ways = [
+                _left_out(*(t[..., i].sum(axis=a) for t in (moved, told))) for a in (1, 0)
+            ]
             shift[i], sigma[i] = ways[0][0], max(way[1] for way in ways)
         good &= np.isfinite(sigma)
         if good.sum() < MIN_BINS:
             return None
         kept, renumbered = good[place], np.cumsum(good) - 1
-        radius, weight, place = radius[kept], weight[kept].clip(1e-30), renumbered[place[kept]]
+        radius, weight, place = (
+            radius[kept],
+            weight[kept].clip(1e-30),
+            renumbered[place[kept]],
+        )
         return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
 
-    def _sums(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _sums(
+        self, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Sum up differences and slopes of both ends of rays.
 
         Args:
@@ -360,7 +389,9 @@ class ConjugateRays:
         """
         axis = self.scan.column(values, self.row)
         apart_px = max(1.0, self.smoothing / PER_SIGMA)
-        radius = np.arange(0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing, apart_px)
+        radius = np.arange(
+            0.5, min(self.cols - 1 - axis, axis) - 3.0 * self.smoothing, apart_px
+        )
         apart, own, other = np.zeros((3, self.views, len(self.rows), len(radius)))
         little = 0.25 + 0.25 * self.smoothing
         columns = axis + radius
@@ -390,8 +421,13 @@ class ConjugateRays:
         """
         view = self.scan.view(values)
         middle = (np.array(self.scan.shape[::-1]) - 1) / 2
-        at = np.vstack([columns - middle[0], np.full(len(columns), self.rows[group] - middle[1]),
-                        np.ones(len(columns))])  # fmt: skip
+        at = np.vstack(
+            [
+                columns - middle[0],
+                np.full(len(columns), self.rows[group] - middle[1]),
+                np.ones(len(columns)),
+            ]
+        )
         mirrored = mirror_map(view) @ at
         opposite = mirrored[0] / mirrored[2] + middle[0]
         source, detector, u, v = view.reshape(4, 3)
@@ -406,9 +442,13 @@ class ConjugateRays:
 
     def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
         """Read one group of rows between views (n, k) at columns of the panel (k,)."""
-        at = np.stack([view % self.views + EDGE_VIEWS, np.broadcast_to(columns, view.shape)])
+        at = np.stack(
+            [view % self.views + EDGE_VIEWS, np.broadcast_to(columns, view.shape)]
+        )
         return np.asarray(
-            map_coordinates(self.splines[group], at, order=3, prefilter=False, mode="nearest")
+            map_coordinates(
+                self.splines[group], at, order=3, prefilter=False, mode="nearest"
+            )
         )
 
 

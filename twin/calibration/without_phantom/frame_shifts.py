@@ -89,14 +89,20 @@ class _System:
         found, self.ones = pairs.integrals(at, self.views)
         self.rest = self._difference(found)
         self.slopes = self._slopes(pairs.sums)
-        usual = np.add.reduceat(np.square(self.rest).sum(axis=1), pairs.starts) / pairs.sizes
+        usual = (
+            np.add.reduceat(np.square(self.rest).sum(axis=1), pairs.starts) / pairs.sizes
+        )
         self.weight = np.repeat(1.0 / np.maximum(usual, 1e-300), pairs.sizes)
         self.places = (2 * pairs.pairs[:, :, None] + [0, 1]).reshape(-1, 4)
         n = 2 * len(shifts)
         self.normal = np.zeros((n, n))
-        blocks = np.einsum("qak,qbk,q->qab", self.slopes, self.slopes, self.weight, optimize=True)
+        blocks = np.einsum(
+            "qak,qbk,q->qab", self.slopes, self.slopes, self.weight, optimize=True
+        )
         np.add.at(self.normal, (self.places[:, :, None], self.places[:, None]), blocks)
-        self.normal[np.diag_indices(n)] += PRIOR_WEIGHT * np.trace(self.normal) / n + 1e-300
+        self.normal[np.diag_indices(n)] += (
+            PRIOR_WEIGHT * np.trace(self.normal) / n + 1e-300
+        )
 
     def _difference(self, found: FloatArray) -> FloatArray:
         return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)
@@ -112,14 +118,20 @@ class _System:
                 moved[:, 3:6] -= sign * moved[:, first : first + 3]
                 ends.append(self.pairs.integrals(self.at, moved, sums)[0])
             change = ends[0] - ends[1]
-            parts.append([without(self.ones, s * change[:, i], self.pairs.valid)
-                          for i, s in ((0, 1.0), (1, -1.0))])  # fmt: skip
+            parts.append(
+                [
+                    without(self.ones, s * change[:, i], self.pairs.valid)
+                    for i, s in ((0, 1.0), (1, -1.0))
+                ]
+            )
         return np.stack([parts[a][side] for side in (0, 1) for a in (0, 1)], axis=1)
 
     def share(self, noise: Float32Array) -> FloatArray:
         """Compute the noise's share in the squares of the slopes for either shift, (2,)."""
         own, all_ = (
-            np.einsum("qak,qak,q->a", slopes, slopes, self.weight).reshape(2, 2).sum(axis=0)
+            np.einsum("qak,qak,q->a", slopes, slopes, self.weight)
+            .reshape(2, 2)
+            .sum(axis=0)
             for slopes in (self._slopes(noise), self.slopes)
         )
         return np.asarray(own / np.maximum(all_, 1e-300))
@@ -131,7 +143,9 @@ class _System:
     def solve(self, rest: FloatArray) -> FloatArray:
         """Solve for shifts (n, 2) that would leave such differences (q, k)."""
         right = np.zeros(len(self.normal))
-        np.add.at(right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight))
+        np.add.at(
+            right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight)
+        )
         return np.asarray(np.linalg.solve(self.normal, right).reshape(-1, 2))
 
     def power(self, rest: FloatArray) -> float:

@@ -16,7 +16,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays, Profile, Step
+from flexdt.twin.calibration.without_phantom.conjugate_rays import (
+    ConjugateRays,
+    Profile,
+    Step,
+)
 from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap, hidden_gap
 from flexdt.twin.calibration.without_phantom.tile_gap import Gap, local_gaps
 from flexdt.twin.errors import NotIdentifiableError
@@ -131,7 +135,9 @@ def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
     return gap
 
 
-def _require_one(rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequence[Gap]) -> None:
+def _require_one(
+    rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequence[Gap]
+) -> None:
     """Check that no other gap is left when one is closed.
 
     Args:
@@ -154,6 +160,7 @@ def _require_one(rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequ
         both = sorted((gap.column, columns[0]))
         raise NotIdentifiableError(
             f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
-            "gaps between tiles of the panel, of which one can be found; calibrate with a phantom, "
+            "gaps between tiles of the panel, of which one can be found; calibrate with "
+            "a phantom, "
             "and give that correction"
         )

@@ -101,7 +101,9 @@ class Evidence:
     @property
     def ratio(self) -> FloatArray:
         """Likelihood of a gap over none at each column, for any width, (c,)."""
-        return np.asarray(np.exp(np.minimum(logsumexp(self.found + _LOG_PRIOR, axis=0), 600.0)))
+        return np.asarray(
+            np.exp(np.minimum(logsumexp(self.found + _LOG_PRIOR, axis=0), 600.0))
+        )
 
     @property
     def widths(self) -> FloatArray:
@@ -142,9 +144,14 @@ def hidden_gap(
     shown = columns[hidden]
     best = int(odds.argmax())
     return HiddenGap(
-        int(shown[0]), int(shown[-1]), total / (1.0 + total), math.sqrt(mean_square),
-        _gap_at(int(columns[best]), evidence.widths[:, best]) if total > REPORTED_ODDS else None,
-    )  # fmt: skip
+        int(shown[0]),
+        int(shown[-1]),
+        total / (1.0 + total),
+        math.sqrt(mean_square),
+        _gap_at(int(columns[best]), evidence.widths[:, best])
+        if total > REPORTED_ODDS
+        else None,
+    )
 
 
 def _gap_at(column: int, share: FloatArray) -> Gap:
@@ -158,14 +165,18 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
     """Return the distance from the axis up to which both ends of rays do not determine
     steps [px].
     """
-    told = np.array([SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX for r in profile.radii.tolist()])
+    told = np.array(
+        [SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX for r in profile.radii.tolist()]
+    )
     inner = 2.0 * smoothing
     if not told.any():
         return max(inner, float(profile.radii[-1]))
     return max(inner, float(profile.radii[int(told.argmax())]))
 
 
-def _evidence_of_rays(columns: npt.NDArray[np.intp], axis: float, profile: Profile) -> FloatArray:
+def _evidence_of_rays(
+    columns: npt.NDArray[np.intp], axis: float, profile: Profile
+) -> FloatArray:
     """Compute log likelihood ratios, (w, c), from the steps of both ends of rays."""
     beside = columns - 0.5 - axis
     steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
@@ -182,7 +193,9 @@ def _evidence(images: FloatArray) -> Evidence:
         images: frames of columns about the axis, (n, rows, c + 2 SIDE - 1).
     """
     table = (images - images.mean(axis=0)).reshape(-1, images.shape[2])
-    around = np.lib.stride_tricks.sliding_window_view(np.diff(table, axis=1), 2 * SIDE - 1, axis=1)
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.diff(table, axis=1), 2 * SIDE - 1, axis=1
+    )
     power = np.square(around).sum(axis=2)
     share = min(EDGE_SHARE, MOST_EDGES / power.size)
     row, border = np.nonzero(power > np.quantile(power, 1.0 - share))
@@ -198,7 +211,9 @@ def _evidence(images: FloatArray) -> Evidence:
         for width in WIDTHS_PX.tolist():
             gain = likelihood(edges, of_distance, width, blur) - without
             of_place = np.bincount(of_frame * places + border, gain, len(images) * places)
-            judged.append(_beside_others(np.asarray(of_place.reshape(-1, places), np.float64)))
+            judged.append(
+                _beside_others(np.asarray(of_place.reshape(-1, places), np.float64))
+            )
     found = np.array([one.found for one in judged]).reshape(shape)
     gain = np.array([one.gain for one in judged]).reshape(shape)
     trust = np.array([one.trust for one in judged]).reshape(shape[:2]).min(axis=1)
@@ -235,10 +250,13 @@ def _beside_others(gains: FloatArray) -> Judged:
     of_frames = float(np.median(np.sqrt(np.square(gains).sum(axis=0))))
     spread = max(between, of_frames, 1e-6)
     excess = (whole - usual) / spread
-    # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its mean.
+    # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its
+    # mean.
     lost = max(-2.0 * usual, 0.0)
     short = np.minimum(excess - EVIDENCE_SHARES[:, None] * lost / spread, 0.0)
-    found = np.logaddexp.reduce(_log_student(short), axis=0) - math.log(len(EVIDENCE_SHARES))
+    found = np.logaddexp.reduce(_log_student(short), axis=0) - math.log(
+        len(EVIDENCE_SHARES)
+    )
     found = found - _log_student(np.maximum(excess, 0.0))
     return Judged(np.asarray(found), whole, min(lost / spread**2, 1.0))
 

@@ -1,9 +1,9 @@
 """Mirror symmetry of the mean projection: axis column, roll and yaw.
 
 The mean over a full turn is the projection of a body of revolution, which any plane through the
-axis divides into mirror images. The plane of source and axis maps rays to rays, so the mean is the
-same at a pixel and at its mirror image, at any cone angle and in the overlap of truncated scans.
-The map is a homography of the panel.
+axis divides into mirror images. The plane of source and axis maps rays to rays, so the mean is
+the same at a pixel and at its mirror image, at any cone angle and in the overlap of truncated
+scans. The map is a homography of the panel.
 
 The estimate is the root of Z' W r: r is the mean minus its mirror image, Z the slopes of
 a smoother copy, freed of what a flat field that is wrong by a polynomial of third degree
@@ -70,7 +70,8 @@ def mirror_map(view: FloatArray) -> FloatArray:
     mirror image.
 
     Args:
-        view: source, panel centre, u, v in a frame with the axis along z through its origin, (12,).
+        view: source, panel centre, u, v in a frame with the axis along z through its origin,
+            (12,).
     """
     source, detector, u, v = view.reshape(4, 3)
     rays = np.column_stack([u, v, detector - source])
@@ -93,7 +94,9 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
     cols = mean.shape[1]
     bands = np.stack([b.mean(axis=0) for b in np.array_split(mean, min(12, len(mean)))])
     bands = gaussian_filter(bands, (0, cols / LEVELS[0] / 2))
-    twice = np.arange(round(2 * (nominal - REACH * cols)), round(2 * (nominal + REACH * cols)) + 1)
+    twice = np.arange(
+        round(2 * (nominal - REACH * cols)), round(2 * (nominal + REACH * cols)) + 1
+    )
     cost = np.full(len(twice), np.inf)
     for i, k in enumerate(twice):
         a = np.arange(max(0, k - cols + 1), min(cols, k + 1))
@@ -111,7 +114,10 @@ def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
     minimum at an end.
     """
     best, inner = int(cost.argmin()), cost[1:-1]
-    dips = np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner)) + 1
+    dips = (
+        np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner))
+        + 1
+    )
     if best not in dips:
         return best, 0.0
     others = cost[dips[np.abs(dips - best) > apart]]
@@ -119,9 +125,14 @@ def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
 
 
 def find_symmetry(
-    turn: Turn, view: View, start: FloatArray, scales: FloatArray, priors: FloatArray,
-    border: int | None = None, held_px: float | None = None,
-) -> Symmetry:  # fmt: skip
+    turn: Turn,
+    view: View,
+    start: FloatArray,
+    scales: FloatArray,
+    priors: FloatArray,
+    border: int | None = None,
+    held_px: float | None = None,
+) -> Symmetry:
     """Estimate the plane of symmetry, coarse to fine.
 
     Args:
@@ -130,7 +141,8 @@ def find_symmetry(
         start: of the parameters, (k,).
         scales: change of each parameter that moves the image's ends by about a pixel, (k,).
         priors: sigma of each parameter about its start, inf for none, (k,).
-        border: first column beyond a gap between two tiles, whose width is the last parameter [px].
+        border: first column beyond a gap between two tiles, whose width is the last parameter
+            [px].
         held_px: that width, where it is no parameter [px].
 
     Returns:
@@ -153,14 +165,23 @@ class _Level:
     """One smoothing of the mean, sampled twice a sigma."""
 
     def __init__(
-        self, turn: Turn, view: View, scales: FloatArray, mean: FloatArray, priors: FloatArray,
-        sigma: float, border: int | None, held_px: float | None,
-    ) -> None:  # fmt: skip
+        self,
+        turn: Turn,
+        view: View,
+        scales: FloatArray,
+        mean: FloatArray,
+        priors: FloatArray,
+        sigma: float,
+        border: int | None,
+        held_px: float | None,
+    ) -> None:
         self.view, self.scales, self.sigma, self.border = view, scales, sigma, border
         self.held_px = held_px
         self.start, self.priors = mean, priors
         rows, cols = self.shape = turn.mean.shape
-        images = [gaussian_filter(i, sigma, mode="nearest") for i in (turn.mean, *turn.doubts)]
+        images = [
+            gaussian_filter(i, sigma, mode="nearest") for i in (turn.mean, *turn.doubts)
+        ]
         self.soft = [spline_filter(i) for i in images]
         self.softer = spline_filter(gaussian_filter(images[0], sigma, mode="nearest"))
         self.relative = turn.noise
@@ -187,7 +208,9 @@ class _Level:
             The plane; not converged if the pixels with a mirror image are too few.
         """
         values, k = start.copy(), len(start)
-        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
+        found = Symmetry(
+            values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False
+        )
         for _ in range(ROUNDS):
             pairs = self._pairs(values)
             if pairs is None:
@@ -196,7 +219,9 @@ class _Level:
             for i in range(k):
                 e = np.zeros(k)
                 e[i] = self.scales[i] * (0.5 + self.sigma / 4)
-                slope[:, i] = (pairs.score(values + e) - pairs.score(values - e)) / (2 * e[i])
+                slope[:, i] = (pairs.score(values + e) - pairs.score(values - e)) / (
+                    2 * e[i]
+                )
             if not np.linalg.cond(slope * np.outer(self.scales, self.scales)) < 1e12:
                 return found
             inverse = np.asarray(np.linalg.inv(slope), dtype=np.float64)
@@ -212,7 +237,9 @@ class _Level:
             sigmas = np.sqrt(np.abs(np.diag(covariance)))
             near = 0.02 if self.border is None else 0.1
             done = bool((np.abs(step) <= near * sigmas + 1e-5 * self.scales).all())
-            found = Symmetry(values, covariance, np.sqrt(np.diag(raw)), pairs.asymmetry(), done)
+            found = Symmetry(
+                values, covariance, np.sqrt(np.diag(raw)), pairs.asymmetry(), done
+            )
             if done or not np.isfinite(values).all():
                 break
         return found
@@ -233,7 +260,11 @@ class _Level:
             else:
                 values, gap = values[:-1], float(values[-1])
         c, r, w = mirror_map(self.view(values)) @ np.vstack(
-            [at[0] + gap * (at[0] > begins) - middle[0], at[1] - middle[1], np.ones(at.shape[1])]
+            [
+                at[0] + gap * (at[0] > begins) - middle[0],
+                at[1] - middle[1],
+                np.ones(at.shape[1]),
+            ]
         )
         image = np.stack([c / w, r / w]) + middle
         far = image[0] - begins
@@ -262,7 +293,9 @@ class _MirrorPairs:
     def __init__(self, level: _Level, here: FloatArray, at: FloatArray) -> None:
         self.level, self.here, self.at = level, here, at
         image = self.image = level._mirrored(here, at)
-        variance = sum(map_coordinates(level.relative, p[::-1], order=1) for p in (at, image))
+        variance = sum(
+            map_coordinates(level.relative, p[::-1], order=1) for p in (at, image)
+        )
         self.own = [read_spline(soft, at) for soft in level.soft]
         self.white = [map_coordinates(level.white, p[::-1], order=1) for p in (at, image)]
         self.steps = [map_coordinates(i, at[::-1], order=1) for i in level.steps]
@@ -299,7 +332,9 @@ class _MirrorPairs:
         power = self.w * self.white[1] / (2.0 * math.pi * both)
         noise = []
         for ends, width in self.ends:
-            low, high = (np.exp(np.square(image - e).sum(axis=0) / (-2 * both)) for e in ends)
+            low, high = (
+                np.exp(np.square(image - e).sum(axis=0) / (-2 * both)) for e in ends
+            )
             noise.append(float(power @ (low - high)) / width)
         return np.asarray((self.slopes.T * self.w) @ rest - np.array(noise))
 
@@ -336,14 +371,16 @@ class _MirrorPairs:
         wider = np.full(len(noise), max(1.0, rest / white))
         weight = self.w * np.square(
             self.slopes / np.linalg.norm(self.slopes * np.sqrt(self.w)[:, None], axis=0)
-        ).sum(axis=1)  # fmt: skip
+        ).sum(axis=1)
         covariance = inverse @ noise @ inverse.T
         stepped = np.zeros(len(noise))
         for place, steps in zip((self.at[1], self.at[0]), self.steps, strict=True):
             order = np.argsort(place, kind="stable")
             share = np.cumsum(weight[order]) / weight.sum()
             block = np.minimum(share * BLOCKS, BLOCKS - 1).astype(np.intp)
-            sums = np.stack([np.bincount(block, p[order], BLOCKS) for p in parts.T], axis=1)
+            sums = np.stack(
+                [np.bincount(block, p[order], BLOCKS) for p in parts.T], axis=1
+            )
             sums -= sums.mean(axis=0)
             free = BLOCKS - 1 - len(noise)
             scatter = inverse @ (sums.T @ sums) @ inverse.T * (BLOCKS / free)
@@ -355,7 +392,9 @@ class _MirrorPairs:
         covariance = covariance * np.sqrt(np.outer(wider, wider)) + np.diag(stepped)
         for i in range(1, len(self.own)):
             shift = inverse @ (z.T @ self._residual(self.here, i))
-            shift /= 2.0 if i == 1 else 1.0  # lack of views: half of what half of them lack
+            shift /= (
+                2.0 if i == 1 else 1.0
+            )  # lack of views: half of what half of them lack
             covariance = covariance + np.outer(shift, shift)
         return np.asarray(covariance)
 

@@ -48,8 +48,8 @@ for rows outside the source's plane to count [px]."""
 EDGE_ROWS: Final = 2
 """Rows around each view's that a cubic spline needs."""
 PATCH, SECTORS = 6.0, 24
-"""Sigmas of the smoothing that a patch of like differences is wide, in columns of both ends, and
-sectors of the views that are as many patches."""
+"""Sigmas of the smoothing that a patch of like differences is wide, in columns of both ends,
+and sectors of the views that are as many patches."""
 MIN_SIGNAL_RATIO: Final = 0.5
 """Least ratio to noise of the images behind the slopes."""
 
@@ -72,12 +72,22 @@ class OppositeRays:
     """
 
     def __init__(
-        self, frames: Float32Array, top: int, shape: tuple[int, int],
-        views: Callable[[FloatArray], FloatArray], start: FloatArray, scales: FloatArray,
-        priors: FloatArray, random: np.random.Generator,
-    ) -> None:  # fmt: skip
+        self,
+        frames: Float32Array,
+        top: int,
+        shape: tuple[int, int],
+        views: Callable[[FloatArray], FloatArray],
+        start: FloatArray,
+        scales: FloatArray,
+        priors: FloatArray,
+        random: np.random.Generator,
+    ) -> None:
         self.frames, self.top, self.shape, self.views = frames, top, shape, views
-        self.start, self.scales, self.known = start, scales, np.diag(1.0 / np.square(priors))
+        self.start, self.scales, self.known = (
+            start,
+            scales,
+            np.diag(1.0 / np.square(priors)),
+        )
         self.noise = noise_like(frames.transpose(0, 2, 1), random).transpose(0, 2, 1)
         rows = views(start)
         depth = np.linalg.norm(rows[0, 3:6] - rows[0, :3])
@@ -92,7 +102,8 @@ class OppositeRays:
             around = np.sort(azimuth % (2 * np.pi))
             gap = float(np.diff(around, append=around[0] + 2 * np.pi).max())
             raise NotIdentifiableError(
-                f"{count} pairs of views see a line from both ends (at least {FEWEST_PAIRS}): the "
+                f"{count} pairs of views see a line from both ends (at least "
+                f"{FEWEST_PAIRS}): the "
                 f"views span {360 - math.degrees(gap):.4g} deg; half a turn and the fan, "
                 f"{180 + math.degrees(2 * fan / (1 + 2 * REACH)):.4g} deg in small steps, or a "
                 "full turn tell it"
@@ -140,7 +151,9 @@ class OppositeRays:
             ray = other[:, :3] - v[:, :3]
             ray *= ((panel * normal).sum(axis=1) / (ray * normal).sum(axis=1))[:, None]
             for i, axis in enumerate((v[:, 6:9], v[:, 9:12])):
-                out[side, i] = ((ray - panel) * axis).sum(axis=1) / np.square(axis).sum(axis=1)
+                out[side, i] = ((ray - panel) * axis).sum(axis=1) / np.square(axis).sum(
+                    axis=1
+                )
             out[side] += middle[:, None]
         inside = (out[:, 0] >= 0) & (out[:, 0] <= self.shape[1] - 1)
         return out, np.asarray(inside.all(axis=0))
@@ -167,7 +180,11 @@ class _Level:
         """Read the values of both views of pairs, (2, q, lifts)."""
         rows = self.rays.frames.shape[1]
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
-        row = np.clip(row, 0, rows - 1) + EDGE_ROWS + pairs.T[:, :, None] * (rows + 2 * EDGE_ROWS)
+        row = (
+            np.clip(row, 0, rows - 1)
+            + EDGE_ROWS
+            + pairs.T[:, :, None] * (rows + 2 * EDGE_ROWS)
+        )
         column = np.broadcast_to(places[:, 0, :, None], row.shape)
         return read_spline(image, np.stack([column, row]))
 
@@ -191,7 +208,9 @@ class _Level:
             The estimate; not converged with few pairs.
         """
         rays, values, k = self.rays, start.copy(), len(start)
-        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
+        found = Symmetry(
+            values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False
+        )
         for _ in range(ROUNDS):
             inside = rays._places(values, rays.pairs)[1]
             if inside.sum() < FEWEST_PAIRS:
@@ -257,14 +276,20 @@ class _Level:
             for which, image in enumerate((self.images, self.alone)):
                 low, high = (difference(image, end) for end in ends)
                 slopes[which, i] = (low - high) / (2.0 * e[i])
-        self.structure = max(float((w * np.square(both - np.average(both))).sum()) / 2, 1e-30)
+        self.structure = max(
+            float((w * np.square(both - np.average(both))).sum()) / 2, 1e-30
+        )
         rest, noise = freed(both[0] - both[1]), freed(difference(self.alone, places))
         return rest, freed(slopes[0]), noise, freed(slopes[1]), w
 
     def _mismatch(
-        self, slope: FloatArray, excess: FloatArray, w: FloatArray,
-        pairs: npt.NDArray[np.intp], values: FloatArray,
-    ) -> float:  # fmt: skip
+        self,
+        slope: FloatArray,
+        excess: FloatArray,
+        w: FloatArray,
+        pairs: npt.NDArray[np.intp],
+        values: FloatArray,
+    ) -> float:
         """Bound the sum of slopes times differences that are no noise: in phase within a
         patch (Cauchy-Schwarz), at random from patch to patch.
 
@@ -286,7 +311,11 @@ class _Level:
         return math.sqrt(float((own * power.clip(0.0)).sum()))
 
     def _scatter(
-        self, slopes: FloatArray, rest: FloatArray, pairs: npt.NDArray[np.intp], values: FloatArray
+        self,
+        slopes: FloatArray,
+        rest: FloatArray,
+        pairs: npt.NDArray[np.intp],
+        values: FloatArray,
     ) -> FloatArray:
         """Compute the covariance of sums over all rays of slopes times differences.
 
@@ -311,7 +340,9 @@ class _Level:
         power = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE
         power /= max(1.0, 2.0 * math.sqrt(math.pi) * self.sigma * (len(change) > 1))
         ends, size = columns.round().astype(np.intp), rays.shape[1]
-        of_columns = [np.bincount(ends[0], part, size) - np.bincount(ends[1], part, size)
-                      for part in slopes.reshape(of_pairs).sum(axis=2)]  # fmt: skip
+        of_columns = [
+            np.bincount(ends[0], part, size) - np.bincount(ends[1], part, size)
+            for part in slopes.reshape(of_pairs).sum(axis=2)
+        ]
         rings = gaussian_filter(np.stack(of_columns), (0, self.sigma))
         return np.asarray(covariance * np.outer(wider, wider) + power * (rings @ rings.T))

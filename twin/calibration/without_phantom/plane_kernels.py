@@ -1,10 +1,11 @@
 """Integrals of an object over planes through two sources, each from the two views alike.
 
-Let b be the line through the sources of two views. In a plane through b the rays of either source
-cover the plane, and the integral of the views' line integrals g over sin(t) dt, where t is the
-angle between ray and b, is that of the object divided by the distance from b: the same for both,
-as long as b stays clear of the object. So is the integral over a bin of neighbouring planes, which
-nothing needs to be smoothed for. A plane is known by its height over the source at the axis.
+Let b be the line through the sources of two views. In a plane through b the rays of either
+source cover the plane, and the integral of the views' line integrals g over sin(t) dt, where t
+is the angle between ray and b, is that of the object divided by the distance from b: the same
+for both, as long as b stays clear of the object. So is the integral over a bin of neighbouring
+planes, which nothing needs to be smoothed for. A plane is known by its height over the source
+at the axis.
 """
 
 from __future__ import annotations
@@ -21,13 +22,20 @@ from flexdt.twin.projection.kernels.compiling import parallel
 
 @parallel(fastmath=True)
 def sum_planes(
-    sums: Float32Array, views: FloatArray, pairs: npt.NDArray[np.intp], inwards: FloatArray,
-    edges: FloatArray, columns: npt.NDArray[np.intp], integrals: FloatArray, ones: FloatArray,
-) -> None:  # fmt: skip
+    sums: Float32Array,
+    views: FloatArray,
+    pairs: npt.NDArray[np.intp],
+    inwards: FloatArray,
+    edges: FloatArray,
+    columns: npt.NDArray[np.intp],
+    integrals: FloatArray,
+    ones: FloatArray,
+) -> None:
     """Integrate both views of each pair over bins of planes.
 
     The rows that a bin covers follow from its two planes column by column; sums of g down each
-    column then give its share without a walk along them, and pixels are cut where planes cut them.
+    column then give its share without a walk along them, and pixels are cut where planes cut
+    them.
 
     Args:
         sums: (n, cols, rows + 1), sums of g from the first row down.
@@ -35,7 +43,8 @@ def sum_planes(
         pairs: (q, 2) indices of views.
         inwards: (q, 2) horizontal unit vector from the line through the sources to the axis.
         edges: (q, k + 1) dz over distance along `inwards` of the planes between the bins.
-        columns: (n, 2) first column of a view that the object can reach, and the one after them.
+        columns: (n, 2) first column of a view that the object can reach, and the one after
+            them.
         integrals: (q, 2, k) integrals of g, written.
         ones: the same of 1 instead of g, written.
     """
@@ -75,7 +84,9 @@ def sum_planes(
                     j = (cut[k] + cut[k + 1]) / 2.0 - rows / 2.0
                     px, py, pz = x + j * v[9], y + j * v[10], z + j * v[11]
                     inward = m + j * mv
-                    weight = volume / (math.sqrt(px * px + py * py + pz * pz) * inward * inward)
+                    weight = volume / (
+                        math.sqrt(px * px + py * py + pz * pz) * inward * inward
+                    )
                     height = cut[k + 1] - cut[k]
                     within = math.copysign(1.0, height) * (above[k + 1] - above[k])
                     integrals[q, side, k] += weight * within

@@ -65,7 +65,12 @@ class PlanePairs:
     """
 
     def __init__(
-        self, frames: Float32Array, mean: FloatArray, factor: int, views: Views, start: FloatArray
+        self,
+        frames: Float32Array,
+        mean: FloatArray,
+        factor: int,
+        views: Views,
+        start: FloatArray,
     ) -> None:
         self.shape, self.factor, self.views, self.start = mean.shape, factor, views, start
         n, rows, cols = frames.shape
@@ -104,7 +109,8 @@ class PlanePairs:
         whole = float((self.valid.sum(axis=1) >= FEWEST_BINS).mean())
         if whole < FEWEST_PAIRS:
             raise NotIdentifiableError(
-                f"the object reaches beyond the panel: {100 * whole:.0f} % of pairs of views have "
+                f"the object reaches beyond the panel: {100 * whole:.0f} % of pairs of "
+                "views have "
                 f"planes through both sources that they see whole (at least "
                 f"{100 * FEWEST_PAIRS:.0f} %)"
             )
@@ -118,7 +124,10 @@ class PlanePairs:
         return np.ascontiguousarray(self.views(at).binned(self.factor, self.shape).rows)
 
     def integrals(
-        self, at: FloatArray, rows: FloatArray | None = None, sums: Float32Array | None = None
+        self,
+        at: FloatArray,
+        rows: FloatArray | None = None,
+        sums: Float32Array | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Compute integrals of both views of each pair, (q, 2, k), and those of 1, (q, k).
 
@@ -131,7 +140,9 @@ class PlanePairs:
         found, ones = np.zeros((2, len(self.pairs), 2, edges.shape[1] - 1))
         given = self.rows(at) if rows is None else np.ascontiguousarray(rows)
         images = self.sums if sums is None else sums
-        sum_planes(images, given, self.pairs, self.inwards, edges, self.columns, found, ones)
+        sum_planes(
+            images, given, self.pairs, self.inwards, edges, self.columns, found, ones
+        )
         return found, ones.mean(axis=1)
 
     def costs(self, at: FloatArray, sums: Float32Array | None = None) -> FloatArray:
@@ -171,7 +182,9 @@ class PlanePairs:
         pairs = costs[:, : len(self.pairs)]
         usual = np.add.reduceat(pairs, self.starts, axis=1) / self.sizes
         scale = np.where(usual > 0, 1.0 / np.maximum(usual, 1e-300), 0.0)
-        return np.hstack([np.repeat(scale, self.sizes, axis=1), np.repeat(scale, BLOCKS, axis=1)])
+        return np.hstack(
+            [np.repeat(scale, self.sizes, axis=1), np.repeat(scale, BLOCKS, axis=1)]
+        )
 
     def total(self, parts: FloatArray) -> FloatArray:
         """Sum parts, laid out as `costs`, over the pairs."""
@@ -188,7 +201,9 @@ class PlanePairs:
             parts: (..., q + distances * BLOCKS).
             blocks: whether sums over heights and over distances count too.
         """
-        worst = np.square(spread(parts[..., : len(self.pairs)], self.pairs, len(self.sums)))
+        worst = np.square(
+            spread(parts[..., : len(self.pairs)], self.pairs, len(self.sums))
+        )
         if blocks:
             for axis in (-2, -1):
                 squares = np.square(self.blocks(parts).sum(axis=axis))
@@ -201,7 +216,9 @@ class PlanePairs:
     def noise(self, random: np.random.Generator) -> Float32Array:
         """Draw images of noise as large as that of the frames, laid out as `sums`."""
         out = np.zeros_like(self.sums)
-        np.cumsum(noise_like(np.diff(self.sums, axis=2), random), axis=2, out=out[:, :, 1:])
+        np.cumsum(
+            noise_like(np.diff(self.sums, axis=2), random), axis=2, out=out[:, :, 1:]
+        )
         return out
 
     def _valid(
@@ -254,8 +271,8 @@ def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Arra
 def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray:
     """Estimate standard deviations of sums over pairs (q, 2) of n frames of parts (..., q).
 
-    Pairs that share a frame, or one of a sector, are not independent: of squares of the sums over
-    all that do, those that count pairs twice are taken away. The largest of three counts.
+    Pairs that share a frame, or one of a sector, are not independent: of squares of the sums
+    over all that do, those that count pairs twice are taken away. The largest of three counts.
     """
     own = parts - parts.mean(axis=-1, keepdims=True)
     worst = np.square(own).sum(axis=-1)
@@ -288,10 +305,14 @@ def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]
     the last, (n, 2).
     """
     i = np.arange(cols) - (cols - 1) / 2
-    x, y = (here[:, 3 + a, None] - here[:, a, None] + i * here[:, 6 + a, None] for a in (0, 1))
+    x, y = (
+        here[:, 3 + a, None] - here[:, a, None] + i * here[:, 6 + a, None] for a in (0, 1)
+    )
     passing = np.abs(here[:, 0, None] * y - here[:, 1, None] * x) / np.hypot(x, y)
     reached = passing <= radius
-    return np.stack([reached.argmax(axis=1), cols - reached[:, ::-1].argmax(axis=1)], axis=1)
+    return np.stack(
+        [reached.argmax(axis=1), cols - reached[:, ::-1].argmax(axis=1)], axis=1
+    )
 
 
 def _support(

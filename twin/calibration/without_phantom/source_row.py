@@ -1,4 +1,5 @@
-"""The row in which the source turns: the panel's height at which planes through two sources agree.
+"""The row in which the source turns: the panel's height at which planes through two sources
+agree.
 
 A panel that is higher than stated gives one view of a pair planes that lean to one side
 and the other view planes that lean to the other. The panel's height is that at which all
@@ -36,8 +37,8 @@ NO_MINIMUM: Final = "the views agree about as well with the source's plane at an
 
 
 class _Bowl(NamedTuple):
-    """Sums of squares about a height, one for each of `LEVELS`: where each would be least, sigmas
-    of that, and second derivatives."""
+    """Sums of squares about a height, one for each of `LEVELS`: where each would be least,
+    sigmas of that, and second derivatives."""
 
     aims: FloatArray
     sigmas: FloatArray
@@ -61,7 +62,9 @@ def find_height(
             small.
     """
     up = np.eye(len(fine.start))[0]
-    bowl, at, h = _settle(fine, coarse, np.linspace(-reach, reach, GRID_HEIGHTS), up, random)
+    bowl, at, h = _settle(
+        fine, coarse, np.linspace(-reach, reach, GRID_HEIGHTS), up, random
+    )
     alone = fine.noise(random)
     places = at + h * np.arange(-NOISE_STEPS, NOISE_STEPS + 1)
     costs = [fine.costs(fine.start + y * up, alone) * bowl.scale for y in places]
@@ -88,9 +91,12 @@ def find_height(
 
 
 def _settle(
-    fine: PlanePairs, coarse: PlanePairs, grid: FloatArray, up: FloatArray,
+    fine: PlanePairs,
+    coarse: PlanePairs,
+    grid: FloatArray,
+    up: FloatArray,
     random: np.random.Generator,
-) -> tuple[_Bowl, float, float]:  # fmt: skip
+) -> tuple[_Bowl, float, float]:
     """Find the minimum by steps.
 
     Args:
@@ -138,9 +144,13 @@ def _first(
     costs = np.stack([pairs.costs(pairs.start + y * up) for y in grid])
     scale = pairs.scales(costs.min(axis=0))
     noise = pairs.noise(random)
-    alone = np.stack([pairs.total(pairs.costs(pairs.start + y * up, noise) * scale) for y in grid])
+    alone = np.stack(
+        [pairs.total(pairs.costs(pairs.start + y * up, noise) * scale) for y in grid]
+    )
     found: list[tuple[float, float]] = []
-    for of_level, wiggle in zip((costs * scale).swapaxes(0, 1), alone.std(axis=0), strict=True):
+    for of_level, wiggle in zip(
+        (costs * scale).swapaxes(0, 1), alone.std(axis=0), strict=True
+    ):
         total = pairs.total(of_level)
         best = int(total.argmin())
         # Planes that lie in a flat face of the object agree in a spike, not in a bowl.
@@ -172,11 +182,16 @@ def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
     # Of several levels the one that happens to bend most would be chosen, its sigma too small.
     wider = np.hypot(1.0, MIN_BEND_SIGMAS / np.maximum(sure, MIN_BEND_SIGMAS))
     sigmas = np.where(
-        sure > MIN_BEND_SIGMAS, wider * left / np.where(sure > MIN_BEND_SIGMAS, bend, 1.0), np.inf
+        sure > MIN_BEND_SIGMAS,
+        wider * left / np.where(sure > MIN_BEND_SIGMAS, bend, 1.0),
+        np.inf,
     )
-    # No two neighbouring blocks of heights may have the answer to themselves: a flat face would.
+    # No two neighbouring blocks of heights may have the answer to themselves: a flat face
+    # would.
     parts = pairs.blocks(np.stack([slopes, bends])).sum(axis=-2)
-    rest_slope, rest_bend = np.stack([slope, bend])[..., None] - parts[..., 1:] - parts[..., :-1]
+    rest_slope, rest_bend = (
+        np.stack([slope, bend])[..., None] - parts[..., 1:] - parts[..., :-1]
+    )
     alone = ~(rest_bend > np.maximum(MIN_BEND_SHARE * bend[:, None], 0.0))
     without = rest_slope / np.where(alone, 1.0, rest_bend) - steps[:, None]
     doubt = np.where(alone, np.inf, np.abs(without) / 2).max(axis=1)

@@ -20,7 +20,11 @@ from flexdt.twin.calibration.without_phantom.circular_scan import (
     about_axis,
 )
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
-from flexdt.twin.calibration.without_phantom.gap_evidence import SIGMAS, GapFound, find_gap
+from flexdt.twin.calibration.without_phantom.gap_evidence import (
+    SIGMAS,
+    GapFound,
+    find_gap,
+)
 from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
@@ -40,7 +44,8 @@ BAND: Final = 12
 MOST_VIEWS: Final = 1440
 """Of more views every second, third and so on is used for opposite rays."""
 LEAST_RATIO: Final = 1.5
-"""How much less symmetric the mean must be about any other column (ratio of squares; assumed)."""
+"""How much less symmetric the mean must be about any other column (ratio of squares;
+assumed)."""
 MOST_ASYMMETRY: Final = 0.05
 """Largest part of the mean's structure that is neither symmetric nor noise (assumed)."""
 MOST_COLUMN: Final = 2.0
@@ -111,8 +116,10 @@ class OppositeColumn(NamedTuple):
         if not abs(self.apart_px) > max(APART_SIGMAS * sigma, LEAST_APART_PX):
             return None
         return (
-            f"opposite rays put the axis {self.apart_px:+.3f} +- {self.sigma_px:.2g} px beside the "
-            f"column of the mean, {abs(self.apart_px) / sigma:.1f} sigma apart: something differs "
+            f"opposite rays put the axis {self.apart_px:+.3f} +- {self.sigma_px:.2g} px "
+            "beside the "
+            f"column of the mean, {abs(self.apart_px) / sigma:.1f} sigma apart: "
+            "something differs "
             "between views; the column's sigma contains it"
         )
 
@@ -207,7 +214,9 @@ def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
     return FirstColumn(turn, None, values, scales, priors, column, ratio, "")
 
 
-def _first_in_rays(scan: CircularScan, no_turn: str, random: np.random.Generator) -> FirstColumn:
+def _first_in_rays(
+    scan: CircularScan, no_turn: str, random: np.random.Generator
+) -> FirstColumn:
     """Search for the axis in opposite rays; `no_turn` begins the messages of errors."""
     scales, given = scan.scales, scan.priors
     scales[1] = 2 / scan.shape[1]
@@ -222,7 +231,9 @@ def _first_in_rays(scan: CircularScan, no_turn: str, random: np.random.Generator
     )
     rays = _opposite_rays(scan, scan.start, scales, priors, random)
     values, ratio = rays.first()
-    return FirstColumn(None, rays, values, scales, priors, scan.column(values), ratio, no_turn)
+    return FirstColumn(
+        None, rays, values, scales, priors, scan.column(values), ratio, no_turn
+    )
 
 
 def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
@@ -239,7 +250,8 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
     refuse_if(
         first.ratio == 0.0,
         f"{first.preface}the images are symmetric about no column within {reach:.0f} px of the "
-        f"nominal one ({scan.column(scan.start):.1f}): the axis is elsewhere, or too much of the "
+        f"nominal one ({scan.column(scan.start):.1f}): the axis is elsewhere, or too "
+        "much of the "
         "object is out of view",
     )
     refuse_if(
@@ -287,10 +299,14 @@ def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
         assert first.rays is not None
         return first.rays.find(first.values)
     return find_symmetry(
-        first.turn, scan.view, first.values, first.scales, first.priors,
+        first.turn,
+        scan.view,
+        first.values,
+        first.scales,
+        first.priors,
         border=gap.column if gap else None,
         held_px=gap.width if gap and gap.beside_axis else None,
-    )  # fmt: skip
+    )
 
 
 def _require_symmetric(found: Symmetry, preface: str) -> None:
@@ -301,13 +317,15 @@ def _require_symmetric(found: Symmetry, preface: str) -> None:
     """
     refuse_if(
         not found.converged,
-        f"{preface}no plane of symmetry is found: too little structure for the noise, or too few "
+        f"{preface}no plane of symmetry is found: too little structure for the noise, or "
+        "too few "
         "columns on both sides of the axis",
     )
     refuse_if(
         found.asymmetry > MOST_ASYMMETRY,
         f"{preface}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, is not "
-        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, "
+        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with "
+        "the stage, "
         "or the angles or the object change during the scan",
     )
 
@@ -354,9 +372,19 @@ def _plane(
     slopes = scan.slopes(values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
     return SymmetryPlane(
-        scan, turn, values, covariance, found.images[1:3], first.priors[1:3], told, sigma, gap,
-        panel, opposite, hidden,
-    )  # fmt: skip
+        scan,
+        turn,
+        values,
+        covariance,
+        found.images[1:3],
+        first.priors[1:3],
+        told,
+        sigma,
+        gap,
+        panel,
+        opposite,
+        hidden,
+    )
 
 
 def _opposite_column(
@@ -445,20 +473,29 @@ def _opposite_rays(
         NotIdentifiableError: there are hardly any.
     """
     rows, cols = scan.shape
-    angle = scan.offsets(start).angle_scale * scan.poses.angle[list(scan.present)] % (2 * np.pi)
+    angle = (
+        scan.offsets(start).angle_scale
+        * scan.poses.angle[list(scan.present)]
+        % (2 * np.pi)
+    )
     order = np.array(scan.present)[np.argsort(angle, kind="stable")][
         :: -(-len(scan.present) // MOST_VIEWS)
     ]
     some = scan.poses[order]
     first = about_axis(some[:1], scan.offsets(start))
-    row = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], scan.shape)[0, 0, 1]
+    row = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], scan.shape)[
+        0, 0, 1
+    ]
     lean = 2 * float(some.sdd[0]) / (cols * float(np.linalg.norm(some.u[0])))
     refuse_if(
         not -lean < row < rows - 1 + lean,
-        f"the source turns in the plane of row {row:.0f}: rays to rows 0 to {rows - 1} lean too "
+        f"the source turns in the plane of row {row:.0f}: rays to rows 0 to {rows - 1} "
+        "lean too "
         f"much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
     )
-    top, end = np.clip(np.round(row) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
+    top, end = np.clip(
+        np.round(row) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)
+    ).astype(int)
     stack = np.stack([scan.image(i)[top:end] for i in order.tolist()])
     if end - top <= 2 * BAND:
         stack = stack.mean(axis=1, keepdims=True)

@@ -43,8 +43,9 @@ LEAST_VARIANCE: Final = 0.02
 """Least variance of differences, as a share of the largest: possible error of the normal
 model."""
 EVIDENCE, STANDS_OUT = 24.0, 5.0
-"""Gain in log likelihood from which on there is a gap, and times the gain at any other border. Of
-93 drawn scans without a gap one had both, of 69 with one of 0.5 to 2 px 65 (`align_faults.py`)."""
+"""Gain in log likelihood from which on there is a gap, and times the gain at any other border.
+Of 93 drawn scans without a gap one had both, of 69 with one of 0.5 to 2 px 65
+(`align_faults.py`)."""
 
 
 class Gap(NamedTuple):
@@ -75,7 +76,9 @@ class Gap(NamedTuple):
         at = np.array([self.column - 0.5, (shape[0] - 1) / 2])
         border = Border(0, float((at + one.shift(at))[0]))
         model = replace(one.model, borders=(*one.model.borders, border))
-        return replace(one, model=model, coefficients=(*one.coefficients, -self.width, 0.0))
+        return replace(
+            one, model=model, coefficients=(*one.coefficients, -self.width, 0.0)
+        )
 
 
 def averaged_rows(image: Float32Array) -> Float32Array:
@@ -115,14 +118,18 @@ def local_gaps(
     mirror = np.rint(2 * axis - place - 2 * SIDE + 1).astype(np.intp)
     known = (mirror >= 0) & (mirror < len(place)) & (np.abs(mirror - place) > SIDE + 2)
     gain = gains.max(axis=0)
-    gain = gain - np.where(known, 2.0 * maximum_filter1d(gain, 5)[np.where(known, mirror, 0)], 0.0)
+    gain = gain - np.where(
+        known, 2.0 * maximum_filter1d(gain, 5)[np.where(known, mirror, 0)], 0.0
+    )
     best = int(gain.argmax())
     others = np.where(np.abs(place - best) > SIDE, gain, 0.0)
     second = int(others.argmax())
     standing = [best]
     if gain[best] < max(EVIDENCE, STANDS_OUT * others[second]):
         third = float(others[np.abs(place - second) > SIDE].max())
-        standing = [best, second] if others[second] >= max(EVIDENCE, STANDS_OUT * third) else []
+        standing = (
+            [best, second] if others[second] >= max(EVIDENCE, STANDS_OUT * third) else []
+        )
     found = []
     for one in standing:
         width = float(WIDTHS[gains[:, one].argmax()])
@@ -138,7 +145,9 @@ def local_sigma(width: FloatArray | float) -> FloatArray:
     return np.asarray(0.2 + 0.3 * np.asarray(width))
 
 
-def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]) -> FloatArray:
+def _gains(
+    edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]
+) -> FloatArray:
     """Compute gains of gaps of all widths at each border over none, less the scatter of
     frames, (w, b).
 
@@ -157,17 +166,21 @@ def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int
 
 
 def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
-    """Return the mean square of the difference of two columns by their distance, 1 and more [px].
+    """Return the mean square of the difference of two columns by their distance, 1 and more
+    [px].
 
     Args:
         edges: differences of neighbouring columns, (k, 2 SIDE - 1).
     """
     place = np.cumsum(np.pad(edges, ((0, 0), (1, 0))), axis=1)
     far = np.arange(1, 2 * SIDE)
-    apart = np.array([np.square(place[:, h:] - place[:, :-h]).mean() for h in far.tolist()])
+    apart = np.array(
+        [np.square(place[:, h:] - place[:, :-h]).mean() for h in far.tolist()]
+    )
     more = np.arange(1, math.ceil(WIDTHS[-1]) + 1)
     return PchipInterpolator(
-        np.append(far, far[-1] + more), np.append(apart, apart[-1] + (apart[-1] - apart[-2]) * more)
+        np.append(far, far[-1] + more),
+        np.append(apart, apart[-1] + (apart[-1] - apart[-2]) * more),
     )
 
 

@@ -26,7 +26,8 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 Image = Callable[[int], Float32Array]
 
 THUMB_COLUMNS: Final = 64
-"""Columns of the small copies in which frames are compared, at least where there are as many."""
+"""Columns of the small copies in which frames are compared, at least where there are as
+many."""
 DARKEST: Final = 8.0
 """Largest line integral in the model of noise; above it the noise is constant."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
@@ -48,8 +49,8 @@ MAX_RETURN_SHARE: Final = 0.3
 WIDEST_GAP: Final = 4.5
 """Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
 BAND, BAND_PART, GROUPS = 12, 20, 7
-"""Rows above and below the plane of the source that are kept, at least; columns over these rows;
-groups of rows. Rays further off lean too much to be each other's."""
+"""Rows above and below the plane of the source that are kept, at least; columns over these
+rows; groups of rows. Rays further off lean too much to be each other's."""
 MOST_BANDS: Final = 1440
 """Of more views every second, third and so on is kept."""
 GAP_IMAGES: Final = 6
@@ -113,7 +114,9 @@ def read_turn(
         NotIdentifiableError: they are too few, or do not close a turn.
     """
     kept = [i for i in present if i not in repeated]
-    index = np.array(sorted(kept, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp)
+    index = np.array(
+        sorted(kept, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp
+    )
     gaps, usual = _require_turn(angle[index])
     weights = _coefficients(angle[index], gaps, usual)
     # After a repeated frame all others may be one step behind what their angles say: what was
@@ -142,21 +145,33 @@ def read_turn(
     if not repeated:
         again, jumps = (index[places].tolist() for places in _repeated(views, gaps))
         if again:
-            return read_turn(image, angle, present, tuple(sorted(again)), tuple(jumps), source_row)
+            return read_turn(
+                image, angle, present, tuple(sorted(again)), tuple(jumps), source_row
+            )
     images, (rows, cols) = np.asarray(total), np.shape(noise)
     (right, down), after = _step(views, gaps, int(index.argmin()))
     step = right * cols / views.shape[2], down * rows / views.shape[1]
     return Turn(
-        images[0], images[1:], np.asarray(noise), used, tuple(samples),
-        np.asarray(bands, dtype=np.float32), tuple((top + end - 1) / 2 for top, end in groups),
-        tuple(index[stride - 1 :: stride].tolist()), repeated, step, int(index[after]),
-    )  # fmt: skip
+        images[0],
+        images[1:],
+        np.asarray(noise),
+        used,
+        tuple(samples),
+        np.asarray(bands, dtype=np.float32),
+        tuple((top + end - 1) / 2 for top, end in groups),
+        tuple(index[stride - 1 :: stride].tolist()),
+        repeated,
+        step,
+        int(index[after]),
+    )
 
 
 def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
     """Divide rows about the plane of the source into groups, (top, end) each."""
     half = max(BAND, cols // BAND_PART)
-    centre = min(max(round(middle), min(half, rows // 2)), rows - 1 - min(half, (rows - 1) // 2))
+    centre = min(
+        max(round(middle), min(half, rows // 2)), rows - 1 - min(half, (rows - 1) // 2)
+    )
     top, end = max(0, centre - half), min(rows, centre + half + 1)
     edges = np.linspace(top, end, min(GROUPS, end - top) + 1).round().astype(int).tolist()
     return list(pairwise(edges))
@@ -176,7 +191,8 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
     usual, widest = float(np.median(own)), float(own.max())
     if widest > WIDEST_GAP * usual:
         raise NotIdentifiableError(
-            f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a view (usual "
+            f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a "
+            "view (usual "
             f"step {math.degrees(usual):.4g} deg): only the mean over a full turn is symmetric",
         )
     return gaps, usual
@@ -222,9 +238,12 @@ def _thumb(image: Float32Array) -> Float32Array:
     factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
     if min(image.shape) < 2 * factor:
         raise NotIdentifiableError.instead(
-            f"images of {image.shape[0]} rows and {image.shape[1]} columns show no plane of the "
-            "source and no roll", list(image.shape), f"{2 * factor} rows or more",
-        )  # fmt: skip
+            f"images of {image.shape[0]} rows and {image.shape[1]} columns show no plane "
+            "of the "
+            "source and no roll",
+            list(image.shape),
+            f"{2 * factor} rows or more",
+        )
     return np.asarray(binned_mean(image, factor), dtype=np.float32)
 
 
@@ -242,7 +261,9 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
     Returns:
         Places of both kinds.
     """
-    soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
+    soft = gaussian_filter(
+        views, (0, 2, 2)
+    )  # less noise: a copy may have been exposed anew
     rest = soft - np.roll(soft, 1, axis=0)
     change, correlation = np.empty((2, len(views)))
     for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
@@ -275,11 +296,14 @@ def _neighbours_correlation(image: FloatArray) -> float:
     return float(max(along)) / max(float(np.square(own).mean()), 1e-30)
 
 
-def _step(views: Float32Array, gaps: FloatArray, first: int) -> tuple[tuple[float, float], int]:
+def _step(
+    views: Float32Array, gaps: FloatArray, first: int
+) -> tuple[tuple[float, float], int]:
     """Find the largest step between neighbours.
 
-    Each frame is compared with the third-order interpolation of its four neighbours on the circle.
-    A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the other.
+    Each frame is compared with the third-order interpolation of its four neighbours on the
+    circle. A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the
+    other.
 
     Args:
         views: (n, rows, cols), sorted by angle.

@@ -50,10 +50,15 @@ class TurnPlanes:
     """
 
     def __init__(
-        self, image: Image, poses: Poses, turn: Turn,
-        offsets: Callable[[FloatArray], Offsets], values: FloatArray, covariance: FloatArray,
+        self,
+        image: Image,
+        poses: Poses,
+        turn: Turn,
+        offsets: Callable[[FloatArray], Offsets],
+        values: FloatArray,
+        covariance: FloatArray,
         priors: Mapping[str, float],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.image, self.poses, self.turn, self.offsets = image, poses, turn, offsets
         self.values, self.priors = values, priors
         self.doubts = np.linalg.cholesky(covariance)
@@ -73,7 +78,8 @@ class TurnPlanes:
             given,
             dD_y=given.dD_y + float(at[0]) * self.pitch,
             dD_z=given.dD_z + float(at[4]) * self.priors["dD_z"],
-            det_pitch=given.det_pitch + math.radians(float(at[5]) * self.priors["det_pitch"]),
+            det_pitch=given.det_pitch
+            + math.radians(float(at[5]) * self.priors["det_pitch"]),
         )
 
     def _pairs(self, stride: int, coarser: int = 1) -> PlanePairs:
@@ -87,7 +93,9 @@ class TurnPlanes:
         def views(at: FloatArray) -> ConeVec:
             return about_axis(poses, self._of(at))
 
-        return PlanePairs(stack, self.turn.mean, coarser * self.factor, views, np.zeros(6))
+        return PlanePairs(
+            stack, self.turn.mean, coarser * self.factor, views, np.zeros(6)
+        )
 
     def row(self, random: np.random.Generator) -> tuple[Offsets, AlignEstimate]:
         """Estimate the panel's height and the row of the source's plane.
@@ -111,7 +119,8 @@ class TurnPlanes:
         known = math.hypot(self.priors["dD_y"], lean) / self.pitch
         refuse_if(
             sigma > known / 2,
-            f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and axis_tilt_x to +- "
+            f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and "
+            "axis_tilt_x to +- "
             f"{known:.2g} px",
         )
         at = np.array([height, *(5 * [0.0])])
@@ -128,7 +137,9 @@ class TurnPlanes:
                 frames.
         """
         n = len(self.sorted)
-        refuse_if(n > MOST_SHIFTS, f"{n} frames; shifts are looked for in up to {MOST_SHIFTS}")
+        refuse_if(
+            n > MOST_SHIFTS, f"{n} frames; shifts are looked for in up to {MOST_SHIFTS}"
+        )
         at = np.zeros(6)
         at[0] = (corrected.dD_y - self._of(at).dD_y) / self.pitch
         angle = corrected.angle_scale * self.poses.angle[self.sorted]
@@ -138,8 +149,12 @@ class TurnPlanes:
         pose = self.poses[self.sorted[:1]]
         scale = self.factor * float(pose.sod[0] / pose.sdd[0])
         values, sigmas = np.zeros((2, len(self.poses), 2))
-        sigmas[:] = np.sqrt(np.square(shifts.values).mean(axis=0))  # of frames that are not used
+        sigmas[:] = np.sqrt(
+            np.square(shifts.values).mean(axis=0)
+        )  # of frames that are not used
         across, upwards = scale * float(pose.u[0, 0]), scale * float(pose.v[0, 2])
         values[self.sorted] = shifts.values * [across, upwards]
         sigmas[self.sorted] = shifts.sigmas
-        return Motion(("dO_x", "dO_y"), values, sigmas * np.abs([across, upwards]), shifts.evidence)
+        return Motion(
+            ("dO_x", "dO_y"), values, sigmas * np.abs([across, upwards]), shifts.evidence
+        )

@@ -1,15 +1,15 @@
 """Exact chords through convex solids, and path lengths through closed triangle meshes. Double
 precision.
 
-*Solids*, one detector row at a time: a row's rays are cut by one surface after the other (loops a
-compiler can vectorise), only over the columns that a solid's shadow can reach. Quadrics and slabs
-come from `analytic_solids`.
+*Solids*, one detector row at a time: a row's rays are cut by one surface after the other (loops
+a compiler can vectorise), only over the columns that a solid's shadow can reach. Quadrics and
+slabs come from `analytic_solids`.
 
-*Meshes*, triangle by triangle instead of ray by ray: the signed distances at which a ray leaves (+)
-and enters (-) the solid add up to its path length, so each triangle is drawn once onto the pixels
-it covers. Whether a ray passes left or right of an edge is computed from the edge alone, the same
-way for both its triangles: no ray slips through between them or is counted twice. `analytic` has
-checked that the mesh is closed.
+*Meshes*, triangle by triangle instead of ray by ray: the signed distances at which a ray leaves
+(+) and enters (-) the solid add up to its path length, so each triangle is drawn once onto the
+pixels it covers. Whether a ray passes left or right of an edge is computed from the edge alone,
+the same way for both its triangles: no ray slips through between them or is counted twice.
+`analytic` has checked that the mesh is closed.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ BAND = 16
 @kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
     """Cut [t0, t1] down to low <= at + t (rate + column * step) <= high."""
-    # A ray along the slab gets TINY: both quotients are huge, of one sign where it runs outside (no
-    # chord is left) and of two where it runs inside (nothing is cut). No branch, so it vectorises.
+    # A ray along the slab gets TINY: both quotients are huge, of one sign where it runs outside
+    # (no chord is left) and of two where it runs inside (nothing is cut). No branch, so it
+    # vectorises.
     for i in range(t0.size):
         speed = rate + (first + i) * step
         inverse = 1.0 / (speed if speed != 0.0 else TINY)
@@ -168,8 +169,9 @@ def edge_form(p, i, j, g, form):
     x = p[a, 1] * ez - p[a, 2] * ey
     y = p[a, 2] * ex - p[a, 0] * ez
     z = p[a, 0] * ey - p[a, 1] * ex
-    # The ray to pixel (c, r) is g[3:6] + c g[6:9] + r g[9:12]: its product with p_a x (p_b - p_a)
-    # is affine in c and r, so that three numbers say for every pixel on which side it passes.
+    # The ray to pixel (c, r) is g[3:6] + c g[6:9] + r g[9:12]: its product with p_a x (p_b -
+    # p_a) is affine in c and r, so that three numbers say for every pixel on which side it
+    # passes.
     for k in range(3):
         at = 3 + 3 * k
         form[k] = g[at] * x + g[at + 1] * y + g[at + 2] * z
@@ -184,17 +186,17 @@ def draw_row(line, forms, flips, plane, r, c0, c1):
     n0, n1 = plane[0] + plane[2] * r, plane[1]
     reach = plane[3]
     f0, f1, f2 = flips[0], flips[1], flips[2]
-    # `!=` undoes the order of the vertices: an edge that the triangle runs through from the higher
-    # number to the lower has the triangle on its other side. Left of all three edges the ray leaves
-    # the solid there (+), right of all three it enters (-).
+    # `!=` undoes the order of the vertices: an edge that the triangle runs through from the
+    # higher number to the lower has the triangle on its other side. Left of all three edges the
+    # ray leaves the solid there (+), right of all three it enters (-).
     for c in range(c0, c1):
         left0 = (a0 + b0 * c >= 0.0) != f0
         left1 = (a1 + b1 * c >= 0.0) != f1
         left2 = (a2 + b2 * c >= 0.0) != f2
         if left0 == left1 and left1 == left2:
             speed = n0 + n1 * c
-            # In lengths of the ray, from the source (0) to the pixel (1): what lies behind either
-            # counts as there, so that a solid that is cut by the panel is cut off at it.
+            # In lengths of the ray, from the source (0) to the pixel (1): what lies behind
+            # either counts as there, so that a solid that is cut by the panel is cut off at it.
             t = reach / speed if speed != 0.0 else 0.0
             t = min(max(t, 0.0), 1.0)
             line[c] += t if left0 else -t
@@ -209,7 +211,8 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
     front = pixels[i, 2] + pixels[j, 2] + pixels[k, 2]
     if front == 0.0:
         return
-    # A triangle that reaches behind the source has no bounding box of pixels: every pixel is tried.
+    # A triangle that reaches behind the source has no bounding box of pixels: every pixel is
+    # tried.
     first, last, c0, c1 = row0, row1, 0, cols
     if front == 3.0:
         low = min(pixels[i, 1], min(pixels[j, 1], pixels[k, 1]))
@@ -231,8 +234,8 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
     edge_form(p, j, k, g, forms[1])
     edge_form(p, k, i, g, forms[2])
     flips[0], flips[1], flips[2] = i > j, j > k, k > i
-    # The plane of the triangle: a ray d meets it at t = (p_i . n) / (d . n), and d . n is affine in
-    # the pixel as the edges are.
+    # The plane of the triangle: a ray d meets it at t = (p_i . n) / (d . n), and d . n is
+    # affine in the pixel as the edges are.
     ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
     bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -256,8 +259,12 @@ def locate(vertices, g, inverse, p, pixels):
         p[i, 0], p[i, 1], p[i, 2] = x, y, z
         depth = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
         if depth > 1e-9:
-            pixels[i, 0] = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2] * z) / depth
-            pixels[i, 1] = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2] * z) / depth
+            pixels[i, 0] = (
+                inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2] * z
+            ) / depth
+            pixels[i, 1] = (
+                inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2] * z
+            ) / depth
             pixels[i, 2] = 1.0
         else:
             pixels[i, 2] = 0.0
@@ -300,7 +307,9 @@ def project_triangles(vertices, faces, rays, inverses, workers, out, first_job, 
                 seen = view
             sums[:] = 0.0
             for f in range(len(faces)):
-                draw_triangle(sums, p, pixels, faces[f], g, row0, row1, cols, forms, flips, plane)
+                draw_triangle(
+                    sums, p, pixels, faces[f], g, row0, row1, cols, forms, flips, plane
+                )
             for r in range(row0, row1):
                 for c in range(cols):
                     total = sums[r - row0, c]

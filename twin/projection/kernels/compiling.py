@@ -1,19 +1,19 @@
-"""How all kernels are compiled, two processor instructions that numba has no name for, and a key
-that keeps numba's disk cache honest.
+"""How all kernels are compiled, two processor instructions that numba has no name for, and a
+key that keeps numba's disk cache honest.
 
 A voxel column starts on a new page as often as not, where the hardware's own prefetchers start
-from nothing: prefetching a few steps ahead doubled the projector's speed on one core. numba deals
-out the iterations of a parallel loop beforehand; workers that fetch their next job from a counter
-do not wait for the slowest.
+from nothing: prefetching a few steps ahead doubled the projector's speed on one core. numba
+deals out the iterations of a parallel loop beforehand; workers that fetch their next job from a
+counter do not wait for the slowest.
 
-numba optimises and assembles each function that it compiles, with all that it calls, and again as
-part of each function that calls it: a kernel four calls deep in a parallel loop eight times. Here
-only an entry point (`parallel`, `serial`) is, at the end, with all that was linked into it; results
-are the same to the last bit, and compiling takes less than half the time.
+numba optimises and assembles each function that it compiles, with all that it calls, and again
+as part of each function that calls it: a kernel four calls deep in a parallel loop eight times.
+Here only an entry point (`parallel`, `serial`) is, at the end, with all that was linked into
+it; results are the same to the last bit, and compiling takes less than half the time.
 
 Each parallel loop looks at `kernel_threads.ALONE` first: where it is set, the loop runs in the
-calling thread and numba's threading layer is not called. That is so in a forked child, which has
-none of its parent's threads. The look is part of the compiled code: one kernel serves both.
+calling thread and numba's threading layer is not called. That is so in a forked child, which
+has none of its parent's threads. The look is part of the compiled code: one kernel serves both.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ from flexdt.twin import kernel_threads, long_work
 
 LOG = logging.getLogger("flexdt.kernels")
 """Logger of the kernels, to standard error unless the program has set up logging."""
-SLOW = "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
+SLOW = (
+    "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
+)
 """Message of a process that compiles for the first time instead of loading the disk
 cache."""
 
@@ -76,12 +78,15 @@ def _choose(module: ir.Module) -> None:
         with then:
             # A loop's body takes all iterations that its dimensions say, one after the other.
             loop, args, sizes, steps, data = chosen.args[:5]
-            word = ir.IntType(64 if "i64" in str(chosen.args[5].type) else 32).as_pointer()
+            word = ir.IntType(
+                64 if "i64" in str(chosen.args[5].type) else 32
+            ).as_pointer()
             kinds = [args.type.as_pointer(), word, word, data.type]
             body = ir.FunctionType(ir.VoidType(), kinds).as_pointer()
             given = zip((args, sizes, steps, data), kinds, strict=True)
             builder.call(
-                builder.bitcast(loop, body), [builder.bitcast(each, kind) for each, kind in given]
+                builder.bitcast(loop, body),
+                [builder.bitcast(each, kind) for each, kind in given],
             )
         with otherwise:
             builder.call(layer, chosen.args)
@@ -104,9 +109,12 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int | None:
-        # Only Python would call this; it raises TypeError, as arguments are no attribute's name.
+        # Only Python would call this; it raises TypeError, as arguments are no attribute's
+        # name.
         self._ensure_finalized()
-        return ctypes.cast(ctypes.pythonapi.PyObject_GenericGetAttr, ctypes.c_void_p).value
+        return ctypes.cast(
+            ctypes.pythonapi.PyObject_GenericGetAttr, ctypes.c_void_p
+        ).value
 
 
 @contextmanager
@@ -170,14 +178,16 @@ def _entry_point(function: Callable[..., Any] | None = None, **options: Any) -> 
     return made
 
 
-# Only entry points go to the disk cache: a cached inner function would not notice that a function
-# it calls has changed. They call no other entry points.
+# Only entry points go to the disk cache: a cached inner function would not notice that a
+# function it calls has changed. They call no other entry points.
 parallel = partial(_entry_point, error_model="numpy", parallel=True)
 serial = _entry_point
-linked = partial(njit, pipeline_class=_Linked, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+linked = partial(
+    njit, pipeline_class=_Linked, no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
 maker = partial(linked, error_model="numpy")
-# No reference counting: in loops of 100 ns it would cost as much as the work. Such functions may
-# slice arrays, but not make new ones.
+# No reference counting: in loops of 100 ns it would cost as much as the work. Such functions
+# may slice arrays, but not make new ones.
 kernel = partial(maker, _nrt=False)
 inline = partial(kernel, forceinline=True)
 fused = partial(kernel, fastmath={"contract", "nsz"})
@@ -271,8 +281,8 @@ LOOKS = 2000
 
 @kernel
 def wait_until(counters, index, count):
-    """Return when counters[index] has reached count, asleep if that takes long: on a busy machine
-    the thread that is waited for may need this thread's core.
+    """Return when counters[index] has reached count, asleep if that takes long: on a busy
+    machine the thread that is waited for may need this thread's core.
     """
     looks = 0
     while _look(counters, index) < count:

@@ -4,8 +4,8 @@ projector.
 The rays of a fan leave the focal spot in (nearly) one plane parallel to z, so that seen along z
 they (nearly) share one line through the voxel columns; `fan_walk_kernels` carries them along it
 together. Fans for which that cannot work (source or pixels inside the box, rays along a voxel
-plane) go ray by ray. This module deals out jobs to workers and moves pixels; `fan_plan` cuts the
-fans. The drawing in docs/performance.md shows fan, walk and schedule.
+plane) go ray by ray. This module deals out jobs to workers and moves pixels; `fan_plan` cuts
+the fans. The drawing in docs/performance.md shows fan, walk and schedule.
 """
 
 from __future__ import annotations
@@ -105,12 +105,25 @@ def take(image, buffer, starts, ends, width, top, bottom):
 
 @inline
 def work_on(
-    box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer, transposed
+    box,
+    g,
+    lines,
+    first,
+    last,
+    shadow,
+    image,
+    starts,
+    ends,
+    found,
+    rays,
+    work,
+    buffer,
+    transposed,
 ):
     """Do one job: fill the columns of an image between two lines; transposed, read them."""
     rows, cols = image.shape
-    # The job's pixels lie between two slanted lines: each row has a start and an end of its own,
-    # and the buffer holds the rows one behind the other, all `width` long.
+    # The job's pixels lie between two slanted lines: each row has a start and an end of its
+    # own, and the buffer holds the rows one behind the other, all `width` long.
     width = columns_of(lines, first, last, cols, starts, ends)
     top, bottom = shadow[0], shadow[1]
     if transposed:
@@ -130,14 +143,15 @@ def work_on(
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
     @parallel
     def project_fans(box, fans, shadows, workers, out):
-        """Fill out (n, rows, cols), but for views without a job; shadows (n, 4): rows and columns
-        of each view that the box can reach.
+        """Fill out (n, rows, cols), but for views without a job; shadows (n, 4): rows and
+        columns of each view that the box can reach.
         """
         _ = key
         views, lines, jobs, room, widest = fans
         rows = out.shape[1]
         counter = np.zeros(1, np.int64)
-        # Each worker keeps its memory and takes the next job when it is free: jobs differ in cost.
+        # Each worker keeps its memory and takes the next job when it is free: jobs differ in
+        # cost.
         for _ in prange(workers):
             found, rays = make_found(room), make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
@@ -147,9 +161,21 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             while job < len(jobs):
                 view, first, last = jobs[job]
                 work_on(
-                    box, views[view], lines, first, last, shadows[view], out[view],
-                    starts, ends, found, rays, work, buffer, False,
-                )  # fmt: skip
+                    box,
+                    views[view],
+                    lines,
+                    first,
+                    last,
+                    shadows[view],
+                    out[view],
+                    starts,
+                    ends,
+                    found,
+                    rays,
+                    work,
+                    buffer,
+                    False,
+                )
                 job = fetch_next(counter)
 
     @parallel
@@ -191,17 +217,38 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 low, high = slices[part]
                 # The slice as a box of its own: its first voxel is z = 0 of the piece.
                 piece = Box(
-                    box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
-                    box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
-                )  # fmt: skip
+                    box.flat,
+                    marks[part],
+                    box.base + low,
+                    box.hop_x,
+                    box.hop_y,
+                    box.nx,
+                    box.ny,
+                    high - low,
+                    box.size_x,
+                    box.size_y,
+                    box.size_z,
+                )
                 for job in range(units[unit, 0], units[unit, 1]):
                     view, first, last = jobs[job]
                     g[:] = views[view]
                     g[2] -= low  # the source, seen from the piece
                     work_on(
-                        piece, g, lines, first, last, shadows[part, view], values[view],
-                        starts, ends, found, rays, work, buffer, True,
-                    )  # fmt: skip
+                        piece,
+                        g,
+                        lines,
+                        first,
+                        last,
+                        shadows[part, view],
+                        values[view],
+                        starts,
+                        ends,
+                        found,
+                        rays,
+                        work,
+                        buffer,
+                        True,
+                    )
                 count_one(done, turn)
                 item = fetch_next(counter)
 
@@ -216,7 +263,9 @@ def open_rest(box, slices, marks):
             low, high = slices[part]
             for iy in range(box.ny):
                 first = box.base + ix * box.hop_x + iy * box.hop_y + low
-                open_column(box.flat, marks[part], 2 * (iy * box.nx + ix), first, high - low)
+                open_column(
+                    box.flat, marks[part], 2 * (iy * box.nx + ix), first, high - low
+                )
 
 
 project_fans, spread_fans = _entry_points(SOURCES)

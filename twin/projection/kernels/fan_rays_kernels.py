@@ -1,7 +1,7 @@
 """From detector pixels to a fan of rays ready to walk: directions, sorting, first crossings.
 
-Coordinates of a fan: t along the dominant axis of its central ray, l lateral, z; unit voxels; t and
-l mirrored so that rays grow in both. No voxel is read here.
+Coordinates of a fan: t along the dominant axis of its central ray, l lateral, z; unit voxels; t
+and l mirrored so that rays grow in both. No voxel is read here.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from flexdt.twin.projection.kernels.fan_walk_kernels import BINS, NONE, ZERO
 SPREAD = 1e-7
 """Lateral spread [voxels] below which the rays of a fan share one line."""
 DRIFT = 0.95
-"""Largest distance [voxels] of a ray from its reference line: the corrections reach one voxel."""
+"""Largest distance [voxels] of a ray from its reference line: the corrections reach one
+voxel."""
 ON_AXIS = 0.2
-"""Rays drifting less than this [voxels] across the box travel alone: 1 / m grows without bound."""
+"""Rays drifting less than this [voxels] across the box travel alone: 1 / m grows without
+bound."""
 
 
 @kernel
@@ -28,10 +30,13 @@ def oriented(box, g, lines, line, rows):
     next.
     """
     r = 0.5 * (rows - 1)
-    c = 0.5 * (lines[line, 0] + lines[line + 1, 0] + (lines[line, 1] + lines[line + 1, 1]) * r)
+    c = 0.5 * (
+        lines[line, 0] + lines[line + 1, 0] + (lines[line, 1] + lines[line + 1, 1]) * r
+    )
     dx = g[3] + c * g[6] + r * g[9]
     dy = g[4] + c * g[7] + r * g[10]
-    # t is the axis along which the central ray goes faster, so that slopes dl / dt are at most 1.
+    # t is the axis along which the central ray goes faster, so that slopes dl / dt are at most
+    # 1.
     sx, sy, sz = box.size_x**2, box.size_y**2, box.size_z**2
     if abs(dy) >= abs(dx):
         axis, dl, dt, sl, st, square_l, square_t = 1, dx, dy, g[0], g[1], sx, sy
@@ -50,9 +55,25 @@ def oriented(box, g, lines, line, rows):
         st, base, hop_t = nt - st, base + (nt - 1) * hop_t, -hop_t
         span_base, span_t = span_base + (nt - 1) * span_t, -span_t
     return Grid(
-        axis, sign_l, sign_t, base, hop_l, hop_t, span_base, span_l, span_t, nl, nt, box.nz,
-        sl, st, g[2], square_l, square_t, sz,
-    )  # fmt: skip
+        axis,
+        sign_l,
+        sign_t,
+        base,
+        hop_l,
+        hop_t,
+        span_base,
+        span_l,
+        span_t,
+        nl,
+        nt,
+        box.nz,
+        sl,
+        st,
+        g[2],
+        square_l,
+        square_t,
+        sz,
+    )
 
 
 @kernel
@@ -160,7 +181,9 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
         z0 = grid.sz + rise[q] * reach0
         z1 = grid.sz + rise[q] * reach1
         met = max(z0, z1) >= 0.0 and min(z0, z1) <= grid.nz
-        part[q] = min(max((slope[q] - fan.m0 - fan.low) * scale, 0.0), top) if met else -1.0
+        part[q] = (
+            min(max((slope[q] - fan.m0 - fan.low) * scale, 0.0), top) if met else -1.0
+        )
     for q in range(n):
         if part[q] >= 0.0:
             bins[np.uint64(part[q]) + np.uint64(1)] += 1
@@ -184,7 +207,12 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
 def start(grid, fan, rays, work, n):
     """Initialise n sorted rays for their walk, and list their first z crossings by slab."""
     slope, rise = rays.slope[:n], rays.rise[:n]
-    weight, tilt, ratio, length = rays.weight[:n], rays.tilt[:n], rays.ratio[:n], rays.length[:n]
+    weight, tilt, ratio, length = (
+        rays.weight[:n],
+        rays.tilt[:n],
+        rays.ratio[:n],
+        rays.length[:n],
+    )
     cross, pace, level, acc = rays.cross[:n], rays.pace[:n], rays.level[:n], rays.acc[:n]
     m0, sz, st, nz = fan.m0, grid.sz, grid.st, float(grid.nz)
     square_l, square_t, square_z = grid.square_l, grid.square_t, grid.square_z
@@ -195,7 +223,9 @@ def start(grid, fan, rays, work, n):
         weight[q] = np.float32(inverse)
         tilt[q] = np.float32(m - m0)
         ratio[q] = np.float32(m0 * inverse - 1.0)
-        length[q] = np.float32(math.sqrt(m * m * square_l + square_t + up * up * square_z))
+        length[q] = np.float32(
+            math.sqrt(m * m * square_l + square_t + up * up * square_z)
+        )
         k = min(max(np.floor(sz + up * reach), -1.0), nz)
         plane = k + 1.0 if up > 0.0 else k
         every = 1.0 / up
@@ -225,9 +255,14 @@ def start(grid, fan, rays, work, n):
 def make_found(room):
     """Create arrays for fans of up to `room` pixels."""
     return Found(
-        row=np.empty(room), column=np.empty(room), slope=np.empty(room), rise=np.empty(room),
-        span=np.empty(room), slot=np.empty(room, np.uint32), bin=np.empty(room),
-    )  # fmt: skip
+        row=np.empty(room),
+        column=np.empty(room),
+        slope=np.empty(room),
+        rise=np.empty(room),
+        span=np.empty(room),
+        slot=np.empty(room, np.uint32),
+        bin=np.empty(room),
+    )
 
 
 @maker
@@ -235,12 +270,20 @@ def make_rays(room):
     """Create arrays for fans of up to `room` rays."""
     f32, u32 = np.float32, np.uint32
     return Rays(
-        slope=np.empty(room), rise=np.empty(room), slot=np.empty(room, u32),
-        cross=np.empty(room), pace=np.empty(room), acc=np.empty(room, f32),
-        weight=np.empty(room, f32), tilt=np.empty(room, f32), ratio=np.empty(room, f32),
-        level=np.empty(room, u32), following=np.empty(room, u32), length=np.empty(room, f32),
+        slope=np.empty(room),
+        rise=np.empty(room),
+        slot=np.empty(room, u32),
+        cross=np.empty(room),
+        pace=np.empty(room),
+        acc=np.empty(room, f32),
+        weight=np.empty(room, f32),
+        tilt=np.empty(room, f32),
+        ratio=np.empty(room, f32),
+        level=np.empty(room, u32),
+        following=np.empty(room, u32),
+        length=np.empty(room, f32),
         picked=np.empty(room, f32),
-    )  # fmt: skip
+    )
 
 
 @maker
@@ -248,7 +291,10 @@ def make_work(slabs, levels):
     """Create a worker's arrays for a box of up to `slabs` slabs and `levels` levels."""
     f32 = np.float32
     return Work(
-        head=np.empty(slabs + 2, np.uint32), bins=np.empty(BINS + 1, np.int64),
-        total=np.zeros(levels + 2, f32), moment=np.zeros(levels + 2, f32),
-        jump=np.zeros(levels + 2, f32), zeros=np.zeros(levels + 2, f32),
-    )  # fmt: skip
+        head=np.empty(slabs + 2, np.uint32),
+        bins=np.empty(BINS + 1, np.int64),
+        total=np.zeros(levels + 2, f32),
+        moment=np.zeros(levels + 2, f32),
+        jump=np.zeros(levels + 2, f32),
+        zeros=np.zeros(levels + 2, f32),
+    )

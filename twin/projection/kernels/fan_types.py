@@ -28,8 +28,8 @@ class Box(NamedTuple):
 
 class Fans(NamedTuple):
     """views (n, 12): source, first pixel minus source, u, v in voxel units; lines (m, 2): fan
-    boundaries c = a + b r; jobs (k, 3): view, first line, last line; room: rays in the largest fan;
-    widest: columns of the widest job.
+    boundaries c = a + b r; jobs (k, 3): view, first line, last line; room: rays in the largest
+    fan; widest: columns of the widest job.
     """
 
     views: Any
@@ -40,8 +40,8 @@ class Fans(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A box as one fan sees it: axis of t (0 x, 1 y), signs of the mirroring, offset and steps in
-    the voxels and in their spans, counts, source, and squares of the voxel's edges [mm^2].
+    """A box as one fan sees it: axis of t (0 x, 1 y), signs of the mirroring, offset and steps
+    in the voxels and in their spans, counts, source, and squares of the voxel's edges [mm^2].
     """
 
     axis: int
@@ -82,8 +82,8 @@ class Fan(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Rays as collected from the detector: row, column, slope dl / dt, rise dz / dt, t of the pixel
-    from the source, place in the job's buffer, and bin of slope (-1: misses the box).
+    """Rays as collected from the detector: row, column, slope dl / dt, rise dz / dt, t of the
+    pixel from the source, place in the job's buffer, and bin of slope (-1: misses the box).
     """
 
     row: Any
@@ -98,9 +98,10 @@ class Found(NamedTuple):
 class Rays(NamedTuple):
     """Rays of a fan in order of slope.
 
-    slope; rise; slot as in Found; cross: t of the next z crossing; pace: t between them, signed by
-    direction; acc: integral so far (transposed: the value to spread); weight: 1 / slope; tilt:
-    slope - m0; ratio: m0 / slope - 1; level; following: next ray with a crossing in the same slab;
+    slope; rise; slot as in Found; cross: t of the next z crossing; pace: t between them, signed
+    by direction; acc: integral so far (transposed: the value to spread); weight: 1 / slope;
+    tilt: slope - m0; ratio: m0 / slope - 1; level; following: next ray with a crossing in the
+        same slab;
     length: mm a unit of t; picked: spare.
     """
 

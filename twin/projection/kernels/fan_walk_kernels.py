@@ -1,19 +1,20 @@
 """How a fan of rays walks through the voxels, forward and transposed: the inner loops.
 
 The reference line goes slab by slab along the dominant axis t. S[k] (total) is the integral of
-level k along it so far, by contiguous multiply-adds along z. A ray acts only where it passes from
-one level to the next, taking the difference of two integrals. Three exact corrections make rays
-that only nearly share the line equal to each ray's own walk:
+level k along it so far, by contiguous multiply-adds along z. A ray acts only where it passes
+from one level to the next, taking the difference of two integrals. Three exact corrections make
+rays that only nearly share the line equal to each ray's own walk:
 
-- lengths: the crossing of a lateral plane p lies at t_p = s_t + (p - s_l) / m, linear in 1 / m of
-  the ray's slope m. With Q[k] (moment) the sum of (t_p - s_t) times the jump there,
+- lengths: the crossing of a lateral plane p lies at t_p = s_t + (p - s_l) / m, linear in 1 / m
+  of the ray's slope m. With Q[k] (moment) the sum of (t_p - s_t) times the jump there,
   S[k] + (m0 / m - 1) Q[k] is S[k] of a ray of slope m instead of the line's m0;
-- order: a ray that passes a grid vertex on the other side than the line, d beyond it, differs by
-  d / m times the mixed difference of the four columns around the vertex;
+- order: a ray that passes a grid vertex on the other side than the line, d beyond it, differs
+  by d / m times the mixed difference of the four columns around the vertex;
 - inside a slab, at a z crossing, the ray's own column is looked up.
 
 All identities are exact. Crossings are computed in double precision, sums are kept in single.
-Levels count from 1; 0 and nz + 1 lie outside. The drawing in docs/performance.md shows the terms.
+Levels count from 1; 0 and nz + 1 lie outside. The drawing in docs/performance.md shows the
+terms.
 """
 
 from __future__ import annotations
@@ -72,7 +73,13 @@ def part_of(rays, first, last):
     1 of a sorted fan.
     """
     some = slice(first, last)
-    return rays.acc[some], rays.weight[some], rays.tilt[some], rays.level[some], rays.picked[some]
+    return (
+        rays.acc[some],
+        rays.weight[some],
+        rays.tilt[some],
+        rays.level[some],
+        rays.picked[some],
+    )
 
 
 @fused
@@ -165,7 +172,13 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
     be the same, but rays within a voxel plane have slopes of rounding errors, by which
     nothing can be divided.
     """
-    cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
+    cross, pace, slope, weight, ratio = (
+        rays.cross,
+        rays.pace,
+        rays.slope,
+        rays.weight,
+        rays.ratio,
+    )
     all_acc, all_level, following = rays.acc, rays.level, rays.following
     head, total, moment = work.head, work.total, work.moment
     stop = float(fan.j1)
@@ -194,8 +207,8 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
                 here = difference(flat, grid, j, r0, level, after)
                 if second:
                     there = difference(flat, grid, j, r1, level, after)
-            # The integral up to the start of the slab, then the piece from there to the crossing
-            # as though the ray were in column r0 all along.
+            # The integral up to the start of the slab, then the piece from there to the
+            # crossing as though the ray were in column r0 all along.
             acc += (total[level] - total[after]) + np.float32(t - j) * here
             if not fan.spread:
                 if r1 > r0:
@@ -203,7 +216,8 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
             else:
                 x = grid.sl + m * (t - grid.st)
                 acc += ratio[r] * (moment[level] - moment[after])
-                # The line has changed from r0 to r1 by now: the ray has spent (x - r1) / m in r1.
+                # The line has changed from r0 to r1 by now: the ray has spent (x - r1) / m in
+                # r1.
                 if r1 > r0:
                     acc += np.float32(max(x - r1, 0.0)) * w * (there - here)
                 # The ray itself, at lateral position x, may be in a column beside those of the
@@ -226,9 +240,13 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
                         here = there
             level = after
             t += abs(every)
-            if level - ONE >= inside:  # the ray has left the box through its top or bottom
+            if (
+                level - ONE >= inside
+            ):  # the ray has left the box through its top or bottom
                 break
-            if t >= j + 1:  # the next crossing is in a later slab: wait on that slab's list
+            if (
+                t >= j + 1
+            ):  # the next crossing is in a later slab: wait on that slab's list
                 if t < stop:
                     slab = np.uint64(t)
                     following[r] = head[slab]
@@ -256,7 +274,13 @@ def add_pair(flat, grid, j, i, a, b, value):
 @inline
 def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
     """Apply the transpose of `cross_levels`: total and moment receive each level's share."""
-    cross, pace, slope, weight, ratio = rays.cross, rays.pace, rays.slope, rays.weight, rays.ratio
+    cross, pace, slope, weight, ratio = (
+        rays.cross,
+        rays.pace,
+        rays.slope,
+        rays.weight,
+        rays.ratio,
+    )
     value, all_level, following = rays.acc, rays.level, rays.following
     head, total, moment = work.head, work.total, work.moment
     stop = float(fan.j1)
@@ -309,8 +333,8 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
 
 @inline
 def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
-    """Correct the rays that pass a grid vertex of plane t = j on the other side than the reference
-    line, which is at l = x there.
+    """Correct the rays that pass a grid vertex of plane t = j on the other side than the
+    reference line, which is at l = x there.
     """
     bins, jump, zeros = work.bins, work.jump, work.zeros
     w0, w1 = levels_between(grid, fan, j, j)
@@ -319,14 +343,14 @@ def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
         return
     below = math.floor(x)
     for side in range(2):
-        # side 0: the vertex on the right (passed by rays of large tilt), side 1: on the left. Rays
-        # stay within one voxel of the line, so no vertex farther away concerns them.
+        # side 0: the vertex on the right (passed by rays of large tilt), side 1: on the left.
+        # Rays stay within one voxel of the line, so no vertex farther away concerns them.
         p = below + 1 - side
         if p < 0 or p > grid.nl:
             continue
         gap = p - x if side == 0 else x - p
-        # Only bins of slope that can hold a ray beyond the vertex; `correct` clamps d at 0 for the
-        # rays of the outermost bin that are not.
+        # Only bins of slope that can hold a ray beyond the vertex; `correct` clamps d at 0 for
+        # the rays of the outermost bin that are not.
         if side == 0:
             part = (gap / reach - fan.low) / fan.width * BINS
             first, last = bins[min(max(math.floor(part), 0), BINS)], n
@@ -384,8 +408,8 @@ def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
 def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
     """Add slab j along the reference line to S and Q (or, transposed, from them to the slab).
 
-    The line is in column r0 for `share` of the slab, for the rest in r1. Q takes the jump between
-    them at its distance from the source (arm).
+    The line is in column r0 for `share` of the slab, for the rest in r1. Q takes the jump
+    between them at its distance from the source (arm).
     """
     total, moment = work.total, work.moment
     w0, w1 = levels_between(grid, fan, j, j + 1)
@@ -437,8 +461,8 @@ def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
 
 @inline
 def prefetch_slab(flat, spans, grid, fan, j, transposed):
-    """Prefetch the voxel columns of slab j on the reference line and, transposed, those beside it
-    that are to be opened.
+    """Prefetch the voxel columns of slab j on the reference line and, transposed, those beside
+    it that are to be opened.
     """
     x = grid.sl + fan.m0 * (j - grid.st)
     w0, w1 = levels_between(grid, fan, j, j + 1)
@@ -473,8 +497,8 @@ def open_slab(flat, marks, grid, j, i0, i1):
 def settle(rays, work, n):
     """Add the integral of its level to each ray, and start all levels again from zero.
 
-    Integrals of levels grow along the whole line, a ray takes a difference of two: without this, a
-    ray with a short path through a long volume would lose digits.
+    Integrals of levels grow along the whole line, a ray takes a difference of two: without
+    this, a ray with a short path through a long volume would lose digits.
     """
     acc, ratio, level = rays.acc, rays.ratio, rays.level
     total, moment = work.total, work.moment
@@ -533,7 +557,8 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
             break
         if j + AHEAD < fan.j1:
             prefetch_slab(flat, spans, grid, fan, j + AHEAD, transposed)
-        # Within one slab the line, of slope 0 <= m0 <= 1, is in column r0 and then perhaps in r1.
+        # Within one slab the line, of slope 0 <= m0 <= 1, is in column r0 and then perhaps in
+        # r1.
         share = min(max((r1 - x) / fan.m0, 0.0), 1.0) if r1 > r0 else 1.0
         if transposed:
             cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share)

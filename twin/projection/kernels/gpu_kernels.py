@@ -1,33 +1,35 @@
-"""CUDA kernels: exact Siddon forward, and its transpose with atomic additions; arithmetic on flat
-arrays of single precision, and sums of them.
+"""CUDA kernels: exact Siddon forward, and its transpose with atomic additions; arithmetic on
+flat arrays of single precision, and sums of them.
 
-`project_slabs` and `spread_slabs` are for views that cross the whole box and rise at most one voxel
-a slab (`gpu.by_slabs` says which); `project_rays` and `spread_rays` for all others. Imported only
-where a CUDA device (or numba's simulator of one) has been found: `gpu` decides.
+`project_slabs` and `spread_slabs` are for views that cross the whole box and rise at most one
+voxel a slab (`gpu.by_slabs` says which); `project_rays` and `spread_rays` for all others.
+Imported only where a CUDA device (or numba's simulator of one) has been found: `gpu` decides.
 
-The slab walk. Seen along its faster axis of x and y, called a, a ray goes through slabs one voxel
-thick. All axes are mirrored so that the ray moves up them; then in one slab it crosses at most one
-plane of the other axis b and at most one of z, and meets at most three voxels: before both
-crossings, between them, after both. If shares h >= l of the slab lie behind the crossings, the
-slab gives v + h (m - v) + l (w - m). 32 lanes of a warp are 32 neighbouring rows of a detector
-column: they are in the same slab at the same time and read neighbouring voxels of a few columns.
+The slab walk. Seen along its faster axis of x and y, called a, a ray goes through slabs one
+voxel thick. All axes are mirrored so that the ray moves up them; then in one slab it crosses at
+most one plane of the other axis b and at most one of z, and meets at most three voxels: before
+both crossings, between them, after both. If shares h >= l of the slab lie behind the crossings,
+the slab gives v + h (m - v) + l (w - m). 32 lanes of a warp are 32 neighbouring rows of a
+detector column: they are in the same slab at the same time and read neighbouring voxels of a
+few columns.
 
 - *Fixed point.* Where a ray is at slab k (b and z in voxels) is kept as an integer with 44 bits
   behind the point, start + k slope: no rounding adds up, on cards that are 64 times slower in
   double precision, too. The slope is off by 2^-45 at most, a position after 2000 slabs by 6e-11
-  voxels; 19 bits before the point hold boxes of up to 2^17 voxels with room for rays beside them.
-- *Single precision between.* Every 32 slabs the position is split anew into its nearest plane (an
-  integer) and the distance from it (single precision): within the 32 slabs a crossing is off by at
-  most 1e-5 slabs, 2^-24 (32 + 64) + 2^-24 32 for rounding the sum, the distance and the slope, for
-  *any* slope: near a plane the distance itself is small, so that even a slope of 1e-6 does not
-  enlarge it. The 32 slabs are summed on their own before they join the rest.
+  voxels; 19 bits before the point hold boxes of up to 2^17 voxels with room for rays beside
+  them.
+- *Single precision between.* Every 32 slabs the position is split anew into its nearest plane
+  (an integer) and the distance from it (single precision): within the 32 slabs a crossing is
+  off by at most 1e-5 slabs, 2^-24 (32 + 64) + 2^-24 32 for rounding the sum, the distance and
+  the slope, for *any* slope: near a plane the distance itself is small, so that even a slope of
+  1e-6 does not enlarge it. The 32 slabs are summed on their own before they join the rest.
 - *Floor without a conversion.* y + 1.5 2^23, rounded down, has floor(y) in its lowest bits, one
   instruction; y minus that floor, over the slope and clamped to [0, 1], is the share behind the
   crossing, and is 1 where none was crossed in this slab: the two voxels are then the same.
 - *The middle loop asks nothing.* Slabs that all lanes of a warp cross well inside the box are
-  walked four at a time without any branch: twelve loads are under way before the first is needed,
-  which is what hides the memory's latency. The slabs at both ends are walked by a loop that checks
-  each voxel; cells outside count 0.
+  walked four at a time without any branch: twelve loads are under way before the first is
+  needed, which is what hides the memory's latency. The slabs at both ends are walked by a loop
+  that checks each voxel; cells outside count 0.
 - *Sides.* A ray that lies in a voxel plane belongs to the voxel above, or below where it moves
   down, however slowly: as on the processor. For the direction to have the same sign there, its
   products are rounded on their own (no fused multiply-add), as they are there.
@@ -43,7 +45,9 @@ import operator
 import numpy as np
 from numba import config, cuda
 
-config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # one small image is no reason to warn in a server's log
+config.CUDA_LOW_OCCUPANCY_WARNINGS = (
+    0  # one small image is no reason to warn in a server's log
+)
 
 BLOCK = (32, 4)
 """Threads a block: detector rows (one warp), and columns."""
@@ -78,7 +82,8 @@ FEW_REGISTERS = {} if config.ENABLE_CUDASIM else {"max_registers": 56}
 (H200, 512^3); the rest is stored once every 32 slabs."""
 
 if config.ENABLE_CUDASIM:
-    # What the simulator lacks. A lane there exchanges with itself, unless a test lets lanes meet.
+    # What the simulator lacks. A lane there exchanges with itself, unless a test lets lanes
+    # meet.
 
     times, plus = operator.mul, operator.add
 
@@ -225,9 +230,29 @@ def slab_kernel(transposed):
         return share * flat[place(p)]
 
     @cuda.jit
-    def walk(flat, base, hop_x, hop_y, nx, ny, nz, size_x, size_y, size_z, views, start, n,
-             images, rows, cols, step_r, step_c, factor):  # fmt: skip
-        # Views are fastest in the grid: blocks at work together read the same part of the volume.
+    def walk(
+        flat,
+        base,
+        hop_x,
+        hop_y,
+        nx,
+        ny,
+        nz,
+        size_x,
+        size_y,
+        size_z,
+        views,
+        start,
+        n,
+        images,
+        rows,
+        cols,
+        step_r,
+        step_c,
+        factor,
+    ):
+        # Views are fastest in the grid: blocks at work together read the same part of the
+        # volume.
         view = start + cuda.blockIdx.x % n
         # Lanes beyond the detector's end go along with its last ray, and write nothing.
         r = cuda.blockIdx.y * BLOCK[0] + cuda.threadIdx.x
@@ -252,22 +277,28 @@ def slab_kernel(transposed):
             sz, dz, base, hop_z = nz - sz, -dz, base + nz - 1, -1
         each = 1.0 / da
         mb, mz = db * each, dz * each
-        at_b, rate_b, slope_b, steps_b, enter_b, leave_b = fixed_line(sb - sa * mb, mb, nb)
-        at_z, rate_z, slope_z, steps_z, enter_z, leave_z = fixed_line(sz - sa * mz, mz, nz)
+        at_b, rate_b, slope_b, steps_b, enter_b, leave_b = fixed_line(
+            sb - sa * mb, mb, nb
+        )
+        at_z, rate_z, slope_z, steps_z, enter_z, leave_z = fixed_line(
+            sz - sa * mz, mz, nz
+        )
         enter = max(max(enter_b, enter_z), ZERO)
         leave = min(min(leave_b, leave_z), np.float32(na))
         scale = np.float32(length * each)
         value = ZERO
         if transposed and written:
             value = np.float32(images[pixel] * scale * factor)
-        # Slabs [first, last) that some lane crosses, and [quick, slow) that all cross well inside.
+        # Slabs [first, last) that some lane crosses, and [quick, slow) that all cross well
+        # inside.
         first, last, quick, slow = NEVER, 0, 0, 0
         if leave + MARGIN >= enter:
             first = max(int(math.floor(enter - MARGIN)), 0)  # noqa: RUF046
             last = min(int(math.floor(leave + MARGIN)) + 1, na)  # noqa: RUF046
             quick = int(math.ceil(enter + MARGIN))  # noqa: RUF046
             slow = int(math.floor(leave - MARGIN))  # noqa: RUF046
-        # Lanes with different axes a have different numbers of slabs, and each keeps to its own.
+        # Lanes with different axes a have different numbers of slabs, and each keeps to its
+        # own.
         first, last = least(narrow(first)), min(most(narrow(last)), narrow(na))
         quick, slow = most(narrow(quick)), least(narrow(slow))
         hop_a, hop_b, hop_z = narrow(hop_a), narrow(hop_b), narrow(hop_z)
@@ -278,7 +309,10 @@ def slab_kernel(transposed):
             plane_b, distance_b = anchor(at_b, rate_b, begin)
             plane_z, distance_z = anchor(at_z, rate_z, begin)
             origin = narrow(base + begin * hop_a + plane_b * hop_b + plane_z * hop_z)
-            k, end = narrow(max(begin, first) - begin), narrow(min(ANCHORED, last - begin))
+            k, end = (
+                narrow(max(begin, first) - begin),
+                narrow(min(ANCHORED, last - begin)),
+            )
             inner = narrow(min(max(quick - begin, k), end))
             outer = narrow(min(max(slow - begin, inner), end))
             outer = narrow(inner + ((outer - inner) & -UNROLLED))
@@ -331,8 +365,14 @@ def slab_kernel(transposed):
                                 meet(flat, True, m, h - l, value)
                                 meet(flat, True, w, l, value)
                             else:
-                                low, mid, high = flat[place(p)], flat[place(m)], flat[place(w)]
-                                part = fused(l, high - mid, fused(h, mid - low, part + low))
+                                low, mid, high = (
+                                    flat[place(p)],
+                                    flat[place(m)],
+                                    flat[place(w)],
+                                )
+                                part = fused(
+                                    l, high - mid, fused(h, mid - low, part + low)
+                                )
                             origin_k = narrow(origin_k + hop_a)
                             level, p = narrow(above + hop_a), narrow(w + hop_a)
                             b, z = next_b, next_z
@@ -369,8 +409,27 @@ def column_kernel(transposed):
         return share * flat[place(p)]
 
     @cuda.jit(**FEW_REGISTERS)
-    def walk(flat, base, hop_x, hop_y, nx, ny, nz, size_x, size_y, size_z, views, start, n,
-             images, rows, cols, step_r, step_c, factor):  # fmt: skip
+    def walk(
+        flat,
+        base,
+        hop_x,
+        hop_y,
+        nx,
+        ny,
+        nz,
+        size_x,
+        size_y,
+        size_z,
+        views,
+        start,
+        n,
+        images,
+        rows,
+        cols,
+        step_r,
+        step_c,
+        factor,
+    ):
         view = start + cuda.blockIdx.x % n
         lane, warp = cuda.threadIdx.x, cuda.threadIdx.y
         r = cuda.blockIdx.y * BLOCK[0] + lane
@@ -395,8 +454,12 @@ def column_kernel(transposed):
             sz, dz, low_z, hop_z = nz - sz, -dz, nz - 1, -1
         each = 1.0 / da
         mb, mz = db * each, dz * each
-        at_b, rate_b, slope_b, steps_b, enter_b, leave_b = fixed_line(sb - sa * mb, mb, nb)
-        at_z, rate_z, slope_z, steps_z, enter_z, leave_z = fixed_line(sz - sa * mz, mz, nz)
+        at_b, rate_b, slope_b, steps_b, enter_b, leave_b = fixed_line(
+            sb - sa * mb, mb, nb
+        )
+        at_z, rate_z, slope_z, steps_z, enter_z, leave_z = fixed_line(
+            sz - sa * mz, mz, nz
+        )
         enter = max(max(enter_b, enter_z), ZERO)
         leave = min(min(leave_b, leave_z), np.float32(na))
         scale = np.float32(length * each)
@@ -427,11 +490,16 @@ def column_kernel(transposed):
             next_b, h = crossing(np.float32(lane + 1), slope_b, distance_b, steps_b)
             here, there = narrow(b + plane_b), narrow(next_b + plane_b)
             meet_lanes()
-            pairs[mine] = packed(narrow((there - here) * hop_b), h if next_b != b else ZERO)
+            pairs[mine] = packed(
+                narrow((there - here) * hop_b), h if next_b != b else ZERO
+            )
             places[mine] = narrow(base + (begin + lane) * hop_a + here * hop_b)
             inside[mine] = (1 if 0 <= here < nb else 0) + (2 if 0 <= there < nb else 0)
             meet_lanes()
-            k, end = narrow(max(begin, first) - begin), narrow(min(ANCHORED, last - begin))
+            k, end = (
+                narrow(max(begin, first) - begin),
+                narrow(min(ANCHORED, last - begin)),
+            )
             inner = narrow(min(max(quick - begin, k), end))
             outer = narrow(min(max(slow - begin, inner), end))
             outer = narrow(inner + ((outer - inner) & -UNROLLED))
@@ -442,7 +510,9 @@ def column_kernel(transposed):
                     y = fused(np.float32(k), slope_z, distance_z)
                     floor, z = floor_bits(y)
                     z = narrow(low_z + (z + plane_z) * hop_z)
-                    ahead = ((floor + ONE) - distance_z) * steps_z  # exact where it is near
+                    ahead = (
+                        (floor + ONE) - distance_z
+                    ) * steps_z  # exact where it is near
                 t = np.float32(k)
                 while k < stop:
                     jump, h = unpacked(pairs[place(own + k)])
@@ -452,7 +522,10 @@ def column_kernel(transposed):
                     if l > ZERO:
                         up = hop_z
                         ahead += steps_z
-                    in_b, out_b = inside[place(own + k)] & 1 != 0, inside[place(own + k)] & 2 != 0
+                    in_b, out_b = (
+                        inside[place(own + k)] & 1 != 0,
+                        inside[place(own + k)] & 2 != 0,
+                    )
                     in_z, out_z = 0 <= z < nz, 0 <= z + up < nz
                     p = narrow(places[place(own + k)] + z)
                     mid = out_b and in_z if h >= l else in_b and out_z
@@ -482,8 +555,14 @@ def column_kernel(transposed):
                                 meet(flat, True, m, h - l, value)
                                 meet(flat, True, w, l, value)
                             else:
-                                low, mid, high = flat[place(p)], flat[place(m)], flat[place(w)]
-                                part = fused(l, high - mid, fused(h, mid - low, part + low))
+                                low, mid, high = (
+                                    flat[place(p)],
+                                    flat[place(m)],
+                                    flat[place(w)],
+                                )
+                                part = fused(
+                                    l, high - mid, fused(h, mid - low, part + low)
+                                )
                             p = narrow(w + hop_a)
                         at = place(at + place(UNROLLED))
                         k = narrow(k + UNROLLED)
@@ -520,7 +599,12 @@ def first_crossing(s, d, n, enter, unit):
     # On the device, floor gives a float.
     i = min(max(int(math.floor(at)), 0), n - 1)  # noqa: RUF046
     if d > 0.0:
-        return i, np.float32(max((i + 1 - at) / d * unit, 0.0)), np.float32(unit / d), n - i
+        return (
+            i,
+            np.float32(max((i + 1 - at) / d * unit, 0.0)),
+            np.float32(unit / d),
+            n - i,
+        )
     if d < 0.0:
         return i, np.float32(max((i - at) / d * unit, 0.0)), np.float32(-unit / d), i + 1
     return i, np.float32(math.inf), np.float32(0.0), 1
@@ -536,8 +620,27 @@ def ray_kernel(transposed):
     """
 
     @cuda.jit
-    def walk(flat, base, hop_x, hop_y, nx, ny, nz, size_x, size_y, size_z, views, start, n,
-             images, rows, cols, step_r, step_c, factor):  # fmt: skip
+    def walk(
+        flat,
+        base,
+        hop_x,
+        hop_y,
+        nx,
+        ny,
+        nz,
+        size_x,
+        size_y,
+        size_z,
+        views,
+        start,
+        n,
+        images,
+        rows,
+        cols,
+        step_r,
+        step_c,
+        factor,
+    ):
         view = start + cuda.blockIdx.x % n
         r = cuda.blockIdx.y * BLOCK[0] + cuda.threadIdx.x
         c = cuda.blockIdx.x // n * BLOCK[1] + cuda.threadIdx.y
@@ -674,7 +777,8 @@ def fold(kind, a, b, parts):
     i = cuda.grid(1)
     if i >= parts.size:
         return
-    # Which numbers a thread adds depends on `parts` alone, and the host adds the parts in order.
+    # Which numbers a thread adds depends on `parts` alone, and the host adds the parts in
+    # order.
     total = -math.inf if kind == LARGEST else 0.0
     for first in range(i * RUN, a.size, parts.size * RUN):
         last = min(first + RUN, a.size)

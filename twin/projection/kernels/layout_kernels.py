@@ -1,6 +1,6 @@
-"""Compiled passes that bring a volume into the layout of `volume.Layout`: a blocked transpose from
-[z, y, x] to z contiguous, and the occupied range of each voxel column. `volume` computes positions
-and crops.
+"""Compiled passes that bring a volume into the layout of `volume.Layout`: a blocked transpose
+from [z, y, x] to z contiguous, and the occupied range of each voxel column. `volume` computes
+positions and crops.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
             x1 = min(nx, x0 + BLOCK)
             for z0 in range(0, nz, BLOCK):
                 z1 = min(nz, z0 + BLOCK)
-                # Reading goes along x and writing along z; a block of both stays in the cache, so
-                # that no line of memory is fetched twice.
+                # Reading goes along x and writing along z; a block of both stays in the cache,
+                # so that no line of memory is fetched twice.
                 for x in range(x0, x1):
                     at = y * stride_y + x * stride_x
                     for z in range(z0, z1):
@@ -64,7 +64,8 @@ SIZE_BITS, INFINITE = np.uint32(0x7FFFFFFF), np.uint32(0x7F800000)
 
 @parallel
 def unfit_parts(bits):
-    """Count the runs of `CHECKED` float32 numbers, given as uint32, with one that is not finite."""
+    """Count the runs of `CHECKED` float32 numbers, given as uint32, with one that is not
+    finite."""
     runs = (bits.size + CHECKED - 1) // CHECKED
     unfit = 0
     for run in prange(runs):
@@ -79,8 +80,8 @@ def unfit_parts(bits):
 
 @parallel
 def touch(flat):
-    """Write a zero into every page of fresh zeros: threads get pages of their own at the same time,
-    instead of several of them the same page.
+    """Write a zero into every page of fresh zeros: threads get pages of their own at the same
+    time, instead of several of them the same page.
     """
     chunk = 1 << 19
     for part in prange((flat.size + chunk - 1) // chunk):

@@ -1,21 +1,21 @@
-"""Exact Siddon along single rays, for any geometry: the path that is always right; and how its line
-integrals change with the geometry.
+"""Exact Siddon along single rays, for any geometry: the path that is always right; and how its
+line integrals change with the geometry.
 
 Each ray walks from voxel to voxel (Amanatides and Woo 1987), positions and sum in double
-precision, between the focal spot and the pixel centre. Coordinates are in voxel units of the box,
-derivatives in 1/mm.
+precision, between the focal spot and the pixel centre. Coordinates are in voxel units of the
+box, derivatives in 1/mm.
 
-A ray from s to e has the integral p = L sum_i mu_i (t[i+1] - t[i]): L its length, mu_i the value of
-the i-th voxel it meets, t the parameters of s + t (e - s) at which it goes from one voxel to the
-next. Each t[k] belongs to a plane across one axis a, t = (plane - s_a) / (e_a - s_a), so that it
-depends on s and e along that axis alone:
+A ray from s to e has the integral p = L sum_i mu_i (t[i+1] - t[i]): L its length, mu_i the
+value of the i-th voxel it meets, t the parameters of s + t (e - s) at which it goes from one
+voxel to the next. Each t[k] belongs to a plane across one axis a, t = (plane - s_a) / (e_a -
+s_a), so that it depends on s and e along that axis alone:
 
     dt / ds_a = (t - 1) / (e_a - s_a),    dt / de_a = -t / (e_a - s_a).
 
-In p, t[k] has the factor L J with the jump J = mu before the plane - mu behind it (outside the box
-mu is 0). So two sums for each axis, of J and of J t, are all that a walk along the ray has to
-gather. Where a ray runs through an edge of the grid, or within one of its planes, p has a kink and
-no derivative; the walk then gives that of one side.
+In p, t[k] has the factor L J with the jump J = mu before the plane - mu behind it (outside the
+box mu is 0). So two sums for each axis, of J and of J t, are all that a walk along the ray has
+to gather. Where a ray runs through an edge of the grid, or within one of its planes, p has a
+kink and no derivative; the walk then gives that of one side.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def clip(s, d, n, enter, leave):
     if d != 0.0:
         a, b = -s / d, (n - s) / d
         return max(enter, min(a, b)), min(leave, max(a, b))
-    # Parallel to the planes: within them for all t or for none. [0, n) is half open, so that a ray
-    # in the plane between two voxels belongs to one of them.
+    # Parallel to the planes: within them for all t or for none. [0, n) is half open, so that a
+    # ray in the plane between two voxels belongs to one of them.
     if s < 0.0 or s >= n:
         return 1.0, 0.0
     return enter, leave
@@ -157,7 +157,8 @@ def walk_ray(box, g, r, c, value, transposed):
 def project_rays(box, views, chosen, out, tile, first_job, last_job):
     """Fill the chosen views of out (n, rows, cols) with line integrals.
 
-    views (n, 12): source, first pixel centre minus source, u, v in voxel units of the box; chosen:
+    views (n, 12): source, first pixel centre minus source, u, v in voxel units of the box;
+        chosen:
     indices of views; tile: columns a job; of each chosen view one job after the other.
     """
     rows, cols = out.shape[1:]
@@ -183,9 +184,18 @@ def spread_rays(box, views, chosen, values, slices, marks, first_column, last_co
     for job in prange(len(slices)):
         z0, z1 = slices[job, 0], slices[job, 1]
         piece = Box(
-            box.flat, marks[job], box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
-            box.size_x, box.size_y, box.size_z,
-        )  # fmt: skip
+            box.flat,
+            marks[job],
+            box.base + z0,
+            box.hop_x,
+            box.hop_y,
+            box.nx,
+            box.ny,
+            z1 - z0,
+            box.size_x,
+            box.size_y,
+            box.size_z,
+        )
         g = np.empty(12)
         for column in range(first_column, last_column):
             view, c = chosen[column // cols], column % cols
@@ -228,8 +238,8 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
     near_x, far_x = faces(sx, dx, nx)
     near_y, far_y = faces(sy, dy, ny)
     near_z, far_z = faces(sz, dz, nz)
-    # Into the box through the face that is reached last: a jump from 0. A ray that begins inside
-    # (enter = 0, whatever the geometry) meets no face there.
+    # Into the box through the face that is reached last: a jump from 0. A ray that begins
+    # inside (enter = 0, whatever the geometry) meets no face there.
     if enter > 0.0:
         if near_x >= near_y and near_x >= near_z:
             jx, mx = -value, -value * enter
@@ -239,8 +249,8 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
             jz, mz = -value, -value * enter
     t = enter
     while True:
-        # The nearest of the three next planes ends the piece in this voxel. Its axis gets the jump;
-        # at an edge, where two are equally near, the first one does (see above: a kink).
+        # The nearest of the three next planes ends the piece in this voxel. Its axis gets the
+        # jump; at an edge, where two are equally near, the first one does (see above: a kink).
         upto = min(next_x, min(next_y, next_z))
         if upto >= leave:
             break
@@ -273,7 +283,9 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
             jump = value - flat[p]
             jz += jump
             mz += jump * t
-        value -= jump  # jump = before - behind, so that this is the voxel behind the plane
+        value -= (
+            jump  # jump = before - behind, so that this is the voxel behind the plane
+        )
     total += (leave - t) * value
     # Out through the face that is reached first, a jump to 0; none if the ray ends inside.
     if leave < 1.0:
@@ -311,9 +323,20 @@ def ray_derivatives(box, g, r, c):
     """
     dx, dy, dz, length = ray_of(box, g, r, c)
     total, jx, mx, jy, my, jz, mz = walk_jumps(
-        box.flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
-        g[0], g[1], g[2], dx, dy, dz,
-    )  # fmt: skip
+        box.flat,
+        box.base,
+        box.hop_x,
+        box.hop_y,
+        box.nx,
+        box.ny,
+        box.nz,
+        g[0],
+        g[1],
+        g[2],
+        dx,
+        dy,
+        dz,
+    )
     sx, ex = ends(total, length, dx * box.size_x, jx, mx)
     sy, ey = ends(total, length, dy * box.size_y, jy, my)
     sz, ez = ends(total, length, dz * box.size_z, jz, mz)
@@ -322,12 +345,13 @@ def ray_derivatives(box, g, r, c):
 
 @parallel
 def gather(box, views, weights, tile, parts, first_job, last_job):
-    """Sum over the pixels of weight times derivative, with respect to the twelve numbers of a view.
+    """Sum over the pixels of weight times derivative, with respect to the twelve numbers of a
+    view.
 
-    A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what it gets
-    goes to D, u and v with these factors. Each job, `tile` columns of one view, adds into a row of
-    its own of parts (n * tiles, 12): no two write to the same place, and the sums do not depend on
-    the number of threads.
+    A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what it
+    gets goes to D, u and v with these factors. Each job, `tile` columns of one view, adds into
+    a row of its own of parts (n * tiles, 12): no two write to the same place, and the sums do
+    not depend on the number of threads.
 
     Args:
         box: the volume.
@@ -346,8 +370,9 @@ def gather(box, views, weights, tile, parts, first_job, last_job):
         part = parts[job]
         for c in range(first, min(cols, first + tile)):
             across = c - (cols - 1) / 2
-            # Sums of one column: of a source's derivatives, of a pixel's, and of these times the
-            # row, which is what v gets. `across` is the same all along, so that u needs no sums.
+            # Sums of one column: of a source's derivatives, of a pixel's, and of these times
+            # the row, which is what v gets. `across` is the same all along, so that u needs no
+            # sums.
             s0 = s1 = s2 = e0 = e1 = e2 = d0 = d1 = d2 = 0.0
             for r in range(rows):
                 w = np.float64(weights[view, r, c])
@@ -356,7 +381,11 @@ def gather(box, views, weights, tile, parts, first_job, last_job):
                     sx, sy, sz, ex, ey, ez = ray_derivatives(box, views[view], r, c)
                     s0, s1, s2 = s0 + w * sx, s1 + w * sy, s2 + w * sz
                     e0, e1, e2 = e0 + w * ex, e1 + w * ey, e2 + w * ez
-                    d0, d1, d2 = d0 + w * down * ex, d1 + w * down * ey, d2 + w * down * ez
+                    d0, d1, d2 = (
+                        d0 + w * down * ex,
+                        d1 + w * down * ey,
+                        d2 + w * down * ez,
+                    )
             part[0] += s0
             part[1] += s1
             part[2] += s2
@@ -391,8 +420,10 @@ def follow(box, views, change, tile, out, first_job, last_job):
                 down = r - (rows - 1) / 2
                 sx, sy, sz, ex, ey, ez = ray_derivatives(box, views[view], r, c)
                 out[view, r, c] = np.float32(
-                    sx * m[0] + sy * m[1] + sz * m[2]
+                    sx * m[0]
+                    + sy * m[1]
+                    + sz * m[2]
                     + ex * (m[3] + across * m[6] + down * m[9])
                     + ey * (m[4] + across * m[7] + down * m[10])
                     + ez * (m[5] + across * m[8] + down * m[11])
-                )  # fmt: skip
+                )

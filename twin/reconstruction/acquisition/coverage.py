@@ -21,7 +21,12 @@ import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.reconstruction.acquisition.trajectory import Circle, fan_angles, no_fdk, reach
+from flexdt.twin.reconstruction.acquisition.trajectory import (
+    Circle,
+    fan_angles,
+    no_fdk,
+    reach,
+)
 
 MIN_SEEN_SHARE: Final = 0.4
 """Least share of the weight of all views that must see a voxel. At the panel's upper
@@ -76,10 +81,17 @@ def normalise_coverage(
     middle = order[(starts + np.append(starts[1:], len(order))) // 2]
     step = np.add.reduceat(circle.step[order], starts)
     fdk_kernels.normalise_coverage(
-        np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows,
-        np.array(panel) + (-0.5, 0.5), circle.radius, *first, *size, MIN_SEEN_SHARE,
-        (MIN_LINES_SHARE * np.pi - circle.step.max()) * cut_off, data,
-    )  # fmt: skip
+        np.ascontiguousarray(table[middle]),
+        weights[middle] * step[:, None],
+        rows,
+        np.array(panel) + (-0.5, 0.5),
+        circle.radius,
+        *first,
+        *size,
+        MIN_SEEN_SHARE,
+        (MIN_LINES_SHARE * np.pi - circle.step.max()) * cut_off,
+        data,
+    )
 
 
 def first_and_steps(like: Volume) -> tuple[list[float], list[float]]:
@@ -99,7 +111,8 @@ def layer_warnings(lost: int, layers: int) -> list[str]:
     if not lost:
         return []
     return [
-        f"{lost} of {layers} layers of the grid lie outside what the panel sees; their voxels are "
+        f"{lost} of {layers} layers of the grid lie outside what the panel sees; their "
+        "voxels are "
         "NaN"
     ]
 
@@ -129,7 +142,9 @@ class Sharing:
     whole: tuple[float, float]
 
     @classmethod
-    def of(cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> Sharing:
+    def of(
+        cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume
+    ) -> Sharing:
         """Compute the shares of upright panels of `shape` (rows, cols) for a grid.
 
         Raises:
@@ -149,15 +164,20 @@ class Sharing:
         if circle.rise > most:
             raise no_fdk(
                 f"the helix rises by {circle.rise:.4g} mm a turn; FDK needs every voxel in "
-                f"every direction: at most {most:.4g} mm a turn for this panel and a grid as wide "
-                "as this", circle.rise, most,
-            )  # fmt: skip
+                f"every direction: at most {most:.4g} mm a turn for this panel and a "
+                "grid as wide "
+                "as this",
+                circle.rise,
+                most,
+            )
         # Of a direction just missed at an end, the first view is a whole rise further on.
         lack = circle.rise - 0.5 * most
         panel = cone_vec.detector[:, 2] - cone_vec.source[:, 2]
         middle = cone_vec.source[:, 2] + panel * axis / distance
         whole = float(middle.min()) + lack, float(middle.max()) - lack
-        return cls(circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]), whole)
+        return cls(
+            circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]), whole
+        )
 
     def columns(self) -> FloatArray:
         """Compute the kernel's depth lookup, (n, 2): first depth, and depths a mm."""
@@ -168,11 +188,15 @@ class Sharing:
         """Compute shares of rows first <= r < last at each depth, (n, DEPTHS, rows)."""
         first, last = self.depth[views].T[..., None]
         depth = first + (last - first) * np.linspace(0.0, 1.0, DEPTHS)
-        turn = self.circle.rise * self.scale[views, None] / depth  # rows that a voxel sinks
+        turn = (
+            self.circle.rise * self.scale[views, None] / depth
+        )  # rows that a voxel sinks
         span = float(self.circle.step.sum())
         since = (self.circle.angle + 0.5 * self.circle.step)[views]
         until = span - since
-        inside = np.arange(*rows).clip(0, self.rows - 1)  # rows off the panel repeat its edge
+        inside = np.arange(*rows).clip(
+            0, self.rows - 1
+        )  # rows off the panel repeat its edge
         row = (inside - (self.rows - 1) / 2).astype(np.float32)
         most = int(min(span / (2 * np.pi), self.rows / np.abs(turn).min())) + 1
         own = total = np.zeros((len(since), DEPTHS, len(row)), np.float32)
@@ -180,10 +204,14 @@ class Sharing:
             end = np.minimum(since + 2 * np.pi * k, until - 2 * np.pi * k)
             if (end <= 0.0).all():
                 continue
-            off = np.abs(row + (k * turn)[..., None].astype(np.float32)) / np.float32(self.rows / 2)
+            off = np.abs(row + (k * turn)[..., None].astype(np.float32)) / np.float32(
+                self.rows / 2
+            )
             part = np.maximum(np.float32(1.0) - off, 0)
             part *= part * (3 - 2 * part)
-            part *= np.clip(end / HELIX_TAPER_RAD, 0.0, 1.0)[:, None, None].astype(np.float32)
+            part *= np.clip(end / HELIX_TAPER_RAD, 0.0, 1.0)[:, None, None].astype(
+                np.float32
+            )
             total = total + part
             own = part if k == 0 else own
         return np.asarray(own / total)

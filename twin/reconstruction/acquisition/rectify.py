@@ -34,7 +34,9 @@ FLAT = 1e-3
 def leans(cone_vec: ConeVec) -> bool:
     """Return whether rows are not horizontal, or columns not vertical."""
     slope_u = np.abs(cone_vec.u[:, 2]) / np.linalg.norm(cone_vec.u, axis=1)
-    slope_v = np.linalg.norm(cone_vec.v[:, :2], axis=1) / np.linalg.norm(cone_vec.v, axis=1)
+    slope_v = np.linalg.norm(cone_vec.v[:, :2], axis=1) / np.linalg.norm(
+        cone_vec.v, axis=1
+    )
     return bool(max(slope_u.max(), slope_v.max()) > UPRIGHT)
 
 
@@ -53,7 +55,9 @@ def on_its_side(cone_vec: ConeVec) -> bool:
 
 def swapped(cone_vec: ConeVec) -> ConeVec:
     """Return the geometry of images whose rows and columns are swapped."""
-    return ConeVec.from_vectors(cone_vec.source, cone_vec.detector, cone_vec.v, cone_vec.u)
+    return ConeVec.from_vectors(
+        cone_vec.source, cone_vec.detector, cone_vec.v, cone_vec.u
+    )
 
 
 def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
@@ -71,7 +75,8 @@ def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
     level = np.hypot(away[:, 0], away[:, 1])
     if level.min() <= FLAT:
         why = (
-            "a panel lies flat: it has no rows across the rotation axis; FDK needs one that stands"
+            "a panel lies flat: it has no rows across the rotation axis; FDK needs one "
+            "that stands"
         )
         raise no_fdk(why, float(level.min()), f"> {FLAT:g}")
     # Down times the normal is to the right, whatever turn the panel had about its normal.
@@ -112,13 +117,17 @@ def homography(
     """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
-        first = row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
+        first = (
+            row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
+        )
         return np.column_stack([row[6:9], row[9:12], first])
 
     return np.asarray(np.linalg.solve(plane(old, *shape), plane(new, *new_shape)))
 
 
-def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None) -> Grid:
+def field_of_view(
+    cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None
+) -> Grid:
     """Compute the largest box about the object frame's z axis that all views together can
     fill.
 
@@ -147,13 +156,17 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
     to_axis = -(cone_vec.source * normal).sum(axis=1)
     scale = float((to_axis / cone_vec.source_detector_distance).min())
     if scale <= 0:
-        raise GeometryError("the object's origin is not in front of the source in every view")
+        raise GeometryError(
+            "the object's origin is not in front of the source in every view"
+        )
     pitch = float(np.linalg.norm(cone_vec.u[0]))
     if voxel_mm is None:
         size = pitch * scale
         voxel_mm = round(size, 3) if size >= SMALL_MM else float(f"{size:.3g}")
     centre = cone_vec.project_points(np.zeros((1, 3)), shape)[:, 0]
-    reach = float(np.abs(np.concatenate([centre[:, 0] + 0.5, cols - 0.5 - centre[:, 0]])).max())
+    reach = float(
+        np.abs(np.concatenate([centre[:, 0] + 0.5, cols - 0.5 - centre[:, 0]])).max()
+    )
     up = float((centre[:, 1] + 0.5).max()) * pitch * scale
     down = float((rows - 0.5 - centre[:, 1]).max()) * pitch * scale
     wide = max(1, math.ceil(2 * reach * pitch * scale / voxel_mm))
@@ -161,7 +174,9 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
     return Grid((high, wide, wide), voxel_mm, (0.0, 0.0, (up - down) / 2))
 
 
-def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tuple[int, int]:
+def rows_needed(
+    cone_vec: ConeVec, shape: tuple[int, int], like: Volume
+) -> tuple[int, int]:
     """Find rows first <= r < last with the volume's shadow in some view (a few to spare).
 
     There is one more above the panel and one below it: pixels see beyond their centres.
@@ -177,11 +192,16 @@ def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tupl
 
 
 def window(
-    cone_vec: ConeVec, shape: tuple[int, int], rows: tuple[int, int], cols: tuple[int, int]
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
+    rows: tuple[int, int],
+    cols: tuple[int, int],
 ) -> ConeVec:
     """Compute the geometry of rows and columns first <= i < last, which may be off the
     panel.
     """
-    down, right = ((sum(part) - size) / 2 for part, size in zip((rows, cols), shape, strict=True))
+    down, right = (
+        (sum(part) - size) / 2 for part, size in zip((rows, cols), shape, strict=True)
+    )
     centre = cone_vec.detector + down * cone_vec.v + right * cone_vec.u
     return ConeVec.from_vectors(cone_vec.source, centre, cone_vec.u, cone_vec.v)

@@ -1,12 +1,13 @@
 """A scan's trajectory for FDK: its circle, the arc of each view, and its redundancy.
 
-Any flat panel on a circle about an axis parallel to z: any number of turns and parts of turns with
-any gaps, as long as the views see every line through the object, a detector moved to one side, and
-helices of a turn or more. Other trajectories are an error; iterative methods take those.
+Any flat panel on a circle about an axis parallel to z: any number of turns and parts of turns
+with any gaps, as long as the views see every line through the object, a detector moved to one
+side, and helices of a turn or more. Other trajectories are an error; iterative methods take
+those.
 
-What the views cover decides, not the order in which they are listed. Those of a circle are sorted
-by their angle on it, whatever the turn, and each stands for the arc to halfway to its neighbours. A
-step much wider than the usual one is a gap, which the opposite views make up for.
+What the views cover decides, not the order in which they are listed. Those of a circle are
+sorted by their angle on it, whatever the turn, and each stands for the arc to halfway to its
+neighbours. A step much wider than the usual one is a gap, which the opposite views make up for.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ side."""
 MIN_TAPER_COLS = 24
 """Least width of that transition [columns]."""
 MIN_CONFIDENCE = 3e-3
-"""Confidence in the rays at the panel's near edge, relative to that in their opposites. It decides
-only where an opposite ray was hardly seen: next to a gap of the angles."""
+"""Confidence in the rays at the panel's near edge, relative to that in their opposites. It
+decides only where an opposite ray was hardly seen: next to a gap of the angles."""
 MAX_PANEL_WIDTHS = 8
 """Largest width to which a panel moved to one side is continued, over its columns."""
 MAX_CIRCLE_RISE = 1e-3
@@ -80,7 +81,9 @@ class Circle:
         if self.full:
             return np.full_like(angle, np.inf)
         first, last = self.gaps.T
-        arc = np.append(first[1:], first[0] + TURN) - last  # that the views cover behind each gap
+        arc = (
+            np.append(first[1:], first[0] + TURN) - last
+        )  # that the views cover behind each gap
         at = np.concatenate([first, last, last + arc / 2])
         value = np.concatenate([np.zeros(2 * len(arc)), arc / 2])
         return np.asarray(np.interp(angle, at, value, period=TURN))
@@ -100,7 +103,9 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     """
     s = cone_vec.source
     if len(s) < 3:
-        raise GeometryError.instead(f"{len(s)} views", len(s), "for FDK a circle of at least 3")
+        raise GeometryError.instead(
+            f"{len(s)} views", len(s), "for FDK a circle of at least 3"
+        )
     # x^2 + y^2 = 2 a x + 2 b y + c, least squares
     rows = np.column_stack([2.0 * s[:, :2], np.ones(len(s))])
     (a, b, c), _, rank, _ = np.linalg.lstsq(rows, (s[:, :2] ** 2).sum(axis=1), rcond=None)
@@ -114,10 +119,14 @@ def circle_of(cone_vec: ConeVec) -> Circle:
         worst = max(worst, float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
     if worst > MAX_CIRCLE_DEVIATION * radius:
         raise no_fdk(
-            f"the sources leave a horizontal circle of radius {radius:.4g} mm by {worst:.4g} mm; "
-            "FDK needs a circle, or a helix that rises steadily for a turn or more and has no gap "
-            "of angles", worst, MAX_CIRCLE_DEVIATION * radius,
-        )  # fmt: skip
+            f"the sources leave a horizontal circle of radius {radius:.4g} mm by "
+            f"{worst:.4g} mm; "
+            "FDK needs a circle, or a helix that rises steadily for a turn or more and "
+            "has no gap "
+            "of angles",
+            worst,
+            MAX_CIRCLE_DEVIATION * radius,
+        )
     return helix or _turn(azimuth % TURN, centre, radius)
 
 
@@ -152,8 +161,9 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     at, same = np.unique(_on_circle(azimuth), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
-    # The widest may be the gap of a short scan, so that it does not say what is usual. A step of
-    # more than a third of the circle is a gap even of few views: three even ones just reach it.
+    # The widest may be the gap of a short scan, so that it does not say what is usual. A step
+    # of more than a third of the circle is a gap even of few views: three even ones just reach
+    # it.
     usual = _usual(np.delete(ahead, ahead.argmax()))
     for most in (GAP_STEPS, RANDOM_GAP_STEPS):
         open_ = (ahead > most * usual) | (ahead > TURN / 3 + 1e-6)
@@ -171,7 +181,11 @@ def _usual(steps: FloatArray) -> float:
     """
     ordered = np.sort(steps)
     covered = np.cumsum(ordered)
-    return float(ordered[int(np.searchsorted(covered, covered[-1] / 3))]) if len(steps) else TURN
+    return (
+        float(ordered[int(np.searchsorted(covered, covered[-1] / 3))])
+        if len(steps)
+        else TURN
+    )
 
 
 def _helix(
@@ -182,10 +196,15 @@ def _helix(
     run = np.empty(len(order))
     run[order] = np.unwrap(azimuth[order])
     span = float(np.ptp(run))
-    if np.ptp(height) <= MAX_CIRCLE_RISE * radius or span * len(run) / (len(run) - 1) < TURN - 1e-6:
+    if (
+        np.ptp(height) <= MAX_CIRCLE_RISE * radius
+        or span * len(run) / (len(run) - 1) < TURN - 1e-6
+    ):
         return None
     slope, level = np.polyfit(run, height, 1)
-    if np.abs(height - level - slope * run).max() > MAX_HELIX_DEVIATION * TURN * abs(slope):
+    if np.abs(height - level - slope * run).max() > MAX_HELIX_DEVIATION * TURN * abs(
+        slope
+    ):
         return None
     # The ends of a helix need not meet: the first and the last view stand for whole steps.
     run *= np.sign(slope)
@@ -201,7 +220,9 @@ def _helix(
     return Circle(centre, radius, run - run.min(), step, np.zeros((0, 2)), rise)
 
 
-def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = False) -> FloatArray:
+def redundancy(
+    circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = False
+) -> FloatArray:
     """Compute weights (n, cols) of rays so that a line and its opposite together count
     once.
 
@@ -224,9 +245,13 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
     _check_covered(circle, float(np.abs(fan).max()))
     column, overlap = (low + high) / cols, min(low, high)
     least = 0.0 if circle.full else MIN_CONFIDENCE
-    alone = np.zeros_like(fan)  # +1 where only the ray itself falls on the panel, -1 its opposite
+    alone = np.zeros_like(
+        fan
+    )  # +1 where only the ray itself falls on the panel, -1 its opposite
     if abs(high - low) > column and (circle.full or beyond):
-        taper = min(overlap, max(TAPER_REACHES * abs(high - low), MIN_TAPER_COLS * column))
+        taper = min(
+            overlap, max(TAPER_REACHES * abs(high - low), MIN_TAPER_COLS * column)
+        )
         side = fan if high > low else -fan
         past = np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)
         alone = np.sign(side) * (1 - least) * np.sin(np.pi / 2 * past) ** 2
@@ -253,18 +278,24 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
     at = cone_vec.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = np.round(2.0 * at) / 2.0 - at
     return ConeVec.from_vectors(
-        cone_vec.source, cone_vec.detector - moved[:, None] * cone_vec.u, cone_vec.u, cone_vec.v
+        cone_vec.source,
+        cone_vec.detector - moved[:, None] * cone_vec.u,
+        cone_vec.u,
+        cone_vec.v,
     )
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
     """Compute the confidence, 0 to 1, of views at angles from a gap."""
     from_gap = circle.from_gap(angle)
-    return np.asarray(np.sin(np.pi / 2 * np.minimum(from_gap / GAP_RAMP_RAD, 1.0)) ** 2 + 1e-12)
+    return np.asarray(
+        np.sin(np.pi / 2 * np.minimum(from_gap / GAP_RAMP_RAD, 1.0)) ** 2 + 1e-12
+    )
 
 
 def _check_covered(circle: Circle, widest: float) -> None:
-    """Check that the lines which gaps leave out, up to an angle of the fan, are seen from behind.
+    """Check that the lines which gaps leave out, up to an angle of the fan, are seen from
+    behind.
 
     Raises:
         GeometryError: some are not.
@@ -276,16 +307,22 @@ def _check_covered(circle: Circle, widest: float) -> None:
             f"{first:.4g} to {last:.4g}" for first, last in np.rad2deg(circle.gaps[:3])
         )
         raise no_fdk(
-            f"the views span {span:.4g} deg of the circle, and with the gap at {listed} deg they "
-            f"do not see every line: FDK needs {need:.4g} deg (half a turn and the fan) without a "
-            "gap, or gaps that have views on the other side", float(span), [float(need), 360.0],
-        )  # fmt: skip
+            f"the views span {span:.4g} deg of the circle, and with the gap at {listed} "
+            "deg they "
+            f"do not see every line: FDK needs {need:.4g} deg (half a turn and the fan) "
+            "without a "
+            "gap, or gaps that have views on the other side",
+            float(span),
+            [float(need), 360.0],
+        )
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
     """Compute the overlap of gaps with the opposites of others, up to a fan angle [rad]."""
     width, middle = np.diff(gaps)[:, 0], gaps.mean(axis=1)
-    apart = np.abs((middle[:, None] - middle) % TURN - np.pi)  # of a gap and what is behind another
+    apart = np.abs(
+        (middle[:, None] - middle) % TURN - np.pi
+    )  # of a gap and what is behind another
     return float(((width[:, None] + width) / 2 + 2 * widest - apart).max(initial=-TURN))
 
 
@@ -333,7 +370,9 @@ def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
     source = cone_vec.source[:, :2]
     inward = circle.centre - source
     offset = np.arange(cols) - (cols - 1) / 2
-    ray = (cone_vec.detector[:, :2] - source)[:, None] + offset[:, None] * cone_vec.u[:, None, :2]
+    ray = (cone_vec.detector[:, :2] - source)[:, None] + offset[:, None] * cone_vec.u[
+        :, None, :2
+    ]
     cross = inward[:, None, 0] * ray[..., 1] - inward[:, None, 1] * ray[..., 0]
     dot = (inward[:, None] * ray).sum(axis=-1)
     return np.asarray(np.arctan2(cross, dot))

@@ -49,15 +49,16 @@ SIGNIFICANT_SIGMAS = 4.0
 of thousands of bands, views and edges none is beyond by chance."""
 ACCURACY = 0.01
 """Relative error of densities that is taken for none. The best quarter of the rays may
-deviate from the prism by half of it: what deviated by less was right within 1 %, and outlines that
-were up to 4 % off (an octagon of twice the field of view) deviate by 0.6 % and more. A tenth of it
-at the edges is nothing."""
+deviate from the prism by half of it: what deviated by less was right within 1 %, and outlines
+that were up to 4 % off (an octagon of twice the field of view) deviate by 0.6 % and more. A
+tenth of it at the edges is nothing."""
 
 EDGE_BINS = 2
 """Bins of columns at either edge that have one value where no object is."""
 MAX_SPREAD, MAX_SLOPE = 0.02, 0.003
-"""Largest standard deviation of a view's edges over the contrast of the object, and largest step
-between these bins over their values: a cylinder of four times the panel has just that slope."""
+"""Largest standard deviation of a view's edges over the contrast of the object, and largest
+step between these bins over their values: a cylinder of four times the panel has just that
+slope."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,10 @@ class Prism:
         squared, middle = (along * along).sum(axis=-1), (start * along).sum(axis=-1)
         inside = middle * middle - squared * ((start * start).sum(axis=-1) - 1.0)
         length = (
-            2.0 * np.sqrt(np.maximum(inside, 0.0)) / squared * np.hypot(*np.moveaxis(rays, -1, 0))
+            2.0
+            * np.sqrt(np.maximum(inside, 0.0))
+            / squared
+            * np.hypot(*np.moveaxis(rays, -1, 0))
         )
         return np.asarray(self.attenuation * length)
 
@@ -111,7 +115,9 @@ class Prism:
         """Compute (72, 3) points around it [mm]."""
         turn = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         disc = np.stack([np.cos(turn), np.sin(turn)])
-        return np.pad(np.linalg.solve(self.to_disc, disc).T + self.centre, ((0, 0), (0, 1)))
+        return np.pad(
+            np.linalg.solve(self.to_disc, disc).T + self.centre, ((0, 0), (0, 1))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +149,9 @@ class Truncation:
     @property
     def explained(self) -> bool:
         """True if each band whose rows are continued has a prism."""
-        return all(p is not None for p, cut in zip(self.prisms, self.cut_off, strict=True) if cut)
+        return all(
+            p is not None for p, cut in zip(self.prisms, self.cut_off, strict=True) if cut
+        )
 
     @property
     def otherwise(self) -> Truncation:
@@ -169,7 +177,10 @@ class Truncation:
         for prism in (one for one in self.prisms if one is not None):
             at = middle_row.project_points(prism.rim(), (1, cols))[..., 0]
             at = np.where(np.isfinite(at), at, most)
-            before, after = max(before, -float(at.min())), max(after, float(at.max()) - cols + 1)
+            before, after = (
+                max(before, -float(at.min())),
+                max(after, float(at.max()) - cols + 1),
+            )
         return int(min(before + 2.0, most)), int(min(after + 2.0, most))
 
     def continuation(
@@ -188,7 +199,9 @@ class Truncation:
         band = np.clip(np.searchsorted(self.rows, at, "right") - 1, 0, len(self.rows) - 1)
         above = np.minimum(band + 1, len(self.rows) - 1)
         apart = self.rows[above] - self.rows[band]
-        share = np.where(apart > 0.0, (at - self.rows[band]) / np.where(apart > 0.0, apart, 1.0), 0)
+        share = np.where(
+            apart > 0.0, (at - self.rows[band]) / np.where(apart > 0.0, apart, 1.0), 0
+        )
         cols = panel.stop - panel.start
         column = np.arange(wide)
         away = np.maximum(panel.start - column, column - panel.stop + 1) - 0.5
@@ -238,13 +251,20 @@ class Continuation:
         """Make a continuation with nothing beyond the edges."""
         none = np.zeros(rows)
         return cls(
-            0, np.zeros((views, 6)), np.zeros((1, 6)), none.astype(np.intp), none, none,
+            0,
+            np.zeros((views, 6)),
+            np.zeros((1, 6)),
+            none.astype(np.intp),
+            none,
+            none,
             np.zeros(wide),
-        )  # fmt: skip
+        )
 
 
 def truncation_of(
-    image: Callable[[int], npt.NDArray[np.generic]], cone_vec: ConeVec, shape: tuple[int, int]
+    image: Callable[[int], npt.NDArray[np.generic]],
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
 ) -> Truncation | None:
     """Estimate the object beyond the panel's edges from some views of a scan.
 
@@ -259,7 +279,9 @@ def truncation_of(
     circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
     places, same = distinct_angles(circle)
     views = len(places)
-    chosen = np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
+    chosen = np.unique(
+        np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp)
+    )
     images = [mean_image(image, np.flatnonzero(same == i)) for i in chosen]
     cone_vec = cone_vec[places[chosen]]
     if on_its_side(cone_vec):
@@ -299,7 +321,9 @@ def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -
     apart = 2 * _edge(cols) + 2
     for image, columns in zip(smooth, there, strict=True):
         noise = _noise(image[:, ::apart])
-        if columns.any() and image[:, columns].max() > max(least, 2.0 * SIGNIFICANT_SIGMAS * noise):
+        if columns.any() and image[:, columns].max() > max(
+            least, 2.0 * SIGNIFICANT_SIGMAS * noise
+        ):
             return True
     return False
 
@@ -324,9 +348,14 @@ def _fitted(
     limits = np.linspace(0, rows, min(BANDS, rows) + 1).round().astype(int)
     bins = np.linspace(0, cols, min(SAMPLES, cols) + 1).round().astype(int)
     middles, columns = (0.5 * (at[:-1] + at[1:] - 1.0) for at in (limits, bins))
-    source, rays, up = _rays(cone_vec, middles - (rows - 1) / 2.0, columns - (cols - 1) / 2.0)
+    source, rays, up = _rays(
+        cone_vec, middles - (rows - 1) / 2.0, columns - (cols - 1) / 2.0
+    )
     seen = np.array(
-        [np.add.reduceat(np.add.reduceat(im, limits[:-1], 0), bins[:-1], 1) for im in images]
+        [
+            np.add.reduceat(np.add.reduceat(im, limits[:-1], 0), bins[:-1], 1)
+            for im in images
+        ]
     )
     seen /= np.diff(limits)[:, None] * np.diff(bins)
     seen /= np.sqrt(1.0 + up[:, :, None] ** 2 / (rays**2).sum(axis=-1)[:, None])
@@ -345,7 +374,9 @@ def _fitted(
         cut_off[k] = (_cut_off(band, least, usual) & edges_that_count).any()
         if not cut_off[k]:
             continue
-        even = max(float(np.ptp(band.mean(axis=axis))) for axis in (0, 1)) < ACCURACY * usual
+        even = (
+            max(float(np.ptp(band.mean(axis=axis))) for axis in (0, 1)) < ACCURACY * usual
+        )
         if not helix and not even:
             prisms[k], others[k] = _fit(source, rays, band, usual, known)
             known = prisms[k] or known
@@ -371,7 +402,11 @@ def _open_beam(seen: FloatArray) -> bool:
     contrast = float(np.percentile(seen, 90.0)) - usual
     inwards = seen[..., 1] - seen[..., 0] + seen[..., -2] - seen[..., -1]
     level = abs(float(inwards.mean())) < 2.0 * MAX_SLOPE * abs(usual)
-    return level and contrast > 0.0 and float(edges.std(axis=1).max()) < MAX_SPREAD * contrast
+    return (
+        level
+        and contrast > 0.0
+        and float(edges.std(axis=1).max()) < MAX_SPREAD * contrast
+    )
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:
@@ -394,10 +429,13 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     from scipy.ndimage import median_filter
 
     ends = band[:, [0, -1]]
-    noise = SIGNIFICANT_SIGMAS * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
+    noise = SIGNIFICANT_SIGMAS * np.array(
+        [_noise(band[:, :5:2]), _noise(band[:, :-6:-2])]
+    )
     some = median_filter(ends, (min(3, len(band)), 1)) > np.maximum(least, noise)
-    # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts is
-    # what would change densities by the accuracy. Two edges add a pi-th of their sum, at most.
+    # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts
+    # is what would change densities by the accuracy. Two edges add a pi-th of their sum, at
+    # most.
     mean = band.mean(axis=0)
     apart = np.array([_noise(end) for end in ends.T]) / np.sqrt(len(ends))
     apart = SIGNIFICANT_SIGMAS * np.hypot(apart, _noise(mean))
@@ -406,7 +444,11 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
 
 
 def _fit(
-    source: FloatArray, rays: FloatArray, seen: FloatArray, usual: float, near: Prism | None
+    source: FloatArray,
+    rays: FloatArray,
+    seen: FloatArray,
+    usual: float,
+    near: Prism | None,
 ) -> tuple[Prism | None, Prism | None]:
     """Fit the prism that explains the values, or else the best one.
 
@@ -461,18 +503,27 @@ def _fit(
     if near is not None:
         size = np.log(field * np.diag(near.to_disc))
         starts = [
-            [*near.centre / field, *size, field * near.to_disc[1, 0], np.log(near.attenuation)]
+            [
+                *near.centre / field,
+                *size,
+                field * near.to_disc[1, 0],
+                np.log(near.attenuation),
+            ]
         ]
     scale = 5.0 * ACCURACY * usual
     _, x = min((fit(start, scale) for start in starts), key=lambda one: one[0])
-    # Narrower and narrower: what deviates by more than the best quarter does then hardly counts.
+    # Narrower and narrower: what deviates by more than the best quarter does then hardly
+    # counts.
     while (best := float(np.percentile(np.abs(rest(x)[hit]), 25.0))) < 0.8 * scale:
         scale = max(best, 0.1 * ACCURACY * usual)
         _, x = fit(x, scale)
         if scale > best:
             break
-    by_noise = 0.319 * _noise(rest(x))  # a quarter of normal noise is below so many deviations
-    # Both are estimates; the ratio of their squares varies by 4.9 over the root of their number.
+    by_noise = 0.319 * _noise(
+        rest(x)
+    )  # a quarter of normal noise is below so many deviations
+    # Both are estimates; the ratio of their squares varies by 4.9 over the root of their
+    # number.
     by_noise *= np.sqrt(1.0 + 0.5 * SIGNIFICANT_SIGMAS * 4.9 / np.sqrt(seen.size))
     if np.sqrt(max(best**2 - by_noise**2, 0.0)) <= 0.5 * ACCURACY * usual:
         return Prism.of(x, field), None

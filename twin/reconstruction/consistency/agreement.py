@@ -1,9 +1,9 @@
 """Whether the images of a scan and its geometry belong together.
 
 A coarse volume is projected again and compared with the images. How large the residual is where
-both are right depends on object and trajectory; the volume, projected and reconstructed a second
-time, shows it. Where the residual is larger, other explanations are tried, each with a coarse
-reconstruction of its own. All of it is done with few views and rows.
+both are right depends on object and trajectory; the volume, projected and reconstructed a
+second time, shows it. Where the residual is larger, other explanations are tried, each with a
+coarse reconstruction of its own. All of it is done with few views and rows.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ PROBE_COLUMNS: Final = 0.35
 FAR_PROBE_COLUMNS: Final = 3.0
 """The same if images do not fit at all [coarse columns]."""
 UNEXPLAINED: Final = (
-    "No other direction, order, mirror or offset explains it; motion during the scan does, images "
+    "No other direction, order, mirror or offset explains it; motion during the scan "
+    "does, images "
     "in a wrong order, and images that are not line integrals of one object"
 )
 MAX_PROBE_STEPS: Final = 7
@@ -86,7 +87,8 @@ class Contradiction:
         """Describe the contradiction for the user."""
         said = (
             "no accuracy is claimed: images and geometry contradict each other; the volume, "
-            f"projected again, differs from the images {self.misfit:.2g} times as much as it should"
+            f"projected again, differs from the images {self.misfit:.2g} times as much "
+            "as it should"
         )
         if not self.kinds:
             return f"{said}. {UNEXPLAINED}"
@@ -157,10 +159,15 @@ class _Trial:
             else MAX_MUCH_BETTER_MISFIT
         )
         tried = [self._tried(reversed_turn(self.scan)), *self._beside(unfit)]
-        tried += [self._tried(one) for one in suspects(self.scan, whole=self.whole and self.even)]
+        tried += [
+            self._tried(one)
+            for one in suspects(self.scan, whole=self.whole and self.even)
+        ]
         best = min(tried, key=lambda one: one.score)
         if best.score < better and self._explains(best):
-            as_good = [one for one in tried if one.score <= EQUAL_MISFIT_RATIO * best.score]
+            as_good = [
+                one for one in tried if one.score <= EQUAL_MISFIT_RATIO * best.score
+            ]
             named = {one.suspect.kind: one.suspect.figure for one in as_good}
             kinds, figures = tuple(named), tuple(named.values())
             return Contradiction(self.excess, kinds, best.score, figures)
@@ -184,7 +191,9 @@ class _Trial:
         """Compute the misfit relative to the expected one: by edges, if the coarse volume
         has some.
         """
-        return float((shown.misfit(MIN_SIGNAL_SHARE) / expected)[1 if self.telling[1] else 0])
+        return float(
+            (shown.misfit(MIN_SIGNAL_SHARE) / expected)[1 if self.telling[1] else 0]
+        )
 
     def _tried(self, suspect: Suspect) -> _Tried:
         # The explanation of a scan also explains why it seemed cut off.

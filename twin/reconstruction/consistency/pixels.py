@@ -79,7 +79,9 @@ class BadPixels:
         )
 
 
-def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) -> BadPixels | None:
+def bad_pixels(
+    views: Callable[[], Iterable[Float32Array]], axis_column: float
+) -> BadPixels | None:
     """Find pixels that do not respond as their neighbours do.
 
     Args:
@@ -94,7 +96,9 @@ def bad_pixels(views: Callable[[], Iterable[Float32Array]], axis_column: float) 
     first, response = _outliers(views(), axis_column)
     if not first.any():
         return None
-    worst = first & (response >= _largest_about(np.where(first, response, np.float32(0.0))))
+    worst = first & (
+        response >= _largest_about(np.where(first, response, np.float32(0.0)))
+    )
     second, _ = _outliers((_interpolated(view, worst) for view in views()), axis_column)
     mask = _lasting_or_flickering(views(), worst | second)
     if not mask.any():
@@ -197,7 +201,9 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
     padded = np.pad(response, ((0, -rows % tall), (0, -cols % wide)), "reflect")
     down, across = padded.shape[0] // tall, padded.shape[1] // wide
     blocks = padded.reshape(down, tall, across, wide).transpose(0, 2, 1, 3)
-    usual = maximum_filter(np.median(blocks.reshape(down, across, -1), axis=2), 3, mode="nearest")
+    usual = maximum_filter(
+        np.median(blocks.reshape(down, across, -1), axis=2), 3, mode="nearest"
+    )
     usual = usual.repeat(tall, axis=0)[:rows].repeat(wide, axis=1)[:, :cols]
     least = np.full(cols, MIN_BAD_RESPONSE)
     least[:NEIGHBOURS] = least[-NEIGHBOURS:] = MIN_EDGE_RESPONSE
@@ -216,7 +222,9 @@ def _beyond_neighbours(view: Float32Array) -> Float32Array:
     other = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
     low, high = np.minimum(one, other), np.maximum(one, other)
     for ends in (slice(NEIGHBOURS), slice(-NEIGHBOURS, None)):
-        span = EDGE_SLOPE_FACTOR * (high[:, ends] - low[:, ends])  # a slope goes on beyond them
+        span = EDGE_SLOPE_FACTOR * (
+            high[:, ends] - low[:, ends]
+        )  # a slope goes on beyond them
         low[:, ends] -= span
         high[:, ends] += span
     np.subtract(low, view, out=low)

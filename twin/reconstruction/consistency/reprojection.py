@@ -78,10 +78,13 @@ class Reprojection:
 
     @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean squares of residual, images and noise: of the values, and of their changes, (2,)."""
+        """Mean squares of residual, images and noise: of the values, and of their changes,
+        (2,)."""
         rest = self.again - self.images
         # Differences between neighbours in both are the object's.
-        noise = NOISE_VARIANCE_RATIO * max(_noise_of(self.images) - _noise_of(self.again), 0.0)
+        noise = NOISE_VARIANCE_RATIO * max(
+            _noise_of(self.images) - _noise_of(self.again), 0.0
+        )
         residual, signal = (
             np.array([_mean_square(what), _mean_square(_changes(what))])
             for what in (rest, self.images)
@@ -110,5 +113,7 @@ def _noise_of(images: Float32Array) -> float:
     else:
         mixed, terms = np.diff(images, n=2, axis=2), 6.0
     beside = float(np.median(np.square(mixed), axis=0).mean()) / terms
-    between = float(np.median(np.square(np.diff(images, n=2, axis=0)), axis=0).mean()) / 6.0
+    between = (
+        float(np.median(np.square(np.diff(images, n=2, axis=0)), axis=0).mean()) / 6.0
+    )
     return min(beside, between) / MEDIAN_OF_SQUARES

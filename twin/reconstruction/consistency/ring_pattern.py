@@ -99,7 +99,9 @@ def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Arr
         waiting = []
         if len(medians) == MAX_GROUPS:
             pairs = zip(medians[::2], medians[1::2], strict=True)
-            medians = [np.asarray(0.5 * (one + other), np.float32) for one, other in pairs]
+            medians = [
+                np.asarray(0.5 * (one + other), np.float32) for one, other in pairs
+            ]
             joined *= 2
     if medians:
         return medians
@@ -146,7 +148,9 @@ class _Pattern:
         noise = MEDIAN_VARIANCE / len(groups) * np.square(apart)
         return cls(middle, _block_mean(np.asarray(noise, np.float32)))
 
-    def errors(self, ways: Sequence[Callable[[Float32Array], Float32Array]]) -> Float32Array:
+    def errors(
+        self, ways: Sequence[Callable[[Float32Array], Float32Array]]
+    ) -> Float32Array:
         """Compute the pixels' share of the pattern, (rows, cols).
 
         Args:
@@ -160,7 +164,9 @@ class _Pattern:
         for alike in ways:
             other = alike(left)
             shared = np.maximum(_block_mean(left * other), np.float32(0.0))
-            other_power = np.maximum(_block_mean(np.square(other)), np.finfo(np.float32).tiny)
+            other_power = np.maximum(
+                _block_mean(np.square(other)), np.finfo(np.float32).tiny
+            )
             of_pixels = of_pixels - np.maximum(shared, shared**2 / other_power)
             left = np.subtract(left, shared / other_power * other, dtype=np.float32)
         power = np.maximum(_block_mean(np.square(left)), np.finfo(np.float32).tiny)

@@ -93,7 +93,9 @@ def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
         return np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
 
     views = scan.cone_vec
-    source, panel = (about(place - centre) + centre for place in (views.source, views.detector))
+    source, panel = (
+        about(place - centre) + centre for place in (views.source, views.detector)
+    )
     return ConeVec.from_vectors(source, panel, about(views.u), about(views.v))
 
 
@@ -142,11 +144,18 @@ def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
     """
     shape = (scan.images.shape[1], scan.images.shape[2])
     x, y = scan.circle.centre
-    foot = np.column_stack([np.full(len(scan.angles), x), np.full(len(scan.angles), y),
-                            scan.cone_vec.source[:, 2]])  # fmt: skip
-    at = np.array([
-        scan.cone_vec[k : k + 1].project_points(foot[k : k + 1], shape)[0, 0]
-        for k in range(0, len(foot), max(1, len(foot) // 8))
-    ])  # fmt: skip
+    foot = np.column_stack(
+        [
+            np.full(len(scan.angles), x),
+            np.full(len(scan.angles), y),
+            scan.cone_vec.source[:, 2],
+        ]
+    )
+    at = np.array(
+        [
+            scan.cone_vec[k : k + 1].project_points(foot[k : k + 1], shape)[0, 0]
+            for k in range(0, len(foot), max(1, len(foot) // 8))
+        ]
+    )
     along, down = at.mean(axis=0) - (np.array(shape[::-1]) - 1.0) / 2.0
     return float(along), float(down)

@@ -1,8 +1,8 @@
 """Views weighed, filtered and added to a volume: on a CUDA device or on the processor.
 
-Both take views in parts and hand out the volume at the end; the volume stays where it is computed
-until then. They give the same numbers (to 1e-5 of the maximum), and both add up what the noise of
-the volume is found from, if there is a `meter`.
+Both take views in parts and hand out the volume at the end; the volume stays where it is
+computed until then. They give the same numbers (to 1e-5 of the maximum), and both add up what
+the noise of the volume is found from, if there is a `meter`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
-from flexdt.twin.reconstruction.feldkamp.filtering import filtered, response_of_length, taps
+from flexdt.twin.reconstruction.feldkamp.filtering import (
+    filtered,
+    response_of_length,
+    taps,
+)
 from flexdt.twin.reconstruction.feldkamp.image_upload import ImageUpload
 from flexdt.twin.reconstruction.feldkamp.noise import NoiseMeter
 
@@ -65,7 +69,10 @@ class OnProcessor:
 
         n, wide, cols, rows = views.sizes
         if views.sizes != self._sizes:  # new memory costs as much as filtering
-            self._sizes, self._columns = views.sizes, fdk_kernels.room(n, cols, rows, views.few)
+            self._sizes, self._columns = (
+                views.sizes,
+                fdk_kernels.room(n, cols, rows, views.few),
+            )
         views = replace(views, images=np.ascontiguousarray(views.images))
         fitting = min(GROUP, 2 * GROUP * views.images.shape[2] // wide)
         group = max(1, fitting, PIXELS // (wide * rows))
@@ -74,9 +81,15 @@ class OnProcessor:
             lines = filtered(_weighed(views.of(some)), views.response)
             fdk_kernels.stand_up(lines, views.kept.start, self._columns[some])
         fdk_kernels.backproject(
-            self._columns, rows, views.shares, views.table, *self._first, *self._size, self._data,
+            self._columns,
+            rows,
+            views.shares,
+            views.table,
+            *self._first,
+            *self._size,
+            self._data,
             threads(),
-        )  # fmt: skip
+        )
         if self.meter is not None:
             self.meter.add(views, self._columns)
 
@@ -127,7 +140,9 @@ class OnDevice:
         def prepare() -> None:
             from numba import cuda
 
-            self._grid = [cuda.to_device(np.array(numbers)) for numbers in first_and_steps(like)]
+            self._grid = [
+                cuda.to_device(np.array(numbers)) for numbers in first_and_steps(like)
+            ]
             self._flat, self._stream = gpu.zeros(ny * nx * nz), cuda.stream()
             self._upload = ImageUpload(self._stream)
 
@@ -142,7 +157,9 @@ class OnDevice:
         ends = int((signs > 0.0).sum()), int((signs >= 0.0).sum())
         gpu.demand(lambda: self._add(views.without_images(order), order, *ends))
 
-    def _add(self, views: Views, order: npt.NDArray[np.intp], plus: int, minus: int) -> None:
+    def _add(
+        self, views: Views, order: npt.NDArray[np.intp], plus: int, minus: int
+    ) -> None:
         """Weigh, filter and add images in the order of their arrival.
 
         Args:
@@ -158,7 +175,9 @@ class OnDevice:
         else:
             ready = self._convolved(replace(views, images=views.images[order]))
         n, _, cols, rows = views.sizes
-        self._backproject(ready, (cols, rows), views.table, self._grid, self._flat, self._shape)
+        self._backproject(
+            ready, (cols, rows), views.table, self._grid, self._flat, self._shape
+        )
         if self.meter is not None:
             shape = self.meter.data.shape
             halves = zip((slice(plus), slice(minus, n)), self._both(), strict=True)
@@ -170,24 +189,34 @@ class OnDevice:
 
     def _transformed(self, views: Views, order: npt.NDArray[np.intp], length: int) -> Any:
         """Weigh and filter columns of the images by a transform, (n, cols, rows)."""
-        from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+        from flexdt.twin.reconstruction.kernels import (
+            gpu_reconstruction_kernels as kernels,
+        )
 
         upload, on = self._upload, views.beyond
         shown = views.shown
         there = upload.images(views.images, order, shown)
         tables = [
-            upload.table("factors", views.factors), upload.table("across", views.across),
-            upload.table("up", views.up), upload.table("lengths", views.prism_lengths()),
-        ]  # fmt: skip
+            upload.table("factors", views.factors),
+            upload.table("across", views.across),
+            upload.table("up", views.up),
+            upload.table("lengths", views.prism_lengths()),
+        ]
         if not self._filter:
             self._filter = self._filter_tables(views, length)
         upload.hand_over()
         n, _, cols, rows = views.sizes
         ready = self._ready(n, cols, rows)
         kernels.filter_rows[(-(-rows // 2), n), kernels.THREADS, self._stream](
-            there, views.top - shown.start, views.before, on.edge, *tables,
-            *self._filter, views.kept.start, ready,
-        )  # fmt: skip
+            there,
+            views.top - shown.start,
+            views.before,
+            on.edge,
+            *tables,
+            *self._filter,
+            views.kept.start,
+            ready,
+        )
         upload.end()
         return ready
 
@@ -210,7 +239,9 @@ class OnDevice:
         """Weigh and filter by a sum over taps, for rows of any length; as `_transformed`."""
         from numba import cuda
 
-        from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+        from flexdt.twin.reconstruction.kernels import (
+            gpu_reconstruction_kernels as kernels,
+        )
 
         n, wide, cols, rows = views.sizes
         upload, stream = self._upload, self._stream
@@ -218,17 +249,20 @@ class OnDevice:
         views.widen(lines)
         there = upload.images(lines, np.arange(n), slice(0, rows))
         tables = [
-            upload.table("factors", views.factors), upload.table("across", views.across),
+            upload.table("factors", views.factors),
+            upload.table("across", views.across),
             upload.table("up", views.up),
             upload.table("taps", taps(views.response, wide, kernels.RUN)),
-        ]  # fmt: skip
+        ]
         upload.hand_over()
 
         def plane(columns: int) -> tuple[int, int, int]:
             return -(-rows // kernels.PLANE[0]), -(-columns // kernels.PLANE[1]), n
 
         weighted = cuda.device_array((n, wide, rows), np.float32, stream=stream)
-        kernels.weigh[plane(wide), (*kernels.PLANE, 1), stream](there, 0, *tables[:3], weighted)
+        kernels.weigh[plane(wide), (*kernels.PLANE, 1), stream](
+            there, 0, *tables[:3], weighted
+        )
         ready = self._ready(n, cols, rows)
         kernels.convolve[plane(-(-cols // kernels.RUN)), (*kernels.PLANE, 1), stream](
             weighted, tables[3], views.kept.start, ready
@@ -256,10 +290,16 @@ class OnDevice:
         """Add filtered columns of images of `size` (cols, rows) to a volume (ny, nx, nz)."""
         from numba import cuda
 
-        from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
+        from flexdt.twin.reconstruction.kernels import (
+            gpu_reconstruction_kernels as kernels,
+        )
 
         ny, nx, nz = shape
-        blocks = (-(-nz // (kernels.BLOCK[0] * kernels.RUN)), -(-nx // kernels.BLOCK[1]), ny)
+        blocks = (
+            -(-nz // (kernels.BLOCK[0] * kernels.RUN)),
+            -(-nx // kernels.BLOCK[1]),
+            ny,
+        )
         views = cuda.to_device(np.ascontiguousarray(table), self._stream)
         kernels.backproject[blocks, (*kernels.BLOCK, 1), self._stream](
             ready.reshape(ready.size), *size, views, *grid, flat.reshape(ny, nx, nz)
@@ -294,7 +334,8 @@ class OnDevice:
 
 
 def padded_power(views: Views) -> int:
-    """Count the columns of a row padded to a power of 2; 0 where the device has no room for it."""
+    """Count the columns of a row padded to a power of 2; 0 where the device has no room for
+    it."""
     from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
     least = max(2 * views.reach - 1, views.factors.shape[1], 2)

@@ -1,4 +1,5 @@
-"""Filtered backprojection for cone beams on a circle (Feldkamp, Davis and Kress 1984) or a helix.
+"""Filtered backprojection for cone beams on a circle (Feldkamp, Davis and Kress 1984) or a
+helix.
 
 The panel may be moved to any side and turned about the vertical: distances and angles come from
 each row of the geometry. Tilted panels are resampled upright first. Views may come in parts, so

@@ -57,7 +57,8 @@ class Panels:
         turned: whether the images' rows and columns are swapped first.
         seen: (rows, cols) of the images, so swapped.
         recorded: the geometry of the images, so swapped.
-        upright: the geometry of the panels that FDK works on; `recorded` where they are the same.
+        upright: the geometry of the panels that FDK works on; `recorded` where they are the
+            same.
         shape: (rows, cols) of these.
     """
 
@@ -169,16 +170,30 @@ class FdkPlan:
         if self.truncation is None:
             beyond = Continuation.empty(len(part), *shape)
         else:
-            beyond = self.truncation.continuation(level, widths.first, shape, widths.panel)
+            beyond = self.truncation.continuation(
+                level, widths.first, shape, widths.panel
+            )
         shares = np.zeros((len(part), 0, 0), np.float32)
         if self.sharing is not None:
             shares = self.sharing.table(views, (widths.first, widths.last))
-        factors, across, up = weighing(shape, level, self.circle, views, self.weights[views])
+        factors, across, up = weighing(
+            shape, level, self.circle, views, self.weights[views]
+        )
         few = panels.shape[0] <= FEW_ROWS and self.sharing is None
         return Views(
-            images, widths.first, widths.before, beyond, factors, across, up, self.response,
-            widths.kept, shares, self.table[views], few,
-        )  # fmt: skip
+            images,
+            widths.first,
+            widths.before,
+            beyond,
+            factors,
+            across,
+            up,
+            self.response,
+            widths.kept,
+            shares,
+            self.table[views],
+            few,
+        )
 
     def cover(self, data: Float32Array, grid: Volume, *, outside: bool) -> None:
         """Scale voxels that some views do not see, and make NaN those that too few see.
@@ -196,9 +211,15 @@ class FdkPlan:
         widths = self.widths
         own = widths.near[0], widths.near[0] + widths.cols - 1
         normalise_coverage(
-            data, grid, self.circle, self.table, self.weights[:, widths.kept], widths.rows, own,
+            data,
+            grid,
+            self.circle,
+            self.table,
+            self.weights[:, widths.kept],
+            widths.rows,
+            own,
             cut_off=self.truncation is not None and not outside,
-        )  # fmt: skip
+        )
 
 
 def plan_fdk(
@@ -218,8 +239,8 @@ def plan_fdk(
         truncation: object beyond the panel's edges (`truncation_of`); None for nothing.
 
     Raises:
-        GeometryError: no circle and no helix, too short a scan, too steep a helix, or rows of one
-            pixel.
+        GeometryError: no circle and no helix, too short a scan, too steep a helix, or rows of
+            one pixel.
         UnknownNameError: no such window.
     """
     circle = circle_of(cone_vec)
@@ -255,7 +276,9 @@ def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels
     if turned:
         cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
     if shape[1] < 2:
-        raise GeometryError.instead("rows of 1 pixel, which cannot be filtered", 1, "2 or more")
+        raise GeometryError.instead(
+            "rows of 1 pixel, which cannot be filtered", 1, "2 or more"
+        )
     seen, level = shape, cone_vec
     if leans(cone_vec):
         shape = (shape[0], round(FINER * shape[1]))
@@ -281,7 +304,9 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
         raise no_fdk(f"{said}; FDK takes {most:.1f} at most", moved, most)
 
 
-def _widths(circle: Circle, panels: Panels, like: Volume, truncation: Truncation | None) -> Widths:
+def _widths(
+    circle: Circle, panels: Panels, like: Volume, truncation: Truncation | None
+) -> Widths:
     """Find the rows and columns that a grid and the object beyond the panel's edges need."""
     level, cols = panels.upright, panels.shape[1]
     near = columns_beyond(circle, level, cols)
@@ -293,12 +318,17 @@ def _widths(circle: Circle, panels: Panels, like: Volume, truncation: Truncation
 
 
 def weighing(
-    shape: tuple[int, int], cone_vec: ConeVec, circle: Circle, views: slice, weights: FloatArray
+    shape: tuple[int, int],
+    cone_vec: ConeVec,
+    circle: Circle,
+    views: slice,
+    weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute the weights that FDK applies before the filter: factors, across and up of `Views`.
+    """Compute the weights that FDK applies before the filter: factors, across and up of
+    `Views`.
 
-    The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion for a
-    panel at any angle to that line then needs the distance along the panel's normal only.
+    The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion
+    for a panel at any angle to that line then needs the distance along the panel's normal only.
     """
     rows, cols = shape
     source, u, v = cone_vec.source, cone_vec.u, cone_vec.v

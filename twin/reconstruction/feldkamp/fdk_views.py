@@ -71,10 +71,14 @@ class Views:
     def without_images(self, which: slice | npt.NDArray[np.intp]) -> Views:
         """Select some of these views, with the images of all."""
         return replace(
-            self, beyond=self.beyond.of(which),
-            factors=self.factors[which], across=self.across[which], up=self.up[which],
-            shares=self.shares[which], table=self.table[which],
-        )  # fmt: skip
+            self,
+            beyond=self.beyond.of(which),
+            factors=self.factors[which],
+            across=self.across[which],
+            up=self.up[which],
+            shares=self.shares[which],
+            table=self.table[which],
+        )
 
     @property
     def reach(self) -> int:
@@ -92,18 +96,31 @@ class Views:
         on, cols = self.beyond, self.images.shape[2]
         n, wide = self.factors.shape
         out = np.empty((n, len(on.prisms), wide), np.float32)
-        truncation_kernels.prism_lengths(self.before, cols, on.edge, on.plane, on.prisms, out)
+        truncation_kernels.prism_lengths(
+            self.before, cols, on.edge, on.plane, on.prisms, out
+        )
         return out
 
     def widen(self, out: Float32Array) -> None:
-        """Write the rows that are needed, continued beyond the panel's edges, (n, rows, cols)."""
+        """Write the rows that are needed, continued beyond the panel's edges, (n, rows,
+        cols)."""
         from flexdt.twin.reconstruction.kernels import truncation_kernels
 
         on = self.beyond
         truncation_kernels.continue_rows(
-            np.ascontiguousarray(self.images), self.top, self.before, on.edge,
-            self.prism_lengths(), on.band, on.share, on.cut, on.fade, self.across, self.up, out,
-        )  # fmt: skip
+            np.ascontiguousarray(self.images),
+            self.top,
+            self.before,
+            on.edge,
+            self.prism_lengths(),
+            on.band,
+            on.share,
+            on.cut,
+            on.fade,
+            self.across,
+            self.up,
+            out,
+        )
 
 
 def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:

@@ -16,8 +16,8 @@ def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
     """Compute the frequency response of the filter, times the pitch, (length / 2 + 1,) [1/mm].
 
     Args:
-        reach: least distance between columns that do not act on each other; the number of columns
-            of a row, or less where not all filtered values are needed.
+        reach: least distance between columns that do not act on each other; the number of
+            columns of a row, or less where not all filtered values are needed.
         pitch_mm: between columns.
         window: of `WINDOWS`.
 
@@ -25,7 +25,9 @@ def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
         UnknownNameError: lists the windows.
     """
     if window not in WINDOWS:
-        raise UnknownNameError.among(f"unknown filter {window!r}; there are", window, WINDOWS)
+        raise UnknownNameError.among(
+            f"unknown filter {window!r}; there are", window, WINDOWS
+        )
     length = _even_length(2 * reach)
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.zeros(length)
@@ -75,7 +77,8 @@ def taps(response: Float32Array, wide: int, more: int) -> FloatArray:
 
 
 def response_of_length(response: Float32Array, length: int) -> FloatArray:
-    """Compute the response of the same filter on rows padded to another length, (length / 2 + 1,).
+    """Compute the response of the same filter on rows padded to another length, (length / 2 +
+    1,).
 
     Columns are right as far as both lengths allow: half of the shorter one.
 

@@ -1,7 +1,7 @@
 """Upload images to a CUDA device through page-locked memory while it works on earlier ones.
 
-All cores copy a portion into page-locked memory, from where the device fetches it by itself. Two
-portions take turns, small enough that page-locking them costs little.
+All cores copy a portion into page-locked memory, from where the device fetches it by itself.
+Two portions take turns, small enough that page-locking them costs little.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ class ImageUpload:
         if self._read[self._chunk] is not None:
             self._read[self._chunk].wait(self._writer)
 
-    def images(self, images: Float32Array, order: npt.NDArray[np.intp], rows: slice) -> Any:
+    def images(
+        self, images: Float32Array, order: npt.NDArray[np.intp], rows: slice
+    ) -> Any:
         """Upload some rows of images, (n, rows.stop - rows.start, cols).
 
         Args:
@@ -59,7 +61,9 @@ class ImageUpload:
         for first in range(0, n, each):
             some = min(each, n - first)
             portion = self._portion(some * count * cols).reshape(some, count, cols)
-            fdk_kernels.copy_rows(images, order[first : first + some], rows.start, portion)
+            fdk_kernels.copy_rows(
+                images, order[first : first + some], rows.start, portion
+            )
             self._fetch(portion, there[first : first + some])
         return there
 

@@ -1,11 +1,11 @@
 """The standard deviation of the noise in a volume of FDK, from the images themselves.
 
-Nothing has to be known of the camera. What differs from view to view: the views are added up once
-more, every second one with a minus (in the order of their angles). What the object gives to
-neighbouring views cancels, what noise gives does not, and has the variance that it has in the
-volume. What all views share, the noise of the flat and dark images: its spectrum is that of the
-views' mean, less that of their alternating mean. A voxel's variance follows from where the views
-see it. On a grid of every few voxels, both cost little.
+Nothing has to be known of the camera. What differs from view to view: the views are added up
+once more, every second one with a minus (in the order of their angles). What the object gives
+to neighbouring views cancels, what noise gives does not, and has the variance that it has in
+the volume. What all views share, the noise of the flat and dark images: its spectrum is that of
+the views' mean, less that of their alternating mean. A voxel's variance follows from where the
+views see it. On a grid of every few voxels, both cost little.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ class Noise:
         x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
         out = interpolated(self.views, grid)
-        np.sqrt(out + np.interp(flat, self.radii, self.shared), out=out, casting="same_kind")
+        np.sqrt(
+            out + np.interp(flat, self.radii, self.shared), out=out, casting="same_kind"
+        )
         return np.where(np.isnan(grid.data), np.float32(np.nan), out)
 
 
@@ -106,7 +108,9 @@ class NoiseMeter:
         counts = np.maximum(1, np.array(like.shape[::-1]) // steps)
         nx, ny, nz = (int(n) for n in counts)
         dx, dy, dz = (float(s) for s in steps * size)
-        self.grid = Volume(np.zeros((nz, ny, nx), np.float32), (dx, dy, dz), like.center_mm)
+        self.grid = Volume(
+            np.zeros((nz, ny, nx), np.float32), (dx, dy, dz), like.center_mm
+        )
         self.data = np.zeros((ny, nx, nz), np.float32)
         order = np.argsort(circle.angle % (2.0 * np.pi), kind="stable")
         self._signs = np.zeros(len(order), np.float32)
@@ -137,7 +141,8 @@ class NoiseMeter:
         return signs
 
     def add(self, views: Views, columns: Float32Array) -> None:
-        """Add views whose filtered columns are at hand, (n, cols, rows); the columns are lost."""
+        """Add views whose filtered columns are at hand, (n, cols, rows); the columns are
+        lost."""
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         signs, rows = self.note(views), views.sizes[3]
@@ -154,7 +159,9 @@ class NoiseMeter:
         x, y, _ = self.grid.centers()
         farthest = float(np.hypot(*(np.abs([x[[0, -1]], y[[0, -1]]]).max(axis=1))))
         pitch = self._circle.radius / float(self._table[:, 7].mean())
-        radii = np.append(0.0, np.geomspace(0.25 * pitch, max(farthest, pitch), POINTS - 1))
+        radii = np.append(
+            0.0, np.geomspace(0.25 * pitch, max(farthest, pitch), POINTS - 1)
+        )
         turn = np.arange(POINTS) * np.pi * (3.0 - np.sqrt(5.0))  # even at every few radii
         around = np.stack([np.cos(turn), np.sin(turn)], 1)
         return radii, radii[:, None] * around + self._circle.centre
@@ -167,10 +174,16 @@ class NoiseMeter:
         g = views.table[:, :, None]
         x, y = points[:, 0] - g[:, 0], points[:, 1] - g[:, 1]
         depth = x * g[:, 3] + y * g[:, 4]
-        column = g[:, 8] + (x * g[:, 5] + y * g[:, 6]) / depth * g[:, 7] + views.kept.start
-        inside = (depth > 0.0) & (column >= 0.0) & (column <= views.factors.shape[1] - 1.0)
+        column = (
+            g[:, 8] + (x * g[:, 5] + y * g[:, 6]) / depth * g[:, 7] + views.kept.start
+        )
+        inside = (
+            (depth > 0.0) & (column >= 0.0) & (column <= views.factors.shape[1] - 1.0)
+        )
         nearest = np.where(inside, column, 0.0).round().astype(int)
-        factors = np.take_along_axis(views.factors / np.sqrt(views.across), nearest, axis=1)
+        factors = np.take_along_axis(
+            views.factors / np.sqrt(views.across), nearest, axis=1
+        )
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
     def found(self) -> Noise | None:
@@ -179,7 +192,9 @@ class NoiseMeter:
         if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():
             return None
         alternating = self.data
-        if alternating.shape[2] > 2:  # without what few views cause, which layers have in common
+        if (
+            alternating.shape[2] > 2
+        ):  # without what few views cause, which layers have in common
             pairs = np.diff(alternating, axis=2, append=alternating[:, :, -2:-1])
             pairs /= np.float32(np.sqrt(2.0))
             alternating = np.where(np.isnan(pairs), alternating, pairs)
@@ -197,10 +212,16 @@ class NoiseMeter:
         counts = np.concatenate([factors for _, factors in self._hits])
         first = np.floor(column).astype(int)
         part, row = column - first, np.arange(column.shape[1]) * length
-        hits = np.bincount((row + first).ravel(), (counts * (1.0 - part)).ravel(), row[-1] + length)
-        hits += np.bincount((row + first + 1).ravel(), (counts * part).ravel(), row[-1] + length)
+        hits = np.bincount(
+            (row + first).ravel(), (counts * (1.0 - part)).ravel(), row[-1] + length
+        )
+        hits += np.bincount(
+            (row + first + 1).ravel(), (counts * part).ravel(), row[-1] + length
+        )
         power = np.abs(np.fft.rfft(hits.reshape(-1, length))) ** 2 * self._response**2
-        mean, alternating = (_spectrum(image / self._done, length) for image in self._means)
+        mean, alternating = (
+            _spectrum(image / self._done, length) for image in self._means
+        )
         # The object is in the mean, blurred as it turned: its finest details are not.
         fine = slice(len(mean) // 2, None)
         share = max(mean[fine].sum() / max(alternating[fine].sum(), TINY) - 1.0, 0.0)
@@ -219,7 +240,9 @@ def _local_variance(values: Float32Array) -> Float32Array:
 
     unseen = np.isnan(values)
     if unseen.any():
-        nearest = distance_transform_edt(unseen, return_distances=False, return_indices=True)
+        nearest = distance_transform_edt(
+            unseen, return_distances=False, return_indices=True
+        )
         values = values[tuple(nearest)]
     typical = median_filter(np.abs(values), WINDOW_NODES, mode="nearest") / NORMAL_MEDIAN
     out: Float32Array = gaussian_filter(typical**2, 1.0, mode="nearest")
@@ -236,12 +259,13 @@ def _spectrum(image: Float32Array, length: int) -> FloatArray:
     between = 0.5 * (image[1:] + image[:-1])
     power = [
         np.median(
-            np.abs(np.fft.rfft(rows[MIN_ROW_DISTANCE:] - rows[:-MIN_ROW_DISTANCE])) ** 2, axis=0
+            np.abs(np.fft.rfft(rows[MIN_ROW_DISTANCE:] - rows[:-MIN_ROW_DISTANCE])) ** 2,
+            axis=0,
         )
         for rows in (image, between)
     ]
-    # Of an exponential distribution the median is log 2 times the mean; linear interpolation at any
-    # place is a third of what it is on the rows and two thirds of what it is between them.
+    # Of an exponential distribution the median is log 2 times the mean; linear interpolation at
+    # any place is a third of what it is on the rows and two thirds of what it is between them.
     mean = (power[0] + 2.0 * power[1]) / 3.0 / np.log(2.0) / 2.0 / image.shape[1]
     bands = np.array_split(np.arange(len(mean)), BANDS)
     middle = [band.mean() / (len(mean) - 1) for band in bands if len(band)]

@@ -4,11 +4,12 @@ All voxels above one another fall on one line of detector columns, so a column o
 interpolated once and every voxel costs one look-up between two rows. Arguments are not checked.
 
 Two columns of an image are mixed, and the result, resampled with constant step, is added to a
-column of voxels: sixteen voxels at a time by register permutation where the processor has AVX-512,
-eight where it has AVX2, one by one elsewhere; the results differ by rounding only. Registers begin
-at multiples of their length, so that a slab of a volume that begins at one is the whole volume's,
-bit by bit. Places on a line are integers with 44 bits behind the point: from register to register
-they are added to, and their whole part is a shift, where in floating point half the time went.
+column of voxels: sixteen voxels at a time by register permutation where the processor has
+AVX-512, eight where it has AVX2, one by one elsewhere; the results differ by rounding only.
+Registers begin at multiples of their length, so that a slab of a volume that begins at one is
+the whole volume's, bit by bit. Places on a line are integers with 44 bits behind the point:
+from register to register they are added to, and their whole part is a shift, where in floating
+point half the time went.
 """
 
 from __future__ import annotations
@@ -24,7 +25,13 @@ from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection.kernels.compiling import fetch_next, fused, inline, kernel, parallel
+from flexdt.twin.projection.kernels.compiling import (
+    fetch_next,
+    fused,
+    inline,
+    kernel,
+    parallel,
+)
 from flexdt.twin.projection.volume import aligned_zeros
 
 
@@ -62,7 +69,9 @@ def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
 
     def permute(name: str, *args: Any) -> Any:
         kind = ir.FunctionType(_FLOATS, [arg.type for arg in args])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, kind, name), args
+        )
 
     if LANES == 16:
         return permute("llvm.x86.avx512.vpermi2var.ps.512", low, index, high)
@@ -72,7 +81,9 @@ def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
     return builder.select(beyond, high, low)
 
 
-def _at(context: Any, builder: Any, signature: Any, args: Any, array: int, index: Any) -> Any:
+def _at(
+    context: Any, builder: Any, signature: Any, args: Any, array: int, index: Any
+) -> Any:
     """Compute the address of LANES values in the argument number `array`."""
     data = context.make_array(signature.args[array])(context, builder, args[array]).data
     return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
@@ -110,7 +121,9 @@ def mix_lanes(
 
 
 @intrinsic
-def resample_lanes(typingctx: Any, acc: Any, k: Any, line: Any, at: Any, v: Any, step: Any) -> Any:
+def resample_lanes(
+    typingctx: Any, acc: Any, k: Any, line: Any, at: Any, v: Any, step: Any
+) -> Any:
     """Add line at (at + v / 2^POINT + i step), linear, to acc[k + i], 0 <= i < LANES.
 
     Not for 1 lane. Needs 0 <= v / 2^POINT + i step < 2 LANES - 1; reads line[at : at + 2
@@ -194,7 +207,8 @@ def add_line_wide(acc, line, first, count, start, step):
         add_line(acc, line, first + k, count - k, start + k * step, step)
 
 
-# Chosen here, not in a kernel: an instruction that the processor lacks must not even be compiled.
+# Chosen here, not in a kernel: an instruction that the processor lacks must not even be
+# compiled.
 add_column = add_line if LANES == 1 else add_line_wide
 mix_columns = mix_one_by_one if LANES == 1 else mix_wide
 
@@ -241,15 +255,15 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
     # The row of voxel k is start + k step.
     step = -dz * g[9] * inverse
     start = g[10] - (z0 - g[2]) * g[9] * inverse
-    # Rows fall with z (step < 0): voxels lowest to highest have 0 <= start + k step <= rows - 1,
-    # with a margin for rounding.
+    # Rows fall with z (step < 0): voxels lowest to highest have 0 <= start + k step <= rows -
+    # 1, with a margin for rounding.
     every = 1.0 / step
     lowest = max(0, math.ceil((rows - 1 - start) * every + 1e-3))
     highest = min(acc.size - 1, math.floor(-start * every - 1e-3))
     if highest < lowest:
         return
-    # The column between image columns i and i + 1, only over the rows that are needed, from a whole
-    # register on, times the weight.
+    # The column between image columns i and i + 1, only over the rows that are needed, from a
+    # whole register on, times the weight.
     top = int(start + highest * step) // LANES * LANES
     bottom = min(rows - 1, int(start + lowest * step) + 1)
     weight, part = inverse * inverse, c - i
@@ -282,7 +296,11 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
     slope, turn, rise: change a voxel of the depth, and of column and row times the depth.
     """
     none = np.float32(0.0)
-    first, last, lowest = np.float32(-base), np.float32(size[0] - 1 - base), np.float32(size[1] - 1)
+    first, last, lowest = (
+        np.float32(-base),
+        np.float32(size[0] - 1 - base),
+        np.float32(size[1] - 1),
+    )
     for k in range(at.size):
         step = np.float32(k - zero)
         far = depth + step * slope
@@ -334,16 +352,41 @@ def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
     for k in range(acc.shape[1]):
         up = (z0 + k * dz - g[2]) * g[9] / depth
         _places(
-            at, across, down, weight, (cols, rows), base, zero, np.float32(depth),
-            np.float32(slope), np.float32(c - base), np.float32(turn), np.float32(g[10] - up),
+            at,
+            across,
+            down,
+            weight,
+            (cols, rows),
+            base,
+            zero,
+            np.float32(depth),
+            np.float32(slope),
+            np.float32(c - base),
+            np.float32(turn),
+            np.float32(g[10] - up),
             np.float32(up * slope),
-        )  # fmt: skip
+        )
         _add_places(acc[:, k], image.reshape(cols * rows), rows, at, across, down, weight)
 
 
 @kernel
 def _add_tile(
-    images, rows, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, at, parts, volume
+    images,
+    rows,
+    shares,
+    views,
+    first_x,
+    first_y,
+    x0,
+    y0,
+    z0,
+    dx,
+    dy,
+    dz,
+    line,
+    at,
+    parts,
+    volume,
 ):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
@@ -355,11 +398,25 @@ def _add_tile(
             y = y0 + iy * dy
             if few:
                 some = volume[iy, first_x:last_x]
-                _add_few(some, images[view], rows, g, x0 + first_x * dx, y, z0, dx, dz, at, parts)
+                _add_few(
+                    some,
+                    images[view],
+                    rows,
+                    g,
+                    x0 + first_x * dx,
+                    y,
+                    z0,
+                    dx,
+                    dz,
+                    at,
+                    parts,
+                )
                 continue
             for ix in range(first_x, last_x):
                 x = x0 + ix * dx
-                _add_view(volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line)
+                _add_view(
+                    volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line
+                )
 
 
 def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
@@ -391,9 +448,23 @@ def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
             while tile < tiles:
                 across, along = tile % tiles_x * wide, tile // tiles_x * TILE
                 _add_tile(
-                    images, rows, shares, views, across, along, x0, y0, z0, dx, dy, dz, line, at,
-                    parts, volume,
-                )  # fmt: skip
+                    images,
+                    rows,
+                    shares,
+                    views,
+                    across,
+                    along,
+                    x0,
+                    y0,
+                    z0,
+                    dx,
+                    dy,
+                    dz,
+                    line,
+                    at,
+                    parts,
+                    volume,
+                )
                 tile = fetch_next(counter)
 
     return backproject
@@ -404,9 +475,9 @@ backproject = _entry_point(LANES)
 
 @kernel
 def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
-    """Add a view's weight to the voxels above one another at (x, y) that its rows see; `seen` holds
-    the differences from one to the next. Returns that weight, and the angle of the lines through
-    the voxels that the panel's columns see in this view; see `normalise_coverage`.
+    """Add a view's weight to the voxels above one another at (x, y) that its rows see; `seen`
+    holds the differences from one to the next. Returns that weight, and the angle of the lines
+    through the voxels that the panel's columns see in this view; see `normalise_coverage`.
     """
     depth, c = _column(g, weights.size, x, y)
     if depth == 0.0:
@@ -417,7 +488,8 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
     lowest = max(0, math.ceil((rows - 1 - start) * every))
     highest = min(seen.size - 2, math.floor(-start * every))
     weight = weights[int(c)]
-    # A source that moves on by an angle turns the line to a voxel by radius cos(fan) / distance.
+    # A source that moves on by an angle turns the line to a voxel by radius cos(fan) /
+    # distance.
     angle = 0.0
     if on_panel[0] <= c <= on_panel[1]:
         slope = (c - g[8]) / g[7]
@@ -432,7 +504,20 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
 
 @parallel
 def normalise_coverage(
-    views, weights, rows, on_panel, radius, x0, y0, z0, dx, dy, dz, least, half_turn, volume
+    views,
+    weights,
+    rows,
+    on_panel,
+    radius,
+    x0,
+    y0,
+    z0,
+    dx,
+    dy,
+    dz,
+    least,
+    half_turn,
+    volume,
 ):
     """Divide each voxel by the share of the views' weight that saw it.
 
@@ -455,9 +540,17 @@ def normalise_coverage(
             angles = 0.0
             for view in range(len(views)):
                 weight, angle = _cover(
-                    views[view], weights[view], rows, on_panel, radius, x0 + ix * dx,
-                    y0 + iy * dy, z0, dz, seen,
-                )  # fmt: skip
+                    views[view],
+                    weights[view],
+                    rows,
+                    on_panel,
+                    radius,
+                    x0 + ix * dx,
+                    y0 + iy * dy,
+                    z0,
+                    dz,
+                    seen,
+                )
                 total += weight
                 angles += angle
             part = 0.0
@@ -506,7 +599,8 @@ def weigh(images, first, factors, across, up, out):
 def add_views(images, first, signs, sums):
     """Add images to their sum, and each with its sign to their alternating sum.
 
-    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its outermost ones.
+    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its outermost
+        ones.
     first: row of the panel that is the first of `sums`.
     signs: float32 (n,).
     sums: float32 (2, rows, cols), added to.

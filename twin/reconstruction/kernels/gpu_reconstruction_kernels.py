@@ -3,12 +3,12 @@
 FDK: weights, filter, and backprojection. Neighbouring threads take neighbouring rows of one
 detector column (weights and filter), or voxels above one another, which read such rows.
 
-Total variation, see `tv_kernels`: lengths of differences, and both half-steps, one thread a voxel.
-Volumes are flat: voxel (z, y, x) is number z + stride (x + nx y), and what lies between nz and
-stride is 0. Dual variables are three such arrays behind one another, of z, y and x.
+Total variation, see `tv_kernels`: lengths of differences, and both half-steps, one thread a
+voxel. Volumes are flat: voxel (z, y, x) is number z + stride (x + nx y), and what lies between
+nz and stride is 0. Dual variables are three such arrays behind one another, of z, y and x.
 
-Imported only where a CUDA device (or numba's simulator of one) has been found. Arguments are not
-checked.
+Imported only where a CUDA device (or numba's simulator of one) has been found. Arguments are
+not checked.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ BLOCK = (32, 4)
 RUN = 8
 """Voxels of a thread, BLOCK[0] apart along z; columns of a thread of the filter."""
 PLANE = (32, 8)
-"""Threads a block of `weigh` and `convolve`: rows, and columns, of which eight are one sector of
-memory in an image whose columns are neighbours."""
+"""Threads a block of `weigh` and `convolve`: rows, and columns, of which eight are one sector
+of memory in an image whose columns are neighbours."""
 BITS = 32
 """Bits of a row's number behind the point."""
 FIXED = float(2**BITS)
@@ -58,7 +58,9 @@ def weigh(images, top, factors, across, up, out):
     view = cuda.blockIdx.z
     if c < out.shape[1] and r < out.shape[2]:
         weight = factors[view, c] / math.sqrt(across[view, c] + up[view, r])
-        out[view, c, r] = images[view, min(max(top + r, 0), images.shape[1] - 1), c] * weight
+        out[view, c, r] = (
+            images[view, min(max(top + r, 0), images.shape[1] - 1), c] * weight
+        )
 
 
 @cuda.jit
@@ -113,7 +115,9 @@ def prism_path(lengths, view, low, share, slant, c):
 
 
 @cuda.jit(device=True, inline=True)
-def edge_sum(images, top, lengths, band, share, across, up, before, edge, view, r, side, part):
+def edge_sum(
+    images, top, lengths, band, share, across, up, before, edge, view, r, side, part
+):
     """Compute a 32nd of the sum, over an edge's columns, of a row less the prisms' path
     lengths.
     """
@@ -129,7 +133,21 @@ def edge_sum(images, top, lengths, band, share, across, up, before, edge, view, 
 
 @cuda.jit(device=True, inline=True)
 def weighted_pixel(
-    images, top, factors, across, up, lengths, band, share, fade, before, rests, view, r, c, which
+    images,
+    top,
+    factors,
+    across,
+    up,
+    lengths,
+    band,
+    share,
+    fade,
+    before,
+    rests,
+    view,
+    r,
+    c,
+    which,
 ):
     """Compute a pixel of a widened row with FDK's weight; see `fdk_kernels.weigh`.
 
@@ -147,9 +165,24 @@ def weighted_pixel(
 
 @cuda.jit
 def filter_rows(
-    images, top, before, edge, factors, across, up, lengths, band, share, cut, fade, response,
-    cosines, sines, start, out,
-):  # fmt: skip
+    images,
+    top,
+    before,
+    edge,
+    factors,
+    across,
+    up,
+    lengths,
+    band,
+    share,
+    cut,
+    fade,
+    response,
+    cosines,
+    sines,
+    start,
+    out,
+):
     """Continue rows beyond the panel's edges, weigh and filter them.
 
     A block takes two rows as the real and the imaginary part of one signal, through a Fourier
@@ -177,9 +210,20 @@ def filter_rows(
         which = part // 32
         row = second if which >= 2 else r
         real[part] = edge_sum(
-            images, top, lengths, band, share, across, up, before, edge, view, row, which % 2,
+            images,
+            top,
+            lengths,
+            band,
+            share,
+            across,
+            up,
+            before,
+            edge,
+            view,
+            row,
+            which % 2,
             part % 32,
-        )  # fmt: skip
+        )
     cuda.syncthreads()
     for which in range(thread, 4, THREADS):
         total = np.float32(0)
@@ -192,13 +236,39 @@ def filter_rows(
         a, b = np.float32(0), np.float32(0)
         if c < wide:
             a = weighted_pixel(
-                images, top, factors, across, up, lengths, band, share, fade, before, rests, view,
-                r, c, 0,
-            )  # fmt: skip
+                images,
+                top,
+                factors,
+                across,
+                up,
+                lengths,
+                band,
+                share,
+                fade,
+                before,
+                rests,
+                view,
+                r,
+                c,
+                0,
+            )
             b = weighted_pixel(
-                images, top, factors, across, up, lengths, band, share, fade, before, rests, view,
-                second, c, 1,
-            )  # fmt: skip
+                images,
+                top,
+                factors,
+                across,
+                up,
+                lengths,
+                band,
+                share,
+                fade,
+                before,
+                rests,
+                view,
+                second,
+                c,
+                1,
+            )
         real[c], imaginary[c] = a, b
     half, step = narrow(length // 2), narrow(1)
     while half > 0:
@@ -240,8 +310,8 @@ def backproject(images, cols, rows, views, first, size, volume):
     """Add views to a volume.
 
     The line of rows that a voxel column meets is the same for all its voxels. The threads of a
-    warp, which have one voxel column in common, find it in double precision for as many views at a
-    time, one each; then every thread goes through these views with rows in fixed point.
+    warp, which have one voxel column in common, find it in double precision for as many views
+    at a time, one each; then every thread goes through these views with rows in fixed point.
 
     images: float32 (n * cols * rows,), rows of a column beside each other; fewer than 2^32.
     views: float64 (n, 11), as `fdk.view_table` makes them.
@@ -281,8 +351,12 @@ def backproject(images, cols, rows, views, first, size, volume):
                 if 0.0 <= c <= cols - 1:
                     i = max(min(int(c), cols - 2), 0)
                     step = -size[2] * views[view, 9] * inverse
-                    start = views[view, 10] - (first[2] - views[view, 2]) * views[view, 9] * inverse
-                    # Rows fall with z. The margin at the edges is that of the processor's kernel.
+                    start = (
+                        views[view, 10]
+                        - (first[2] - views[view, 2]) * views[view, 9] * inverse
+                    )
+                    # Rows fall with z. The margin at the edges is that of the processor's
+                    # kernel.
                     every = 1.0 / step
                     low = max(0, int(math.ceil((rows - 1 - start) * every + 1e-3)))  # noqa: RUF046
                     high = min(nz - 1, int(math.floor(-start * every - 1e-3)))  # noqa: RUF046
@@ -364,7 +438,9 @@ def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
     if k < counts[0] and allowed[i] > ZERO:
         # What this voxel gives less what the voxels before it gave along each axis: see
         # `tv_kernels.primal_step`. counts[2] columns are a row along x.
-        spread = scale[0] * dual[i] + scale[1] * dual[size + i] + scale[2] * dual[2 * size + i]
+        spread = (
+            scale[0] * dual[i] + scale[1] * dual[size + i] + scale[2] * dual[2 * size + i]
+        )
         if k > 0:
             spread -= scale[0] * dual[i - 1]
         if column >= counts[2]:

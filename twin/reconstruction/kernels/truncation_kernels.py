@@ -1,7 +1,8 @@
 """An elliptic prism: its path lengths beyond a panel's edges, and its fit to the views.
 
 Rows are continued on all cores, in one pass over the pixels, for the processor and for a device
-alike: of 360 views into 512^3 a device takes milliseconds a view, this a fraction of one, and what
+alike: of 360 views into 512^3 a device takes milliseconds a view, this a fraction of one, and
+    what
 it writes is what has to be copied there anyway.
 
 The fit is Levenberg and Marquardt's, of six numbers, with normal equations of six rows that are
@@ -65,7 +66,8 @@ def _edge_mean(line, before, first, last, lower, upper, share, across, high):
 
 @kernel
 def _continue_side(out, first, last, lower, upper, share, across, high, rest, fade):
-    """Fill columns first <= c < last of a row: the prisms, and the rest at the edge fading out."""
+    """Fill columns first <= c < last of a row: the prisms, and the rest at the edge fading
+    out."""
     for c in range(first, last):
         model = lower[c] + share * (upper[c] - lower[c])
         out[c] = np.float32(model * math.sqrt(across[c] + high) + rest * fade[c])
@@ -97,7 +99,9 @@ def prism_lengths(before, cols, edge, plane, prisms, out):
 
 
 @parallel
-def continue_rows(images, first, before, edge, lengths, band, share, cut, fade, across, up, out):
+def continue_rows(
+    images, first, before, edge, lengths, band, share, cut, fade, across, up, out
+):
     """Continue rows beyond the panel's edges.
 
     images: float32 (n, rows of the panel, cols).
@@ -132,7 +136,9 @@ def continue_rows(images, first, before, edge, lengths, band, share, cut, fade, 
         _continue_side(row, 0, before, lower, upper, part, flat, high, low * cut[r], fade)
         for c in range(cols):
             row[before + c] = line[c]
-        _continue_side(row, after, wide, lower, upper, part, flat, high, top * cut[r], fade)
+        _continue_side(
+            row, after, wide, lower, upper, part, flat, high, top * cut[r], fade
+        )
 
 
 @kernel
@@ -242,7 +248,11 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
     scale: deviation from which on rays count less.
     x: (6,) of `Prism.of`; the first guess, then the result.
     """
-    slope, gradient, step = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
+    slope, gradient, step = (
+        np.empty(PARAMETERS),
+        np.empty(PARAMETERS),
+        np.empty(PARAMETERS),
+    )
     matrix = np.empty((PARAMETERS, PARAMETERS))
     factor = np.empty((PARAMETERS, PARAMETERS))
     free, trial = np.empty(PARAMETERS, np.bool_), np.empty(PARAMETERS)
@@ -253,7 +263,9 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
     fresh = False
     for _ in range(MAX_STEPS):
         if not fresh:
-            _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient)
+            _normal_equations(
+                x, source, rays, length, seen, scale, slope, matrix, gradient
+            )
             fresh = True
         for a in range(PARAMETERS):
             outward = (x[a] <= least[a] and gradient[a] > 0.0) or (

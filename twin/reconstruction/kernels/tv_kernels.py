@@ -1,10 +1,10 @@
 """Total variation of a volume, and the two half-steps of its proximal map, as kernels.
 
 The variation is the sum over all voxels of the length of the vector of differences to the next
-voxel along z, y and x, each multiplied by `scale` (1 where voxels are cubes); behind the last voxel
-the difference is 0. Arrays are C-ordered [z, y, x], dual ones [axis, z, y, x]. Each job writes one
-layer, first <= z < last, and reads its neighbours from an array that no job writes. Arguments are
-not checked.
+voxel along z, y and x, each multiplied by `scale` (1 where voxels are cubes); behind the last
+voxel the difference is 0. Arrays are C-ordered [z, y, x], dual ones [axis, z, y, x]. Each job
+writes one layer, first <= z < last, and reads its neighbours from an array that no job writes.
+Arguments are not checked.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
                 if allowed[k, j, i] == 0:
                     x[k, j, i] = np.float32(0)
                     continue
-                # D' dual = what the voxel before gave minus what this one gives; the dual of the
-                # last voxel along an axis is 0, because its difference is.
+                # D' dual = what the voxel before gave minus what this one gives; the dual of
+                # the last voxel along an axis is 0, because its difference is.
                 spread = scale[0] * dual[0, k, j, i]
                 spread += scale[1] * dual[1, k, j, i]
                 spread += scale[2] * dual[2, k, j, i]
@@ -85,7 +85,8 @@ def dual_step(x, ahead, dual, rate, momentum, scale, first, last):
         for j in range(ny):
             for i in range(nx):
                 dz, dy, dx = differences(x, k, j, i, scale)
-                # A step uphill, then back onto the unit ball: the dual of a length is bounded by 1.
+                # A step uphill, then back onto the unit ball: the dual of a length is bounded
+                # by 1.
                 a = ahead[0, k, j, i] + rate * dz
                 b = ahead[1, k, j, i] + rate * dy
                 c = ahead[2, k, j, i] + rate * dx

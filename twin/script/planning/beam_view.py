@@ -56,7 +56,10 @@ class View:
         middle = _project(self.poses, self.poses.axis, (rows, cols))[:, 1]
         top, bottom = (np.where(np.isnan(y), middle, y) for y in (self.top, self.bottom))
         return np.asarray(
-            (self.right < -0.5) | (self.left > cols - 0.5) | (bottom < -0.5) | (top > rows - 0.5)
+            (self.right < -0.5)
+            | (self.left > cols - 0.5)
+            | (bottom < -0.5)
+            | (top > rows - 0.5)
         )
 
     @property
@@ -104,7 +107,9 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
     for view in views(plan):
         outside = view.outside
         if view.kind == "projection" and outside.any():
-            found.append(_aggregate(view, outside, "sample_out_of_beam", _outside_text(view)))
+            found.append(
+                _aggregate(view, outside, "sample_out_of_beam", _outside_text(view))
+            )
         if view.kind == "flat" and not outside.all():
             found.append(_aggregate(view, ~outside, "sample_in_flat", _inside_text(view)))
     return tuple(found)
@@ -128,7 +133,8 @@ def _outside_text(view: View) -> str:
         sides = f"columns 0 to {cols - 1}"
         side += " of"
     return (
-        f"the sample is out of the beam: the shadow of its axis lies at column {view.axis[i]:.0f}, "
+        "the sample is out of the beam: the shadow of its axis lies at column "
+        f"{view.axis[i]:.0f}, "
         f"{side} the image's {sides}; projections show no sample"
     )
 

@@ -9,7 +9,12 @@ from typing import Final
 Trace = tuple[tuple[float, float], ...]
 
 
-CUT_AT_SIDE: Final = {"left": "columns", "right": "columns", "top": "rows", "bottom": "rows"}
+CUT_AT_SIDE: Final = {
+    "left": "columns",
+    "right": "columns",
+    "top": "rows",
+    "bottom": "rows",
+}
 """Side of an image -> whether columns or rows are cut off there."""
 MIN_CUT_PX: Final = 0.5
 """Truncation above this is reported [px]."""
@@ -85,7 +90,9 @@ class Optics:
     @property
     def truncated(self) -> bool:
         """Whether the sample is cut off anywhere."""
-        return self.truncation is not None and any(x > 0 for x in self.truncation.values())
+        return self.truncation is not None and any(
+            x > 0 for x in self.truncation.values()
+        )
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form."""
@@ -94,7 +101,9 @@ class Optics:
             "turn_field_mm": "full_turn_diameter_mm",
             "truncation": "truncation_px",
         }
-        document = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
+        document = {
+            n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()
+        }
         document["rows"], document["cols"] = document.pop("shape")
         return {names.get(name, name): value for name, value in document.items()}
 

@@ -29,7 +29,9 @@ OPEN_BEAM_CODES: Final = ("saturated_open_beam", "starved_open_beam")
 Setting = tuple[ExposureSettings, CameraSettings]
 
 
-def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> tuple[ScriptProblem, ...]:
+def open_beam_problems(
+    plan: ScanPlan, physics: Physics = "poly"
+) -> tuple[ScriptProblem, ...]:
     """Warn once for each setting of tube and camera whose open beam is saturated or starved.
 
     Args:
@@ -88,12 +90,15 @@ def brightest_beam(
     beams = [
         beam
         for view in _views(plan, camera, indices)
-        if (beam := open_beam_of(plan.machine, camera, exposure, view, physics)) is not None
+        if (beam := open_beam_of(plan.machine, camera, exposure, view, physics))
+        is not None
     ]
     return max(beams, key=lambda beam: beam.counts, default=None)
 
 
-def _views(plan: ScanPlan, camera: CameraSettings, indices: list[int]) -> Iterator[FloatArray]:
+def _views(
+    plan: ScanPlan, camera: CameraSettings, indices: list[int]
+) -> Iterator[FloatArray]:
     """Yield cone_vec rows (12,) of some images."""
     chosen = np.unique(np.linspace(0, len(indices) - 1, SAMPLED_IMAGES).astype(int))
     index = [indices[i] for i in chosen]

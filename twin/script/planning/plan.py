@@ -38,7 +38,15 @@ from flexdt.twin.script.planning.time_ranges import Range, step_range, total_ran
 from flexdt.twin.script.problems import ScriptProblem, WithProblems
 from flexdt.twin.values import ArrayValue, JsonValue
 
-_OF_STEP = ("line", "start_s", "duration_s", "holds_s", "assumed_s", "assumed_from", "what")
+_OF_STEP = (
+    "line",
+    "start_s",
+    "duration_s",
+    "holds_s",
+    "assumed_s",
+    "assumed_from",
+    "what",
+)
 HOME_ASSUMED = "the machine's home, assumed"
 EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
 
@@ -75,8 +83,10 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     def __repr__(self) -> str:
         return (
-            f"<ScanPlan on {self.machine.name}: {len(self.steps)} steps, {self.frames} projections,"
-            f" {self.duration_s:.1f} s, {len(self.errors)} errors, {len(self.warnings)} warnings>"
+            f"<ScanPlan on {self.machine.name}: {len(self.steps)} steps, {self.frames} "
+            "projections,"
+            f" {self.duration_s:.1f} s, {len(self.errors)} errors, {len(self.warnings)} "
+            "warnings>"
         )
 
     @property
@@ -120,7 +130,9 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         """Nominal geometry of the projections that are saved; it carries the detector's
         shape where all of them have the same."""
         shapes = {g.camera.shape for g, _ in saved_images(self) if g.kind == "projection"}
-        return self.poses.cone_vec().with_shape(shapes.pop() if len(shapes) == 1 else None)
+        return self.poses.cone_vec().with_shape(
+            shapes.pop() if len(shapes) == 1 else None
+        )
 
     def check(self, sample: object = None) -> CheckReport:
         """Check the plan: problems, collisions, truncation and dose, as `flexdt check` does.
@@ -144,7 +156,9 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         Returns:
             matplotlib's figure.
         """
-        return backend("plots").plot_plan(self, self.check() if report is None else report)
+        return backend("plots").plot_plan(
+            self, self.check() if report is None else report
+        )
 
     @cached_property
     def paths(self) -> Mapping[str, AxisPath]:
@@ -182,7 +196,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         of_group = [
-            g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving for g in self.groups
+            g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving
+            for g in self.groups
         ]
         counts = np.array([len(g) for g in self.groups], dtype=int)
         lengths = np.repeat(np.array(of_group), counts)
@@ -251,7 +266,8 @@ class CheckReport(WithProblems):
         """One line."""
         hits = len(self.clearance.collisions) if self.clearance else 0
         return (
-            f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of {self.plan!r}>"
+            f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of "
+            f"{self.plan!r}>"
         )
 
     @property
@@ -290,7 +306,8 @@ class CheckReport(WithProblems):
             "profile": plan.profile.name,
             "problems": [p.to_dict() for p in self.problems],
             "steps": [
-                {n: getattr(s, n) for n in _OF_STEP} | _range(step_range(s, plan.machine.timing))
+                {n: getattr(s, n) for n in _OF_STEP}
+                | _range(step_range(s, plan.machine.timing))
                 for s in plan.steps
             ],
             "duration_s": plan.duration_s,
@@ -304,7 +321,8 @@ class CheckReport(WithProblems):
             "collisions": [x.to_dict() for x in found.collisions],
             "collisions_checked": clearance is not None,
             "min_clearance_mm": found.min_clearance_mm,
-            "min_clearance_pair": found.min_clearance_pair and list(found.min_clearance_pair),
+            "min_clearance_pair": found.min_clearance_pair
+            and list(found.min_clearance_pair),
             "clearance": [list(p) for p in found.trace],
             "optics": [o.to_dict() for o in self.optics],
             "dose": dict(vars(self.dose)),

@@ -172,7 +172,10 @@ class SampleSize:
 
     @classmethod
     def around(
-        cls, size_mm: Sequence[float], source: str = "given", offset: StagePlacement | None = None
+        cls,
+        size_mm: Sequence[float],
+        source: str = "given",
+        offset: StagePlacement | None = None,
     ) -> SampleSize:
         """Make the cylinder that contains a box of `size_mm` (x, y, z) at `offset`,
         at every angle."""

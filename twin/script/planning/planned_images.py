@@ -145,7 +145,9 @@ def _averages(
         period = length / (frames - 1) / speed
         how = f"speed and {frames} frames"
     else:
-        period = (trigger.run_up - speed**2 / (2.0 * acceleration)) / (MARGIN_IMAGES * speed)
+        period = (trigger.run_up - speed**2 / (2.0 * acceleration)) / (
+            MARGIN_IMAGES * speed
+        )
         how = f"speed, run-up {trigger.run_up:.6f} and acceleration {acceleration:g}"
     ratio = period / exposure_s
     averages = round(ratio)
@@ -212,13 +214,19 @@ class ImageCollector:
         """
         name = image_name(command.path)
         if name is None:
-            self.findings.error("path", f"{shorten(command.path)!r} does not end with a file name")
+            self.findings.error(
+                "path", f"{shorten(command.path)!r} does not end with a file name"
+            )
         elif self.last is None:
-            self.findings.error("nothing_to_save", "no image has been taken since the start")
+            self.findings.error(
+                "nothing_to_save", "no image has been taken since the start"
+            )
         else:
             taken = self.images[self.last]
             saved = replace(taken, files=(name,), kind=kind_of(name))
-            if taken.files:  # saved before under another name: a second copy of the same image
+            if (
+                taken.files
+            ):  # saved before under another name: a second copy of the same image
                 self.images.append(saved)
             else:
                 self.images[self.last] = saved
@@ -247,18 +255,24 @@ class ImageCollector:
         if trigger is not None and inference is not None:
             starts, exact = self._fly(trigger, inference, start, period)
         elif moving and frames > 1:
-            what = f"{', '.join(moving)} moves during the sequence without a trigger (POS)"
+            what = (
+                f"{', '.join(moving)} moves during the sequence without a trigger (POS)"
+            )
             which = "where each image lies depends on the timing of commands"
             self.findings.warn("no_trigger", f"{what}: {which}")
         files = sequence_names(command.prefix, command.first, frames)
-        draft = self._taken(starts, start, step, command.line, kind_of(files[0]), files, exact)
+        draft = self._taken(
+            starts, start, step, command.line, kind_of(files[0]), files, exact
+        )
         if draft.kind == "projection" and frames > 1 and not moving:
             self.findings.warn("static_sequence", "nothing moves during this sequence")
         self._saved(draft)
         self.trigger = None
         length = float(starts[-1] - start) + period
         span = self._busy(start, length, self.machine.timing.sequence)
-        what = f": {frames} images" + (f" over {trigger.axis}" if trigger is not None else "")
+        what = f": {frames} images" + (
+            f" over {trigger.axis}" if trigger is not None else ""
+        )
         return replace(span, note=what)
 
     # time ----------------------------------------------------------------------------------
@@ -354,7 +368,11 @@ class ImageCollector:
             self._complained.add("averages")
         if frames is None:
             count = 1 if found is None else found.frames
-            how = "1 is assumed" if found is None else f"inferred from {found.notes['frames']}"
+            how = (
+                "1 is assumed"
+                if found is None
+                else f"inferred from {found.notes['frames']}"
+            )
             self.findings.warn("frames_unsaid", f"the number of frames is not set; {how}")
             camera.assume("frames", count)
         return found
@@ -384,14 +402,20 @@ class ImageCollector:
             what = f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger"
             where = f"{trajectory.position(start):.6g}, not {trigger.position:g} {unit}"
             self.findings.warn("late_start", f"{what}: image 0 is at {where}")
-        if abs(found.mismatch) > _MISMATCH_STEPS * found.increment and "frames" not in found.notes:
+        if (
+            abs(found.mismatch) > _MISMATCH_STEPS * found.increment
+            and "frames" not in found.notes
+        ):
             self.findings.warn(
                 "frame_angles",
                 f"{found.frames} frames of {period * 1000:g} ms at {speed:.9g} {unit}/s cover "
-                f"{found.mismatch:+.4g} {unit} more than whole turns; images are put at steps of "
+                f"{found.mismatch:+.4g} {unit} more than whole turns; images are put at "
+                "steps of "
                 f"{found.increment:.9g} {unit}",
             )
-        first = trigger.position if late <= _TIME_TOLERANCE_S else trajectory.position(start)
+        first = (
+            trigger.position if late <= _TIME_TOLERANCE_S else trajectory.position(start)
+        )
         wanted = first + sign * found.increment * count
         starts = start + found.increment / speed * count
         off = np.abs(trajectory.positions(starts) - wanted) > _POSITION_TOLERANCE
@@ -406,7 +430,9 @@ class ImageCollector:
                 code = "scan_overrun"
                 which = f"(from image {int(np.argmax(off))} on)"
                 what = f"slows down before the last of {len(off)} images {which}"
-            self.findings.warn(code, f"{trigger.axis} {what}; images lie where the motor is")
+            self.findings.warn(
+                code, f"{trigger.axis} {what}; images lie where the motor is"
+            )
             starts = start + period * count
             exact = {}
         return starts, exact
@@ -417,7 +443,9 @@ class ImageCollector:
         """Check saved images: name, stated settings and X-rays."""
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
-            self.findings.warn("overwrites", f"{clash} is saved twice; the last one stays")
+            self.findings.warn(
+                "overwrites", f"{clash} is saved twice; the last one stays"
+            )
         self.names.update(draft.files)
         self._unsaid(draft)
         if draft.kind == "dark" and draft.xrays_on:
@@ -435,7 +463,9 @@ class ImageCollector:
         known = self.hint is not None or "averages" in self.camera.said
         if not known and "averages" not in self._complained:
             self._complained.add("averages")
-            self.findings.warn("averages_unsaid", "the number of averages is not set; 1 is assumed")
+            self.findings.warn(
+                "averages_unsaid", "the number of averages is not set; 1 is assumed"
+            )
         if draft.xrays_on:
             self._default("kV", "the tube voltage", f"{draft.kV:g} kV")
             self._default("power_W", "the tube power", f"{draft.power_W:g} W")
@@ -445,5 +475,6 @@ class ImageCollector:
         if name not in self.camera.said | self.tube.said | self._complained:
             self._complained.add(name)
             self.findings.warn(
-                "default_assumed", f"{what} is not set; {value} of the machine file is assumed"
+                "default_assumed",
+                f"{what} is not set; {value} of the machine file is assumed",
             )

@@ -79,10 +79,14 @@ class Motor:
             return self.moves[-1][1].position(time)
         return self.home
 
-    def move(self, target: float, time: float, speed: float, acceleration: float) -> Trajectory:
+    def move(
+        self, target: float, time: float, speed: float, acceleration: float
+    ) -> Trajectory:
         """Start a move to `target` at `time`, from the current position and velocity."""
         v = self.moves[-1][1].velocity(time) if self.moves else 0.0
-        trajectory = motion.move(self.position(time), v, target, speed, acceleration, time)
+        trajectory = motion.move(
+            self.position(time), v, target, speed, acceleration, time
+        )
         if trajectory.end > time:
             self.moves.append((time, trajectory))
         return trajectory

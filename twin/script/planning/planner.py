@@ -79,10 +79,14 @@ def plan_script(
         duration_s=end,
     )
     extra = beam_problems(plan)
-    return replace(plan, problems=in_order((*script.warnings, *extra, *s.findings.problems)))
+    return replace(
+        plan, problems=in_order((*script.warnings, *extra, *s.findings.problems))
+    )
 
 
-def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:
+def simulated(
+    commands: tuple[c.Command, ...], machine: Machine, start: StartState
+) -> Simulation:
     """Run commands on a virtual clock: steps, motion and images, without the beam's view.
 
     If averages are inferred from a scan, the commands run a second time with them,

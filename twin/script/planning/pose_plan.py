@@ -25,10 +25,12 @@ Pose = Mapping[str, float]
 Route = Callable[[Pose, Pose], Sequence[Pose] | None]
 """Finds the moves from one pose to another; None if there is no free path."""
 _NO_FLAT: Final = (
-    "no flat image is taken, as `flat` is false; without one the data set cannot be reconstructed"
+    "no flat image is taken, as `flat` is false; without one the data set cannot be "
+    "reconstructed"
 )
 _NO_PATH: Final = (
-    "no free path takes the sample out of the beam for the flat image; give `flat` a pose where it "
+    "no free path takes the sample out of the beam for the flat image; give `flat` a "
+    "pose where it "
     "is outside, or false to leave the flat image out"
 )
 
@@ -121,7 +123,9 @@ def plan_poses(
             commands.append(c.WriteSettingsFile(line=line))
         commands += _image(f"scan_{i:06d}.tif", line)
     commands.append(c.XrayOff(line=len(poses)))
-    plan = plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
+    plan = plan_script(
+        c.Script.of(commands), machine, profile, start=begin, sample=sample
+    )
     return replace(plan, problems=in_order((*problems, *plan.problems)))
 
 
@@ -132,11 +136,15 @@ def _image(file: str, line: int = 0) -> list[c.Command]:
 
 def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
     """Make moves that start together; the second request of each waits for its arrival."""
-    moves = [c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()]
+    moves = [
+        c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()
+    ]
     return [*(replace(k, wait=c.Wait.NO_WAIT) for k in moves if len(moves) > 1), *moves]
 
 
-def _arrival(positions: Pose, pose: Pose, machine: Machine, start: StartState) -> dict[str, float]:
+def _arrival(
+    positions: Pose, pose: Pose, machine: Machine, start: StartState
+) -> dict[str, float]:
     """Compute the positions of all motors at a pose reached from `positions`, within travel."""
     motors = Motors(machine, replace(start, positions=positions))
     out = dict(positions)

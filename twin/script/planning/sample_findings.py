@@ -116,7 +116,8 @@ def predicted_exposures(
         physics: how counts are made.
     """
     return tuple(
-        _predicted(plan, probe, seen, physics) for probe, seen in zip(probes, shares, strict=True)
+        _predicted(plan, probe, seen, physics)
+        for probe, seen in zip(probes, shares, strict=True)
     )
 
 
@@ -130,7 +131,9 @@ def _predicted(
     known = ""
     if beam is not None:
         doubt = open_beam_doubt(plan.machine, lit, beam)
-        made = replace(made, open_beam_fill=beam.fill, doubts=() if doubt is None else (doubt,))
+        made = replace(
+            made, open_beam_fill=beam.fill, doubts=() if doubt is None else (doubt,)
+        )
         known = "saturated" if beam.saturated else "starved" if beam.starved else ""
     doubts = [text for name, text in _sentences(seen) if name != known]
     return replace(made, doubts=(*made.doubts, *doubts))

@@ -19,11 +19,21 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.machine.travel import Arrival, Rate, arrival, rate
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
+from flexdt.twin.scanner.state import (
+    CameraChange,
+    TubeSettings,
+    changed_camera,
+    changed_tube,
+)
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
 from flexdt.twin.script.planning import planned_scanner as planned
-from flexdt.twin.script.planning.plan_values import PlanStep, SampleSize, Settings, StartState
+from flexdt.twin.script.planning.plan_values import (
+    PlanStep,
+    SampleSize,
+    Settings,
+    StartState,
+)
 from flexdt.twin.script.planning.planned_images import ImageCollector
 from flexdt.twin.script.problems import Findings
 
@@ -58,12 +68,16 @@ class Simulation:
         averages: inferred in a first run, or None.
     """
 
-    def __init__(self, machine: Machine, start: StartState, averages: int | None = None) -> None:
+    def __init__(
+        self, machine: Machine, start: StartState, averages: int | None = None
+    ) -> None:
         self.machine = machine
         self.now = 0.0
         self.motors = planned.Motors(machine, start)
         on = start.xrays_on
-        self.tube = planned.PlannedTube(start.kV, start.power_W, on is True, on is not None)
+        self.tube = planned.PlannedTube(
+            start.kV, start.power_W, on is True, on is not None
+        )
         self.camera = planned.PlannedCamera(start.camera)
         self.findings = Findings()
         self.imaging = ImageCollector(
@@ -90,9 +104,13 @@ class Simulation:
                 command = replace(command, component=own_name(command.component, axes))
             self.findings.place = (command.line, command.column)
             before = self.now
-            if isinstance(command, _CAMERA):  # a busy camera keeps the script waiting (assumed)
+            if isinstance(
+                command, _CAMERA
+            ):  # a busy camera keeps the script waiting (assumed)
                 self.now = max(self.now, self.camera.free_at)
-            effect = next(_EFFECTS[cls] for cls in type(command).__mro__ if cls in _EFFECTS)
+            effect = next(
+                _EFFECTS[cls] for cls in type(command).__mro__ if cls in _EFFECTS
+            )
             span = effect(self, command)
             self.now = self._release(command, span)
             holds = self.now - before
@@ -131,7 +149,9 @@ class Simulation:
             note: added to the step's description.
         """
         overhead = self.machine.timing.seconds(kind)
-        return planned.Span(self.now, self.now + length + overhead, overhead, kind, note=note)
+        return planned.Span(
+            self.now, self.now + length + overhead, overhead, kind, note=note
+        )
 
     # scanner -------------------------------------------------------------------------------
 
@@ -140,7 +160,8 @@ class Simulation:
         if command.component in self.machine.axes:
             self.findings.warn(
                 "custom_component",
-                f"{command.component}: the twin does not know this command of the axis; no effect",
+                f"{command.component}: the twin does not know this command of the axis; "
+                "no effect",
             )
         return self.timed("command", note=" (no effect)")
 
@@ -242,10 +263,13 @@ class Simulation:
         if self.machine.has(name):
             return True
         if is_reserved(name):
-            self.findings.error("unknown_component", unknown_axis(name, self.machine).message)
+            self.findings.error(
+                "unknown_component", unknown_axis(name, self.machine).message
+            )
         else:
             self.findings.warn(
-                "custom_component", f"{name!r} is a custom component: allowed, without effect here"
+                "custom_component",
+                f"{name!r} is a custom component: allowed, without effect here",
             )
         return False
 
@@ -266,7 +290,9 @@ class Simulation:
         for motor, value in found.motors.items():
             setattr(self.motors.all[motor], what, value)
             if found.told and value < asked * abs(shares[motor]):
-                unit = f"{self.machine.axes[motor].unit}/{'s' if what == 'speed' else 's2'}"
+                unit = (
+                    f"{self.machine.axes[motor].unit}/{'s' if what == 'speed' else 's2'}"
+                )
                 note += f" (limited to {motor} {value:g} {unit})"
         return self.timed("set_motor", note=note)
 
@@ -294,7 +320,9 @@ class Simulation:
         self._tell(found)
         for motor, target in targets.items():
             if found.told and target != asked[motor]:
-                note += f" (limited to {motor} {target:g} {self.machine.axes[motor].unit})"
+                note += (
+                    f" (limited to {motor} {target:g} {self.machine.axes[motor].unit})"
+                )
         begin = {m: self.motors.all[m].position(self.now) for m in targets}
         trajectories = {
             m: self.motors.all[m].move(targets[m], self.now, *rate)
@@ -332,14 +360,17 @@ class Simulation:
         """
         virtual = self.machine.virtual_axes.get(command.component)
         motor = command.component if virtual is None else virtual.of
-        position = trigger if virtual is None else (trigger - virtual.constant) / virtual.factor
+        position = (
+            trigger if virtual is None else (trigger - virtual.constant) / virtual.factor
+        )
         trajectory = made[motor]
         time = trajectory.time_at(position)
         if time is None:
             unit = self.machine.axes[motor].unit
             self.findings.error(
                 "unreachable_trigger",
-                f"{command.component} never passes the trigger {trigger:g} {unit} on its way from "
+                f"{command.component} never passes the trigger {trigger:g} {unit} on its "
+                "way from "
                 f"{begin[motor]:g} to {trajectory.target:g} {unit}: the script would hang here",
             )
             self.imaging.trigger = None

@@ -31,7 +31,9 @@ def step_range(step: PlanStep, timing: Timing) -> Range | None:
     return max(0.0, step.holds_s - below), step.holds_s + above
 
 
-def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> Range | None:
+def total_range(
+    steps: Iterable[_OfKind], duration_s: float, timing: Timing
+) -> Range | None:
     """Compute (5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
 
     Steps are independent of each other, but the error of a kind's median, from n times,

@@ -1,1 +1,2 @@
-"""Meshes of the scanner, of its cabinet and of the bodies that its collisions are found with."""
+"""Meshes of the scanner, of its cabinet and of the bodies that its collisions are found
+with."""

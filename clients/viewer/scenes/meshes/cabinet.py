@@ -13,7 +13,11 @@ from typing import Final, NamedTuple
 import numpy as np
 import trimesh
 
-from flexdt.clients.viewer.scenes.meshes.painted_meshes import Paint, PaintedMesh, bevelled
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import (
+    Paint,
+    PaintedMesh,
+    bevelled,
+)
 from flexdt.clients.viewer.scenes.meshes.paints import ANODISED, SIGNAL, STEEL
 from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.twin.collision.stages import stage_bodies
@@ -84,10 +88,16 @@ def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
         corners = np.concatenate([piece.mesh.vertices for piece in pieces_of(part)])
         if body.turns.any():  # at any angle
             radius = float(np.linalg.norm(corners[:, :2], axis=1).max())
-            corners = np.concatenate([corners, np.array([[-radius] * 2 + [0], [radius] * 2 + [0]])])
+            corners = np.concatenate(
+                [corners, np.array([[-radius] * 2 + [0], [radius] * 2 + [0]])]
+            )
         ends = body.slides[None] * limits.T[:, :, None]
-        low = np.minimum(low, body.origin + corners.min(axis=0) + ends.min(axis=0).sum(axis=0))
-        high = np.maximum(high, body.origin + corners.max(axis=0) + ends.max(axis=0).sum(axis=0))
+        low = np.minimum(
+            low, body.origin + corners.min(axis=0) + ends.min(axis=0).sum(axis=0)
+        )
+        high = np.maximum(
+            high, body.origin + corners.max(axis=0) + ends.max(axis=0).sum(axis=0)
+        )
     return low, high
 
 
@@ -116,27 +126,39 @@ def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
     middle = (door_top + z0) / 2
 
     def block(
-        size: tuple[float, ...], at: tuple[float, ...], paint: Paint, edge: float = EDGE_MM
+        size: tuple[float, ...],
+        at: tuple[float, ...],
+        paint: Paint,
+        edge: float = EDGE_MM,
     ) -> PaintedMesh:
         return bevelled(size, at, paint, edge * s)
 
     pane = door_top - 280 * s
     on_wall = [
-        block((8 * s, wide + 60 * s, tall + 60 * s), (x0 + 4 * s, door_y, middle), ANODISED),
+        block(
+            (8 * s, wide + 60 * s, tall + 60 * s), (x0 + 4 * s, door_y, middle), ANODISED
+        ),
         block((14 * s, wide, tall), (x0 + 7 * s, door_y, middle), DOOR, 4.0),
         block((18 * s, 440 * s, 340 * s), (x0 + 9 * s, door_y, pane), ANODISED),
         block((20 * s, 400 * s, 300 * s), (x0 + 10 * s, door_y, pane), GLASS),
         block(
-            (40 * s, 26 * s, 220 * s), (x0 + 30 * s, left + 90 * s, door_top - 560 * s), STEEL, 8.0
+            (40 * s, 26 * s, 220 * s),
+            (x0 + 30 * s, left + 90 * s, door_top - 560 * s),
+            STEEL,
+            8.0,
         ),
         block(
-            (16 * s, 150 * s, 150 * s), (x0 + 9 * s, right - 170 * s, door_top - 590 * s), SIGNAL
+            (16 * s, 150 * s, 150 * s),
+            (x0 + 9 * s, right - 170 * s, door_top - 590 * s),
+            SIGNAL,
         ),
     ]
     for piece in on_wall:  # as the wall, it is seen from within alone
         piece.mesh.update_faces(piece.mesh.face_normals[:, 0] > 0.2)
     kerb = [
-        block((x1 - x0 + 80 * s, 40 * s, 60 * s), (0.5 * (x0 + x1), y, z0 + 30 * s), STEEL)
+        block(
+            (x1 - x0 + 80 * s, 40 * s, 60 * s), (0.5 * (x0 + x1), y, z0 + 30 * s), STEEL
+        )
         for y in (y0 - 20 * s, y1 + 20 * s)
     ] + [
         block((40 * s, y1 - y0, 60 * s), (x, 0.5 * (y0 + y1), z0 + 30 * s), STEEL)

@@ -39,11 +39,15 @@ class PaintedMesh:
     paint: Paint
 
 
-def bevelled(size: Vector, center: Vector, paint: Paint, bevel: float = 2.0) -> PaintedMesh:
+def bevelled(
+    size: Vector, center: Vector, paint: Paint, bevel: float = 2.0
+) -> PaintedMesh:
     """Build a box [mm] whose edges are cut, so that they catch the light."""
     h = np.asarray(size, dtype=float) / 2.0
     b = min(bevel, 0.35 * float(h.min()))
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    corners = np.array(
+        [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float
+    )
     points = np.concatenate(
         [corners * (h - b * np.array(k)) for k in ((0, 1, 1), (1, 0, 1), (1, 1, 0))]
     )
@@ -61,7 +65,9 @@ def cylinder(
     sections: int = 48,
 ) -> PaintedMesh:
     """Build a cylinder [mm] along z (or y)."""
-    mesh = trimesh.creation.cylinder(radius=diameter / 2, height=height, sections=sections)
+    mesh = trimesh.creation.cylinder(
+        radius=diameter / 2, height=height, sections=sections
+    )
     return _standing(mesh, center, paint, axis)
 
 
@@ -74,7 +80,9 @@ def lathe(
     return _standing(mesh, center, paint, axis)
 
 
-def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) -> PaintedMesh:
+def _standing(
+    mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str
+) -> PaintedMesh:
     """Move a mesh made about z to its place, turned to y if so wanted, and paint it."""
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
@@ -90,7 +98,9 @@ def glb(pieces: Iterable[PaintedMesh]) -> bytes:
         groups.setdefault(piece.paint, []).append(piece.mesh)
     scene = trimesh.Scene()
     for i, (paint, meshes) in enumerate(groups.items()):
-        scene.add_geometry(_painted(meshes, paint), geom_name=f"part{i}", node_name=f"part{i}")
+        scene.add_geometry(
+            _painted(meshes, paint), geom_name=f"part{i}", node_name=f"part{i}"
+        )
     out = io.BytesIO()
     export: Any = scene.export
     export(out, file_type="glb", include_normals=True)
@@ -134,7 +144,9 @@ def turn_matrix(axis: Vector, angle: float) -> FloatArray:
     return out
 
 
-def plain(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+def plain(
+    mesh: trimesh.Trimesh,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
     """Convert a mesh in mm to vertices [m] and faces."""
     return (
         (np.asarray(mesh.vertices) * MM).astype(np.float32),

@@ -15,5 +15,7 @@ BRAND = Paint((28, 120, 200), 0.0, 0.45)
 BRASS = Paint((206, 168, 92), 0.3, 0.35)
 SIGNAL = Paint((255, 140, 0), 0.0, 0.5, (0.25, 0.12, 0.0))
 RUBBER = Paint((34, 37, 43), 0.0, 0.8)
-PAINTS: Final = {name: value for name, value in globals().items() if isinstance(value, Paint)}
+PAINTS: Final = {
+    name: value for name, value in globals().items() if isinstance(value, Paint)
+}
 """Paints by their names in `data/parts.toml`."""

@@ -54,7 +54,9 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
             file = folder / part.mesh
             own = file.suffix.lower() == ".glb"  # with its colours
             looks[part.name] = (
-                file.read_bytes() if own else glb([PaintedMesh(read_part(file), ALUMINIUM)])
+                file.read_bytes()
+                if own
+                else glb([PaintedMesh(read_part(file), ALUMINIUM)])
             )
     return looks
 
@@ -62,7 +64,9 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
 def pieces_of(part: Component) -> list[PaintedMesh]:
     """Build the part's painted meshes, in its own frame [mm]."""
     if part.points_mm:
-        return [PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), ALUMINIUM)]
+        return [
+            PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), ALUMINIUM)
+        ]
     role = part.role if part.role in LOOKS["looks"] else part.shape
     look = LOOKS["looks"][LOOKS["components"].get(part.name, role)]
     pieces = [made for piece in look for made in _pieces(piece, np.array(part.size_mm))]
@@ -90,10 +94,14 @@ def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
                 one = bevelled(size, place, paint, piece.get("bevel", 2.0))
             case "cylinder":
                 along = size["xyz".index(axis)]
-                one = cylinder(size[0], along, place, paint, axis, piece.get("sections", 48))
+                one = cylinder(
+                    size[0], along, place, paint, axis, piece.get("sections", 48)
+                )
             case _:
                 wide = max(sides[0], sides[2])
-                profile = [(r * wide + a, h * sides[1] + b) for r, a, h, b in piece["profile"]]
+                profile = [
+                    (r * wide + a, h * sides[1] + b) for r, a, h, b in piece["profile"]
+                ]
                 one = lathe(profile, place, paint, axis)
         one.mesh.apply_transform(turn_matrix((0, 0, 1), angle))
         made.append(one)
