@@ -83,7 +83,7 @@ def instructions() -> dict[str, list[tuple[str, str]]]:
 
 
 def build(steps: list[tuple[str, str]], place: Place) -> None:
-    """The build stage, with /opt and /src inside `place`."""
+    """Run the build stage, with /opt and /src inside `place`."""
     source = place.of("/src")
     if source.exists():
         shutil.rmtree(source)
@@ -127,7 +127,8 @@ def _as_user() -> dict[str, Any]:
 
 def start(name: str, stages: dict[str, list[tuple[str, str]]], place: Place, more: list[str],
           health: str) -> tuple[subprocess.Popen[bytes], float]:  # fmt: skip
-    """An image's entry point; returns the process and seconds until its health check passed."""
+    """Start an image's entry point; return the process and seconds until its health check
+    passed."""
     home = f"{STATE}/{name}"  # the images have one each; here they share a file system
     for path in (home, f"{home}/data"):
         place.of(path).mkdir(parents=True, exist_ok=True)
@@ -159,7 +160,7 @@ def start(name: str, stages: dict[str, list[tuple[str, str]]], place: Place, mor
 
 @contextlib.contextmanager
 def prepared(root: Path | None) -> Iterator[Place]:
-    """The place, with what an engine would give it: names, certificates, /proc and /dev."""
+    """Prepare the place as an engine would: names, certificates, /proc and /dev."""
     if root is None:
         with tempfile.TemporaryDirectory(prefix="flexdt-image-") as folder:
             Path(folder).chmod(0o755)

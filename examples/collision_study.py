@@ -84,7 +84,7 @@ class Outcome:
 
 
 def random_solid(rng: np.random.Generator) -> tuple[str, ConvexSolid]:
-    """A solid of a random kind, off its frame's origin by up to 60 mm."""
+    """Draw a solid of a random kind, off its frame's origin by up to 60 mm."""
     name = rng.choice(["box", "hull", "wall", "long", "cylinder"])
     center = rng.uniform(-60, 60, 3) * rng.integers(0, 2)
     turn = Rotation.random(random_state=rng).as_matrix()
@@ -105,7 +105,8 @@ def random_solid(rng: np.random.Generator) -> tuple[str, ConvexSolid]:
 
 
 def random_trajectory(rng: np.random.Generator, span: float) -> Trajectory:
-    """A motor's way over about `span`, begun up to 2 s late, at times retargeted on the way."""
+    """Draw a motor's way over about `span`, begun up to 2 s late, at times retargeted on the
+    way."""
     start = rng.uniform(0, 2) * rng.integers(0, 2)
     speed, acceleration = rng.uniform(0.05, 0.5) * span, rng.uniform(0.02, 1.0) * span
     first = motion.move(0.0, 0.0, span, speed, acceleration, start)
@@ -187,7 +188,7 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
 
 
 def _tip(solid: ConvexSolid, direction: np.ndarray) -> np.ndarray:
-    """The solid's farthest point along `direction`."""
+    """Return the solid's farthest point along `direction`."""
     if isinstance(solid, Polytope):
         return solid.vertices[np.argmax(solid.vertices @ direction)]
     assert isinstance(solid, UprightCylinder)
@@ -259,7 +260,7 @@ def separated(
 
 
 def sample_times(case: Case) -> np.ndarray:
-    """Times at most `STEP_MM` of way apart (within 2001 to 12001 of them)."""
+    """Return times at most `STEP_MM` of way apart (within 2001 to 12001 of them)."""
     fine = np.linspace(0.0, case.end, 2001)
     way = np.zeros(2000)
     for n, t in case.trajectories.items():
@@ -278,8 +279,8 @@ def sample_times(case: Case) -> np.ndarray:
 def swept(
     scene: CollisionScene, trajectories: Mapping[str, Trajectory], end: float
 ) -> SweepResult:
-    """The first contact from 0 s to `end` [s]; without one the least clearance, as `check`
-    does."""
+    """Find the first contact from 0 s to `end` [s], or without one the least clearance, as
+    `check` does."""
     search = PathSearch(scene, scene.path(trajectories, 0.0, end))
     found = search.first_contact()
     return search.refined(found) if found.contact is None else found
@@ -331,7 +332,8 @@ def study_pairs(sweeps: int, seed: int, progress: Callable[[int], None]) -> list
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
-    """Counts and times; `missed` are sweeps that let the clearance fall below the margin."""
+    """Sum up counts and times; `missed` are sweeps that let the clearance fall below the
+    margin."""
     ms = np.array([o.seconds for o in outcomes]) * 1e3
     stops = [o for o in outcomes if o.stopped]
     free = [o for o in outcomes if not o.stopped]
@@ -368,7 +370,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
 
 
 def study_machine(moves: int, seed: int) -> dict[str, object]:
-    """Times of sweeps of the whole FleX-ray with a LEGO-sized sample: 1 to 8 motors at once."""
+    """Measure sweeps of the whole FleX-ray with a LEGO-sized sample: 1 to 8 motors at once."""
     machine = builtin_machine()
     scene = build_scene(
         machine, builtin_profile(machine.default_profile), [box((24, 16, 49.8))]
@@ -408,7 +410,7 @@ def study_machine(moves: int, seed: int) -> dict[str, object]:
 
 
 def study_scripts() -> dict[str, object]:
-    """Times of whole checks (parse, plan, optics, collisions) without imaging, best of five."""
+    """Measure whole checks (parse, plan, optics, collisions) without imaging, best of five."""
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
     lego = convex_pieces(load_phantom("lego").mesh())

@@ -64,7 +64,7 @@ def blocks(page: str) -> dict[str, str]:
 
 
 def given() -> dict[str, Any]:
-    """What the blocks take for granted: an array, a spectrum, files in the working
+    """Return the names that the blocks presuppose: an array, a spectrum, files in the working
     directory."""
     array = np.zeros((24, 24, 24), np.float32)
     array[6:18, 6:18, 6:18] = 0.05
@@ -111,7 +111,7 @@ def spread_mm(rows: np.ndarray, wanted: fx.ConeVec, upwards: bool) -> float:
 
 
 def fifth_task() -> list[fx.ConeVec]:
-    """The geometries of the library page's fifth task."""
+    """Return the geometries of the library page's fifth task."""
     rng = np.random.default_rng(1)
     scan = {"sod": 600, "sdd": 1059, "angles": 4, "shape": (48, 60), "pixel": 2.4}
     offsets, rolls = rng.normal(0, 0.5, (100, 2)), rng.normal(0, 0.3, 100)
@@ -122,7 +122,7 @@ def fifth_task() -> list[fx.ConeVec]:
 
 
 def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
-    """The same for the blocks of the five tasks."""
+    """Compare as above, for the blocks of the five tasks."""
     if caption.endswith("task 2"):
         vectors = fx.ConeVec(np.load("vectors.npy"))
         if caption.startswith("tomosipo") and "scan" in theirs:
@@ -151,7 +151,7 @@ def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
 
 
 def cil_rows(theirs: dict[str, Any]) -> np.ndarray:
-    """The geometry of CIL's `scan`, as CIL gives it to ASTRA."""
+    """Return the geometry of CIL's `scan`, as CIL gives it to ASTRA."""
     from cil.plugins.astra.utilities import convert_geometry_to_astra_vec_3D
 
     rows: np.ndarray = convert_geometry_to_astra_vec_3D(theirs["volume"], theirs["scan"])[
@@ -194,7 +194,7 @@ def compared(peer: str, theirs: dict[str, Any], ours: dict[str, Any]) -> dict[st
 
 
 def named(peer: str) -> str | None:
-    """The version of a peer that is installed."""
+    """Return the installed version of a peer; None if it is not installed."""
     try:
         return version(PACKAGES.get(peer, peer.split()[0].lower()))
     except PackageNotFoundError:

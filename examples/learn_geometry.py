@@ -50,7 +50,7 @@ class Task:
     truth: np.ndarray
 
     def rows(self, values: np.ndarray) -> np.ndarray:
-        """The geometry (n, 12) with a shift, a roll and an axis [px]."""
+        """Return the geometry (n, 12) with a shift, a roll and an axis [px]."""
         shift, roll, axis = values
         width = self.nominal.shape[2]
         source, centre, u, v = (
@@ -67,7 +67,7 @@ class Task:
         )
 
     def operator(self, values: np.ndarray) -> fx.Operator:
-        """The projector with a misalignment."""
+        """Return the projector with a misalignment."""
         return fx.Operator(
             fx.ConeVec(self.rows(values), self.nominal.detector_shape), self.volume
         )
@@ -134,7 +134,7 @@ def render(
 
 
 def voxels(ellipsoids: list[tuple], grid: fx.Grid, sharp: bool) -> fx.Volume:
-    """The ellipsoids as voxels: the mean of some points in each."""
+    """Voxelise the ellipsoids: the mean of some points in each."""
     fine = 4 if sharp else 2
     steps = ((np.arange(fine) + 0.5) / fine - 0.5) * grid.voxel_mm
     x, y, z = grid.blank().centers()
@@ -152,7 +152,7 @@ def voxels(ellipsoids: list[tuple], grid: fx.Grid, sharp: bool) -> fx.Volume:
 
 
 def make(seed: int, views: int, count: int, sharp: bool = False) -> Task:
-    """A random object of about count^3 voxels, a random misalignment, and the images."""
+    """Draw a random object of about count^3 voxels, a random misalignment, and the images."""
     rng = np.random.default_rng(seed)
     size = 40.0
     ellipsoids = []

@@ -109,7 +109,7 @@ class Together:
 
 
 def _family(pid: int) -> list[int]:
-    """A process and all below it."""
+    """List a process and its descendants."""
     below: dict[int, list[int]] = {}
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:

@@ -24,7 +24,7 @@ from flexdt.clients import TwinClient
 
 
 def start(*words: str) -> tuple[subprocess.Popen[str], int]:
-    """A `flexdt` process and its port."""
+    """Start a `flexdt` process and return it with its port."""
     command = [sys.executable, "-m", "flexdt.clients.cli", *words, "--port", "0"]
     child = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

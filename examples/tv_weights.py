@@ -30,7 +30,7 @@ SIZE_MM = 43.2
 
 
 def truth(count: int, fine: int = 3) -> np.ndarray:
-    """The scene as voxels: the mean of fine^3 points in each."""
+    """Voxelise the scene: the mean of fine^3 points in each."""
     at = (np.arange(count * fine) - (count * fine - 1) / 2) * SIZE_MM / (count * fine)
     z, y, x = np.meshgrid(at, at, at, indexing="ij", sparse=True)
     full = 0.03 * ((x / 18) ** 2 + (y / 14) ** 2 + (z / 16) ** 2 < 1)

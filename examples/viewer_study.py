@@ -182,7 +182,8 @@ def cpu_s(pid: int) -> float:
 
 
 def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
-    """The viewer's resident memory and the page's heap in use [MB], while the stage turns."""
+    """Measure the viewer's resident memory and the page's heap in use [MB], while the stage
+    turns."""
     samples, end = [], time.monotonic() + 60.0 * minutes
     session = page.context.new_cdp_session(page)
     begun = time.monotonic()
@@ -211,7 +212,7 @@ def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
 
 
 def viewer_pid(port: int) -> int:
-    """The process that listens on a port, among those started here."""
+    """Find the process that listens on a port, among those started here."""
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             words = (entry / "cmdline").read_bytes().split(b"\0")

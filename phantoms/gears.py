@@ -50,7 +50,7 @@ Ring = FloatArray
 
 
 def gear_phantom() -> Phantom:
-    """The gear and its pinion: 40 x 40 x 30 mm about the origin.
+    """Build the gear and its pinion: 40 x 40 x 30 mm about the origin.
 
     >>> gear_phantom().size_mm
     (40.0, 40.0, 30.0)
@@ -104,7 +104,7 @@ def _angles() -> FloatArray:
 
 
 def _circle(level_mm: float) -> Ring:
-    """A ring of the bore (n, 3)."""
+    """Return a ring of the bore (n, 3)."""
     angle = _angles()
     flat = np.full(len(angle), level_mm)
     return np.stack(
@@ -133,7 +133,7 @@ def _teeth(
 
 
 def _closed(rings: Sequence[Ring]) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """A closed surface through rings, each joined to the next and the last to the first.
+    """Build a closed surface through rings, each joined to the next and the last to the first.
 
     Args:
         rings: (n, 3) each, counter-clockwise seen from above; up outside, down inside.

@@ -118,7 +118,7 @@ class PastScan:
 
 
 def standing(scan: PastScan, machine: Machine) -> PastScan:
-    """The scan with its motors, camera and the zero offsets behind its printed figures.
+    """Return the scan with its motors, camera and the zero offsets behind its printed figures.
 
     Raises:
         TwinError: its texts do not say them, or contradict themselves.
@@ -152,8 +152,9 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 
 
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
-    """What its script asks for: axis -> target when the settings file is written, and settings
-    of camera and tube, by the names of `ScanSettings`, at the first projection.
+    """Read the settings that its script asks for: axis -> target when the settings file is
+    written, and settings of camera and tube, by the names of `ScanSettings`, at the first
+    projection.
 
     `projections` counts all that it saves: those of sequences, and single images.
     """
@@ -253,8 +254,8 @@ def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
 def contradictions(
     scans: Sequence[PastScan], shipped: Machine, fitted: Machine
 ) -> Iterator[Finding]:
-    """What texts, scripts, images and replies of the scans, and the machine that ships, say
-    differently; `fitted` has the signs and limits that the scans show."""
+    """Find where texts, scripts, images and replies of the scans and the shipped machine state
+    things differently; `fitted` has the signs and limits that the scans show."""
     said: dict[str, list[tuple[Any, list[str]]]] = {}
     lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
     every = [
@@ -360,7 +361,7 @@ def _alike(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
 
 
 def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
-    """The same of a machine file."""
+    """Yield the same facts of a machine file."""
     yield "original_pixel_mm", machine.detector.pitch_mm
     for name, axis in machine.axes.items():
         yield f"rates of {name}", (axis.speed, axis.acceleration)
@@ -503,8 +504,8 @@ def zero_offsets(
 def _axis(
     machine: Machine, scan: PastScan, base: Profile, roll: float
 ) -> tuple[float, ...]:
-    """The axis's column [px] with the offsets of `base`, and its slopes [px/mm] with axs_tan
-    and det_tan, in which it is linear."""
+    """Return the axis's column [px] with the offsets of `base`, and its slopes [px/mm] with
+    axs_tan and det_tan, in which it is linear."""
     own, camera = scan.profile or base, scan.camera or machine.detector.camera
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     column = []

@@ -31,7 +31,8 @@ class TwinError(ValueError):
 
     @classmethod
     def instead(cls, said: str, asked: object, allowed: object, **where: object) -> Self:
-        """The error whose message is `said` and what is allowed; `where` goes into its data.
+        """Make the error whose message is `said` and what is allowed; `where` goes into its
+        data.
 
         Example:
             >>> error = TwinError.instead("no unit 'mile'", "mile", ("mm", "m"))
@@ -53,8 +54,8 @@ class TwinError(ValueError):
     def of_shape(
         cls, what: str, got: Sequence[int], allowed: Sequence[int | str], more: str = ""
     ) -> Self:
-        """The error whose message is `what`, the shape it has and the one it must have, and
-        `more`.
+        """Make the error whose message is `what`, the shape it has and the one it must have,
+        and `more`.
 
         Example:
             >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
@@ -170,7 +171,7 @@ class UnknownNameError(TwinError):
     def among(
         cls, problem: str, asked: str, allowed: Iterable[str], more: str = ""
     ) -> Self:
-        """The error whose message is `problem`, a colon, the names there are, and `more`.
+        """Make the error whose message is `problem`, a colon, the names there are, and `more`.
 
         Example:
             >>> print(UnknownNameError.among("no axis 'w'; there are", "w", ["x", "y"]))

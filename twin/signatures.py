@@ -77,7 +77,7 @@ class Kind(NamedTuple):
 def with_arguments_of(
     other: Callable[P, object],
 ) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
-    """A decorator that gives a function the parameters of `other`, for `help` and type
+    """Make a decorator that gives a function the parameters of `other`, for `help` and type
     checkers."""
 
     def typed(function: Callable[..., Result]) -> Callable[P, Result]:
@@ -90,7 +90,7 @@ def with_arguments_of(
 
 
 def with_options_of(declared: type) -> Callable[[Thing], Thing]:
-    """A decorator: the `**options` of a function are the keys of a TypedDict, each None by
+    """Make a decorator: a function's `**options` are the keys of a TypedDict, each None by
     default.
 
     They stand in its signature, and their descriptions in its docstring, in place of the line
@@ -119,7 +119,7 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
 
 
 def public(thing: Thing) -> Thing:
-    """A decorator: calls of a function, or of a class and its methods, are checked.
+    """Check calls of a function, or of a class and its methods (decorator).
 
     Raises:
         ArgumentError: when called with arguments that the signature does not allow.
@@ -172,7 +172,8 @@ def _checked(function: Thing, text: str) -> Thing:
 
 
 def _type(value: Any) -> Any:
-    """What decides whether a value is allowed; None where its content does, too."""
+    """Return the type that decides whether a value is allowed; None where its content does,
+    too."""
     if type(value) is tuple:
         inner = tuple(map(_type, value))
         return None if None in inner else inner
@@ -214,7 +215,7 @@ class Known:
         return {name: kind for name, kind in found.items() if kind is not None}
 
     def checked(self, given: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-        """The keywords, under the names that the signature has.
+        """Return the keywords, under the names that the signature has.
 
         Raises:
             ArgumentError: arguments that the signature does not allow.
@@ -313,7 +314,8 @@ class Names(dict[str, Any]):
 
 
 def kind_of(annotation: Any) -> Kind | None:
-    """What an annotation allows; None where it is no more than anything.
+    """Return the kind of value that an annotation allows; None where it is no more than
+    anything.
 
     Example:
         >>> kind_of(float | None).words, kind_of(tuple[int, int]).holds((3, 4.5))

@@ -55,14 +55,14 @@ class JsonValue:
     """A dataclass that goes to JSON and back, by its annotations."""
 
     def to_dict(self) -> dict[str, Any]:
-        """The value as JSON types: dictionaries, lists, texts and numbers."""
+        """Return the value as JSON types: dictionaries, lists, texts and numbers."""
         adapter = adapter_of(type(self))
         document: dict[str, Any] = adapter.dump_python(self, mode="json", by_alias=True)
         return document
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """The value that `to_dict` wrote.
+        """Read the value that `to_dict` wrote.
 
         Raises:
             TwinError: the document has another form; the message names each place.
@@ -75,7 +75,7 @@ class JsonValue:
 
 
 def told(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
-    """What does not hold in a document, place by place: an error's message and data."""
+    """Describe a document's errors, place by place, as an error's message and data."""
     lines = [
         f"{name}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
         for e in error.errors(include_url=False, include_context=False)[:10]
@@ -84,12 +84,13 @@ def told(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
 
 
 def message_of(problem: Mapping[str, Any]) -> str:
-    """What one of pydantic's problems says, without the words it puts before errors of ours."""
+    """Return the message of one of pydantic's problems, without the words it puts before errors
+    of ours."""
     return str(problem["msg"]).removeprefix("Value error, ")
 
 
 def adapter_of(cls: type[Any]) -> TypeAdapter[Any]:
-    """The conversion of a dataclass; making one takes milliseconds, so each is kept."""
+    """Return the converter of a dataclass; making one takes milliseconds, so each is kept."""
     if cls not in _ADAPTERS:
         _ADAPTERS[cls] = TypeAdapter(cls)
     return _ADAPTERS[cls]

@@ -234,7 +234,8 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         token_file: TokenFile = None,
         verbose: Verbose = None,
     ) -> None:
-        """What these options say, `completed` commands take from the context."""
+        """Take the options before a command; `completed` commands read them from the
+        context."""
         speak(quiet=verbose is False, verbose=verbose is True)
 
     for name, command in COMMANDS.items():

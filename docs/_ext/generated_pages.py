@@ -133,7 +133,7 @@ def _option(parameter: Any) -> str:
 
 
 def _value(parameter: Any) -> str:
-    """What an option's value looks like; typer's own click and the click package differ."""
+    """Return the form of an option's value; typer's own click and the click package differ."""
     kind = getattr(parameter, "type", None)
     if kind is not None:
         choices = getattr(kind, "choices", None)

@@ -26,7 +26,8 @@ LINK = re.compile(r"(?<!!)\[([^\]\n]+)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s
 
 
 def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
-    """A page's text with links out of the site as paths, and the links that lead nowhere.
+    """Return a page's text with links out of the site as paths, and the links that lead
+    nowhere.
 
     Args:
         text: Markdown.

@@ -68,7 +68,7 @@ class Target:
 
 
 def target_table(document: Mapping[str, Any]) -> list[str]:
-    """The table as lines of Markdown."""
+    """Return the table as lines of Markdown."""
     entries = {entry["name"]: entry for entry in document["cases"]}
     lines = [
         "| target | to be accepted | wanted | measured | |",
@@ -233,7 +233,7 @@ BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
 
 
 def into_page(page: str, document: dict[str, Any], picture: str) -> str:
-    """A Markdown page with what stands between its two marks replaced by the figures.
+    """Replace the text between the two marks of a Markdown page by the figures.
 
     Raises:
         ValueError: the page has no marks.
@@ -314,7 +314,7 @@ def _growth(document: dict[str, Any]) -> list[str]:
 
 
 def merged(old: Document, new: Document) -> Document:
-    """`new`, with what it did not measure taken from `old`, cases in the order of `old`.
+    """Merge two runs: what `new` did not measure is taken from `old`, in its order.
 
     What the machine was at the start is the new run's; each case keeps the load it met.
     """
@@ -360,7 +360,7 @@ def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
 
 
 def _bars(cases: Sequence[dict[str, Any]]) -> str:
-    """Times faster than the first peer, one bar a case."""
+    """Draw how many times faster we are than the first peer, one bar a case."""
     bars = [(c["name"], *next(iter(c["ratio"].items()))) for c in cases if c["ratio"]]
     if not bars:
         return _text(WIDTH / 2, PANEL / 2, "no peer took part")

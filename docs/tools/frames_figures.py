@@ -108,7 +108,7 @@ class Sheet:
 
 
 def stand(angle_deg: float) -> Poses:
-    """The default scanner's pose at one stage angle."""
+    """Return the default scanner's pose at one stage angle."""
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
     where = {"ver_tube": 26.3, "ver_det": 20.0, "rot_obj": angle_deg, "mag_obj": 600.0}
@@ -206,7 +206,7 @@ def detector() -> str:
 
 
 def unity() -> str:
-    """The thesis's axes beside ours."""
+    """Draw the thesis's axes beside ours."""
     sheet = Sheet(640, 250, (110.0, 190.0), 1.0)
     slant = np.array([0.6, 0.45])
 

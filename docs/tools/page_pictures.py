@@ -79,7 +79,7 @@ def opened(browser: Any, url: str, view: str, tab: str) -> Any:
 
 
 def taken(page: Any, path: Path) -> None:
-    """A picture, once the scenes rest and nothing is said to be old."""
+    """Save a picture of the page once its scenes rest and it marks nothing as old."""
     last = b""
     while (now := page.locator("#views").screenshot()) != last:
         page.wait_for_timeout(FADED_MS)
@@ -108,7 +108,7 @@ def four_views(browser: Any, url: str, to: Path) -> None:
 
 
 def scan(browser: Any, url: str, to: Path) -> None:
-    """A plan on its timeline, then the same scan run, for `virtual`; and the scan designer."""
+    """Save a plan's timeline and the scan designer, and run the scan for `virtual`."""
     page = opened(browser, url, "iso", "scan")
     page.select_option("#wish-kind", "step")
     page.fill("#wish-frames", "13")
@@ -129,7 +129,7 @@ def scan(browser: Any, url: str, to: Path) -> None:
 
 
 def virtual(browser: Any, url: str, to: Path) -> None:
-    """Recorded less virtual, with the beads of a fit, of the newest data set."""
+    """Save recorded less virtual image of the newest data set, with a fit's beads."""
     page = opened(browser, url, "iso", "data")
     page.locator(".data-set").first.click()
     page.get_by_role("button", name="Calibrate", exact=True).click()

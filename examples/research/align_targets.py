@@ -72,7 +72,7 @@ class Hidden:
         return np.arange(self.views) * self.span / self.views
 
     def nominal(self) -> fx.ConeVec:
-        """What the data set says."""
+        """Return the geometry that the data set states."""
         return fx.ConeVec.circular(
             sod=self.sod,
             sdd=self.sdd,
@@ -135,7 +135,7 @@ class Hidden:
 
 
 def drawn(rng: np.random.Generator, plain: Hidden) -> Hidden:
-    """A scanner with offsets drawn about a plain one."""
+    """Draw a scanner's offsets about those of a plain one."""
     wide = plain.pixel * plain.shape[1] / 956
     return replace(
         plain,
@@ -158,7 +158,7 @@ class Solids:
 
 
 def lego(rng: np.random.Generator) -> Solids:
-    """A hollow brick that leans on no axis, with studs, and beads in its walls."""
+    """Build a hollow brick that leans on no axis, with studs, and beads in its walls."""
     shift = rng.uniform(-4, 4, 2)
     boxes = [[0, 0, 0, 16, 8, 10, 0.02], [0, 0, -1, 14.5, 6.5, 9, -0.02]]
     boxes += [[x, y, 11, 2.4, 2.4, 1, 0.02] for x in (-12, -4, 4, 12) for y in (-4, 4)]
@@ -173,7 +173,7 @@ def lego(rng: np.random.Generator) -> Solids:
 
 
 def porous(rng: np.random.Generator) -> Solids:
-    """An ellipsoid with 80 pores."""
+    """Build an ellipsoid with 80 pores."""
     body = [[*rng.uniform(-3, 3, 2), 0, *rng.uniform(15, 20, 2), 22, 0.03]]
     for _ in range(80):
         direction = rng.normal(size=3)
@@ -195,7 +195,7 @@ def smooth(rng: np.random.Generator) -> Solids:
 
 
 def truncated(rng: np.random.Generator) -> Solids:
-    """A porous body that is wider and higher than the field of view."""
+    """Build a porous body that is wider and higher than the field of view."""
     inside = porous(rng)
     wide = inside.ellipsoids.copy()
     wide[:, :3] *= 2.9
@@ -232,7 +232,7 @@ def _window(solid, source, centre, u, v, shape):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath=True)
 def add_chords(source, centre, u, v, solids, round_, out):  # type: ignore[no-untyped-def]
-    """Adds the line integrals of ellipsoids (`round_`) or boxes (k, 7); u is perpendicular to
+    """Add the line integrals of ellipsoids (`round_`) or boxes (k, 7); u is perpendicular to
     v."""
     rows, cols = out.shape
     for k in range(len(solids)):
@@ -283,7 +283,7 @@ def measured(
     lines: np.ndarray, hidden: Hidden, photons: float, rng: np.random.Generator,
     keep: np.ndarray | None = None, ramp: float = 0.0,
 ) -> fx.DataSet:  # fmt: skip
-    """A data set of counts with Poisson noise and 20 flat images.
+    """Make a data set of counts with Poisson noise and 20 flat images.
 
     Args:
         lines: line integrals (n, rows, cols).
@@ -334,7 +334,7 @@ def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
 
 
 def _angle(found: Any) -> float:
-    """The angle of the axis in the image by the corrected geometry [deg]."""
+    """Return the angle of the axis in the image by the corrected geometry [deg]."""
     cone = found.dataset.with_correction(found.correction).geometry
     (c0, r0), (c1, r1) = cone.project_points([[0, 0, -10], [0, 0, 10]])[0]
     return math.degrees(math.atan2(c1 - c0, r0 - r1))
@@ -343,8 +343,8 @@ def _angle(found: Any) -> float:
 def left_of(
     true: np.ndarray, motion: Any, hidden: Hidden, degrees: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a motion leaves of shifts, without what all frames share or turns once with the
-    stage, and its sigmas, both (n, 2) as columns and rows [px]."""
+    """Return the shifts that a motion leaves, less those that all frames share or that turn
+    once with the stage, and its sigmas, both (n, 2) as columns and rows [px]."""
     to_px = hidden.sdd / hidden.sod / hidden.pixel
     angle = np.radians(degrees)
     modes = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
@@ -357,7 +357,8 @@ def left_of(
 def shifted(
     name: str, plain: Hidden, size: float, photons: float, seed: tuple[int, ...]
 ) -> str:
-    """What is left of shifts of `size` pixels (0.1496 mm, rms) in every frame, in words."""
+    """Say how much is left of shifts of `size` pixels (0.1496 mm, rms) in every frame, in
+    words."""
     rng = np.random.default_rng([*seed, sorted(OBJECTS).index(name)])
     hidden, solids = drawn(rng, plain), OBJECTS[name](rng)
     factor = hidden.pixel / PIXEL

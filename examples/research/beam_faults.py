@@ -98,7 +98,7 @@ class Laboratory:
 
 
 def rays(truth: Mapping[str, float], step: int = 1) -> Array:
-    """Unit vectors from the source through every `step`-th pixel, (rows, cols, 3)."""
+    """Return unit vectors from the source through every `step`-th pixel, (rows, cols, 3)."""
     panel, across, down = own.places(np.zeros((1, 3)), np.zeros(1), own.SOD, truth)[1]
     column = np.arange(0, own.SHAPE[1], step) - (own.SHAPE[1] - 1) / 2
     row = np.arange(0, own.SHAPE[0], step) - (own.SHAPE[0] - 1) / 2
@@ -155,7 +155,7 @@ def light(
     truth: Mapping[str, float],
     straight: Array,
 ) -> Array:
-    """What part of the beam passes at one angle, (rows, cols)."""
+    """Return the transmitted share of the beam at one angle, (rows, cols)."""
     ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
     turn = np.array([angle])
     (at,), panel = own.places(np.concatenate([beads, ends]), turn, own.SOD, truth)
@@ -194,7 +194,7 @@ def _blurred(image: Array, blur: tuple[float, float, float]) -> Array:
 
 
 def _shifted(image: Array, shift: tuple[Array, Array]) -> Array:
-    """What is at a place appears `shift` (rows, columns) further on."""
+    """Shift an image by `shift` (rows, columns)."""
     row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
     places = np.array([row - shift[0], column - shift[1]])
     return np.asarray(ndimage.map_coordinates(image, places, order=3, mode="nearest"))
@@ -227,7 +227,7 @@ def _with(**fields: object) -> Change:
 
 
 def _strained(i: int, j: int) -> Change:
-    """A phantom that is off by .05 to 1 % in one way."""
+    """Strain the phantom by .05 to 1 % in one way."""
 
     def change(lab: Laboratory, rng: Rng) -> Laboratory:
         strain = np.zeros((3, 3))

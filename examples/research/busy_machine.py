@@ -55,7 +55,7 @@ def cases() -> dict[str, Callable[[], object]]:
 
 @contextmanager
 def busy_loops(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes that never wait, stopped, in a session of their own."""
+    """Start busy processes, stopped at first, in a session of their own."""
     script = (
         f"import os\nfor _ in range({count - 1}):\n    if os.fork() == 0: break\nwhile "
         "True: pass\n"

@@ -129,7 +129,7 @@ def scored(kind: str, seed: int) -> Scored:
 
 
 def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
-    """The largest error in sigmas; what moves may have any of the values it had."""
+    """Return the largest error in sigmas; a parameter that moves may have any of its values."""
     assert result.fit is not None
     worst, where = 0.0, ""
     for name, e in result.fit.certificate.estimates.items():

@@ -237,7 +237,7 @@ def thick_response() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def figures(found: dict[str, dict[str, np.ndarray]], curve: dict) -> dict[str, object]:
-    """What the page says."""
+    """Return the figures of the page."""
     made: dict[str, object] = {}
     for name, one in found.items():
         half, ratio = one["at"] <= 0.5, one["power"] / one["power_theory"]

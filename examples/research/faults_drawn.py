@@ -234,7 +234,7 @@ class Draft:
 
 
 def drawn(kind: str, seed: int) -> Faulty:
-    """A scan with the fault `kind`, of KINDS."""
+    """Draw a scan with the fault `kind`, of KINDS."""
     rng = np.random.default_rng([seed, *kind.encode()])
     n, k = int(rng.choice([24, 36, 60])), int(rng.integers(5, 8))
     beads = phantom(rng, k)
@@ -301,7 +301,7 @@ UNSEEN: Final = {
 
 
 def _bent(draft: Draft, rng: Rng, after: Callable[..., list[Array | None]]) -> Draft:
-    """A panel that is distorted, and is not exactly where it is said to be, as usual."""
+    """Distort the panel, and move it off its stated place as far as is usual."""
     offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
     world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
     return replace(draft, world=world, after=after, names=("panel_distorted",),
@@ -323,7 +323,7 @@ def _low_dose(draft: Draft, rng: Rng) -> Draft:
 def _offset(
     name: str, low: float, high: float, *names: str, silent: bool = False
 ) -> Fault:
-    """The scanner is off in one parameter by `low` to `high`; right is one of `names` named."""
+    """Offset one parameter by `low` to `high`; any of `names` is a right finding."""
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         value = _sign(rng) * float(rng.uniform(low, high))
@@ -368,7 +368,7 @@ def _jump(name: str, low: float, high: float) -> Fault:
 
 
 def _spot_drift(draft: Draft, rng: Rng) -> Draft:
-    """Looks like a drift of the object the other way, and is to be called a drift."""
+    """Let the focal spot drift: it looks like the object drifting the other way."""
     n = len(draft.world.angles)
     way = np.array([_sign(rng) * rng.uniform(0.05, 0.3), 0.0, 0.0])
     world = replace(draft.world, spot=np.linspace(0, 1, n)[:, None] * way)
@@ -394,7 +394,7 @@ def _screw(draft: Draft, rng: Rng) -> Draft:
 
 
 def _wobble(draft: Draft, rng: Rng) -> Draft:
-    """The axis leans to and fro, twice a turn."""
+    """Lean the axis to and fro, twice a turn."""
     turn = np.radians(draft.world.angles)
     size = float(rng.uniform(0.1, 0.4))
     draft = _varying(draft, "axis_tilt_z", size * np.sin(2 * turn))
@@ -412,7 +412,7 @@ def _vibration(draft: Draft, rng: Rng) -> Draft:
 def _angles(
     change: Callable[[Array, Rng], Array], *names: str, beside: tuple[str, ...] = ()
 ) -> Fault:
-    """The stage really turned by other angles than is believed."""
+    """Turn the stage by other angles than the stated ones."""
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         angles = change(draft.world.angles, rng)
@@ -431,7 +431,7 @@ def _gap(angles: Array, rng: Rng) -> Array:
 
 
 def _stuttered(draft: Draft, rng: Rng) -> Draft:
-    """The camera delivered some frames twice."""
+    """Deliver some frames twice, as a camera that stutters."""
     n = len(draft.world.angles)
     again = rng.choice(np.arange(1, n), size=max(2, n // 12), replace=False)
 
@@ -581,7 +581,7 @@ def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
 
 
 def _distorted(terms: str) -> Fault:
-    """A panel whose picture is distorted smoothly, by up to a pixel at its upper edge."""
+    """Distort the panel's picture smoothly, by up to a pixel at its upper edge."""
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         half = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
@@ -629,7 +629,7 @@ def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
 
 
 def _row_offset(draft: Draft, rng: Rng) -> Draft:
-    """The read-out starts some rows late, as if the panel stood higher or lower."""
+    """Begin the read-out some rows late, as if the panel were higher or lower."""
     rows = int(_sign(rng) * rng.integers(2, 8))
 
     def after(spots: list[Array | None]) -> list[Array | None]:
@@ -693,7 +693,7 @@ def _usual(draft: Draft, rng: Rng) -> Draft:
 
 
 def _right(draft: Draft, rng: Rng) -> Draft:
-    """A printed phantom as good as is assumed, in a scanner as good as is assumed."""
+    """Draw a phantom and a scanner within their assumed tolerances."""
     draft = _usual(draft, rng)
     change = np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
     world = replace(draft.world, beads=draft.world.beads @ change.T)
@@ -702,7 +702,7 @@ def _right(draft: Draft, rng: Rng) -> Draft:
 
 
 def _strained(kind: str) -> Fault:
-    """The phantom is not as its file says, by 0.05 to 1 %."""
+    """Strain the phantom against its file by 0.05 to 1 %."""
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         draft = _usual(draft, rng)
@@ -723,7 +723,7 @@ def _strained(kind: str) -> Fault:
 
 
 def _exposed_long(draft: Draft, rng: Rng) -> Draft:
-    """A continuous scan: each exposure lasts a part of a step, or all of it."""
+    """Expose while the stage turns, for a part of a step or all of it."""
     draft = _usual(draft, rng)
     step = 360.0 / len(draft.world.angles)
     share = float(rng.uniform(0.1, 1.0))
@@ -734,7 +734,7 @@ def _exposed_long(draft: Draft, rng: Rng) -> Draft:
 
 
 def _exposed_as_said(draft: Draft, rng: Rng) -> Draft:
-    """A continuous scan whose script says how long each exposure lasts."""
+    """Expose while the stage turns, with the exposure's length in the script."""
     draft = _exposed_long(draft, rng)
     share = draft.world.arc * len(draft.world.angles) / 360.0
     return replace(draft, believed=replace(draft.believed, arc=share))
@@ -768,7 +768,7 @@ def _exposed_again(draft: Draft, rng: Rng) -> Draft:
 
 
 def _four_tiles(draft: Draft, rng: Rng) -> Draft:
-    """A panel of 2 x 2 tiles, each a little elsewhere."""
+    """Shift each of a panel's 2 x 2 tiles a little."""
     column = SHAPE[1] * rng.uniform(0.42, 0.58)
     row = SHAPE[0] * rng.uniform(0.42, 0.58)
     across, down = (float(_sign(rng) * rng.uniform(0.3, 2.0)) for _ in range(2))
@@ -786,7 +786,7 @@ def _four_tiles(draft: Draft, rng: Rng) -> Draft:
 
 
 def _source_jumps(draft: Draft, rng: Rng) -> Draft:
-    """The focal spot jumps aside; an object that jumps looks alike."""
+    """Let the focal spot jump aside, which looks like an object that jumps."""
     draft = _usual(draft, rng)
     n = len(draft.world.angles)
     at = int(rng.integers(n // 4, 3 * n // 4))
@@ -797,7 +797,7 @@ def _source_jumps(draft: Draft, rng: Rng) -> Draft:
 
 
 def _grows(draft: Draft, rng: Rng) -> Draft:
-    """The phantom warms up during the scan."""
+    """Let the phantom grow during the scan, as one that warms up."""
     draft = _usual(draft, rng)
     size = float(rng.uniform(5e-4, 7e-3))
     n = len(draft.world.angles)

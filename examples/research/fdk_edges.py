@@ -53,14 +53,14 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def turned(vector: tuple[float, float, float], angles: FloatArray) -> FloatArray:
-    """A vector turned counter-clockwise about z, (n, 3)."""
+    """Turn a vector counter-clockwise about z, (n, 3)."""
     x, y, z = vector
     c, s = np.cos(angles), np.sin(angles)
     return np.stack([c * x - s * y, s * x + c * y, np.full_like(c, z)], axis=1)
 
 
 def scan(views: int, aside: float = 0.0, yaw: float = 0.0) -> ConeVec:
-    """A full turn; `aside` [mm] along x, `yaw` [rad] of the panel."""
+    """Return a full turn; `aside` [mm] along x, `yaw` [rad] of the panel."""
     angles = np.linspace(0.0, 2.0 * np.pi, views, endpoint=False)
     u = (PITCH * np.cos(yaw), PITCH * np.sin(yaw), 0.0)
     return ConeVec.from_vectors(
@@ -72,7 +72,8 @@ def scan(views: int, aside: float = 0.0, yaw: float = 0.0) -> ConeVec:
 def layers(
     solids: list[Solid], geometry: ConeVec, radius: float, rtk: bool, wide: bool = False
 ) -> list[FloatArray]:
-    """The middle layer of the reconstruction out to `radius`, in units of MU, and RTK's."""
+    """Return the middle layer of the reconstruction out to `radius`, in units of MU, and
+    RTK's."""
     images = project_scene(Scene(tuple(solids)), geometry, (ROWS, COLS))
     grid = Grid((1, CELLS, CELLS), 2.0 * radius / CELLS)
     layer = fdk(images, geometry, grid.blank(), errors=False).data[0]
@@ -166,7 +167,7 @@ def moved_aside(views: int, rtk: bool) -> None:
 
 
 def prism(corners: int, radius: float) -> Shape:
-    """An upright regular prism around a circle."""
+    """Return an upright regular prism around a circle."""
     turn = 0.2 + 2.0 * np.pi * np.arange(corners) / corners
     normals = [(float(np.cos(t)), float(np.sin(t)), 0.0) for t in turn]
     return ConvexPolyhedron(
@@ -256,7 +257,7 @@ def wider(views: int, rtk: bool) -> None:
 def drawn(
     outline: str, inside: str, rng: np.random.Generator
 ) -> tuple[list[Solid], npt.NDArray[np.bool_]]:
-    """An object wider than the field of view, and where a layer of it is of its own
+    """Draw an object wider than the field of view, and where a layer of it is of its own
     material."""
     x, y = layer()
     turn, place = rng.uniform(0.0, np.pi), FIELD * rng.uniform(-0.2, 0.2, 2)

@@ -266,7 +266,7 @@ def _middle_error(volume: Volume) -> float:
 
 
 def cold_start() -> list[Entry]:
-    """A new process until its first image, of 8^3 voxels on C1's detector: imports and
+    """Measure a new process until its first image, of 8^3 voxels on C1's detector: imports and
     `forward` alone, its kernels on disk or compiled.
     """
     code = (
@@ -370,7 +370,7 @@ BOUNDS = ("bound-C1", "bound-C2", "bound-C3", "bound-C1x36", "bound-C2x10", "bou
 
 
 def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
-    """What memory allows, and what threads cannot share; all for one view but FDK's.
+    """Compute what memory bandwidth and serial parts allow, for one view except FDK.
 
     least: bytes that any method reads once; asked: those that ours asks for, of caches or
         memory.
@@ -609,7 +609,7 @@ CHECKED = 300
 
 
 def bead_scene() -> Scene:
-    """A box with five steel beads, the usual calibration phantom."""
+    """Build a box with five steel beads, the usual calibration phantom."""
     beads = [Sphere((i - 2.0, 2 * i - 4.0, 8.0 * (i - 2)), 1.0) for i in range(5)]
     box = Solid(Box((0, 0, 0), (16.0, 24.0, 49.8)), "abs", 0.02)
     return Scene((box, *(Solid(bead, "steel", 0.3) for bead in beads)))
@@ -659,7 +659,7 @@ def scene_chords(scene: Scene, view: ConeVec, shape: tuple[int, int]) -> FloatAr
 
 
 def ball_mesh(subdivisions: int) -> TriangleMesh:
-    """A ball of 20 * 4^n triangles, 20 mm across."""
+    """Build a ball of 20 * 4^n triangles, 20 mm across."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=10.0)
@@ -791,7 +791,7 @@ FURTHER = (
 
 
 def names() -> list[str]:
-    """What `--only` may name."""
+    """List the names that `--only` allows."""
     cases = [name for group in GROUPS for name in group]
     return [*cases, "growth", *(f"growth-{key}" for key in CURVES), "memory"]
 

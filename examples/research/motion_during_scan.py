@@ -80,7 +80,7 @@ def nominal(angles: Array) -> Poses:
 
 
 def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
-    """A scan and what was found of it."""
+    """Make a scan, estimate its motion, and return both as a row."""
     rng = np.random.default_rng([seed, sorted(ASKED).index(kind)])
     beads = load_phantom("lego").beads
     count = 90 if images else 180

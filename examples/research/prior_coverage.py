@@ -200,7 +200,7 @@ def scan(
     rng: np.random.Generator, truth: Mapping[str, float], frames: int, count: int, sure: bool,
     images: bool = False,
 ) -> tuple[FitResult | None, bool, dict[str, float]]:  # fmt: skip
-    """The fit of one scan (of `count` placements, at two SODs), or None if it is refused;
+    """Fit one scan (of `count` placements, at two SODs), or None if it is refused;
     whether its priors were widened; and the true values of what a reconstruction needs."""
     beads = spread(rng, 4 * RADIUS if images else 0.0)
     angles = 360.0 * np.arange(frames) / frames

@@ -109,7 +109,7 @@ def _kept(file: Path) -> dict[int, tuple[str, Outcome]]:
 
 
 def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, object]:
-    """Counts in all and by kind."""
+    """Count in all and by kind."""
     rows = []
     for kind in KINDS:
         some = [o for o in outcomes if o.kind == kind]

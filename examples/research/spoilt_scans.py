@@ -85,8 +85,8 @@ def corrupt(
 
 
 def careful_scan(rng: Rng, frames: int) -> tuple[Poses, Offsets]:
-    """A scan in scenario G0's geometry with its object near the right place, and a truth that a
-    careful operator may be off by, at any start angle."""
+    """Draw a scan in scenario G0's geometry with its object near the right place, and a truth
+    that a careful operator may be off by, at any start angle."""
     nominal, _ = scenario("G0", frames)
     centre = np.array([0.0, 570.0, 22.0])
     nominal = replace(nominal, axis=np.broadcast_to(centre, (frames, 3)))

@@ -45,7 +45,7 @@ HAND_PX: Final = 0.5
 
 
 def geometry(angles: Array) -> ConeVec:
-    """The nominal scan, as a foreign scanner would state it."""
+    """Return the nominal scan, as a foreign scanner would state it."""
     return ConeVec.circular(sod=SOD, sdd=SDD, angles=angles, shape=SHAPE, pixel=PIXEL)
 
 
@@ -153,7 +153,8 @@ def annotated(
 
 
 def write(folder: Path, seed: int = 0, views: int = 36) -> DataSet:
-    """A folder of float TIFFs, geometry.npy (ASTRA's vectors) and markers.csv beside it."""
+    """Write a folder of float TIFFs, geometry.npy (ASTRA's vectors) and markers.csv beside
+    it."""
     import tifffile
 
     rng = np.random.default_rng([7, seed])

@@ -136,7 +136,7 @@ def _mirrored(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _scaled(scan: Spoilt, rng: Rng) -> Spoilt:
-    """The model's beads are spread by 5 to 30 % too far or too near; their size is right. (A
+    """Spread the model's beads by 5 to 30 % too far or too near; their size is right. (A
     model scaled with its beads looks exactly right at another distance; see
     PLAUSIBLE_SHARE.)"""
     factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.3)
@@ -167,7 +167,7 @@ def _foreign_box(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _other_body(scan: Spoilt, rng: Rng) -> Spoilt:
-    """What holds the beads is elsewhere by up to 3 mm, of another attenuation, or absent."""
+    """Move the beads' holder by up to 3 mm, change its attenuation, or take it away."""
     shift = rng.normal(size=3) * math.exp(rng.uniform(math.log(0.05), math.log(2.0)))
     factor = float(rng.choice([0.0, 1.0, math.exp(rng.normal())]))
 
@@ -307,7 +307,7 @@ def _scanner_off(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """The detector is shifted or tilted by far more than its prior says."""
+    """Shift or tilt the detector by far more than its prior allows."""
     largest = {"dD_x": 15.0, "dD_y": 15.0, "dD_z": 15.0, "det_roll": 2.0, "det_pitch": 3.0,
                "det_yaw": 3.0}  # fmt: skip
     name = str(rng.choice(list(largest)))
@@ -391,7 +391,7 @@ def _rotated(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _repeated(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Some frames are copies of the one before: the camera stuttered."""
+    """Replace some frames by the one before, as a camera that stutters."""
     stuck = rng.random(FRAMES) < rng.uniform(0.03, 0.3)
     images = list(scan.images)
     for i in range(1, FRAMES):

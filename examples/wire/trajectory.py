@@ -24,7 +24,7 @@ class Twin:
         self.count = 0
 
     def call(self, method: str, **params: object) -> dict:
-        """The result of a request; events in between are passed over."""
+        """Return the result of a request; events in between are skipped."""
         self.count += 1
         request = {"jsonrpc": "2.0", "id": self.count, "method": method, "params": params}
         self.lines.write(json.dumps(request) + "\n")

@@ -51,7 +51,8 @@ def features(images: Array) -> Array:
 
 
 def questions(seen: Array, angles: Array, asked: Array) -> Array:
-    """The network's input for every pair of a state and an angle [rad]: (k, asked, inputs).
+    """Return the network's input for every pair of a state and an angle [rad]: (k, asked,
+    inputs).
 
     For each frame so far: its features, alone and times cosines and sines of twice and four
     times the angle between it and the one in question, because a plate looks the same from both
@@ -129,7 +130,8 @@ ANGLES = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
 
 
 def play(envs: ScanVectorEnv, policy: Policy, seeds: list[int]) -> dict[str, Array]:
-    """An episode of each environment; what was seen, done and gained, (k, frames, ...)."""
+    """Run an episode of each environment; return observations, actions and rewards, (k, frames,
+    ...)."""
     observation, _ = envs.reset(seed=seeds)
     seen = np.zeros((envs.num_envs, 0, FEATURES))
     sectors = np.zeros((envs.num_envs, 0), np.int64)
@@ -144,12 +146,12 @@ def play(envs: ScanVectorEnv, policy: Policy, seeds: list[int]) -> dict[str, Arr
 
 
 def fixed(sectors: list[int]) -> Policy:
-    """The same angles whatever is seen."""
+    """Choose the same angles whatever is observed."""
     return lambda seen, angles: np.full(len(seen), sectors[seen.shape[1]])
 
 
 def greedy_sectors() -> list[int]:
-    """The package's greedy baseline: most information about upright columns, blind to
+    """Choose by the package's greedy baseline: most information about upright columns, blind to
     images."""
     env = ScanEnv(action="discrete", task="plates", frames=FRAMES, time_weight=0.0)
     env.reset(seed=0)
@@ -162,7 +164,7 @@ def greedy_sectors() -> list[int]:
 
 
 def best(network: Ensemble, rng: np.random.Generator, random_part: float) -> Policy:
-    """The angle of the highest value; the first is 0, and some are drawn."""
+    """Choose the angle of the highest value; the first is 0, and some are drawn."""
 
     def policy(seen: Array, angles: Array) -> Array:
         k, frames = angles.shape

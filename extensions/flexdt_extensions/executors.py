@@ -87,7 +87,7 @@ def _count(jobs: int | None) -> int:
 
 @contextmanager
 def processes(jobs: int | None) -> Iterator[Executor]:
-    """Processes that start afresh, use one thread each, and end with this one, however it ends.
+    """Start spawned processes of one thread each, which end with this one, however it ends.
 
     Afresh, because a fork of a process whose kernels run in threads (OpenMP) is ended by them.
     """

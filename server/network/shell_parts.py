@@ -119,7 +119,7 @@ class Session(Protocol):
         """Answer a call: a result model or plain data, or raise `RpcError`."""
 
     def close(self) -> None:
-        """Called once when the connection has ended."""
+        """End the client's session; called once, when the connection has ended."""
 
 
 class Peer(Protocol):

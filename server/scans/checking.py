@@ -127,7 +127,7 @@ class CheckInput:
     def free_moves(
         self, start: Mapping[str, float], goal: Mapping[str, float]
     ) -> list[dict[str, float]] | None:
-        """Moves without a contact, one after the other; None if there are none."""
+        """Find moves without a contact, one after the other; None if there are none."""
         scene = build_scene(self.machine, self.profile, self.pieces, self.parameters)
         begin = self.start
         paces = {

@@ -170,7 +170,7 @@ class Hub:
         return self._seq.get(topic, 0)
 
     def views(self, topic: TopicName) -> set[ImageWish]:
-        """Views that subscribers of `topic` want."""
+        """Return the views that subscribers of `topic` want."""
         return {s.view for s in self._listeners.get(topic, {}).values()}
 
     def publish(

@@ -98,7 +98,8 @@ def _once(values: FloatArray) -> FloatArray:
 
 
 def _turns(axes: FloatArray) -> FloatArray:
-    """Turns (n, 3) about x, y and z [rad] whose product, Rz Ry Rx, is `axes` (n, 3, 3).
+    """Find the turns (n, 3) about x, y and z [rad] whose product, Rz Ry Rx, is `axes` (n, 3,
+    3).
 
     Two triples give the same product; the one whose turns about x and z are small is taken.
     """

@@ -446,7 +446,7 @@ class ConeVec:
             yield ConeVec(row, self.detector_shape)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """The rows, (n, 12)."""
+        """Return the rows, (n, 12)."""
         if copy:
             return np.array(self.rows, dtype=dtype)
         return np.asarray(self.rows, dtype=dtype)

@@ -103,7 +103,8 @@ def placement_findings(
 def _seen(
     places: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
 ) -> npt.NDArray[np.bool_]:
-    """Views on whose panel a box may cast a shadow, (n,), from its corners' images (n, 8, 2).
+    """Mark the views on whose panel a box may cast a shadow, (n,), from its corners' images (n,
+    8, 2).
 
     A box that the source's plane crosses may be anywhere.
     """

@@ -68,7 +68,7 @@ def cil_operator(
     geometry: ConeVec,
     image_shape: tuple[int, int, int],
 ) -> Any:
-    """A `LinearOperator` from `ImageData` (vertical, horizontal_y, horizontal_x) to
+    """Make a `LinearOperator` from `ImageData` (vertical, horizontal_y, horizontal_x) to
     `AcquisitionData` (angle, vertical, horizontal).
 
     Args:
@@ -92,11 +92,11 @@ def cil_operator(
         """A linear map with its transpose."""
 
         def direct(self, x: Any, out: Any = None) -> Any:
-            """The projections of voxels."""
+            """Project voxels."""
             return filled(project, x, like.shape, self.range_geometry(), out)
 
         def adjoint(self, x: Any, out: Any = None) -> Any:
-            """The transpose of `direct`."""
+            """Apply the transpose of `direct`."""
             return filled(spread, x, image_shape, self.domain_geometry(), out)
 
     nz, ny, nx = like.shape

@@ -149,7 +149,7 @@ def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
 def _shadows(
     model: BeadModel, planned: PlannedScans, truth: Offsets, rng: np.random.Generator
 ) -> tuple[list[Detections], list[npt.NDArray[np.intp]]]:
-    """Simulated detections in random order, and the bead of each."""
+    """Simulate detections in random order, and the bead of each."""
     tracks = _tracks(model, planned, truth)
     radii = spot_radii(model, planned.poses.cone_vec(truth))
     out, owners = [], []

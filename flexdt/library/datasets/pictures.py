@@ -68,7 +68,7 @@ def coloured(
 
 
 def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Marks on the outermost pixels, drawn into the picture."""
+    """Draw marks of the outermost pixels into the picture."""
     wide = max(2, max(edge.shape) // BAND)
     out = edge.copy()
     out[:wide] |= edge[0]

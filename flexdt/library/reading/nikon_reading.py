@@ -169,8 +169,8 @@ def _number(
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:
-    """Takes rows of vectors into the frame whose z is the axis: rolled about y, tilted about
-    x."""
+    """Return the matrix that takes row vectors into the frame whose z is the axis: rolled about
+    y, tilted about x."""
     c, s = np.cos([roll, tilt]), np.sin([roll, tilt])
     rolled = np.array([[c[0], 0.0, s[0]], [0.0, 1.0, 0.0], [-s[0], 0.0, c[0]]])
     tilted = np.array([[1.0, 0.0, 0.0], [0.0, c[1], -s[1]], [0.0, s[1], c[1]]])

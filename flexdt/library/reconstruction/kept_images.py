@@ -119,13 +119,13 @@ class CountsOnce:
         self._latest: dict[int, Counts] = {}
 
     def looked_at(self, index: int) -> Counts:
-        """Counts that are held until they are read by index."""
+        """Return counts and hold them until they are read by index."""
         if index not in self._looked_at:
             self._looked_at[index] = self._read(index)
         return self._looked_at[index]
 
     def __getitem__(self, index: int) -> Counts:
-        """Counts that are held until two others have been read: a lag takes the frame
+        """Return counts and hold them until two others have been read: a lag takes the frame
         before."""
         if index not in self._latest:
             counts = self._looked_at.pop(index, None)

@@ -72,7 +72,7 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
 
 
 def endings() -> list[str]:
-    """Endings of all formats, in the order in which they are listed."""
+    """List the endings of all formats, in the order in which they are listed."""
     return [ending for form in VOLUME_FORMATS for ending in form.endings]
 
 

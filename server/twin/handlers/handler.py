@@ -79,14 +79,15 @@ def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_
 
 
 def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
-    """Checks that control has not changed hands since the request."""
+    """Return a check that control has not changed hands since the request."""
     return lambda: twin.control.ensure_allowed(client.name, what)
 
 
 def ensure_idle(
     twin: TwinServer, client: Client, method: str, what: str
 ) -> Callable[[], None]:
-    """Checks that neither control has changed hands nor a job begun since the request."""
+    """Return a check that neither control has changed hands nor a job begun since the
+    request."""
 
     def check() -> None:
         twin.control.ensure_allowed(client.name, method)

@@ -195,7 +195,7 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
         return blurs, misfit, scale
 
     def near(last: _Tried) -> FloatArray:
-        """The blurs next to the one that leaves least."""
+        """Return the blurs next to the one that leaves least."""
         i = int(np.searchsorted(blurs, last[0][int(last[1].argmin())]))
         return blurs[max(i - 1, 0) : i + 2]
 

@@ -40,7 +40,7 @@ PARTS: Final[dict[str, FloatArray]] = {
 
 
 def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding]:
-    """Findings of the causes of a fit.
+    """Report the causes of a fit as findings.
 
     Args:
         fit: with the causes as columns.

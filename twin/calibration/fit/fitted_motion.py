@@ -518,7 +518,7 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
         return known[whole]
 
     def climbed(i: int, at: tuple[int, int]) -> tuple[int, int]:
-        """The best place of the grid that is reached uphill."""
+        """Find the best place of the grid that is reached uphill."""
         while True:
             around = [
                 (w, t)

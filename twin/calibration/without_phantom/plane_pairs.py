@@ -120,7 +120,7 @@ class PlanePairs:
         self.rise = float(ends[0][5] - ends[1][5]) / 2 / float(magnified)
 
     def rows(self, at: FloatArray) -> FloatArray:
-        """Views of the binned frames, (n, 12)."""
+        """Return the views of the binned frames, (n, 12)."""
         return np.ascontiguousarray(self.views(at).binned(self.factor, self.shape).rows)
 
     def integrals(

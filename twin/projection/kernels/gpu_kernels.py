@@ -139,12 +139,13 @@ else:
 
     @cuda.jit(device=True, inline=True)
     def packed(jump, share):
-        """An integer of 32 bits and a float as one number, which one instruction reads."""
+        """Pack an integer of 32 bits and a float into one number, which one instruction
+        reads."""
         return np.int64(jump) << 32 | np.int64(np.uint32(libdevice.float_as_int(share)))
 
     @cuda.jit(device=True, inline=True)
     def unpacked(pair):
-        """What `packed` took."""
+        """Unpack a number of `packed` into its integer and float."""
         return np.int32(pair >> 32), libdevice.int_as_float(np.int32(pair))
 
 

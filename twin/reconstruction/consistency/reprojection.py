@@ -97,7 +97,7 @@ def _mean_square(values: Float32Array) -> float:
 
 
 def _changes(images: Float32Array) -> Float32Array:
-    """Changes between neighbouring columns of smoothed rows."""
+    """Return the changes between neighbouring columns of smoothed rows."""
     smooth = 0.25 * images[..., :-2] + 0.5 * images[..., 1:-1] + 0.25 * images[..., 2:]
     return np.diff(smooth, axis=-1)
 

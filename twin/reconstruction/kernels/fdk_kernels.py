@@ -65,7 +65,7 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
-    """Samples of two registers, one after the other, by their index."""
+    """Select samples of two registers, one after the other, by their index."""
 
     def permute(name: str, *args: Any) -> Any:
         kind = ir.FunctionType(_FLOATS, [arg.type for arg in args])
