@@ -170,7 +170,12 @@ def drawn_geometries(sizes: Sizes, left_s: float) -> Document:
 
     count, most = sizes.geometries
     return gpu_geometries.campaign(
-        count, 1, most, print, twice=sizes is FULL, budget_s=min(GEOMETRIES_S, left_s)
+        range(count),
+        1,
+        most,
+        print,
+        twice=sizes is FULL,
+        budget_s=min(GEOMETRIES_S, left_s),
     )
 
 
