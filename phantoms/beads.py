@@ -79,7 +79,10 @@ def spiral_positions(
             {"asked": radius_mm, "allowed": [0.0, min(width, breadth, height) / 2]},
         )
     k = np.arange(beads, dtype=np.float64)
-    y = (k / (beads - 1) - 0.5) * (height - 2.0 * radius_mm) if beads > 1 else np.zeros(1)
+    if beads > 1:
+        y = (k / (beads - 1) - 0.5) * (height - 2.0 * radius_mm)
+    else:
+        y = np.zeros(1)
     angle = 2.0 * math.pi * k / beads
     unity = np.stack(
         [

@@ -104,11 +104,9 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
         made_of = material(phantom.voxels.material or STAND_IN)
         density = _scaled(as_volume(phantom.voxels), made_of)
         thick = longest * max(1.0, float(np.abs(density.data).max()))
-        known_as = (
-            ""
-            if phantom.voxels.material
-            else "voxels are taken as water of varying density"
-        )
+        known_as = "voxels are taken as water of varying density"
+        if phantom.voxels.material:
+            known_as = ""
         out.append(Channel(made_of, density, thick, known_as))
     return tuple(out)
 
@@ -277,11 +275,10 @@ def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Ob
     amounts = [
         np.maximum(_fractions_filled(part.body, empty, box), 0.0) for part in parts
     ]
-    data = (
-        np.stack(amounts, axis=-1)
-        if amounts
-        else np.zeros((*empty.data.shape, 0), np.float32)
-    )
+    if amounts:
+        data = np.stack(amounts, axis=-1)
+    else:
+        data = np.zeros((*empty.data.shape, 0), np.float32)
     return Object(
         np.ascontiguousarray(data, dtype=np.float32),
         empty.voxel_xyz,

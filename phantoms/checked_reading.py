@@ -55,7 +55,8 @@ class PhantomError(TwinError):
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
     """Make the error for a value that is not what is `allowed` at key path `where`."""
     shown = repr(value)
-    shown = shown if len(shown) <= 80 else shown[:77] + "..."
+    if len(shown) > 80:
+        shown = shown[:77] + "..."
     return PhantomError.instead(f"{where} is {shown}", shown, allowed, path=where)
 
 

@@ -226,11 +226,20 @@ def expose(
         >>> 0.0 < forecast.transmission.least < 0.3, forecast.best[0].kV
         (True, 90.0)
     """
-    scanner = machine if isinstance(machine, Machine) else builtin_machine(machine)
+    if isinstance(machine, Machine):
+        scanner = machine
+    else:
+        scanner = builtin_machine(machine)
     spec = scanner.detector
     tried = np.atleast_1d(scanner.tube.kV if kV is None else kV).astype(float).tolist()
-    power = scanner.tube.power_W if power_W is None else power_W
-    time_ms = spec.exposure_ms if exposure_ms is None else exposure_ms
+    if power_W is None:
+        power = scanner.tube.power_W
+    else:
+        power = power_W
+    if exposure_ms is None:
+        time_ms = spec.exposure_ms
+    else:
+        time_ms = exposure_ms
     _check_settings(scanner, tried, power, time_ms, averages, images)
     missing, size = _layer("detail", detail)
     wanted = (None if missing == VOID else material_of(missing).substance, size)
@@ -294,9 +303,10 @@ def expose(
     other = ray.with_detail(wanted, [part.material.substance for part in parts])
     seen = _SeenDetail(layers, camera, ray, other, sod, images)
     low, high = _voltages(scanner)
-    kVs = (
-        tried if len(tried) > 1 else np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
-    )
+    if len(tried) > 1:
+        kVs = tried
+    else:
+        kVs = np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
     found = [
         seen.setting(layer, seen.unsaturated(layer, replace(lit, kV=float(one))))
         for layer in FILTERS

@@ -22,7 +22,8 @@ from flexdt.twin.projection.analytic_solids import Cylinder, Ellipsoid, Scene, S
 MATERIAL: Final = "abs"
 BORE_RADIUS_MM: Final = 3.0
 """Of the hole along the axis."""
-GEAR_TEETH, PINION_TEETH = 20, 10
+GEAR_TEETH: Final = 20
+PINION_TEETH: Final = 10
 GEAR_RADII_MM: Final = (17.0, 20.0)
 """Of the gear's teeth, at their foot and tip."""
 PINION_RADII_MM: Final = (8.5, 11.0)
@@ -35,8 +36,11 @@ STEPS_PER_TOOTH: Final = 8
 """Corners of a ring for each of the gear's teeth."""
 LAYERS: Final = 6
 """Rings in each half of a gear's height."""
-WINDOWS, WINDOW_RADIUS_MM, WINDOW_PLACE_MM = 6, 2.4, 12.6
-"""Holes through the gear: how many, their radius, their distance from the axis."""
+WINDOWS: Final = 6
+"""Number of holes through the gear."""
+WINDOW_RADIUS_MM: Final = 2.4
+WINDOW_PLACE_MM: Final = 12.6
+"""Distance of a hole's middle from the axis."""
 PORES_MM: Final = (
     (15.6, 20.0, -6.0, 0.9),
     (15.4, 140.0, -10.5, 0.7),
@@ -146,7 +150,8 @@ def _closed(rings: Sequence[Ring]) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     ahead = (k + 1) % n
     faces = []
     for ring in range(len(rings)):
-        here, there = ring * n, (ring + 1) % len(rings) * n
+        here = ring * n
+        there = (ring + 1) % len(rings) * n
         faces.append(np.stack([here + k, here + ahead, there + ahead], axis=1))
         faces.append(np.stack([here + k, there + ahead, there + k], axis=1))
     return np.concatenate(rings), np.concatenate(faces).astype(np.int32)

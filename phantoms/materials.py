@@ -84,7 +84,9 @@ class Material:
             return self.substance.attenuation_at(energy_keV)
         after = next(i for i, p in enumerate(self.points) if p[0] >= energy_keV)
         (e0, m0), (e1, m1) = self.points[max(after - 1, 0)], self.points[after]
-        part = 0.0 if e1 == e0 else math.log(energy_keV / e0) / math.log(e1 / e0)
+        part = 0.0
+        if e1 != e0:
+            part = math.log(energy_keV / e0) / math.log(e1 / e0)
         mass = math.exp(math.log(m0) + part * math.log(m1 / m0))
         if energy_keV == e1:
             mass = m1

@@ -112,7 +112,9 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
         not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron)
         or one.mu_per_mm < 0.0
     ):
-        what = type(one.shape).__name__.lower() if one.mu_per_mm > 0.0 else "hole"
+        what = "hole"
+        if one.mu_per_mm > 0.0:
+            what = type(one.shape).__name__.lower()
         raise PhantomError(
             f"a {what} of {one.material} overlaps something of another priority; "
             "allowed: meshes, "

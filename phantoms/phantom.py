@@ -159,7 +159,10 @@ class Phantom(ArrayValue):
                     f"{self.name}: voxels cannot be put together with other parts"
                 )
             return as_volume(self.voxels)
-        voxel = self.default_voxel_mm if voxel_mm is None else voxel_mm
+        if voxel_mm is None:
+            voxel = self.default_voxel_mm
+        else:
+            voxel = voxel_mm
         return voxelise(self.scene, self.surfaces, self.size_mm, voxel, oversample)
 
     def to_dict(self) -> dict[str, object]:

@@ -338,7 +338,10 @@ def _labelled(
     Raises:
         PhantomError: neither array nor Volume, or a label without a material.
     """
-    labels: Any = sample.data if isinstance(sample, Volume) else sample
+    if isinstance(sample, Volume):
+        labels: Any = sample.data
+    else:
+        labels = sample
     if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "buif":
         raise PhantomError(
             f"materials by label are for an array or a Volume, not for {_shown(sample)}",

@@ -114,5 +114,7 @@ def open_beam_doubts(
         At most one sentence, with an exposure that would do.
     """
     beam = open_beam_of(machine, camera, exposure, view, physics)
-    doubt = None if beam is None else open_beam_doubt(machine, exposure, beam)
+    doubt = None
+    if beam is not None:
+        doubt = open_beam_doubt(machine, exposure, beam)
     return [] if doubt is None else [doubt]

@@ -267,9 +267,9 @@ def _plain(name: str, text: str) -> str:
     if (
         found := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)
     ) is not None:
-        but = (
-            "surrogates" if name in BINARY_FIELDS else "surrogates and control characters"
-        )
+        but = "surrogates and control characters"
+        if name in BINARY_FIELDS:
+            but = "surrogates"
         raise AcquilaError(
             f"{name} holds U+{ord(found[0]):04X} at {found.start()}; allowed: anything "
             f"but {but}"

@@ -177,7 +177,10 @@ class Connection:
         if self.closed or self._broken or not data:
             return
         if self.codec is None:
-            self.codec = Codec.MSGPACK if data[0] == 0 else Codec.JSON
+            if data[0] == 0:
+                self.codec = Codec.MSGPACK
+            else:
+                self.codec = Codec.JSON
         if self.codec is Codec.JSON:
             self._feed_lines(bytes(data))
         else:
@@ -276,7 +279,10 @@ class Connection:
 
     def decode(self, raw: bytes) -> Message:
         """Decode the bytes that `next_raw` returned; malformed ones become `Malformed`."""
-        read = codecs.read_msgpack if self.codec is Codec.MSGPACK else codecs.read_json
+        if self.codec is Codec.MSGPACK:
+            read = codecs.read_msgpack
+        else:
+            read = codecs.read_json
         try:
             document = read(raw)
         except (ValueError, RecursionError, MemoryError) as error:
@@ -469,7 +475,9 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
     """
     document = to_plain(message)
     inner = _innermost(document)
-    payload = None if inner is None else _large(inner.get("data"))
+    payload = None
+    if inner is not None:
+        payload = _large(inner.get("data"))
     if inner is None or payload is None:
         head = codecs.write_msgpack(document)
         return frame_head(len(head)) + head, None
@@ -486,7 +494,9 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
 def unpack(body: memoryview) -> Message:
     """Decode a frame's body; a large last `data` becomes a view into `body`."""
     try:
-        document = _split(body) if len(body) > MAX_COPIED_BYTES else None
+        document = None
+        if len(body) > MAX_COPIED_BYTES:
+            document = _split(body)
         return from_plain(codecs.read_msgpack(body) if document is None else document)
     except ValueError as error:
         return Malformed(parse_error(str(error)))

@@ -245,7 +245,9 @@ def _request(document: dict[object, object], id: Id) -> Single:
         return Malformed(invalid_request('"params" must be an object or a list'), id)
     if isinstance(params, dict) and not all(isinstance(key, str) for key in params):
         return Malformed(invalid_request('the names in "params" must be text'), id)
-    call: Params = params if isinstance(params, (dict, list)) else None
+    call: Params = None
+    if isinstance(params, (dict, list)):
+        call = params
     if "id" in document:
         return Request(id, method, call)
     return Notification(method, call)

@@ -140,7 +140,9 @@ def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcErro
             problem["allowed"] = limits
         problems.append(problem)
     first = problems[0]
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    more = ""
+    if error.error_count() > 1:
+        more = f" (and {error.error_count() - 1} more)"
     return invalid_params(
         f"{method}: {first['path']}: {first['message']}{more}", problems, allowed
     )

@@ -158,7 +158,10 @@ def cancelled(request: object) -> RpcError:
 
 def clip(value: object, limit: int = 200) -> str:
     """Convert `value` to text of at most `limit` characters, without formatting more of it."""
-    text = value[: limit + 1] if isinstance(value, str) else _brief(value, limit)
+    if isinstance(value, str):
+        text = value[: limit + 1]
+    else:
+        text = _brief(value, limit)
     text = text.encode("utf-8", "backslashreplace").decode("utf-8")  # no lone surrogates
     if len(text) <= limit:
         return text

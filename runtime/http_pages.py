@@ -305,7 +305,10 @@ async def served_pages(
     check_bind(host, token)
 
     class Server(_Server):
-        address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        if ":" in host:
+            address_family = socket.AF_INET6
+        else:
+            address_family = socket.AF_INET
 
     loopback = is_loopback(host)
     application = _application(pages, None if loopback else token, loopback=loopback)
@@ -341,7 +344,10 @@ def watching_pages(
         """Make `/healthz`: status and the server's facts."""
         dead = failed()
         document = {"status": "failed" if dead else "ok", **health()}
-        status = HTTPStatus.SERVICE_UNAVAILABLE if dead else HTTPStatus.OK
+        if dead:
+            status = HTTPStatus.SERVICE_UNAVAILABLE
+        else:
+            status = HTTPStatus.OK
         return HttpResponse(json.dumps(document) + "\n", status)
 
     def metrics() -> HttpResponse:

@@ -104,7 +104,10 @@ class _Watched(selectors.DefaultSelector):
             self._holds.observe(now - self._woke)
         events = super().select(timeout)
         # A look that does not wait takes no time, unless another thread has the interpreter.
-        self._woke = now if timeout is not None and timeout <= 0.0 else perf_counter()
+        if timeout is not None and timeout <= 0.0:
+            self._woke = now
+        else:
+            self._woke = perf_counter()
         return events
 
 
@@ -303,7 +306,9 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
             return runner.run(run(settings))
     except AccessError as error:
         problem = str(error)
-        code = INVALID if isinstance(error, AccessFileError) else USAGE
+        code = USAGE
+        if isinstance(error, AccessFileError):
+            code = INVALID
     except (TwinError, ValueError) as error:
         problem = str(error)
         code = INVALID
@@ -327,9 +332,9 @@ def _allow_descriptors() -> None:
     except ImportError:  # Windows has no such limit
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    limit = (
-        MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
-    )
+    limit = MAX_DESCRIPTORS
+    if hard != resource.RLIM_INFINITY:
+        limit = min(hard, MAX_DESCRIPTORS)
     with contextlib.suppress(OSError, ValueError):  # macOS allows fewer than it reports
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, limit), hard))
 

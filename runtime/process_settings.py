@@ -87,7 +87,9 @@ def memory_size(text: str) -> int:
         typer.BadParameter: not a size.
     """
     match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
-    size = 0 if match is None else int(float(match[1]) * BYTES_OF_UNIT[match[2]])
+    size = 0
+    if match is not None:
+        size = int(float(match[1]) * BYTES_OF_UNIT[match[2]])
     if size <= 0:
         raise typer.BadParameter(f"{text!r} is not a size such as 512M or 4GiB")
     return size
@@ -118,7 +120,9 @@ def scatter_method(text: str) -> str:
         typer.BadParameter: another one.
     """
     if text not in get_args(Scatter):
-        removed = "; 'first' has been removed, use 'mc'" if text == "first" else ""
+        removed = ""
+        if text == "first":
+            removed = "; 'first' has been removed, use 'mc'"
         raise typer.BadParameter(
             f"{text!r} is not one of {', '.join(get_args(Scatter))}{removed}"
         )
@@ -256,11 +260,9 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
     @property
     def places(self) -> tuple[Address, ...]:
         """Addresses of the projectors, each once."""
-        port = (
-            None
-            if self.projector_port is None
-            else Address(LOOPBACK, self.projector_port)
-        )
+        port = None
+        if self.projector_port is not None:
+            port = Address(LOOPBACK, self.projector_port)
         named = [place for place in (self.projector or port,) if place is not None]
         found = tuple(dict.fromkeys((*named, *addresses(self.projectors))))
         return found or (Address(LOOPBACK, PROJECTOR_PORT),)

@@ -102,7 +102,9 @@ class TerminalBar:
             full = round(WIDTH_CHARS * min(max(done, 0.0), 1.0))
             text = f"{what} [{'#' * full}{'.' * (WIDTH_CHARS - full)}] {told_time(done, seconds)}"
         columns = shutil.get_terminal_size().columns
-        kept = text[: columns - 1] if columns > NARROWEST_CHARS else text
+        kept = text
+        if columns > NARROWEST_CHARS:
+            kept = text[: columns - 1]
         self._write(f"\r\x1b[2K{kept}")
 
     def close(self) -> None:
@@ -129,7 +131,9 @@ class NotebookBar:
 
     def show(self, what: str, done: float | None, seconds: float) -> None:
         """Draw over what was drawn before."""
-        value = "" if done is None else f' value="{done:.3f}"'
+        value = ""
+        if done is not None:
+            value = f' value="{done:.3f}"'
         text = f"{html.escape(what)} {told_time(done, seconds)}"
         self._draw(
             f'<progress max="1"{value} aria-label="{html.escape(what)}"></progress> {text}'

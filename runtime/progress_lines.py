@@ -64,7 +64,10 @@ class _Work:
                 return
             if self.shown is None:
                 self.shown = shown_on(LOG)
-            what = f"{self.what}: {self.inner}" if self.inner else self.what
+            if self.inner:
+                what = f"{self.what}: {self.inner}"
+            else:
+                what = self.what
             self.shown.show(what, self.done, time.monotonic() - self.begun)
             self.due = time.monotonic() + (DRAWN_S if self.shown.bar else SILENT_S)
 
@@ -171,7 +174,8 @@ ended: one kernel compiles after another."""
 def _forget() -> None:
     """Begin anew in a forked process, where no thread but one lives."""
     global _teller, _threads
-    _teller, _threads = _Teller(), _Threads()
+    _teller = _Teller()
+    _threads = _Threads()
 
 
 os.register_at_fork(after_in_child=_forget)
@@ -207,9 +211,11 @@ def told(what: str, progress: Progress = None) -> Iterator[Advance]:
 @contextmanager
 def _shown(what: str) -> Iterator[_Work]:
     """Have a work shown until it ends."""
-    kind, now = what.split(" ", maxsplit=1)[0], time.monotonic()
+    kind = what.split(" ", maxsplit=1)[0]
+    now = time.monotonic()
     begun, ended = _last.get(kind, (now, now))
-    begun = begun if now <= ended + SILENT_S else now
+    if now > ended + SILENT_S:
+        begun = now
     work = _Work(what, begun, max(now, begun + SILENT_S))
     _teller.add(work)
     try:
@@ -237,7 +243,8 @@ def _lent(outer: _Work | None, what: str) -> Iterator[None]:
     if outer is None:
         yield
         return
-    before, outer.inner = outer.inner, what
+    before = outer.inner
+    outer.inner = what
     try:
         yield
     finally:

@@ -88,7 +88,10 @@ class Ends:
         Args:
             steady_s: for how long the service had been ready.
         """
-        self.row = 1 if steady_s >= STEADY_S else self.row + 1
+        if steady_s >= STEADY_S:
+            self.row = 1
+        else:
+            self.row = self.row + 1
         if self.row == 1:
             return 0.0
         return min(FIRST_PAUSE_S * 2.0 ** min(self.row - 2, 60), LONGEST_PAUSE_S)
@@ -182,11 +185,9 @@ class Supervisor:
             self._bury(service)
             pause = ends.after(0.0 if begun is None else clock() - begun)
             if ends.told:
-                times = (
-                    f" for the {ends.row}th time in a row"
-                    if ends.row > MAX_SINGLE_REPORTS
-                    else ""
-                )
+                times = ""
+                if ends.row > MAX_SINGLE_REPORTS:
+                    times = f" for the {ends.row}th time in a row"
                 later = f" in {pause:g} s" if pause else ""
                 self.note(
                     f"the {service.name} ended ({how}){times}; starting it again{later}"

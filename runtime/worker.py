@@ -65,7 +65,9 @@ def limit(what: str, most: int) -> None:
     """Limit one resource of this process."""
     number = getattr(resource, what)
     hard = resource.getrlimit(number)[1]
-    value = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    value = most
+    if hard != resource.RLIM_INFINITY:
+        value = min(most, hard)
     resource.setrlimit(number, (value, hard))
 
 

@@ -140,7 +140,10 @@ class Worker:
                 if now != used:
                     used = now
                     since = time.monotonic()
-                worked = 0.0 if now is None or begun is None else now - begun
+                if now is None or begun is None:
+                    worked = 0.0
+                else:
+                    worked = now - begun
                 if worked > seconds or time.monotonic() - since > seconds:
                     raise TimeoutError
 

@@ -123,7 +123,9 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
     Raises:
         TwinError: its texts do not say them, or contradict themselves.
     """
-    s = None if scan.settings is None else rebuild.physical(scan.settings, scan.name)[0]
+    s = None
+    if scan.settings is not None:
+        s = rebuild.physical(scan.settings, scan.name)[0]
     f = None if s is None else s.figures
     if (
         s is None
@@ -137,7 +139,8 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
     camera = CameraSettings(s.mode, s.roi, modes=machine.detector.camera.modes)
     zero = Profile(name=ZERO, machine=machine.name, source="figures of the settings text")
     built = rebuild.rebuild(s, 1, camera.shape, [machine], [zero], file=scan.name)
-    sod, sdd = float(built.poses.sod[0]), float(built.poses.sdd[0])
+    sod = float(built.poses.sod[0])
+    sdd = float(built.poses.sdd[0])
     far = zero.model_copy(update={"c_obj": f.sod_mm - sod, "c_det": f.sdd_mm - sdd})
     at = motor_poses(machine, far, camera, built.positions)
     own = stated_geometry.figures_of(at, camera.shape)
@@ -178,7 +181,9 @@ def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
                     for n, v in now.items()
                     if n not in machine.axes and n != "frames"
                 }
-    return moved if first is None else first | {"projections": taken} | moved
+    if first is None:
+        return moved
+    return first | {"projections": taken} | moved
 
 
 def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> int:
@@ -241,12 +246,12 @@ def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
         groups.setdefault(one, []).append(name)
     words = []
     for one, names in groups.items():
-        serial = f"serial number {one.serial}" if one.serial else "no serial number"
-        machine = (
-            f"{one.machine} (by {one.by})"
-            if one.machine
-            else "a scanner that nothing names"
-        )
+        serial = "no serial number"
+        if one.serial:
+            serial = f"serial number {one.serial}"
+        machine = "a scanner that nothing names"
+        if one.machine:
+            machine = f"{one.machine} (by {one.by})"
         words.append(f"{machine}, {serial}: {', '.join(names)}")
     return "; ".join(words)
 
@@ -280,7 +285,10 @@ def contradictions(
         for name, axis in m.axes.items()
     ]
     for about, value, who, name in every:
-        slack = (0.0, rebuild.MATCH_MM) if name in lengths else (AGREE, 0.0)
+        if name in lengths:
+            slack = (0.0, rebuild.MATCH_MM)
+        else:
+            slack = (AGREE, 0.0)
         told = said.setdefault(about, [])
         names = next((n for other, n in told if _agree(value, other, slack)), None)
         if names is None:
@@ -304,7 +312,8 @@ def contradictions(
 
 def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
     """(name, value, who) of what a scan's own parts say of the same thing."""
-    s, camera = scan.settings, scan.camera
+    s = scan.settings
+    camera = scan.camera
     if s is None:
         return
     signs = {name: axis.settings_sign for name, axis in machine.axes.items()}
@@ -417,7 +426,8 @@ def zero_offsets(
         (scan.profile for scan in reversed(scans) if scan.profile is not None), usual
     )
     lines = {name: Line(getattr(base, name)) for name in OFFSETS}
-    findings, columns = list[Finding](), dict[str, tuple[float, float, float]]()
+    findings = list[Finding]()
+    columns = dict[str, tuple[float, float, float]]()
     last = max((scan.date for scan in scans if scan.date is not None), default=None)
     told = [
         s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters
@@ -474,7 +484,9 @@ def zero_offsets(
             told, measured, seen[:, 0] + sides @ at, spread, strict=True
         ):
             columns[s.name] = (m.value, float(more[0]), float(more[1]))
-    day = "undated" if last is None else f"{last:%Y-%m-%d}"
+    day = "undated"
+    if last is not None:
+        day = f"{last:%Y-%m-%d}"
     source = "; ".join(
         f"{n}: {x.scans or 'texts of the'} scans" for n, x in lines.items()
     )
@@ -506,7 +518,8 @@ def _axis(
 ) -> tuple[float, ...]:
     """Return the axis's column [px] with the offsets of `base`, and its slopes [px/mm] with
     axs_tan and det_tan, in which it is linear."""
-    own, camera = scan.profile or base, scan.camera or machine.detector.camera
+    own = scan.profile or base
+    camera = scan.camera or machine.detector.camera
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     column = []
     for axs, det in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
@@ -536,9 +549,11 @@ def _fit(
     while True:
         inverse = np.linalg.inv(a[kept].T @ a[kept])
         at = inverse @ (a[kept].T @ b[kept])
-        rest, leverage = b - a @ at, np.einsum("ij,jk,ik->i", a, inverse, a)
+        rest = b - a @ at
+        leverage = np.einsum("ij,jk,ik->i", a, inverse, a)
         spread = np.sqrt(np.maximum(np.where(kept, 1.0 - leverage, 1.0 + leverage), 1e-9))
-        pulls, freedom = (rest / spread)[:scans], int(kept.sum()) - a.shape[1]
+        pulls = (rest / spread)[:scans]
+        freedom = int(kept.sum()) - a.shape[1]
         far = np.where(kept[:scans], np.abs(pulls), 0.0)
         if freedom < FOR_A_LINE or far.max() <= FAR_OFF:
             return (

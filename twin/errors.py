@@ -39,10 +39,12 @@ class TwinError(ValueError):
             >>> print(error, error.data)
             no unit 'mile'; allowed: mm, m {'asked': 'mile', 'allowed': ['mm', 'm']}
         """
-        several = (
-            list(map(str, allowed)) if isinstance(allowed, list | tuple | dict) else None
-        )
-        words = allowed if several is None else ", ".join(several)
+        several = None
+        if isinstance(allowed, list | tuple | dict):
+            several = list(map(str, allowed))
+        words = allowed
+        if several is not None:
+            words = ", ".join(several)
         data = {
             **where,
             "asked": asked,
@@ -102,7 +104,10 @@ def require_within(
     """
     number = isinstance(value, Real)
     if not (number and low <= value <= high):
-        given = f"{value:g}" if number else f"{value!r}, no number"
+        if number:
+            given = f"{value:g}"
+        else:
+            given = f"{value!r}, no number"
         raise LimitError(
             f"{what} is {given}; allowed: {low:g} to {high:g} {unit}".rstrip(),
             {
@@ -155,7 +160,8 @@ class UnknownNameError(TwinError):
 
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
         facts = dict(data or {})
-        asked, allowed = facts.get("asked"), facts.get("allowed")
+        asked = facts.get("asked")
+        allowed = facts.get("allowed")
         if (
             isinstance(asked, str)
             and isinstance(allowed, Sequence)

@@ -56,7 +56,8 @@ class Passes:
     """
 
     def __init__(self, count: int) -> None:
-        self._count, self._seen = max(count, 1), 0
+        self._count = max(count, 1)
+        self._seen = 0
         self.advance: Advance = ignore
 
     def step(self) -> None:

@@ -149,7 +149,9 @@ def public(thing: Thing) -> Thing:
                     type(member)(_checked(inside, inspect.getdoc(inside) or "")),
                 )
             elif inspect.isfunction(member):
-                said = text if name == "__init__" else inspect.getdoc(member) or ""
+                said = text
+                if name != "__init__":
+                    said = inspect.getdoc(member) or ""
                 setattr(thing, name, _checked(member, said))
     return thing
 
@@ -179,7 +181,9 @@ def _type(value: Any) -> Any:
         return None if None in inner else inner
     if isinstance(value, Mapping | list | tuple | str) or getattr(value, "ndim", 0) == 1:
         return None
-    return (value.dtype, value.ndim) if hasattr(value, "ndim") else type(value)
+    if hasattr(value, "ndim"):
+        return (value.dtype, value.ndim)
+    return type(value)
 
 
 class Known:
@@ -190,7 +194,8 @@ class Known:
     """
 
     def __init__(self, function: Callable[..., Any], text: str) -> None:
-        self.function, self.text = function, text
+        self.function = function
+        self.text = text
         self.allowed: set[tuple[Any, ...]] = set()
         self.qualname = function.__qualname__.split("<locals>.")[-1]
 
@@ -229,8 +234,11 @@ class Known:
                 f"{where}: {error}", [*map(_shown, given), *named], self._names()
             ) from None
         for name, value in bound.items():
-            kind, form = self.kinds.get(name), self.signature.parameters[name].kind
-            members = value if form is inspect.Parameter.VAR_KEYWORD else {name: value}
+            kind = self.kinds.get(name)
+            form = self.signature.parameters[name].kind
+            members = value
+            if form is not inspect.Parameter.VAR_KEYWORD:
+                members = {name: value}
             if kind is None or form is inspect.Parameter.VAR_POSITIONAL:
                 continue
             for label, one in members.items():
@@ -241,11 +249,10 @@ class Known:
     def _name_for(self, given: tuple[Any, ...]) -> str:
         """Name the function as the caller does: a method by the class that it was called on."""
         owner, dot, method = self.qualname.rpartition(".")
-        called = (
-            given[0]
-            if given and isinstance(given[0], type)
-            else type(next(iter(given), None))
-        )
+        if given and isinstance(given[0], type):
+            called = given[0]
+        else:
+            called = type(next(iter(given), None))
         known = any(base.__name__ == owner for base in called.__mro__)
         name = f"{called.__name__ if known else owner}{dot}{method}"
         return name.removesuffix(".__init__")
@@ -270,7 +277,9 @@ class Known:
                 found[other] = value
             else:
                 near = nearest_name(name, self._names())
-                hint = "" if near is None else f" (did you mean {near!r}?)"
+                hint = ""
+                if near is not None:
+                    hint = f" (did you mean {near!r}?)"
                 said = f"{where} has no argument {name!r}{hint}"
                 raise ArgumentError.instead(said, name, self._names())
         return found
@@ -279,7 +288,9 @@ class Known:
         self, where: str, name: str, label: str, value: object, values: Mapping[str, Any]
     ) -> ArgumentError:
         *first, last = self.kinds[name].words
-        words = f"{', '.join(first)} or {last}" if first else last
+        words = last
+        if first:
+            words = f"{', '.join(first)} or {last}"
         takes = self.signature.parameters
         places = [
             n for n in self._names() if takes[n].kind is takes[n].POSITIONAL_OR_KEYWORD
@@ -291,13 +302,15 @@ class Known:
             if self.kinds[name].holds(values[other])
             and (other not in self.kinds or self.kinds[other].holds(value))
         ]
-        hint = f"; are {label} and {swapped[-1]} in the wrong order?" if swapped else ""
+        hint = ""
+        if swapped:
+            hint = f"; are {label} and {swapped[-1]} in the wrong order?"
         told = re.search(
             rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M
         )
-        more = (
-            f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})" if told else ""
-        )
+        more = ""
+        if told:
+            more = f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})"
         said = f"{where}: {label} is {_shown(value)}"
         return ArgumentError.instead(
             said, repr(value)[:100], words + more + hint, argument=label
@@ -321,7 +334,8 @@ def kind_of(annotation: Any) -> Kind | None:
         >>> kind_of(float | None).words, kind_of(tuple[int, int]).holds((3, 4.5))
         (('a number', 'None'), False)
     """
-    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    parts = typing.get_args(annotation)
     plain = origin not in (Annotated, Literal, Callable)
     inner = [kind_of(part) for part in parts if plain and part is not ...]
     if origin is Annotated:  # a value, which its owner also makes of its JSON
@@ -329,11 +343,9 @@ def kind_of(annotation: Any) -> Kind | None:
     if origin in (typing.Union, types.UnionType):
         kinds = [kind for kind in inner if kind is not None]
         words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))
-        return (
-            Kind(words, lambda v: any(k.holds(v) for k in kinds))
-            if None not in inner
-            else None
-        )
+        if None not in inner:
+            return Kind(words, lambda v: any(k.holds(v) for k in kinds))
+        return None
     if origin is Literal:
         return Kind(
             tuple(map(repr, parts)),
@@ -347,7 +359,9 @@ def kind_of(annotation: Any) -> Kind | None:
         ]
         return Kind((f"({', '.join(members)})",), lambda v: _is_list(v, inner))
     if origin in (tuple, list, Sequence):
-        member = "anything" if inner[0] is None else " or ".join(inner[0].words)
+        member = "anything"
+        if inner[0] is not None:
+            member = " or ".join(inner[0].words)
         return Kind(
             (f"a list ({member}, ...)",), lambda v: _is_list(v, inner, several=True)
         )
@@ -414,7 +428,8 @@ def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False)
     if not (hasattr(value, "__len__") and hasattr(value, "__iter__")):
         return False
     alone = isinstance(value, str | bytes | Mapping) or getattr(value, "ndim", 1) == 0
-    kinds = kinds if alone or not several else [*kinds] * len(value)
+    if several and not alone:
+        kinds = [*kinds] * len(value)
     return (
         not alone
         and len(value) == len(kinds)
@@ -426,7 +441,9 @@ def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False)
 
 
 def _named(kind: type) -> str:
-    name = "path" if kind.__name__ == "PathLike" else kind.__name__
+    name = "path"
+    if kind.__name__ != "PathLike":
+        name = kind.__name__
     return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
 
@@ -436,7 +453,9 @@ def _shown(value: object) -> str:
         return f"an array of shape {tuple(shape)}"
     text = repr(value)
     plain = isinstance(value, Real | str | bytes | list | tuple | Mapping | None)
-    return text if plain and len(text) <= SHOWN else _named(type(value))
+    if plain and len(text) <= SHOWN:
+        return text
+    return _named(type(value))
 
 
 PLAIN: Final = {

@@ -121,7 +121,8 @@ def mesh_phantom(
     if unit is not None and unit not in UNITS_MM:
         raise PhantomError.instead(f"unknown unit {unit!r}", unit, list(UNITS_MM))
     raw, kind, label = _read(source, file_type)
-    unit = default_unit(kind) if unit is None else unit
+    if unit is None:
+        unit = default_unit(kind)
     return filled_mesh(
         _parse(raw, kind),
         unit=unit,
@@ -174,7 +175,9 @@ def filled_mesh(
     solid = _convex(mesh, vertices)
     what = f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
     if twice := filled_twice(vertices, mesh.faces):
-        inner = "1 shell lies" if twice == 1 else f"{twice} shells lie"
+        inner = "1 shell lies"
+        if twice != 1:
+            inner = f"{twice} shells lie"
         warnings.warn(
             f"{label}: {inner} in what others fill, turned outwards, and changes nothing; turn "
             "cavities inwards",
@@ -310,7 +313,9 @@ def _read(
         kind = file_type or path.suffix.lstrip(".")
         try:
             size = path.stat().st_size
-            raw = path.read_bytes() if size <= MAX_BYTES else b""
+            raw = b""
+            if size <= MAX_BYTES:
+                raw = path.read_bytes()
         except OSError as error:
             raise PhantomError(
                 f"cannot read {path}: {error.strerror}", {"path": str(path)}

@@ -73,7 +73,10 @@ def load_phantom_file(
     """
     try:
         text = text.removeprefix(BYTE_ORDER_MARK)
-        document = parse_json(text) if text.lstrip()[:1] == "{" else tomllib.loads(text)
+        if text.lstrip()[:1] == "{":
+            document = parse_json(text)
+        else:
+            document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise PhantomError(
             f"{file}: not valid TOML or JSON: {error}", {"file": file}
@@ -132,9 +135,10 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
             f"{len(listed)} solids", "phantom.solid", f"at most {MAX_SOLIDS}"
         )
     scene = Scene(tuple(solid for several in listed for solid in several))
-    parts = (
-        [] if not listed else [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
-    )
+    if listed:
+        parts = [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
+    else:
+        parts = []
     parts += given.get("mesh", ())
     description = given.get("description", "")
     ranks = [rank for _, rank in parts]
@@ -155,7 +159,10 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
     """
     from flexdt.phantoms.voxelise import voxelise
 
-    listed = solids if isinstance(solids, list | tuple) else [solids]
+    if isinstance(solids, list | tuple):
+        listed = solids
+    else:
+        listed = [solids]
     replaced = [
         one["replaces"]
         for one in listed

@@ -103,7 +103,10 @@ def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[
         if "description" in field:
             entry["description"] = field["description"]
         params.append(entry)
-    limits = {"x-limits": dict(method.limits)} if method.limits else {}
+    if method.limits:
+        limits = {"x-limits": dict(method.limits)}
+    else:
+        limits = {}
     return {
         "name": method.name,
         "summary": method.summary,

@@ -128,7 +128,9 @@ class Folder:
         lost = [name for name in files if name not in self.names]
         if not lost:
             return ""
-        more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+        more = ""
+        if len(lost) > 5:
+            more = f" and {len(lost) - 5} more"
         return f"{', '.join(lost[:5])}{more} {'is' if len(lost) == 1 else 'are'} missing"
 
     def _find(self, wanted: str) -> str | None:

@@ -496,7 +496,9 @@ class Directory:
             "free": free_bytes(self.path),
         }
         if error.errno in _NO_ROOM:
-            free = "" if data["free"] is None else f", {data['free']} bytes free"
+            free = ""
+            if data["free"] is not None:
+                free = f", {data['free']} bytes free"
             return ds.DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
         return ds.DatasetWriteError(
             f"cannot write {path}: {error.strerror or error}", data

@@ -115,7 +115,9 @@ class Changes:
         before = self._before()
         old = None
         try:
-            kept = before if _second_name(folder, name, before) else None
+            kept = None
+            if _second_name(folder, name, before):
+                kept = before
         except DiskFullError:
             if keep is None:
                 raise

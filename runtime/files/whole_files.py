@@ -51,7 +51,8 @@ def room_named(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        number, file = getattr(error, "errno", None), getattr(error, "filename", None)
+        number = getattr(error, "errno", None)
+        file = getattr(error, "filename", None)
         if file is not None and path.name not in Path(str(file)).name:
             raise  # another file, such as one that is read meanwhile
         free = free_bytes(path)

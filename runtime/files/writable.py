@@ -20,7 +20,10 @@ def require_writable(path: Path | None) -> None:
     """
     if path is None:
         return
-    folder = path if path.is_dir() else path.absolute().parent
+    if path.is_dir():
+        folder = path
+    else:
+        folder = path.absolute().parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     try:

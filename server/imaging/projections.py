@@ -357,7 +357,9 @@ class Imaging:
                 raise self._too_large(
                     sample, apart.nbytes, left, self.memory_limit, "the twin"
                 )
-        available = None if self.room is None else await self.room()
+        available = None
+        if self.room is not None:
+            available = await self.room()
         need = sum(memory_of(body) for body in apart.bodies)
         if available is not None and need > available:
             raise self._too_large(sample, need, available, available, "the projector")
@@ -435,7 +437,10 @@ class Imaging:
     async def _forget_old(self) -> None:
         """Drop the least recently used samples beyond the limits; with `_sending` held."""
         stays = self._pinned_keys()
-        limit_bytes = math.inf if self.memory_limit is None else self.memory_limit
+        if self.memory_limit is None:
+            limit_bytes = math.inf
+        else:
+            limit_bytes = self.memory_limit
         used = sum(apart.nbytes for apart in self._known.values())
         newest = next(reversed(self._known))
         for key, apart in list(self._known.items()):

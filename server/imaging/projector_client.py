@@ -122,9 +122,9 @@ class ProjectorClient:
                     "project", lambda c: c.ask_array("project", params, sizes)
                 )
             except RpcError as error:
-                allowed = (
-                    error.data.get("allowed") if isinstance(error.data, Mapping) else None
-                )
+                allowed = None
+                if isinstance(error.data, Mapping):
+                    allowed = error.data.get("allowed")
                 if (
                     body is None
                     or not isinstance(allowed, list)
@@ -186,7 +186,9 @@ class ProjectorClient:
             raise ProjectorUnavailable(
                 f"no projector at {self.host}:{self.port} ({why})"
             ) from None
-        instance = answer.get("instance") if isinstance(answer, Mapping) else None
+        instance = None
+        if isinstance(answer, Mapping):
+            instance = answer.get("instance")
         self._evicts = isinstance(answer, Mapping) and answer.get("evicts") is True
         if instance != self._instance:
             self._instance = instance

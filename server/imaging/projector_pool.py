@@ -151,7 +151,9 @@ class ProjectorPool:
                 if self._turn is None or self._turn.done():
                     self._turn = loop.create_future()
                 wanted = not running or now >= late
-                member = self._free(members | refused, now) if wanted else None
+                member = None
+                if wanted:
+                    member = self._free(members | refused, now)
                 if member is not None:
                     members.add(member)
                     asking = self._ask(member, name, value, views, shape)
@@ -265,9 +267,10 @@ class ProjectorPool:
                 )
             raise
         taken = (loop.time() - begun) / len(views)
-        member.pace_s = (
-            taken if member.pace_s is None else (3 * member.pace_s + taken) / 4
-        )
+        if member.pace_s is None:
+            member.pace_s = taken
+        else:
+            member.pace_s = (3 * member.pace_s + taken) / 4
         member.views += len(views)
         return images
 

@@ -65,8 +65,10 @@ JUDGED_STEP_PX = 3
 """Step of the grid on which pixels are judged; edges are judged on all their pixels."""
 CUT_OFF_INTEGRAL = 0.05
 """Line integral at an edge of the image above which the sample counts as cut off."""
-SATURATED, STARVED, CUT_OFF = 1, 2, 4
-"""Terms of a pixel's mark."""
+# Terms of a pixel's mark; a mark is their sum.
+SATURATED = 1
+STARVED = 2
+CUT_OFF = 4
 
 
 def with_spectra(machine: Machine, physics: Physics) -> Machine:
@@ -157,7 +159,9 @@ class Radiography:
 
     async def require_room(self, sample: Sample) -> None:
         """Check that a scan's sample fits into memory, as `Imaging.require_room`."""
-        pieces: Pieces = "part" if self.physics == "ideal" else "material"
+        pieces: Pieces = "material"
+        if self.physics == "ideal":
+            pieces = "part"
         await self.imaging.require_room(sample, pieces)
 
     async def take(
@@ -203,7 +207,9 @@ class Radiography:
         channels, paths, views = await self.imaging.path_lengths(
             sample, poses, camera, truth=truth, spot=spot
         )
-        mono_keV = stated_keV() if self.physics == "mono" else None
+        mono_keV = None
+        if self.physics == "mono":
+            mono_keV = stated_keV()
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         if points > 1:
             chain = without_spot(chain)
@@ -265,7 +271,9 @@ class Radiography:
             )
             return CountShares.of(counts, self.saturating)
         parts, paths = await self.imaging.nominal_paths(sample, cone)
-        mono_keV = stated_keV() if self.physics == "mono" else None
+        mono_keV = None
+        if self.physics == "mono":
+            mono_keV = stated_keV()
         chain = chain_through(parts, self.panel, self.tube, mono_keV)
         return await asyncio.to_thread(shares_behind, chain, probe, paths, cone.rows)
 

@@ -47,7 +47,9 @@ async def answered(
     with traced(trace):
         answer = await work
     taken = clock() - begun
-    code = answer.error.code if isinstance(answer, m.Failure) else None
+    code = None
+    if isinstance(answer, m.Failure):
+        code = answer.error.code
     observe(method if method in known else "unknown", taken, code)
     if LOGGER.isEnabledFor(logging.DEBUG):
         log(

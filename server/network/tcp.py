@@ -409,7 +409,9 @@ class _Link(asyncio.BufferedProtocol):
         **facts: object,
     ) -> None:
         """Write a line about this connection, unless there are too many of its kind."""
-        kind = event if self.let_in else f"{event}, no token"
+        kind = event
+        if not self.let_in:
+            kind = f"{event}, no token"
         self.server.lines.log(
             event, level, kind=kind, error=error, client=self.name, **facts
         )
@@ -612,7 +614,10 @@ class _Link(asyncio.BufferedProtocol):
     def _count(self, *, broken: bool) -> None:
         """Count broken messages in a row; without the token every message counts. Close
         after too many."""
-        self.broken = self.broken + 1 if broken or not self.let_in else 0
+        if broken or not self.let_in:
+            self.broken = self.broken + 1
+        else:
+            self.broken = 0
         if self.broken >= (
             self.limits.malformed if self.let_in else MAX_STRANGE_MESSAGES
         ):
@@ -656,7 +661,10 @@ class _Link(asyncio.BufferedProtocol):
                 raise self._no_place()
             if isinstance(given, RpcError):
                 raise given
-            params = given if isinstance(given, Params) else parse_params(method, given)
+            if isinstance(given, Params):
+                params = given
+            else:
+                params = parse_params(method, given)
             if isinstance(params, Hello):
                 await self._check_token(params)
             if self.session is None:
@@ -701,13 +709,19 @@ class _Link(asyncio.BufferedProtocol):
     @property
     def _full(self) -> bool:
         """Whether so much waits that reading pauses; an incomplete message may be completed."""
-        ahead = self.wire.pending if self.wire.whole or not self.let_in else 0
-        limit_bytes = READ_AHEAD_BYTES if self.let_in else MAX_INLINE_BYTES
+        ahead = 0
+        if self.wire.whole or not self.let_in:
+            ahead = self.wire.pending
+        limit_bytes = MAX_INLINE_BYTES
+        if self.let_in:
+            limit_bytes = READ_AHEAD_BYTES
         return self._load >= self.limits.max_waiting or ahead > limit_bytes
 
     def _relax(self) -> None:
         """Resume reading once enough messages have been served."""
-        ahead = self.wire.pending if self.wire.whole else 0
+        ahead = 0
+        if self.wire.whole:
+            ahead = self.wire.pending
         if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD_BYTES // 2:
             self.transport.resume_reading()
 

@@ -293,7 +293,8 @@ async def serve_projector(
     check_bind(host, token)
     limits = limits or ConnectionLimits()
     compute = ComputeThread(begin)
-    facts = {"backend": "numba", "threads": 0} if facts is None else facts
+    if facts is None:
+        facts = {"backend": "numba", "threads": 0}
     server = ProjectorServer(
         Context(compute, VolumeStore(memory_limit), token, facts), limits, observe
     )

@@ -198,9 +198,13 @@ class VolumeStore:
         Raises:
             RpcError: -32008, above the memory limit; nothing is removed.
         """
-        old = self._held.get(replaced) if replaced is not None else None
+        old = None
+        if replaced is not None:
+            old = self._held.get(replaced)
         used = self.used - (0 if old is None else memory_of(old))
-        kept = memory_of(old) if old is not None and replaced in self._evictable else 0
+        kept = 0
+        if old is not None and replaced in self._evictable:
+            kept = memory_of(old)
         if used - (self._evictable_bytes - kept) + needed > self.limit:
             free = self.limit - used + self._evictable_bytes - kept
             error = too_large(what, needed, max(0, free))

@@ -107,7 +107,10 @@ class FrameLink(asyncio.BufferedProtocol):
         """Return the memory for the next bytes: the length, or the frame's own memory."""
         if self._over:
             return memoryview(bytearray(SLICE_BYTES))
-        target = self._head if self._body is None else self._body
+        if self._body is None:
+            target = self._head
+        else:
+            target = self._body
         return target[self._filled :]
 
     def buffer_updated(self, count: int) -> None:

@@ -116,7 +116,9 @@ class Acquisition:
     async def _image(self, frame: Exposure) -> Radiograph:
         """Return the image of a frame with X-rays on; it is projected again if not kept."""
         image = self._recent.get(frame.index)
-        return (await self._take([frame]))[0] if image is None else image
+        if image is None:
+            return (await self._take([frame]))[0]
+        return image
 
     async def _traps(self, frame: Exposure) -> Float32Array | None:
         """Compute the charge in the panel's traps at a frame's start, from the first
@@ -137,7 +139,9 @@ class Acquisition:
                 if now.camera != later.camera:
                     charge = np.zeros(later.camera.shape, np.float32)
                 else:
-                    lit = (await self._image(now)).expected if now.xrays_on else None
+                    lit = None
+                    if now.xrays_on:
+                        lit = (await self._image(now)).expected
                     gap = later.start_s - now.start_s - now.duration_s
                     charge = trapped_after(
                         self.radiography.panel,
@@ -198,11 +202,9 @@ class Acquisition:
             batch, images, before, trapped, strict=True
         ):
             assert frame.file is not None
-            rng = (
-                None
-                if self.seed is None
-                else frame_rng(self.seed, self._numbers[frame.file])
-            )
+            rng = None
+            if self.seed is not None:
+                rng = frame_rng(self.seed, self._numbers[frame.file])
             settings = settings_of(frame)
             counts = self.radiography.counts(
                 image, frame.camera, settings, rng, earlier, traps

@@ -98,7 +98,8 @@ class CheckInput:
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
         """
-        wish, machine = self.wish, self.machine
+        wish = self.wish
+        machine = self.machine
         sweep: dry_run.CollisionCheck | None = None
         if machine.components:
             sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
@@ -187,7 +188,8 @@ class Checks:
             RpcError: -32005 or -32002, it may not run; -32008, it takes too long or too
                 much memory.
         """
-        last, self._last = self._last, None
+        last = self._last
+        self._last = None
         if last is not None and last.matter == matter:
             return last
         if self._here(matter):
@@ -248,7 +250,10 @@ def _bare(matter: CheckInput) -> CheckInput:
 def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
     most = MAX_ANSWER[codec]
     report = matter.report(most).to_dict()
-    data = write_json(report) if codec is Codec.JSON else write_msgpack(report)
+    if codec is Codec.JSON:
+        data = write_json(report)
+    else:
+        data = write_msgpack(report)
     if len(data) > most - 1000:  # room for the frame around it
         raise too_large("a report", len(data), most - 1000)
     return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]
@@ -281,13 +286,18 @@ def require_sound(report: CheckReport) -> None:
     other = [p for p in errors if p.code != "collision"]
     if other:
         first = other[0]
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        more = ""
+        if len(errors) > 1:
+            more = f" (and {len(errors) - 1} more)"
         raise RpcError(
             Code.SCRIPT_INVALID,
             f"the script does not hold: line {first.line}: {first.message}{more}",
             [p.to_dict() for p in _worst(problems)],
         )
-    hits = [] if report.clearance is None else list(report.clearance.collisions)
+    if report.clearance is not None:
+        hits = list(report.clearance.collisions)
+    else:
+        hits = []
     first_hit = hits[0]
     raise RpcError(
         Code.COLLISION,

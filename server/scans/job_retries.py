@@ -15,8 +15,10 @@ from flexdt.runtime.files.directory import free_bytes
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 
-FIRST_S, LONGEST_S = 1.0, 30.0
-"""First and longest delay between attempts [real s]."""
+FIRST_S = 1.0
+"""Delay before the first retry [real s]."""
+LONGEST_S = 30.0
+"""Longest delay between attempts [real s]."""
 
 
 def transient(error: Exception | None) -> bool:
@@ -32,7 +34,8 @@ class Retry:
     """
 
     def __init__(self, first_s: float = FIRST_S, longest_s: float = LONGEST_S) -> None:
-        self._first, self._longest = first_s, longest_s
+        self._first = first_s
+        self._longest = longest_s
         self._attempts = 0
         self._task: asyncio.Task[None] | None = None
         self._at = 0.0
@@ -77,7 +80,8 @@ class Retry:
 def _has_room(error: DiskFullError) -> bool:
     """Return whether the unwritten data would fit now, if the system reports it."""
     data = error.data if isinstance(error.data, Mapping) else {}
-    path, need = data.get("path"), data.get("bytes")
+    path = data.get("path")
+    need = data.get("bytes")
     if not isinstance(path, str) or not isinstance(need, int):
         return True
     free = free_bytes(Path(path).parent)

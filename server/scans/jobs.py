@@ -65,9 +65,13 @@ class Jobs:
         today: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._root = root
-        self._max_ended, self._max_age, self._today = max_ended, max_age, today
+        self._max_ended = max_ended
+        self._max_age = max_age
+        self._today = today
         self._projectors = projectors
-        self._scanner, self._clock, self._notify = scanner, clock, changed
+        self._scanner = scanner
+        self._clock = clock
+        self._notify = changed
         self._all: dict[str, Job] = {}
         self._changed: set[str] = set()
         """Names of jobs changed or forgotten since the last call of `changed`."""
@@ -105,10 +109,12 @@ class Jobs:
             asked = "" if job is None else f"no job {job!r}; "
             last = list(self._all)[-MAX_NAMED_JOBS:]
             older = len(self._all) - len(last)
-            more = f"{older} older ones and " if older else ""
-            there = (
-                f"there are: {more}{', '.join(last)}" if last else "there are no jobs yet"
-            )
+            more = ""
+            if older:
+                more = f"{older} older ones and "
+            there = "there are no jobs yet"
+            if last:
+                there = f"there are: {more}{', '.join(last)}"
             raise UnknownNameError(asked + there, {"asked": job, "allowed": last})
         return self._all[job]
 
@@ -142,7 +148,9 @@ class Jobs:
         # While its remainder is swept it is paused still, with its settings back in force.
         going_on = job is not None and job.runner is not None and not job.runner.paused
         if self.current is not None and (going_on or opening):
-            how = "runs; pause it first" if going_on else "begins"
+            how = "begins"
+            if going_on:
+                how = "runs; pause it first"
             raise busy(
                 f"{what} is refused while {self.current.id} {how}",
                 {"asked": what, "job": self.current.id, "allowed": "job.pause"},
@@ -154,7 +162,8 @@ class Jobs:
 
         It is kept if the command is refused before anything has moved.
         """
-        by_hand, programmes = self._by_hand, self._scanner.programmes
+        by_hand = self._by_hand
+        programmes = self._scanner.programmes
         self._by_hand = True
         try:
             yield
@@ -315,7 +324,9 @@ class Jobs:
         if job.runner is not None:
             job.runner.abort(reason)
         elif job.phase == "queued":
-            job.phase, job.aborted_for, job.ended = "aborted", reason, self._today()
+            job.phase = "aborted"
+            job.aborted_for = reason
+            job.ended = self._today()
             self._tell(job)
 
     def interrupt(self, reason: Exception) -> None:
@@ -324,7 +335,9 @@ class Jobs:
         """
         self._take_over()
         self._interrupted = reason
-        runner = None if self.current is None else self.current.runner
+        runner = None
+        if self.current is not None:
+            runner = self.current.runner
         # A paused job that is just being resumed is paused as well.
         if runner is not None and not runner.paused:
             runner.pause(reason)
@@ -342,7 +355,8 @@ class Jobs:
 
     def changed(self) -> dict[str, JobMemory | None]:
         """Return jobs changed since the last call by name; None for a forgotten one."""
-        names, self._changed = self._changed, set()
+        names = self._changed
+        self._changed = set()
         known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
         return {
             name: None if job is None else job.memory() for name, job in known.items()
@@ -425,7 +439,9 @@ class Jobs:
                 continue
             self.current = job
             before = self._clock.speed_up
-            wanted = before if job.speed_up is None else job.speed_up
+            wanted = before
+            if job.speed_up is not None:
+                wanted = job.speed_up
             phase: JobPhase = "incomplete"
             try:
                 self._clock.set_speed_up(wanted)
@@ -435,7 +451,8 @@ class Jobs:
             ) as error:  # whatever it is, it is this job's, and the next one runs
                 phase = self._failed(job, error)
             finally:
-                job.phase, job.ended = phase, self._today()
+                job.phase = phase
+                job.ended = self._today()
                 self.retry.cancel()
                 self.current = None
                 # The plan of a long scan is large, and ended jobs are kept for a while.
@@ -448,7 +465,8 @@ class Jobs:
 
     async def _run(self, job: Job) -> JobPhase:
         """Run one job to its end, whatever that is."""
-        self._interrupted, self._by_hand = None, False
+        self._interrupted = None
+        self._by_hand = False
         try:
             await self._clock.at_rest(
                 self._scanner.rest_time
@@ -462,12 +480,14 @@ class Jobs:
             return self._failed(job, error)
         finally:
             self._preparing = False
-        job.frames_total, job.duration_s = scan.plan.frames, scan.plan.duration_s
+        job.frames_total = scan.plan.frames
+        job.duration_s = scan.plan.duration_s
         try:
             runner = await self._runner_of(job, scan)
             if job.phase != "queued":  # aborted while it was being prepared
                 raise JobAborted(job.aborted_for)
-            job.runner, job.phase = runner, "running"
+            job.runner = runner
+            job.phase = "running"
             job.frames_seen = job.runner.progress.frames_done
             if (stopped := self._stopped()) is not None:
                 job.runner.pause(stopped)
@@ -512,7 +532,9 @@ class Jobs:
         return self._interrupted  # a call: it may change while others run
 
     def _mark(self, job: Job, scan: JobInputs, reason: str) -> None:
-        elapsed = 0.0 if job.runner is None else job.runner.progress.tau
+        elapsed = 0.0
+        if job.runner is not None:
+            elapsed = job.runner.progress.tau
         try:
             scan.store.mark_incomplete(reason, duration_s=elapsed)
         except (
@@ -548,7 +570,9 @@ class Jobs:
         phase = job.phase
         if p.phase in ("running", "paused") and phase in ("running", "paused"):
             job.phase = p.phase
-        error = None if p.error is None else self._error(p.error)
+        error = None
+        if p.error is not None:
+            error = self._error(p.error)
         important = job.phase != phase or error != job.error
         job.error = error
         if p.frames_done > job.frames_seen:

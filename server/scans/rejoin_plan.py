@@ -48,7 +48,10 @@ class Rejoin:
             run_up: tuple[Trajectory, ...] = ()
             if velocity != 0.0:
                 begin = join - abs(velocity) / acceleration
-                rate = acceleration if velocity > 0 else -acceleration
+                if velocity > 0:
+                    rate = acceleration
+                else:
+                    rate = -acceleration
                 piece = Piece(begin, self.start[axis], 0.0, rate)
                 run_up = (Trajectory((piece,), join, position),)
             rest = _remaining(self.plan.trajectories.get(axis, ()), self.tau)
@@ -65,7 +68,9 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
         tau: time on the plan's clock [s].
         accelerations: of each axis's run-up.
     """
-    start, moving, run_up = {}, {}, 0.0
+    start = {}
+    moving = {}
+    run_up = 0.0
     for axis, path in plan.paths.items():
         position, velocity = float(path.positions(tau)), float(path.velocities(tau))
         acceleration = accelerations[axis]

@@ -120,7 +120,8 @@ class ScanRunner:
     projectors: int = 1
 
     def __post_init__(self) -> None:
-        plan, done = self.plan, frozenset(self.done)
+        plan = self.plan
+        done = frozenset(self.done)
         self._frames = [e for e in plan.exposures if e.file is not None]
         self._events = _events(
             plan.steps, [e for e in self._frames if e.file not in done]
@@ -164,7 +165,9 @@ class ScanRunner:
         if self._kept is None:
             self._kept = _Settings.of(self.scanner)
         # The run stops before any further command: the motors may be at rest by now.
-        self._pause, self._stop_due, self._stepping = True, True, False
+        self._pause = True
+        self._stop_due = True
+        self._stepping = False
         self._wake()
 
     def resume(self) -> None:
@@ -175,7 +178,8 @@ class ScanRunner:
 
     def step(self) -> None:
         """Run one frame, or one command that takes none, and pause again."""
-        self._pause, self._stepping = False, True
+        self._pause = False
+        self._stepping = True
         self._steps += 1
         self._set(error=None)
         self._wake()
@@ -227,7 +231,9 @@ class ScanRunner:
                     case PlanStep():
                         await self._until(moment)
                         await self._take_effect(event)
-                        length = 0.0 if event.index in self._quick else event.holds_s
+                        length = 0.0
+                        if event.index not in self._quick:
+                            length = event.holds_s
                     case Exposure():
                         await self._until(moment)
                         # A frame that a pause falls into is discarded: the run goes back before
@@ -239,7 +245,9 @@ class ScanRunner:
                         await self._put(event)
                         # A step requested while the frame waited for room is for the next
                         # frame.
-                        length = event.duration_s if steps == self._steps else 0.0
+                        length = 0.0
+                        if steps == self._steps:
+                            length = event.duration_s
                 if self._stepping and length > 0.0:
                     await self._until(moment + length)
                     self.pause()
@@ -257,7 +265,9 @@ class ScanRunner:
         if not self.done:
             return 0.0
         frames = [moment for moment, event in self._events if isinstance(event, Exposure)]
-        return frames[0] if frames else self.plan.duration_s
+        if frames:
+            return frames[0]
+        return self.plan.duration_s
 
     def _not_made(self, error: Exception) -> None:
         """Pause after an error that may pass; end the run if the same frames would fail

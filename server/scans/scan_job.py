@@ -70,17 +70,23 @@ class Job:
     @property
     def where(self) -> Progress | None:
         """Progress now, or at its end."""
-        return self.last if self.runner is None else self.runner.progress
+        if self.runner is None:
+            return self.last
+        return self.runner.progress
 
     @property
     def frames_done(self) -> int:
         """Number of finished frames."""
-        return 0 if self.where is None else self.where.frames_done
+        if self.where is None:
+            return 0
+        return self.where.frames_done
 
     @property
     def elapsed_s(self) -> float:
         """Elapsed time of the plan [s]."""
-        return 0.0 if self.where is None else max(0.0, self.where.tau)
+        if self.where is None:
+            return 0.0
+        return max(0.0, self.where.tau)
 
     def memory(self) -> JobMemory:
         """Return the record of the job that is kept for a restart."""
@@ -104,10 +110,12 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
     if job.phase in ENDED:
         return job
     if is_complete(folder):  # it was killed between the last file and telling of it
-        job.phase, job.error = "done", None
+        job.phase = "done"
+        job.error = None
         job.last = Progress("done", memory.duration_s, memory.frames_total)
         return job
-    was, job.phase = job.phase, "incomplete"
+    was = job.phase
+    job.phase = "incomplete"
     there = sum(name.endswith(".tif") for name in folder.names())
     job.error = {
         "code": int(Code.BUSY),

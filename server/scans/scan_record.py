@@ -97,7 +97,8 @@ class ScanSource:
         flat: bool | Mapping[str, float] = True,
     ) -> ScanSource:
         """Make a scan from a trajectory; its `script.txt` has a comment for each pose."""
-        poses = poses if isinstance(poses, PoseList) else PoseList.of(poses)
+        if not isinstance(poses, PoseList):
+            poses = PoseList.of(poses)
         head = f"# trajectory, exposure_ms {exposure_ms}, flat {json.dumps(flat)}\r\n".encode()
         return cls(head + poses.listing, poses, exposure_ms, moments, seed, flat)
 
@@ -212,7 +213,8 @@ class JobRecord:
         if document["schema"] != SCHEMA:
             raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")
         begin = BEGINNING.validate_python(document)
-        wish, speed_up = document["wish"], document["speed_up"]
+        wish = document["wish"]
+        speed_up = document["speed_up"]
         poses = wish["poses"]
         if isinstance(poses, list):  # as servers before wrote it
             poses = json.dumps(poses)

@@ -39,8 +39,10 @@ from flexdt.twin.script.planning.plan_values import SampleSize
 
 KEPT = 8
 MAX_BYTES: Final = 64 << 20
-HEADER, FACE = 84, 50
-"""Size of binary STL before the faces, and of each face [bytes]."""
+HEADER = 84
+"""Size of binary STL before the faces [bytes]."""
+FACE = 50
+"""Size of each face of binary STL [bytes]."""
 _Content = tuple[Sample, str | None]
 """A sample and the revision of its upload: another file may get the same name."""
 
@@ -54,7 +56,9 @@ class Stage:
     """
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
-        self._machine, self._profile, self._samples = machine, profile, samples
+        self._machine = machine
+        self._profile = profile
+        self._samples = samples
         self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = (
             OrderedDict()
         )
@@ -66,7 +70,9 @@ class Stage:
         Raises:
             UnknownNameError, LimitError, PhantomError: see `SampleStore.load`.
         """
-        return self._samples.load(sample.name, sample.material) if sample.name else None
+        if sample.name:
+            return self._samples.load(sample.name, sample.material)
+        return None
 
     def revision(self, sample: Sample) -> str | None:
         """Return the revision of a sample's upload, once it has been read; None for
@@ -86,8 +92,14 @@ class Stage:
         before = self._content(sample, upload)
         pieces = self._pieces.get(before)
         if pieces is None:
-            phantom = self.phantom(sample) if upload is None else upload.standing
-            pieces = () if phantom is None else _pieces(phantom, sample.offset)
+            if upload is None:
+                phantom = self.phantom(sample)
+            else:
+                phantom = upload.standing
+            if phantom is not None:
+                pieces = _pieces(phantom, sample.offset)
+            else:
+                pieces = ()
             # The revision is known once an upload has been read.
             now = self._content(sample, upload)
             if before[1] not in (None, now[1]):
@@ -147,7 +159,9 @@ class Stage:
             upload: as for `pieces`.
         """
         scene = self.scene(sample, parameters, upload)
-        return None if scene is None else SceneGuard(scene)
+        if scene is None:
+            return None
+        return SceneGuard(scene)
 
     def _content(self, sample: Sample, upload: ReceivedSample | None) -> _Content:
         return sample, upload.shown if upload else self.revision(sample)
@@ -274,7 +288,10 @@ class ObstacleMoves:
         )
         if found is not None and len(found) <= 1:
             return self._way(start, found)
-        pair = ("?", "?") if contact is None else contact.pair
+        if contact is None:
+            pair = ("?", "?")
+        else:
+            pair = contact.pair
         if found is None:
             raise CollisionError(
                 f"no free way to {_text(goal)} was found: {' and '.join(pair)} would "
@@ -304,7 +321,8 @@ class ObstacleMoves:
         Raises:
             SafetyError: other motion has begun or motion was stopped.
         """
-        scanner, clock = self.scanner, self.clock
+        scanner = self.scanner
+        clock = self.clock
         mine: int | None = None
         """Number of the last leg's programme, to detect other motion."""
         for leg in way.legs:
@@ -326,7 +344,8 @@ class ObstacleMoves:
         *warnings: str,
     ) -> Way:
         """Make the `Way` of legs from `start` with its total time."""
-        seconds, here = 0.0, dict(start)
+        seconds = 0.0
+        here = dict(start)
         for leg in legs:
             moves = {axis: (here[axis], 0.0, value) for axis, value in leg.items()}
             ends = [

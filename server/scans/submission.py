@@ -148,11 +148,16 @@ class Submissions:
                 -32003 the sample of the resumed scan has changed.
             LimitError, DiskFullError, DatasetNameError.
         """
-        resumed = self._resumable(name, wish) if name is not None else None
+        resumed = None
+        if name is not None:
+            resumed = self._resumable(name, wish)
         if resumed is not None:
             begin = resumed
         else:
-            seed = self.seed() if wish.seed is None else wish.seed
+            if wish.seed is None:
+                seed = self.seed()
+            else:
+                seed = wish.seed
             begin = StartConditions(
                 self.start(),
                 self.scanner.sample,
@@ -161,7 +166,10 @@ class Submissions:
                 self.radiography.physics,
                 self.radiography.scatter,
             )
-        chosen = name if name is not None else self._free_name()
+        if name is not None:
+            chosen = name
+        else:
+            chosen = self._free_name()
         sidecar = JobRecord(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(
             sidecar, chosen, resumed is not None, ensure_allowed
@@ -184,7 +192,8 @@ class Submissions:
         Raises:
             RpcError: as `submit`; -32602 if there is nothing to continue.
         """
-        name, refused = job.name, partial(name_conflict, job.name)
+        name = job.name
+        refused = partial(name_conflict, job.name)
         if self.jobs.uses(job.folder):
             raise refused("a job is writing it")
         try:
@@ -273,7 +282,8 @@ class Submissions:
             warnings.insert(
                 0, f"taking up the data set {name}, of which {there} images exist"
             )
-            shown, stands = asked.begin.sample, self.scanner.sample
+            shown = asked.begin.sample
+            stands = self.scanner.sample
             if shown != stands:
                 a, b = shown.name or "nothing", stands.name or "nothing"
                 warnings.insert(
@@ -301,7 +311,9 @@ class Submissions:
             shows = begun.begin.revision or self.stage.revision(begun.begin.sample)
             begun = replace(begun, begin=replace(begun.begin, revision=shows))
             same = final is checked and begun.begin.sample == asked.begin.sample
-            counts = predicted if same else await self._predicted(begun.begin, final.plan)
+            counts = predicted
+            if not same:
+                counts = await self._predicted(begun.begin, final.plan)
             return await asyncio.to_thread(
                 self._open, begun, final.plan, name, resume, counts.exposures
             )
@@ -350,7 +362,9 @@ class Submissions:
         # The data sent to the projector meanwhile are needed by the scan as well: no
         # cancelling.
         done, _ = await asyncio.wait({task}, timeout=PREDICTION_PATIENCE_S)
-        return task.result() if done else [None] * len(probes)
+        if done:
+            return task.result()
+        return [None] * len(probes)
 
     async def _matter(
         self, wish: ScanSource, start: StartState, shown: Sample
@@ -358,13 +372,19 @@ class Submissions:
         """Collect the input of a check: bodies of the sample on the stage, beam through
         `shown`.
         """
-        scanner, stage, stands = self.scanner, self.stage, self.scanner.sample
+        scanner = self.scanner
+        stage = self.stage
+        stands = self.scanner.sample
         parameters = scanner.parameters
 
         def work() -> CheckInput:
-            pieces = stage.pieces(stands) if scanner.machine.components else ()
+            if scanner.machine.components:
+                pieces = stage.pieces(stands)
+            else:
+                pieces = ()
             size = stage.size(shown)
-            machine, profile = scanner.machine, scanner.profile
+            machine = scanner.machine
+            profile = scanner.profile
             return CheckInput(
                 wish,
                 machine,
@@ -446,7 +466,8 @@ class Submissions:
         Raises:
             RpcError: -32003, another file has come under its name.
         """
-        now, name = self.stage.revision(begin.sample), begin.sample.name
+        now = self.stage.revision(begin.sample)
+        name = begin.sample.name
         if begin.revision not in (None, now):
             raise busy(
                 f"the sample {name!r} has been uploaded anew since this scan began, and "
@@ -507,7 +528,8 @@ class Submissions:
 
     def _free_name(self) -> str:
         """Choose a name as the scanner does: date and number."""
-        used, now = {job.name for job in self.jobs.all()}, self.now()
+        used = {job.name for job in self.jobs.all()}
+        now = self.now()
         if self._numbered[0] != dated_name(now, 0):
             self._numbered = dated_name(now, 0), 1
         day, last = self._numbered

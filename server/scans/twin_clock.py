@@ -102,12 +102,13 @@ class TwinClock:
     @property
     def real_time_factor(self) -> float | None:
         """Measured twin seconds a real second over the last few; None before that."""
-        wall, now = self._wall(), self._time()
+        wall = self._wall()
+        now = self._time()
         self._sample(wall, now)
         first_wall, first = self._samples[0]
-        return (
-            (now - first) / (wall - first_wall) if wall - first_wall > SAMPLE_S else None
-        )
+        if wall - first_wall > SAMPLE_S:
+            return (now - first) / (wall - first_wall)
+        return None
 
     def at(self, moment: float) -> asyncio.Future[None]:
         """Return a future that is done once the clock has reached `moment` [s].
@@ -157,7 +158,8 @@ class TwinClock:
         )
 
     def _rebase(self) -> None:
-        self._base, self._base_wall = self._time(), self._wall()
+        self._base = self._time()
+        self._base_wall = self._wall()
 
     def _sample(self, wall: float, now: float) -> None:
         self._samples.append((wall, now))
@@ -178,7 +180,10 @@ class TwinClock:
             self._timer = loop.call_soon(self._jump, WAKE_ROUNDS)
         else:
             now = self._time()
-            pace = self._speed_up if now < LATE_S else min(1.0, self._speed_up)
+            if now < LATE_S:
+                pace = self._speed_up
+            else:
+                pace = min(1.0, self._speed_up)
             wait = max(0.0, self._waiting[0][0] - now) / pace
             self._timer = loop.call_later(min(wait, 3600.0), self._ring)
 
@@ -206,6 +211,7 @@ class TwinClock:
             moment, _, future = heapq.heappop(self._waiting)
             if not future.done():
                 if moment > now and math.isfinite(moment):
-                    self._base, self._base_wall = moment, self._wall()
+                    self._base = moment
+                    self._base_wall = self._wall()
                 future.set_result(None)
         self._arm()

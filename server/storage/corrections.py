@@ -147,7 +147,10 @@ class Corrections:
         """
         date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
         parameters = Offsets.from_edge(values)
-        chosen = name if name is not None else self._free_name(date)
+        if name is not None:
+            chosen = name
+        else:
+            chosen = self._free_name(date)
         if chosen in self._all and self._all[chosen].parameters != parameters:
             raise invalid_params(
                 f"a correction called {chosen!r} exists and corrections are never edited",
@@ -164,7 +167,9 @@ class Corrections:
 
     def after(self, correction: NamedCorrection | None) -> History:
         """Return the history once `correction` is in force instead of the last."""
-        name = None if correction is None else correction.name
+        name = None
+        if correction is not None:
+            name = correction.name
         if name is None and self.in_force is None:
             return self.history
         return [*self.history, name][-MAX_HISTORY:]

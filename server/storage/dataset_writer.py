@@ -239,7 +239,10 @@ class DatasetWriter:
 
     def _end(self, complete: bool, reason: str, duration_s: float | None) -> None:
         """Write the texts with the end of the scan, after the images are safe on the disk."""
-        length = self.record.duration_s if duration_s is None else duration_s
+        if duration_s is None:
+            length = self.record.duration_s
+        else:
+            length = duration_s
         self._files.sync()  # no power cut leaves a complete data set without its images
         self.record = replace(
             self.record, complete=complete, reason=reason, duration_s=length

@@ -130,7 +130,10 @@ def as_of(
     scene = save_scene(scanner, 0.0).model_copy(
         update={"positions": memory.scene.positions}
     )
-    names = memory.corrections if corrections is None else corrections
+    if corrections is None:
+        names = memory.corrections
+    else:
+        names = corrections
     return memory.model_copy(update={"scene": scene, "corrections": names})
 
 
@@ -183,7 +186,9 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
         known = None
     if memory.estop:  # stays in force in any case
         scanner.estop(now)
-    return None if known is None else sample_of(known)
+    if known is None:
+        return None
+    return sample_of(known)
 
 
 class JobsNotWrittenError(DatasetWriteError):
@@ -304,7 +309,9 @@ class StateStore:
     ) -> T:
         """Write a change, apply it, and restore the disk if either fails."""
         async with self._writing:
-            document = None if after is None else after(self._make(False))
+            document = None
+            if after is not None:
+                document = after(self._make(False))
             changes = own.Changes()
             try:
                 await asyncio.to_thread(self._put_all, changes, document, files)

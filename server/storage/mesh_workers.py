@@ -55,10 +55,12 @@ def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Pha
     try:
         [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)
     except RpcError as error:
-        prefix = (
-            f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
-        )
-        data = error.data if isinstance(error.data, dict) else None
+        prefix = ""
+        if error.code == Code.TOO_LARGE:
+            prefix = f"{how['name']!r} cannot be read: "
+        data = None
+        if isinstance(error.data, dict):
+            data = error.data
         raise PhantomError(prefix + error.message, data) from None
     finally:
         worker.kill()

@@ -154,8 +154,9 @@ class _LruCache:
         return value
 
 
-_INFOS, _THUMBNAILS = _LruCache(MAX_SETS), _LruCache(1000)
-"""Unlike those of `lru_cache`, they can be searched: a list has `LIST_S` to read the rest."""
+# Unlike those of `lru_cache`, they can be searched: a list has `LIST_S` to read the rest.
+_INFOS = _LruCache(MAX_SETS)
+_THUMBNAILS = _LruCache(1000)
 
 
 # A data set's folder
@@ -204,9 +205,10 @@ class _Scan:
     @property
     def beam(self) -> tuple[float | None, float | None]:
         """kV and W of the projections."""
-        settings = (
-            self.document.tube if self.document else self.texts and self.texts.settings
-        )
+        if self.document:
+            settings = self.document.tube
+        else:
+            settings = self.texts and self.texts.settings
         if settings:
             return (settings.kV, settings.power_W)
         return (None, None)
@@ -259,7 +261,10 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
         bare += [_UndocumentedFrame(f, "projection") for f in folder.projections.values()]
         return _Scan(folder, tuple(bare), problem=problem)
     s = texts.settings
-    shown = {} if s is None else {"exposure_ms": s.exposure_ms, "mode": s.mode}
+    if s is not None:
+        shown = {"exposure_ms": s.exposure_ms, "mode": s.mode}
+    else:
+        shown = {}
     if s is not None and s.averages:
         shown["averages"] = round(s.averages)
     if s is not None and s.roi is not None:
@@ -484,7 +489,10 @@ def _with_thumbnail(
             return ""
         factor = math.ceil(max(pixels.shape) / side)
         narrow = min(pixels.shape) < factor
-        small = pixels[::factor, ::factor] if narrow else binned_mean(pixels, factor)
+        if narrow:
+            small = pixels[::factor, ::factor]
+        else:
+            small = binned_mean(pixels, factor)
         low, high = np.percentile(small, (0.5, 99.5))
         grey = np.clip((small - low) * (255.0 / max(float(high - low), 1e-6)), 0, 255)
         return ImageValue(**image.encode(grey.astype(np.uint8)))  # type: ignore[arg-type]
@@ -548,7 +556,12 @@ def _same(scan: _Scan, around: TwinContext) -> bool:
     """Return whether the twin has the machine and the profile of a data set."""
     document = scan.document
     texts = scan.texts
-    machine, profile = (document.machine, document.profile) if document else ({}, None)
+    if document:
+        machine = document.machine
+        profile = document.profile
+    else:
+        machine = {}
+        profile = None
     if texts is not None and texts.profile is not None and texts.positions:
         machine = texts.machine.model_dump(mode="json", by_alias=True)
         profile = texts.profile.model_dump(mode="json")
@@ -637,7 +650,9 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
         )
         what = "the machine and the cylinder around the sample"
     correction = document.correction_in_force()
-    offsets = NOMINAL if correction is None else correction.parameters
+    offsets = NOMINAL
+    if correction is not None:
+        offsets = correction.parameters
     scene = build_scene(machine, document.profile_of(), pieces, offsets)
     found = [clearance(scene, scan.images[i].positions).mm for i in at]
     return [mm if math.isfinite(mm) else None for mm in found], what
@@ -672,9 +687,9 @@ def _frame(
             {"asked": asked.index, "allowed": [0, len(images) - 1]},
         )
     frame = images[asked.index]
-    shape = (
-        document.shape_of(frame) if document and isinstance(frame, FrameEntry) else None
-    )
+    shape = None
+    if document and isinstance(frame, FrameEntry):
+        shape = document.shape_of(frame)
     counts = files.read_image(folder.path / _there(folder, frame.file), shape)
     if asked.binning > min(counts.shape):
         raise LimitError(
@@ -689,10 +704,14 @@ def _frame(
         rows, cols = counts.shape
         pixels = _normal(scan, (rows, cols))(counts)
     small = binned_mean(pixels.astype(np.float32), asked.binning)
-    small = np.rint(small).astype(np.uint16) if asked.kind == "counts" else small
+    if asked.kind == "counts":
+        small = np.rint(small).astype(np.uint16)
     before = sum(f.kind == "projection" for f in images[: asked.index])
     kV, power_W = scan.beam
-    size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
+    if codec is Codec.MSGPACK:
+        size = small.nbytes
+    else:
+        size = small.nbytes * 4 // 3
     if size > (limit_bytes := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
         raise too_large("an image (ask for a binned one)", size, limit_bytes)
     return p.DatasetFrameResult(
@@ -748,7 +767,10 @@ def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
             f"{name} has no flat image: there are no line integrals"
         )
     light = files.mean_image(flat, shape)
-    lost = files.mean_image(dark, shape) if dark else np.zeros_like(light)
+    if dark:
+        lost = files.mean_image(dark, shape)
+    else:
+        lost = np.zeros_like(light)
     return LineIntegrals.of(lost, light)
 
 

@@ -100,7 +100,10 @@ class Incoming:
             ):
                 known = self._begin(head)
             if known is None or known.head != head or start > known.received:
-                received = 0 if known is None or known.head != head else known.received
+                if known is None or known.head != head:
+                    received = 0
+                else:
+                    received = known.received
                 raise self._gap(head.name, start, received)
             new = data[known.received - start :]
             self._make_room(head.name, len(new))

@@ -86,7 +86,10 @@ class SampleStore:
         room: DiskRoom | None = None,
         memory_limit: int | None = None,
     ) -> None:
-        self._memory_limit = math.inf if memory_limit is None else memory_limit
+        if memory_limit is None:
+            self._memory_limit = math.inf
+        else:
+            self._memory_limit = memory_limit
         self._folder = folder
         self._limit = limit
         self._most = most
@@ -195,7 +198,9 @@ class SampleStore:
         if head.total > self._limit:
             raise too_large("an upload", head.total, self._limit)
         if head.name == EMPTY or phantoms.is_shipped(head.name):
-            what = "the empty stage" if head.name == EMPTY else "a shipped phantom"
+            what = "a shipped phantom"
+            if head.name == EMPTY:
+                what = "the empty stage"
             raise LimitError(
                 f"{head.name!r} is {what}'s name; choose another",
                 {"asked": head.name, "taken": [EMPTY, *phantoms.phantom_names()]},
@@ -222,7 +227,9 @@ class SampleStore:
         """
         head, raw = self._incoming.take(name)
         phantom = _parse(head, raw, head.material)
-        worn = None if material is None else (material, _parse(head, raw, material))
+        worn = None
+        if material is not None:
+            worn = (material, _parse(head, raw, material))
         return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
     def store(self, changes: own.Changes, upload: ReceivedSample) -> None:
@@ -356,7 +363,9 @@ class SampleStore:
 
 def _bytes_of(phantom: Phantom) -> int:
     """Return the memory that the arrays of a phantom take [bytes]."""
-    voxels = 0 if phantom.voxels is None else phantom.voxels.data.nbytes
+    voxels = 0
+    if phantom.voxels is not None:
+        voxels = phantom.voxels.data.nbytes
     return voxels + sum(s.vertices.nbytes + s.faces.nbytes for s in phantom.surfaces)
 
 
@@ -440,7 +449,10 @@ def sample_material(head: UploadHead | None, material: str | None) -> str | None
     """Return the material that a mesh is filled with; None for a sample that has its own."""
     if head is None or head.kind != "mesh":
         return None
-    chosen = head.material if material is None else material
+    if material is None:
+        chosen = head.material
+    else:
+        chosen = material
     if chosen is None:
         return DEFAULT_MATERIAL
     return chosen

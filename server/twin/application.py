@@ -42,7 +42,8 @@ class TwinSession:
         Raises:
             RpcError: the wire's form of any error.
         """
-        twin, client = self._twin, self._client
+        twin = self._twin
+        client = self._client
         twin.control.heard(client.name)
         try:
             if method.control:
@@ -53,7 +54,9 @@ class TwinSession:
                 by_hand = twin.jobs.manual_control()
             with by_hand:
                 result = HANDLERS[method.name](twin, client, params)
-                return await result if inspect.isawaitable(result) else result
+                if inspect.isawaitable(result):
+                    return await result
+                return result
         except Exception as error:
             if is_user_error(error):
                 raise explain(error, twin.root) from None
@@ -110,12 +113,12 @@ def _figures(
     in_force = twin.scanner.safety.state
     safety = {state: float(in_force == state) for state in get_args(SafetyName)}
     factor = twin.clock.real_time_factor
-    views, free = projector.views, free_bytes(twin.root)
-    room = (
-        []
-        if free is None
-        else [gauge("flexdt_data_free_bytes", "Room on the data disk.", free)]
-    )
+    views = projector.views
+    free = free_bytes(twin.root)
+    if free is not None:
+        room = [gauge("flexdt_data_free_bytes", "Room on the data disk.", free)]
+    else:
+        room = []
     return [
         gauge("flexdt_connections", "Clients connected.", len(server.links)),
         counter(

@@ -63,8 +63,10 @@ from flexdt.twin.script import Exposure
 
 LOG_KEPT = 50
 """Number of entries of the topic `log` that a late subscriber gets."""
-MAX_FAILURES, FAILURE_WINDOW_S = 5, 60.0
-"""Number of failures, within a time [real s], after which a service is not restarted."""
+MAX_FAILURES = 5
+"""Number of failures within `FAILURE_WINDOW_S` after which a service is not restarted."""
+FAILURE_WINDOW_S = 60.0
+"""Time within which a service's failures count [real s]."""
 SERVICE_PAUSE_S = 0.1
 
 
@@ -87,7 +89,8 @@ class ControlLease:
         self, idle_s: float = math.inf, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.holder: str | None = None
-        self._idle_s, self._clock = idle_s, clock
+        self._idle_s = idle_s
+        self._clock = clock
         self._heard = clock()
 
     def heard(self, who: str) -> None:
@@ -125,7 +128,9 @@ class ControlLease:
 
     def force(self, who: str) -> str | None:
         """Take control from its present holder, which is returned."""
-        loser = self.holder if self.holder != who else None
+        loser = None
+        if self.holder != who:
+            loser = self.holder
         self.holder = who
         self.heard(who)
         return loser
@@ -187,8 +192,10 @@ class TwinServer:
         self.instance = secrets.token_hex(8)
         """Random name of this run of the server."""
         machine = with_spectra(machine, physics)
-        self.machine, self.profile = machine, profile
-        self.directory, self.root = root, root.path
+        self.machine = machine
+        self.profile = profile
+        self.directory = root
+        self.root = root.path
         self.clock = TwinClock(speed_up, wall)
         self.scanner = ScannerTwin(
             machine, profile, self.clock.now(), last_stop=secrets.randbits(48)
@@ -217,7 +224,10 @@ class TwinServer:
         self.past_scans = PastScans(self.root, machine, profile)
         self.predictors = predictors()
         self.remembered = kept.read_memory(root)
-        known = [] if self.remembered is None else self.remembered.corrections
+        if self.remembered is not None:
+            known = self.remembered.corrections
+        else:
+            known = []
         self.corrections = corrections.Corrections(
             root.folder("corrections"), known, self.limits.max_corrections
         )
@@ -294,7 +304,8 @@ class TwinServer:
         """Start the services, with `sample` on the stage at the motors' present
         positions.
         """
-        shown, correction = sample or Sample(), self.scanner.correction
+        shown = sample or Sample()
+        correction = self.scanner.correction
         guard = await self.guard(shown, correction)
         for warning in self.scanner.initialise_stage(
             shown, correction, guard, self.clock.now()
@@ -349,7 +360,9 @@ class TwinServer:
                 jobs_to_resume=names,
                 estop=memory.estop,
             )
-        return None if sample is None else self._readable(sample)
+        if sample is None:
+            return None
+        return self._readable(sample)
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
         """Restore the jobs of earlier servers; returns the unfinished ones."""
@@ -372,7 +385,8 @@ class TwinServer:
 
     def _apply_last(self) -> None:
         """Apply the correction of the previous server at the start, if possible."""
-        last, lost = self.corrections.in_force, self.corrections.lost
+        last = self.corrections.in_force
+        lost = self.corrections.lost
         if lost is not None:
             self.tell(
                 "warning", f"the correction in force, {lost!r}, is lost: none is in force"
@@ -431,7 +445,8 @@ class TwinServer:
             GeometryError: the pose is impossible for a scanner.
         """
         snapshot = self.scanner.state(self.clock.now())
-        job, problem = self.jobs.current, self.keeper.problem
+        job = self.jobs.current
+        problem = self.keeper.problem
         watch = self.projector_watch
         return w.State(
             time=snapshot.time,
@@ -461,7 +476,9 @@ class TwinServer:
             for name, axis in snapshot.axes.items()
             if not axis.virtual
         }
-        return clearance(guard.scene, motors) if isinstance(guard, SceneGuard) else None
+        if isinstance(guard, SceneGuard):
+            return clearance(guard.scene, motors)
+        return None
 
     def sample_state(self) -> w.SampleState:
         """Describe the sample on the stage for the wire."""
@@ -483,7 +500,9 @@ class TwinServer:
 
     def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
         """Describe a correction and its source for the wire."""
-        source = None if correction is None else self.corrections.source(correction.name)
+        source = None
+        if correction is not None:
+            source = self.corrections.source(correction.name)
         return state_views.correction_view(correction, source)
 
     # Changing -----------------------------------------------------------------------------------
@@ -529,7 +548,9 @@ class TwinServer:
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
         """Create the guard for a sample and a correction; `upload` as for `Stage.pieces`."""
-        parameters = NOMINAL if correction is None else correction.parameters
+        parameters = NOMINAL
+        if correction is not None:
+            parameters = correction.parameters
         return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
@@ -595,8 +616,12 @@ class TwinServer:
         wanted = self.hub.wanted("projection")
         if not wanted and frame.kind != "projection":
             return
-        job, now = self.jobs.current, self.live.now()
-        shown = now.sample if job is None or job.sample is None else job.sample
+        job = self.jobs.current
+        now = self.live.now()
+        if job is None or job.sample is None:
+            shown = now.sample
+        else:
+            shown = job.sample
         shot = replace(
             now,
             sample=shown,

@@ -49,13 +49,19 @@ class _Event:
         data: object | Render,
         slot: str | None,
     ) -> None:
-        self.topic, self.seq, self.time, self._data = topic, seq, time, data
+        self.topic = topic
+        self.seq = seq
+        self.time = time
+        self._data = data
         self.slot = None if slot is None else f"{topic}:{slot}"
         self._made: dict[ImageWish, Prepared] = {}
 
     def prepared(self, view: ImageWish) -> Prepared:
         if view not in self._made:
-            data = self._data(view) if callable(self._data) else self._data
+            if callable(self._data):
+                data = self._data(view)
+            else:
+                data = self._data
             self._made[view] = Prepared(event(self.topic, self.seq, self.time, data))
         return self._made[view]
 
@@ -90,7 +96,9 @@ class Hub:
         most: int = 2048,
         most_views: int = 16,
     ) -> None:
-        self._now, self._most, self._most_views = now, most, most_views
+        self._now = now
+        self._most = most
+        self._most_views = most_views
         self._kept: dict[TopicName, deque[_Event]] = {
             topic: deque(maxlen=count) for topic, count in (kept or {}).items()
         }
@@ -116,8 +124,11 @@ class Hub:
             RpcError: -32003, more subscriptions or views than there may be; nothing has
                 changed.
         """
-        interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
-        topics, view = set(topics), view or ImageWish()
+        interval = 0.0
+        if max_rate_hz is not None:
+            interval = 1.0 / max_rate_hz
+        topics = set(topics)
+        view = view or ImageWish()
         self._require_room(listener, topics, view)
         for topic in sorted(topics):
             self.unsubscribe(listener, [topic])
@@ -241,7 +252,8 @@ class Hub:
         subscription.next_at = (
             asyncio.get_running_loop().time() + subscription.min_interval_s
         )
-        pending, subscription.pending = subscription.pending, {}
+        pending = subscription.pending
+        subscription.pending = {}
         for newest in pending.values():
             self._deliver(listener, subscription, newest)
 
@@ -264,6 +276,7 @@ class Hub:
             asyncio.get_running_loop().call_soon(self._refill)
 
     def _refill(self) -> None:
-        self._room, self._refilling = EVENTS_A_TURN, False
+        self._room = EVENTS_A_TURN
+        self._refilling = False
         if self._due:
             self._drain()

@@ -71,7 +71,9 @@ class Shot:
     @property
     def origin(self) -> ImageOrigin:
         """Description of the origin of an image, for the wire."""
-        sample, tube, camera = self.sample, self.tube, self.camera
+        sample = self.sample
+        tube = self.tube
+        camera = self.camera
         return ImageOrigin(
             sample=sample.name or None,
             revision=self.revision,
@@ -95,7 +97,8 @@ class Shot:
     @property
     def exposure(self) -> ExposureSettings:
         """Settings of tube and camera."""
-        camera, tube = self.camera, self.tube
+        camera = self.camera
+        tube = self.tube
         return ExposureSettings(
             tube.kV, tube.power_W, camera.exposure_ms, camera.averages, self.lit
         )
@@ -224,7 +227,9 @@ class LiveView:
         scanner = self.scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
         cone = scanner.corrected(poses, shot.camera, shot.correction)
-        known = NOMINAL if shot.correction is None else shot.correction.parameters
+        known = NOMINAL
+        if shot.correction is not None:
+            known = shot.correction.parameters
         images = await self.radiography.take(
             shot.sample,
             poses,
@@ -258,7 +263,8 @@ class LiveView:
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Publish an image to the subscribers in their views."""
         self._count += 1
-        count, views = self._count, self.hub.views("projection")
+        count = self._count
+        views = self.hub.views("projection")
 
         def make(view: ImageWish) -> object:
             rng = np.random.default_rng([count])
@@ -279,7 +285,8 @@ class LiveView:
 
     async def _show_made(self) -> None:
         while self._made is not None:
-            made, self._made = self._made, None
+            made = self._made
+            self._made = None
             await self._publish(*made)
 
 

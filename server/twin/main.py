@@ -56,7 +56,9 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.twin.message_reading import Reader
     from flexdt.twin.scanner.state import Sample
 
-    truth = None if options.truth is None else load_truth(options.truth, root)
+    truth = None
+    if options.truth is not None:
+        truth = load_truth(options.truth, root)
     token = access.read_token(options.projector_token_file)
     secure = access.client_tls(options.projector_tls_ca)
     clients = [
@@ -64,7 +66,8 @@ async def run(options: TwinSettings) -> int:
         for place in options.places
     ]
     projector = ProjectorPool(clients, PATIENCE_S)
-    requests, reader = Requests(), Reader()
+    requests = Requests()
+    reader = Reader()
     twin = TwinServer(
         machine,
         profile,

@@ -55,10 +55,15 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
     """Decode in the worker: returns method and pickle of each item of a message or batch."""
     message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, m.Batch)
-    items = message.items if isinstance(message, m.Batch) else (message,)
+    if isinstance(message, m.Batch):
+        items = message.items
+    else:
+        items = (message,)
     parts = [b"batch" if batch else b"single"]
     for item in items:
-        name = item.method if isinstance(item, m.Request | m.Notification) else ""
+        name = ""
+        if isinstance(item, m.Request | m.Notification):
+            name = item.method
         parts += [name.encode() if name in METHODS else b"", _frozen(item)]
     return parts
 
@@ -70,7 +75,9 @@ def _frozen(message: m.Single) -> bytes:
     if not isinstance(message, m.Request | m.Notification):
         return pickle.dumps(message)
     answered = isinstance(message, m.Request)
-    id = message.id if isinstance(message, m.Request) else None
+    id = None
+    if isinstance(message, m.Request):
+        id = message.id
     call = Call(id, message.method, _params(message), answered)
     data = pickle.dumps(call)
     method = METHODS.get(message.method)

@@ -54,7 +54,10 @@ def safety_view(
     """Convert safety state and clearance to their wire form; below `margin_mm` is a
     warning.
     """
-    near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
+    if clearance is None or not math.isfinite(clearance.mm):
+        near = None
+    else:
+        near = clearance
     warnings = []
     if near is not None and near.pair is not None and near.mm < margin_mm:
         warnings = [

@@ -236,7 +236,10 @@ def build_scene(
     axes = tuple(machine.axes)
     bodies = stage_bodies(machine, profile, parameters)
     bodies += sample_bodies(machine, profile, sample, parameters)
-    margin = machine.safety_margin_mm if margin_mm is None else margin_mm
+    if margin_mm is None:
+        margin = machine.safety_margin_mm
+    else:
+        margin = margin_mm
     scene = scene_of(
         axes,
         bodies,

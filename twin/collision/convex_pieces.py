@@ -61,7 +61,10 @@ def convex_pieces(
     if len(mesh.faces) == 0 or not np.isfinite(vertices).all():
         what = f"a sample mesh needs faces and finite vertices; this has {len(mesh.faces)} faces"
         raise GeometryError(what, {"faces": len(mesh.faces), "vertices": len(vertices)})
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    if rotation is None:
+        turn = np.eye(3)
+    else:
+        turn = np.asarray(rotation, dtype=np.float64)
     placed = vertices @ turn.T + np.asarray(offset, dtype=np.float64)
     triangles = placed[np.asarray(mesh.faces)]
     whole = _Piece(triangles)

@@ -163,7 +163,9 @@ class PathSearch:
             found: result of the pair's sweep.
         """
         motion = self.motion(k)
-        at = START if found.contact is None else found.contact
+        at = START
+        if found.contact is not None:
+            at = found.contact
         time = motion.time(at)
         free = float(self.path.times[0])
         if found.last_free is not None:
@@ -239,6 +241,10 @@ def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
     for an overlap."""
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)
-    turn_a = a.rotation(float(q @ a.turns)) if a.spins else None
-    turn_b = b.rotation(float(q @ b.turns)) if b.spins else None
+    turn_a = None
+    if a.spins:
+        turn_a = a.rotation(float(q @ a.turns))
+    turn_b = None
+    if b.spins:
+        turn_b = b.rotation(float(q @ b.turns))
     return scene.separation(pair)(offset, turn_a, turn_b)[0]

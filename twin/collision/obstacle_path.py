@@ -250,7 +250,10 @@ class _Planner:
         moves: list[dict[str, float]] = []
         moved: dict[str, float] = {}
         for axis, value in way:
-            together = {**moves[-1], axis: value} if moves else {}
+            if moves:
+                together = {**moves[-1], axis: value}
+            else:
+                together = {}
             if moves and axis not in moves[-1] and self.contact(moved, together) is None:
                 moves[-1] = together
                 continue

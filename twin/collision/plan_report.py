@@ -49,7 +49,10 @@ def collision_check(
     def check(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
-        pieces = _from_size(size) if sample is None else tuple(sample)
+        if sample is None:
+            pieces = _from_size(size)
+        else:
+            pieces = tuple(sample)
         return collision_report(plan, build_scene(machine, profile, pieces, parameters))
 
     return check

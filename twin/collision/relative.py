@@ -257,7 +257,10 @@ class _Bound:
         j = int(reached[0])
         above = (float(ends[j - 1]) if j else value) - level
         fall = _fall_time(above, float(rate[j]), float(growth[j]), float(lengths[j]))
-        dt = float(lengths[j]) if fall is None else fall
+        if fall is None:
+            dt = float(lengths[j])
+        else:
+            dt = fall
         return Moment(at.segment + j, dt + (at.dt if j == 0 else 0.0))
 
 
@@ -270,7 +273,10 @@ def _fall_time(above: float, rate: float, growth: float, length: float) -> float
     if square < 0.0:
         return None
     root = math.sqrt(square)
-    dt = 2.0 * above / (root - rate) if root > rate else math.inf
+    if root > rate:
+        dt = 2.0 * above / (root - rate)
+    else:
+        dt = math.inf
     return dt if dt <= length else None
 
 
@@ -317,7 +323,9 @@ class _Turn:
             np.where(both, 0.0, signs * growth)[kept],
         )
         senses = set(signs[kept].tolist()) - {0.0}
-        sense = senses.pop() if len(senses) == 1 and not both[kept].any() else 0.0
+        sense = 0.0
+        if len(senses) == 1 and not both[kept].any():
+            sense = senses.pop()
         return cls(body, side, angle[kept], rate[kept], growth[kept], nearing, sense)
 
     def orientation(self, at: Moment) -> FloatArray:
@@ -378,7 +386,10 @@ class RelativeMotion:
                     (path.a @ body.turns)[:, None],
                 ]
         moving = np.concatenate(changes, axis=1).any(axis=1)
-        kept: Kept = np.flatnonzero(moving) if moving.any() else slice(0, 1)
+        if moving.any():
+            kept: Kept = np.flatnonzero(moving)
+        else:
+            kept = slice(0, 1)
         self.times: FloatArray = path.times[:-1][kept]
         self.lengths: FloatArray = np.diff(path.times)[kept]
         self._origin = (path.q @ slides + (a.origin - b.origin))[:-1][kept]
@@ -421,8 +432,12 @@ class RelativeMotion:
         offset = self._origin[i] + dt * (
             self._velocity[i] + 0.5 * dt * self._acceleration[i]
         )
-        turn_a = None if self._turn_a is None else self._turn_a.orientation(at)
-        turn_b = None if self._turn_b is None else self._turn_b.orientation(at)
+        turn_a = None
+        if self._turn_a is not None:
+            turn_a = self._turn_a.orientation(at)
+        turn_b = None
+        if self._turn_b is not None:
+            turn_b = self._turn_b.orientation(at)
         gap, normal = separate(offset, turn_a, turn_b)
         return Look(at, gap, normal, (turn_a, turn_b))
 

@@ -78,7 +78,10 @@ def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
     motion = RelativeMotion(a, b, path)
     overlap = _Overlap.at(a, b, path.q[0])
     deeper = _deeper(motion, overlap, scene.limits.margin)
-    until = math.inf if deeper is None else motion.time(deeper[1])
+    if deeper is None:
+        until = math.inf
+    else:
+        until = motion.time(deeper[1])
     free = _free_from(motion, scene.separation(pair), scene.limits, until)
     if free is not None:
         pair_scene = replace(scene, pairs=(pair,), distant=())
@@ -208,7 +211,10 @@ class _Overlap:
             if turns and _many(self.bodies[1 - i].solid):
                 continue
             now = self.directions @ (turned[i] @ self.turned[i].T).T
-            other = self._reach_of(1 - i, now, turned) if turns else self._reach[1 - i]
+            if turns:
+                other = self._reach_of(1 - i, now, turned)
+            else:
+                other = self._reach[1 - i]
             gaps = now @ offset - self._reach[i] - other
             best = int(np.argmax(gaps))
             if gaps[best] > widest:
@@ -250,7 +256,10 @@ class _Overlap:
 
 def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Compute a body's orientation (3, 3) and origin (3,) [mm] with the motors at `q`."""
-    turn = body.rotation(float(q @ body.turns)) if body.spins else np.eye(3)
+    if body.spins:
+        turn = body.rotation(float(q @ body.turns))
+    else:
+        turn = np.eye(3)
     return turn, q @ body.slides + body.origin
 
 

@@ -116,7 +116,10 @@ class Body:
             return allowance / self.reach
         # A point moves by sin(d) swing - (1 - cos(d)) inner, so by at most |swing| d + ... d^2 / 2.
         value, side, inner = (self._levers @ toward).reshape(3, -1)
-        ahead = np.abs(side) if sense == 0.0 else np.maximum(sense * side, 0.0)
+        if sense == 0.0:
+            ahead = np.abs(side)
+        else:
+            ahead = np.maximum(sense * side, 0.0)
         curve = np.maximum(-inner, 0.0)
         room = (allowance + value.max()) - value
         root = ahead + np.sqrt(ahead * ahead + 2.0 * curve * room)
@@ -130,9 +133,10 @@ class Body:
     def _levers(self) -> FloatArray:
         """Points, their velocities about the axis, and their distances from it, stacked
         (3 k, 3)."""
-        points = (
-            self.solid.vertices if isinstance(self.solid, Polytope) else np.empty((0, 3))
-        )
+        if isinstance(self.solid, Polytope):
+            points = self.solid.vertices
+        else:
+            points = np.empty((0, 3))
         inner = points - np.outer(points @ self.spin_axis, self.spin_axis)
         return np.concatenate([points, np.cross(self.spin_axis, points), inner])
 
@@ -263,7 +267,10 @@ def _wherever(
     """
     if part.anchor != "object":
         return solid
-    carriers = machine.chain(part) if place is None else tuple(machine.axes)
+    if place is None:
+        carriers = machine.chain(part)
+    else:
+        carriers = tuple(machine.axes)
     ends = np.zeros((2, 3))
     for i, coordinate in enumerate(COORDINATES[:2]):
         factors = machine.geometry.get(f"mount_{coordinate}", {})
@@ -279,7 +286,8 @@ def _wherever(
         return solid
     points = (solid.prism() if isinstance(solid, UprightCylinder) else solid).vertices
     corners = np.array([[x, y, 0.0] for x in ends[:, 0] for y in ends[:, 1]])
-    corners = corners if place is None else corners @ place.T
+    if place is not None:
+        corners = corners @ place.T
     return hull((points[:, None, :] + corners).reshape(-1, 3))
 
 
@@ -322,7 +330,10 @@ def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | P
     """Make the solid of a component; a panel follows its tilts."""
     if part.shape == "cylinder":
         return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
-    solid = hull(part.points_mm) if part.points_mm else box(part.size_mm, part.center_mm)
+    if part.points_mm:
+        solid = hull(part.points_mm)
+    else:
+        solid = box(part.size_mm, part.center_mm)
     turned = profile.det_roll_deg or p.det_yaw or p.det_pitch or p.det_roll
     if part.role == "panel" and turned:
         return Polytope(solid.vertices @ _panel_turn(profile, p).T, solid.faces)

@@ -102,7 +102,9 @@ class FrameBlock(ArrayValue):
         return len(self.files)
 
     def __repr__(self) -> str:
-        span = f", {self.files[0]} to {self.files[-1]}" if self.files else ""
+        span = ""
+        if self.files:
+            span = f", {self.files[0]} to {self.files[-1]}"
         return f"<FrameBlock: {len(self)} {self.kind} images{span}>"
 
 
@@ -187,10 +189,15 @@ class ScanRecord(ArrayValue):
             if g.kind != "preview"
         )
         first = next((g for g in plan.groups if g.kind == "projection" and g.files), None)
-        shown = plan.start if plan.settings is None else plan.settings
+        if plan.settings is None:
+            shown = plan.start
+        else:
+            shown = plan.settings
         positions = shown.positions
         if plan.settings is None:
-            at = first.starts[0] if first is not None else 0.0
+            at = 0.0
+            if first is not None:
+                at = first.starts[0]
             positions = {n: float(v) for n, v in plan.positions(at).items()}
         lit = shown if first is None else first
         if sample is None:
@@ -246,7 +253,10 @@ class ScanRecord(ArrayValue):
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
         """Compute the nominal geometry of all images, or of some blocks."""
-        chosen = self.blocks if blocks is None else tuple(blocks)
+        if blocks is None:
+            chosen = self.blocks
+        else:
+            chosen = tuple(blocks)
         return ConeVec.concatenate(
             [self.poses_of(b).cone_vec() for b in chosen if len(b)]
         )
@@ -254,7 +264,9 @@ class ScanRecord(ArrayValue):
     def angles_deg(self) -> FloatArray:
         """Stage angle of every projection [deg], accumulated."""
         parts = [np.degrees(self.poses_of(b).angle) for b in self.projections if len(b)]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        if parts:
+            return np.concatenate(parts)
+        return np.zeros(0)
 
     def sections(self) -> int:
         """Count the sections of projections that the texts' one pose and one angle rule
@@ -428,7 +440,9 @@ class PredictedEntry(_Model):
 
 def _rounded(value: float | None) -> float | None:
     """Round to the digits that a prediction has."""
-    return None if value is None else float(f"{value:.4g}")
+    if value is None:
+        return None
+    return float(f"{value:.4g}")
 
 
 class DatasetDocument(_Model):
@@ -538,8 +552,13 @@ class DatasetDocument(_Model):
 
     def _camera(self, entry: FrameEntry | DetectorEntry) -> CameraSettings:
         detector = self.machine.get("detector")
-        named = detector.get("modes") if isinstance(detector, dict) else None
-        modes = tuple(named.items()) if isinstance(named, dict) else ()
+        named = None
+        if isinstance(detector, dict):
+            named = detector.get("modes")
+        if isinstance(named, dict):
+            modes = tuple(named.items())
+        else:
+            modes = ()
         roi = Roi(*entry.roi)
         return CameraSettings(
             entry.mode, roi, entry.exposure_ms, entry.averages, modes=modes
@@ -569,11 +588,9 @@ class DatasetDocument(_Model):
     def correction_in_force(self) -> NamedCorrection | None:
         """Return the applied correction in internal units, or None."""
         c = self.correction
-        return (
-            None
-            if c is None
-            else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
-        )
+        if c is None:
+            return None
+        return NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
 
     def machine_of(self, file: str = DOCUMENT) -> Machine:
         """Read the scanner's description.

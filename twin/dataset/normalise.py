@@ -148,7 +148,10 @@ def binned_mean(
         images: (..., rows, cols).
         factor: pixels along each edge of a block, or its rows and columns.
     """
-    down, across = (factor, factor) if isinstance(factor, int) else factor
+    if isinstance(factor, int):
+        down, across = (factor, factor)
+    else:
+        down, across = factor
     if down == across == 1:
         return images
     rows, cols = images.shape[-2] // down, images.shape[-1] // across

@@ -61,13 +61,16 @@ def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
     Raises:
         DatasetFormatError: the texts state no angles.
     """
-    start, last = settings.start_angle_deg, settings.last_angle_deg
+    start = settings.start_angle_deg
+    last = settings.last_angle_deg
     if start is None or last is None:
         raise DatasetFormatError(
             f"{file}: no `Start angle` and `Last angle`; angles cannot be known",
             {"path": file, "missing": ["Start angle", "Last angle"]},
         )
-    n = settings.projections if settings.projections is not None else count
+    n = count
+    if settings.projections is not None:
+        n = settings.projections
     step = (last - start) / (n - 1) if n > 1 else 0.0
     return np.asarray(start + step * np.arange(count), dtype=np.float64)
 
@@ -97,22 +100,22 @@ def rebuild(
     angles = np.radians(angles_deg(settings, count, file))
     settings, notes = physical(settings, file)
     machine = machines[0] if len(machines) == 1 else named_machine(settings, machines)
-    figures, place = settings.figures, dict[str, float]()
+    figures = settings.figures
+    place = dict[str, float]()
     positions: dict[str, FloatArray] = {}
     height = "the sample's reference height is taken to be the focal spot's"
     if machine is None:
         why = f"scanner {settings.scanner_name or '(unnamed)'!r} is not known"
     elif not set(settings.motors) & set(machine.axes):
-        machine, why = None, "the texts state no motor positions"
+        machine = None
+        why = "the texts state no motor positions"
     else:
         positions, assumed = _positions(settings, machine, np.degrees(angles))
         notes = [*assumed, *notes]
         camera = _camera(settings, shape, file, machine.detector.camera.modes)
-        found = (
-            None
-            if camera is None
-            else _profile(machine, profiles, camera, positions, figures)
-        )
+        found = None
+        if camera is not None:
+            found = _profile(machine, profiles, camera, positions, figures)
         if found is not None and camera is not None:
             profile, why = found
             notes.append(f"profile {profile.name}{why}")
@@ -157,7 +160,9 @@ def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]
     if read is None or real is None or abs(real.value - read.value) < 1e-6:
         return settings, []
     far = real.value - read.value
-    sdd, cor, hc = settings.sdd_mm, settings.cor_px, settings.hc_px
+    sdd = settings.sdd_mm
+    cor = settings.cor_px
+    hc = settings.hc_px
     if sdd is not None and sdd + far <= 0.0:
         raise DatasetFormatError(
             f"{file}: mag_det_phys {real.value:g} puts the detector behind the source",
@@ -192,11 +197,9 @@ def _profile(
         return profiles[0], ": as asked"
     if printed is None:
         chosen = _default(machine, profiles)
-        return (
-            None
-            if chosen is None
-            else (chosen, ": the default, no figures to check it by")
-        )
+        if chosen is None:
+            return None
+        return (chosen, ": the default, no figures to check it by")
     first = {n: v[:1] for n, v in positions.items()}
     own = () if machine.default_profile else (profile_of(machine),)
     for profile in (*profiles, *own):
@@ -225,7 +228,9 @@ def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machin
     if said:
         return None
     complete = [m for m in machines if set(m.axes) <= set(settings.motors)]
-    return complete[0] if len(complete) == 1 else None
+    if len(complete) == 1:
+        return complete[0]
+    return None
 
 
 def _word(text: str | None) -> str:

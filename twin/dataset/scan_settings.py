@@ -20,8 +20,12 @@ from flexdt.twin.machine.camera import Roi
 
 Kind = Literal["text", "number", "count", "mm", "minutes", "whole minutes", "roi"]
 """Name of the form in which a value is written."""
-_SCAN, _SAMPLE, _TUBE = "Scan info", "Sample info", "Tube settings"
-_CAMERA, _ACQUISITION, _CT = "Camera settings", "Acquisition settings", "CT-parameters IN"
+_SCAN = "Scan info"
+_SAMPLE = "Sample info"
+_TUBE = "Tube settings"
+_CAMERA = "Camera settings"
+_ACQUISITION = "Acquisition settings"
+_CT = "CT-parameters IN"
 _ORDER = (
     "mag_obj",
     "mag_det",
@@ -155,7 +159,9 @@ class ScanSettings:
             self.binned_pixel_mm,
         )
         known = [v for v in values if v is not None]
-        return Figures(*known) if len(known) == len(values) else None
+        if len(known) == len(values):
+            return Figures(*known)
+        return None
 
 
 ENTRIES: Final[Mapping[str, Entry]] = {
@@ -171,11 +177,15 @@ def settings_of(record: ScanRecord) -> ScanSettings:
     averaged over 30 exposures counts 30. Start and last angle are those of the first and
     last projection.
     """
-    camera, machine = record.camera, record.machine
+    camera = record.camera
+    machine = record.machine
     figures = figures_of(record.settings_pose(), camera.shape)
     angles = record.angles_deg()
     kinds = [block.kind for block in record.blocks]
-    first = kinds.index("projection") if "projection" in kinds else len(kinds)
+    if "projection" in kinds:
+        first = kinds.index("projection")
+    else:
+        first = len(kinds)
     sample = record.sample
     return ScanSettings(
         scan_id=record.name,

@@ -115,7 +115,10 @@ _KINDS: Final[Mapping[Kind, tuple[Callable[[Any], str], Callable[[str], object]]
 
 def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
     """Write `scan settings.txt` (CRLF) for a scan; absent fields have no line."""
-    s = settings_of(scan) if isinstance(scan, ScanRecord) else scan
+    if isinstance(scan, ScanRecord):
+        s = settings_of(scan)
+    else:
+        s = scan
     out: list[str] = []
     for name in (f.name for f in fields(ScanSettings)):
         out += _BEFORE.get(name, ())
@@ -129,7 +132,9 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
             case "stopped":
                 out += [_STOP, _date(value)]
             case "serial":  # The scanner itself runs this and the type together.
-                head = "Scanner type : " if s.scanner_type is None else out.pop()
+                head = "Scanner type : "
+                if s.scanner_type is not None:
+                    head = out.pop()
                 out.append(f"{head}{_SERIAL} : {clean(value)}")
             case "motors":
                 out += [_motor(axis, line) for axis, line in value.items()]
@@ -145,7 +150,9 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
 
 
 def _date(moment: datetime) -> str:
-    hour = moment.hour % 12 if moment.hour % 12 else 12
+    hour = 12
+    if moment.hour % 12:
+        hour = moment.hour % 12
     half = "AM" if moment.hour < 12 else "PM"
     return (
         f"date: {moment.month}/{moment.day}/{moment.year:04d}; "
@@ -212,7 +219,10 @@ def _read_line(
         return
     key, value = _split(line)
     if key == "scan type":
-        found = value if value else next((other for other in rest if other), "")
+        if value:
+            found = value
+        else:
+            found = next((other for other in rest if other), "")
         if _split(found)[0] not in _BY_KEY:
             values.setdefault("scan_type", found)
     elif key is not None and key in _BY_KEY:

@@ -36,7 +36,8 @@ def format_xre(record: ScanRecord) -> str:
     Values of the maker's reconstruction and of hardware the twin does not model are zero
     or empty there, so that readers find every key.
     """
-    s, camera = settings_of(record), record.camera
+    s = settings_of(record)
+    camera = record.camera
     rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
     motors: dict[str, Value] = {name: line.value for name, line in s.motors.items()}
     # Both are written also where there are none.
@@ -52,7 +53,8 @@ def format_xre(record: ScanRecord) -> str:
             "Flat Field position": sign * float(flat.positions[record.flat_axis][0]),
             "Scan position": motors[record.flat_axis],
         }
-    images, seconds = record.count("projection"), int(record.duration_s)
+    images = record.count("projection")
+    seconds = int(record.duration_s)
     turn = abs((s.last_angle_deg or 0.0) - (s.start_angle_deg or 0.0))
     values = {
         "scan_type": f"{'smooth' if record.smooth else 'step'} take and save",
@@ -94,7 +96,9 @@ class _Filled(string.Formatter):
         """Format a value by its type."""
         if format_spec:
             return format(value, format_spec)
-        return _lines(value) if isinstance(value, Mapping) else _written(value)
+        if isinstance(value, Mapping):
+            return _lines(value)
+        return _written(value)
 
 
 def format_settings(settings: ScanSettings) -> str:
@@ -121,7 +125,10 @@ def _lines(entries: Mapping[str, Value]) -> str:
 
 
 def _utc(moment: datetime) -> str:
-    utc = moment if moment.tzinfo is None else moment.astimezone(UTC)
+    if moment.tzinfo is None:
+        utc = moment
+    else:
+        utc = moment.astimezone(UTC)
     return f"{utc:%Y-%m-%d %H:%M:%S}.{utc.microsecond:06d}0 UTC"
 
 
@@ -129,7 +136,8 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     """Name -> entry: axis, piercing point, image, sample, source at the settings file's
     moment."""
     pose = record.settings_pose()
-    source, axis = pose.source[0], pose.axis[0]
+    source = pose.source[0]
+    axis = pose.axis[0]
     rows, cols = record.camera.shape
     u, v = pose.u[0], pose.v[0]
     corner = pose.detector[0] - u * cols / 2.0 - v * rows / 2.0

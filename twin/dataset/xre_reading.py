@@ -66,7 +66,10 @@ class XreSettings:
             elif entry.xre is not None:
                 number = self.number(*entry.xre)
                 whole = entry.kind == "count"
-                values[field] = round(number) if whole and number is not None else number
+                if whole and number is not None:
+                    values[field] = round(number)
+                else:
+                    values[field] = number
         smooth = (
             self.text("Acquisition settings", "Rotation mode") or ""
         ).lower() == "smooth"

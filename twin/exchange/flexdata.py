@@ -59,7 +59,8 @@ def flexdata_text(geometry: ScanGeometry) -> str:
     up = geometry.rows_up()
     pitch_u, pitch_v = g.require_panel(up.cone_vec, "flexDATA")
     circle = g.circle_of(up.cone_vec, "flexDATA", ROUNDED_MM)
-    source, detector = circle.source, circle.detector
+    source = circle.source
+    detector = circle.detector
     first, last = float(circle.angle[0]), float(circle.angle[-1])
     reach = float(np.linalg.norm(source) + np.linalg.norm(detector))
     beside = np.abs(np.linspace(first, last, len(circle.angle)) - circle.angle) * reach
@@ -152,7 +153,10 @@ def read_flexdata(
                 "different points then, which is not imitated",
                 {"path": name, "allowed": 0},
             )
-    count = records.get("proj_count", views) if views is None else views
+    if views is None:
+        count = records.get("proj_count", views)
+    else:
+        count = views
     if not isinstance(count, int) or count < 1:
         raise ExchangeError(
             f"{file} does not say how many views there are; it must be given"
@@ -172,7 +176,9 @@ def read_flexdata(
         math.radians(found[f"det_{name}"]) for name in ("roll", "yaw", "pitch")
     )
     axes = rotation_y(roll) @ rotation_z(yaw) @ rotation_x(pitch)
-    axis, moved, sample = found["axs_tan"], found["vol_tra"], found["det_sample"]
+    axis = found["axs_tan"]
+    moved = found["vol_tra"]
+    sample = found["det_sample"]
     circle = g.CircularScan(
         np.radians(np.linspace(found["ang_range"][0], found["ang_range"][1], count)),
         np.array([-moved[1], -moved[2]]),
@@ -192,14 +198,16 @@ def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
     """Read one of `_NUMBERS` from a file, or its default if absent."""
     usual = np.array(_NUMBERS[name])
     given = records.get(name, usual.tolist())
-    each = given if isinstance(given, list) else [given]
+    if isinstance(given, list):
+        each = given
+    else:
+        each = [given]
     try:
         known = len(each) == usual.size and all(type(v) in (int, float) for v in each)
-        values = (
-            np.reshape([float(v) for v in each], usual.shape)
-            if known
-            else usual * math.nan
-        )
+        if known:
+            values = np.reshape([float(v) for v in each], usual.shape)
+        else:
+            values = usual * math.nan
     except OverflowError:
         values = usual * math.nan
     if (name in records or name in ("det_pixel", "ang_range")) and not np.isfinite(

@@ -77,7 +77,9 @@ class ScanGeometry:
         It belongs to images that are turned upside down.
         """
         down = np.repeat([1.0, -1.0], [9, 3])
-        real = None if self.real is None else ConeVec(self.real.rows * down)
+        real = None
+        if self.real is not None:
+            real = ConeVec(self.real.rows * down)
         return replace(self, cone_vec=ConeVec(self.cone_vec.rows * down), real=real)
 
 
@@ -127,7 +129,8 @@ def circle_of(
     # One direction does not determine the axis: it is the object frame's own then.
     if max(np.ptp(c), np.ptp(s)) >= 1e-3:
         # A point p at angle 0 is seen at center + Rz(angle) p: linear in center and p.
-        one, zero = np.ones_like(c), np.zeros_like(c)
+        one = np.ones_like(c)
+        zero = np.zeros_like(c)
         table = np.concatenate([np.c_[one, zero, c, -s], np.c_[zero, one, s, c]])
         target = np.concatenate([cone_vec.source[:, 0], cone_vec.source[:, 1]])
         center = np.linalg.lstsq(table, target, rcond=None)[0][:2]

@@ -99,13 +99,17 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
         for number, line in enumerate(text.splitlines(), 1)
         if line.strip() and not line.startswith("#")
     ]
-    header = [name.strip() for name in lines[0][1]] if lines else []
+    if lines:
+        header = [name.strip() for name in lines[0][1]]
+    else:
+        header = []
     lost = [name for name in VECTOR_NAMES if name not in header]
     if lost:
         said = f"{file}: the header lacks {', '.join(lost)}"
         raise ExchangeError.instead(said, header, VECTOR_NAMES, missing=lost)
     at = [header.index(name) for name in VECTOR_NAMES]
-    rows, files = [], []
+    rows = []
+    files = []
     for number, cells in lines[1:]:
         if len(cells) != len(header):
             said = f"{file}:{number}: {len(cells)} cells"
@@ -152,7 +156,8 @@ def read_tomosipo(
     shape = arrays["shape"]
     for name, array in zip(TOMOSIPO_NAMES[1:], vectors, strict=True):
         if array.ndim != 2 or array.shape != (len(vectors[0]), 3) or not _real(array):
-            what, like = f"{file}: {name}", " like the others"
+            what = f"{file}: {name}"
+            like = " like the others"
             raise ExchangeError.of_shape(what, array.shape, ("n", 3), like)
     if (
         shape.shape != (2,)
@@ -228,7 +233,10 @@ class _Document(BaseModel):
 
 def geometry_text(geometry: ScanGeometry) -> str:
     """Write a geometry as JSON text, one line a view."""
-    rows, cols = geometry.shape if geometry.shape is not None else (None, None)
+    if geometry.shape is not None:
+        rows, cols = geometry.shape
+    else:
+        rows, cols = (None, None)
     head = {
         "kind": KIND,
         "schema": SCHEMA,
@@ -270,7 +278,9 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise ExchangeError(f"{file}: {where}: {first['msg']}", {"path": where}) from None
-    rows, columns, real = found.detector.rows, found.detector.columns, found.real_cone_vec
+    rows = found.detector.rows
+    columns = found.detector.columns
+    real = found.real_cone_vec
     if (rows is None) != (columns is None):
         raise ExchangeError(
             f"{file}: detector: rows and columns must be whole numbers above 0"

@@ -90,7 +90,8 @@ def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
         gantry = math.atan2(normal[0], normal[2])
         turn = math.atan2(u[1], v[1])
     else:  # the panel is horizontal: only the sum of the two other angles counts
-        gantry, turn = math.atan2(-u[2], u[0]), 0.0
+        gantry = math.atan2(-u[2], u[0])
+        turn = 0.0
     axes = rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
     s, d = axes.T @ source, axes.T @ centre
     if abs(s[2] - d[2]) < 1e-6:
@@ -189,7 +190,8 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
     gantry, out, turn = (math.radians(a) for a in values[:3])
     sid, sdd, sx, sy, px, py = values[3:]
     axes = TO_RTK.T @ rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)
-    source, centre = axes @ [sx, sy, sid], axes @ [px, py, sid - sdd]
+    source = axes @ [sx, sy, sid]
+    centre = axes @ [px, py, sid - sdd]
     return np.concatenate(
         [source, centre, axes[:, 0] * pitch_mm[0], axes[:, 1] * pitch_mm[1]]
     )

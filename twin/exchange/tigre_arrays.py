@@ -85,7 +85,8 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
         "offDetector": -apart[:, :0:-1],
         "rotDetector": _turns(np.stack([np.cross(u, v), u, v], axis=2)),
     }
-    counts, pitch = np.array([rows, columns]), np.array([pitch_v, pitch_u])
+    counts = np.array([rows, columns])
+    pitch = np.array([pitch_v, pitch_u])
     panel = dict(zip(PANEL, (counts, pitch, counts * pitch), strict=True))
     return {**{name: _once(x) for name, x in per_view.items()}, **panel, ANGLES: angles}
 
@@ -93,7 +94,10 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 def _once(values: FloatArray) -> FloatArray:
     """Return one value if all views have the same, else the value of each view."""
     still = np.ptp(values, axis=0).max() <= CONSTANT_TOLERANCE
-    one: FloatArray = values[:1] if values.ndim == 1 else values[0]
+    if values.ndim == 1:
+        one: FloatArray = values[:1]
+    else:
+        one = values[0]
     return np.ascontiguousarray(one if still else values) + 0.0
 
 
@@ -162,7 +166,8 @@ def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatA
 def _axes(turns: FloatArray) -> FloatArray:
     """Compute Rz Ry Rx (n, 3, 3) of turns about x, y and z (n, 3) [rad]."""
     yaw, pitch, roll = turns.T
-    one, zero = np.ones_like(yaw), np.zeros_like(yaw)
+    one = np.ones_like(yaw)
+    zero = np.zeros_like(yaw)
     about_x = _stacked(
         one, zero, zero, zero, np.cos(yaw), -np.sin(yaw), zero, np.sin(yaw), np.cos(yaw)
     )

@@ -143,7 +143,8 @@ class Follower:
             mirror: present state.
             now: moment [s].
         """
-        mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
+        if mirror.ends is False:
+            mirror = self._over(mirror, "", now)
         for waiting in mirror.waiting.values():
             took = now - waiting.sent_s
             quiet = now - waiting.told_s
@@ -216,20 +217,27 @@ class Follower:
             for name, axis in mirror.axes.items()
             if axis.path is not None and axis.path.end > now
         ]
-        rest = () if self.script is None else self.script.commands[mirror.next_line :]
+        if self.script is not None:
+            rest = self.script.commands[mirror.next_line :]
+        else:
+            rest = ()
         commands = c.Script.of([*under_way, *rest])
         plan = plan_script(
             commands, self.machine, self.profile, start=mirror.start, sample=self.sample
         )
-        collision = self.collision if self.machine.components else None
+        collision = None
+        if self.machine.components:
+            collision = self.collision
         report = check_plan(plan, (), collision)
-        assumed = (
-            f" ({', '.join(mirror.assumed)} assumed at home)" if mirror.assumed else ""
-        )
+        assumed = ""
+        if mirror.assumed:
+            assumed = f" ({', '.join(mirror.assumed)} assumed at home)"
         found: dict[tuple[str, int], Alarm] = {}
         exposures = [p for p in report.warnings if p.code in OPEN_BEAM_CODES]
         for p in (*report.errors, *exposures):  # of the contacts of one line, the first
-            where = f"line {p.line}" if p.line else "the move under way"
+            where = "the move under way"
+            if p.line:
+                where = f"line {p.line}"
             what = f"{where}: {p.message}{assumed}"
             alarm = Alarm(now, p.severity, p.code, f"ahead, {where}", what)
             found.setdefault((p.code, p.line), alarm)
@@ -380,17 +388,21 @@ class Follower:
         if at >= len(lines) and lines and bare == lines[0]:
             at = 0
         if at < len(lines) and bare == lines[at]:
-            began = now if at == 0 or mirror.began_s is None else mirror.began_s
+            if at == 0 or mirror.began_s is None:
+                began = now
+            else:
+                began = mirror.began_s
             steps = self._steps[: at + 1]
             holds = sum(s.holds_s for s in steps)
             found = total_range(steps, holds, self.machine.timing)
-            bounds = (
-                [_bounds(s, self.machine) for s in steps]
-                if found is None
-                else [_wider(found)]
-            )
+            if found is None:
+                bounds = [_bounds(s, self.machine) for s in steps]
+            else:
+                bounds = [_wider(found)]
             high = sum(b[1] for b in bounds)
-            due = began + high if at + 1 < len(lines) else None
+            due = None
+            if at + 1 < len(lines):
+                due = began + high
             mirror = mirror.cleared("script")
             return replace(mirror, next_line=at + 1, began_s=began, due_s=due)
         if mirror.began_s is None or at >= len(lines):
@@ -433,7 +445,9 @@ class Follower:
             waiting: the command's record; None if its begin was not heard.
             now: moment [s].
         """
-        command = heard if waiting is None else waiting.heard
+        command = heard
+        if waiting is not None:
+            command = waiting.heard
         unheard = waiting is None and heard.what == "ACK"
         mirror = replace(mirror.finished(command, unheard), ends=True)
         if heard.what == "ERR":
@@ -486,7 +500,8 @@ class Follower:
             return mirror
         name, reply = self._motor(axis, at)
         mirror = self._arrival(mirror, name, reply, waiting.targets[name], now)
-        mirror = mirror.with_axis(name, position=reply) if name in motors else mirror
+        if name in motors:
+            mirror = mirror.with_axis(name, position=reply)
         if motor is None:
             return mirror
         return self._compared(mirror, name, motor, now)
@@ -557,7 +572,8 @@ class Follower:
         name, x = self._motor(axis, at)
         if waiting is not None and moves and not _stays(mirror, name, waiting):
             return mirror
-        mirror = mirror if motor is None else self._compared(mirror, name, motor, now)
+        if motor is not None:
+            mirror = self._compared(mirror, name, motor, now)
         seen = mirror.axes[name]
         path = mirror.axes[name].path
         unit = self.machine.axes[name].unit
@@ -619,7 +635,9 @@ class Follower:
         self, mirror: Mirror, waiting: Waiting, took: float, now: float
     ) -> Mirror:
         """Raise an alarm about a time outside its range."""
-        longer = "more" if took > waiting.most_s else "less"
+        longer = "less"
+        if took > waiting.most_s:
+            longer = "more"
         bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
         what = f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of {bounds}"
         return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], what)
@@ -683,9 +701,12 @@ def _flushed(mirror: Mirror, now: float) -> Mirror:
         if waiting.written or waiting.heard.asks:
             continue
         trigger = getattr(waiting.heard.command, "trigger", None)
-        wait, took = (
-            ("no wait", 0.0) if trigger is None else ("POS", now - waiting.sent_s)
-        )
+        if trigger is None:
+            wait = "no wait"
+            took = 0.0
+        else:
+            wait = "POS"
+            took = now - waiting.sent_s
         lines = (*mirror.lines, *_line(waiting, wait, took, "command sent"))
         mirror = replace(mirror, lines=lines).with_waiting(waiting, written=True)
     return mirror

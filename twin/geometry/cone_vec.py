@@ -464,7 +464,9 @@ class ConeVec:
     def __repr__(self) -> str:
         """One line; for up to two views it evaluates back to an equal value."""
         if len(self) <= MAX_PRINTED_VIEWS:
-            shape = "" if self.detector_shape is None else f", {self.detector_shape}"
+            shape = ""
+            if self.detector_shape is not None:
+                shape = f", {self.detector_shape}"
             return f"ConeVec({self.rows.tolist()!r}{shape})"
         facts = self._facts()
         return (
@@ -481,13 +483,14 @@ class ConeVec:
     def _facts(self) -> dict[str, str]:
         """Sizes and distances in words, for printing."""
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
-        pitch = steps[0] if steps[0] == steps[1] else " x ".join(steps)
+        if steps[0] == steps[1]:
+            pitch = steps[0]
+        else:
+            pitch = " x ".join(steps)
         shape = self.detector_shape
-        pixels = (
-            "pixels"
-            if shape is None
-            else f"{shape[0]} x {shape[1]} pixels (rows x columns)"
-        )
+        pixels = "pixels"
+        if shape is not None:
+            pixels = f"{shape[0]} x {shape[1]} pixels (rows x columns)"
         return {
             "views": f"{len(self)} view{'' if len(self) == 1 else 's'}",
             "detector": f"{pixels} of {pitch} mm",
@@ -504,11 +507,10 @@ class ConeVec:
             >>> sorted(scan.to_dict()), scan.to_dict()["detector_shape"]
             (['detector_shape', 'rows'], [76, 96])
         """
-        known = (
-            {}
-            if self.detector_shape is None
-            else {"detector_shape": list(self.detector_shape)}
-        )
+        if self.detector_shape is not None:
+            known = {"detector_shape": list(self.detector_shape)}
+        else:
+            known = {}
         return {"rows": self.rows.tolist(), **known}
 
     @classmethod
@@ -557,7 +559,9 @@ class ConeVec:
             ((76, 96), (10, 20))
         """
         own = self.detector_shape
-        given = None if shape is None else check_shape(shape)
+        given = None
+        if shape is not None:
+            given = check_shape(shape)
         if given is not None and own is not None and given != own:
             raise GeometryError(
                 f"detector shape {given}; this geometry is of a detector of {own} (rows, "
@@ -798,9 +802,9 @@ class ConeVec:
         shift_u = (cols // factor * factor - cols) / 2
         shift_v = (rows // factor * factor - rows) / 2
         centre = self.detector + shift_u * self.u + shift_v * self.v
-        binned_shape = (
-            None if self.detector_shape is None else (rows // factor, cols // factor)
-        )
+        binned_shape = None
+        if self.detector_shape is not None:
+            binned_shape = (rows // factor, cols // factor)
         return ConeVec.from_vectors(
             self.source, centre, self.u * factor, self.v * factor, binned_shape
         )
@@ -852,7 +856,9 @@ def _numbers(
     if array.ndim == 0 and (repeated or count == 1):
         array = np.full(count, array)
     if array.shape != (count,) or not np.isfinite(array).all():
-        wanted = "one finite number" if count == 1 else f"{count} finite numbers"
+        wanted = "one finite number"
+        if count != 1:
+            wanted = f"{count} finite numbers"
         what = f"{name} is {value!r}; allowed: {wanted} [{unit}]"
         raise GeometryError(what, {"asked": repr(value)[:100], "allowed": wanted})
     return tuple(array.tolist())
@@ -896,11 +902,9 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
     bad = np.flatnonzero(flat | level)
     if len(bad):
         i = int(bad[0])
-        problem = (
-            "u and v do not span a plane (one is zero, or they are parallel)"
-            if flat[i]
-            else "the source lies in the detector's plane"
-        )
+        problem = "the source lies in the detector's plane"
+        if flat[i]:
+            problem = "u and v do not span a plane (one is zero, or they are parallel)"
         raise GeometryError(
             f"cone_vec row {i}: {problem}; allowed: pixels that each have a ray of their own",
             {"row": i, "check": "degenerate", "asked": cone_vec.rows[i].tolist()},
@@ -928,7 +932,10 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
     u = cone_vec.u
     v = cone_vec.v
     lengths = {"|u|": np.linalg.norm(u, axis=1), "|v|": np.linalg.norm(v, axis=1)}
-    pitches = pixel_mm if isinstance(pixel_mm, tuple) else (pixel_mm, pixel_mm)
+    if isinstance(pixel_mm, tuple):
+        pitches = pixel_mm
+    else:
+        pitches = (pixel_mm, pixel_mm)
     for (name, length), pitch in zip(lengths.items(), pitches, strict=True):
         bad = np.abs(length - pitch) > PITCH_TOLERANCE * pitch
         if bad.any():

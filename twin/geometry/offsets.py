@@ -100,7 +100,9 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
     for name, value in parameters.to_edge().items():
         low, high = ranges[UNITS[name]]
         if name != "alpha" and not low <= value <= high:
-            unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
+            unit = ""
+            if UNITS[name] != "1":
+                unit = f" {UNITS[name]}"
             what = f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}"
             raise GeometryError(
                 what, {"check": name, "asked": value, "allowed": [low, high]}

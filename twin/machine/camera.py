@@ -184,7 +184,12 @@ def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     """
     for name, value in vars(roi).items():
         sides = name in ("left", "right")
-        what, size = ("columns", grid.columns) if sides else ("rows", grid.rows)
+        if sides:
+            what = "columns"
+            size = grid.columns
+        else:
+            what = "rows"
+            size = grid.rows
         if not 0 <= value < size:
             raise LimitError(
                 f"ROI {roi}: {name} {value} is outside the sensor's {size} {what} "

@@ -596,7 +596,9 @@ class Machine(_Frozen):
         _require(self.fixed, slides, "fixed", "quantity that slides", f"; {NOT_MODELLED}")
         for quantity, factors in self.geometry.items():
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
-            kind = "rotation" if quantity == "angle" else "linear"
+            kind = "linear"
+            if quantity == "angle":
+                kind = "rotation"
             for name, factor in factors.items():
                 allowed = "a number other than 0, or left out"
                 _refuse_if(factor == 0.0, f"geometry.{quantity}.{name}", factor, allowed)
@@ -736,7 +738,9 @@ class Machine(_Frozen):
                         "a part that carries it"
                     )
                     raise _refused(f"{where}.axis", part.axis, allowed)
-                slack = _AREA_SLACK_MM if role == "panel" else 1e-6
+                slack = 1e-6
+                if role == "panel":
+                    slack = _AREA_SLACK_MM
                 reach = [abs(c) + r for c, r in zip(part.center_mm, half, strict=False)]
                 if part.shape == "cylinder":
                     reach[:2] = [math.hypot(reach[0], reach[1]), 0.0]
@@ -767,7 +771,10 @@ class Machine(_Frozen):
         part: Component | None = component
         while part is not None:
             motors += [part.axis] if part.axis is not None else []
-            part = parents[part.parent] if part.parent is not None else None
+            if part.parent is not None:
+                part = parents[part.parent]
+            else:
+                part = None
         return tuple(motors)
 
     def has(self, axis: str) -> bool:
@@ -841,10 +848,12 @@ def parse_machine(
     driving = {name for factors in machine.geometry.values() for name in factors}
     idle = [name for name in machine.axes if name not in driving]
     if idle or not machine.geometry.get("angle"):
-        path = f"axes.{idle[0]}" if idle else "geometry.angle"
-        allowed = (
-            "in [geometry] with what it moves" if idle else "motors that turn the sample"
-        )
+        path = "geometry.angle"
+        if idle:
+            path = f"axes.{idle[0]}"
+        allowed = "motors that turn the sample"
+        if idle:
+            allowed = "in [geometry] with what it moves"
         raise MachineFileError(
             f"{file}: {path}: must be {allowed}; {NOT_MODELLED}",
             {"file": file, "path": path},
@@ -956,7 +965,10 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
         UnknownNameError: names the component and its problem.
     """
     parts = own.get("components", [])
-    meshed = [p for p in parts if isinstance(p, dict) and "mesh" in p] if parts else []
+    if parts:
+        meshed = [p for p in parts if isinstance(p, dict) and "mesh" in p]
+    else:
+        meshed = []
     for part in meshed:
         where = f"components.{part.get('name')}"
         name = part["mesh"]
@@ -974,7 +986,9 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
                 f"{where}.mesh_at_mm: must be three numbers (value: {at!r})"
             )
         if not isinstance(name, str) or corners is None:
-            allowed = "a file's name" if corners else "left out: no files are read here"
+            allowed = "left out: no files are read here"
+            if corners:
+                allowed = "a file's name"
             raise UnknownNameError(f"{where}.mesh: must be {allowed} (value: {name!r})")
         try:
             found = corners(name)
@@ -1139,12 +1153,13 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 lines.append(f"{file}: {path}: is missing")
                 data.append({"path": path, "message": "is missing"})
                 continue
-            value = e["input"] if at is None else e["ctx"]["value"]
-            message = (
-                "there is no such key"
-                if e["type"] == "extra_forbidden"
-                else message_of(e)
-            )
+            if at is None:
+                value = e["input"]
+            else:
+                value = e["ctx"]["value"]
+            message = "there is no such key"
+            if e["type"] != "extra_forbidden":
+                message = message_of(e)
             if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
                 message += _limit(path)
             lines.append(f"{file}: {path}: {message} (value: {value!r})")

@@ -62,7 +62,9 @@ def _replaced(text: str, blocks: Mapping[str, str]) -> str:
             continue
         if _ANY_HEADER.match(line):
             header = _HEADER.fullmatch(line)
-            name = "" if header is None else header[1].strip()
+            name = ""
+            if header is not None:
+                name = header[1].strip()
             skipping = name in blocks or name.startswith("timing.")
             if skipping:
                 while held and held[-1].strip():
@@ -90,13 +92,11 @@ def _timing_table(timing: Timing) -> str:
         kind = line.split("_s = ")[0]
         found = timing.spread.get(kind)
         measured = found is not None or kind.startswith("drift")
-        origin = (
-            ""
-            if kind.startswith("source")
-            else "measured, log"
-            if measured
-            else "assumed"
-        )
+        origin = ""
+        if not kind.startswith("source"):
+            origin = "assumed"
+            if measured:
+                origin = "measured, log"
         lines.append(line + (f"  # {origin}" if origin else ""))
     lines += ["", "[timing.spread]"]
     for kind, spread in timing.spread.items():

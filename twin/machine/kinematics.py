@@ -199,7 +199,9 @@ def motor_targets(
     moves = machine.moves(axis)
     if axis in machine.axes:  # exactly, and not a sum that rounds to it
         return {axis: value + positions[axis] if relative else value}
-    step = value if relative else value - virtual_reading(machine, axis, positions)
+    step = value
+    if not relative:
+        step = value - virtual_reading(machine, axis, positions)
     return {motor: positions[motor] + factor * step for motor, factor in moves.items()}
 
 
@@ -295,8 +297,13 @@ def place(machine: Machine, quantity: str) -> Place:
         both = sorted((factor * axis.lower, factor * axis.upper))
         ends = [a + b for a, b in zip(ends, both, strict=True)]
         home += factor * axis.home
-        times = "" if abs(factor) == 1.0 else f"{abs(factor):g} "
-        sign = "- " if factor < 0 else "+ " if words else ""
+        times = ""
+        if abs(factor) != 1.0:
+            times = f"{abs(factor):g} "
+        if factor < 0:
+            sign = "- "
+        else:
+            sign = "+ " if words else ""
         words.append(f"{sign}{times}{motor}")
     return Place(
         _QUANTITY_NAMES[quantity], " ".join(words) or "0", ends[0], ends[1], home

@@ -87,7 +87,10 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
     for motor, share in machine.moves(axis).items():
         a = machine.axes[motor]
         requested = value * abs(share)
-        limit = a.max_speed if what == "speed" else a.max_acceleration
+        if what == "speed":
+            limit = a.max_speed
+        else:
+            limit = a.max_acceleration
         if not requested <= limit * (1.0 + POSITION_ROUNDING):  # as one that is no number
             unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
             messages.append(

@@ -120,7 +120,10 @@ def braked_apart(
             # It was braking anyway: where it was bound is where it ends, exactly (and not a
             # rounding error beyond its limit).
             near = abs(rest.target - current.target) < POSITION_ROUNDING
-            out[name] = replace(rest, target=current.target) if near else rest
+            if near:
+                out[name] = replace(rest, target=current.target)
+            else:
+                out[name] = rest
     return out
 
 
@@ -148,7 +151,9 @@ def coasting(
             current.position(now), current.velocity(now), decelerations[name], now
         )
         end = min(max(free.target, axis.lower), axis.upper)
-        met = None if end == free.target else free.time_at(end)
+        met = None
+        if end != free.target:
+            met = free.time_at(end)
         if met is not None:
             pieces = tuple(p for p in free.pieces if p.start < met)
             pieces = pieces or motion.at_rest(end, now).pieces
@@ -236,10 +241,16 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         left = rate * rate - 2.0 * slowing * ahead
         ends = left < MIN_TIME_RATE * MIN_TIME_RATE
         following = 0.0 if ends else math.sqrt(left)
-        length = rate / slowing if ends else 2.0 * ahead / (rate + following)
+        if ends:
+            length = rate / slowing
+        else:
+            length = 2.0 * ahead / (rate + following)
         cell = _Cell(time, s, rate, slowing, length)
         cells.append(cell)
-        s = until if ahead == until - s else s + cell.advance
+        if ahead == until - s:
+            s = until
+        else:
+            s = s + cell.advance
         rate = following
         time = time + length
     return cells

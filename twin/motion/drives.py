@@ -207,7 +207,10 @@ def plan_jog(
         free = motion.jog(*here, wanted, lease, acceleration, now)
         if axis.lower <= free.target <= axis.upper:
             return free
-        limit = axis.upper if free.target > axis.upper else axis.lower
+        if free.target > axis.upper:
+            limit = axis.upper
+        else:
+            limit = axis.lower
         return current.redirected(limit, max(abs(wanted), 1e-9), acceleration, now)
 
     # Coupled motors brake together, when the first of them has to brake for its limit.

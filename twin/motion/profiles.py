@@ -118,7 +118,10 @@ class Trajectory:
             return 0.0, 0.0, self.start
         index = bisect_right(self.knots, time, hi=len(self.pieces)) - 1
         piece = self.pieces[index]
-        until = self.knots[index + 1] if index + 1 < len(self.knots) else self.end
+        if index + 1 < len(self.knots):
+            until = self.knots[index + 1]
+        else:
+            until = self.end
         velocity = piece.velocity + piece.acceleration * (time - piece.start)
         a = piece.acceleration
         if velocity * a < 0.0:
@@ -171,7 +174,10 @@ class Trajectory:
     def time_at(self, position: float) -> float | None:
         """Find the first time at which the motor passes `position`, or None."""
         for i, piece in enumerate(self.pieces):
-            stop = self.pieces[i + 1].start if i + 1 < len(self.pieces) else self.end
+            if i + 1 < len(self.pieces):
+                stop = self.pieces[i + 1].start
+            else:
+                stop = self.end
             dt = _first_root(
                 0.5 * piece.acceleration, piece.velocity, piece.position - position
             )

@@ -191,7 +191,10 @@ class Lookahead:
         }
         if self.guard is None:
             return {}
-        guard = self.guard.standing(here) if standing else self.guard
+        if standing:
+            guard = self.guard.standing(here)
+        else:
+            guard = self.guard
         return guard.touching(here, deep=deep)
 
     # Joining
@@ -452,7 +455,9 @@ class UnsweptProgramme:
         """Sweep the programme to its end; takes about 60 ms for 1440 steps."""
         standing = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
         legs = {name: motion.joined(legs) for name, legs in self.legs.items()}
-        contact = None if self.guard is None else self.guard({**standing, **legs}, 0.0)
+        contact = None
+        if self.guard is not None:
+            contact = self.guard({**standing, **legs}, 0.0)
         return CertifiedProgramme(self, contact)
 
     @property
@@ -460,11 +465,10 @@ class UnsweptProgramme:
         """Motor -> trajectories, the wait for a first one that begins later included."""
         out = {}
         for name, legs in self.programme.items():
-            wait = (
-                [motion.at_rest(self.start[name], 0.0)]
-                if legs and legs[0].start > 0.0
-                else []
-            )
+            if legs and legs[0].start > 0.0:
+                wait = [motion.at_rest(self.start[name], 0.0)]
+            else:
+                wait = []
             out[name] = (*wait, *legs)
         return {name: legs for name, legs in out.items() if legs}
 
@@ -539,7 +543,9 @@ class StageChange:
         now = self.ahead.now
         under_way = self.ahead.ahead()
         self._require_no_nearer(changed)
-        contact = changed.contact(under_way) if under_way else None
+        contact = None
+        if under_way:
+            contact = changed.contact(under_way)
         halted: Trajectories = {}
         if contact is not None:
             found = changed.halted(under_way, contact)
@@ -565,7 +571,10 @@ class StageChange:
         margin = self.ahead.machine.safety_margin_mm
         for standing in (False, True):
             after = changed.touching(deep=True, standing=standing)
-            before = self.ahead.touching(deep=True, standing=standing) if after else {}
+            if after:
+                before = self.ahead.touching(deep=True, standing=standing)
+            else:
+                before = {}
             for pair, clearance in after.items():
                 if pair not in before or clearance < floor(before[pair], margin):
                     raise self._refused(pair, 0.0, {})
@@ -582,7 +591,9 @@ class StageChange:
             seconds: from now to the contact.
             last_free: motor -> last free position [mm, deg].
         """
-        what = f"sample {self.sample.name!r}" if self.sample.name else "the empty stage"
+        what = "the empty stage"
+        if self.sample.name:
+            what = f"sample {self.sample.name!r}"
         if self.correction is not None:
             what += f" with correction {self.correction.name!r}"
         allowed = "a pose at which it is free, or another placement"

@@ -169,7 +169,9 @@ def released(safety: Safety, stop: int | None) -> Safety:
         SafetyError: that is not the latest stop; nothing is released.
     """
     if stop is not None and stop != safety.stop:
-        by = f" by {safety.stopped_by}" if safety.stopped_by else ""
+        by = ""
+        if safety.stopped_by:
+            by = f" by {safety.stopped_by}"
         why = safety.reason or "it has been released"
         raise SafetyError(
             f"the reset is for another stop than the latest{by} ({why}); nothing is released",
@@ -226,7 +228,9 @@ def collision_error(
     """
     ahead = contact.time - now
     where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
-    outcome = f"motion halts at {where}" if where else "nothing changes"
+    outcome = "nothing changes"
+    if where:
+        outcome = f"motion halts at {where}"
     count = safety.blocked_attempts
     allowed = safety.max_blocked_attempts
     return would_touch(
@@ -263,7 +267,9 @@ def would_touch(
         outcome: words for the actual outcome.
         data: further members of the error's data.
     """
-    how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else near
+    how = near
+    if ahead > 0.0:
+        how = f"would collide in {ahead:.3g} s"
     told = {
         "asked": what,
         "pair": list(pair),

@@ -185,7 +185,9 @@ class ScannerTwin:
         Raises:
             GeometryError: a geometry no scanner can have.
         """
-        parameters = NOMINAL if correction is None else correction.parameters
+        parameters = NOMINAL
+        if correction is not None:
+            parameters = correction.parameters
         pixel = camera.pixels_mm(self.machine.detector.pixels)
         return check_cone_vec(nominal.cone_vec(parameters), pixel)
 
@@ -382,7 +384,9 @@ class ScannerTwin:
             trajectories = coasting(
                 self.machine, self._drives, now, self.machine.estop.coasting
             )
-            hit = ahead.contact(trajectories) if trajectories else None
+            hit = None
+            if trajectories:
+                hit = ahead.contact(trajectories)
             self._coasts_until = max((t.end for t in trajectories.values()), default=now)
             return self._stopped(StopMotion.of(trajectories, "coasting", now, hit))
         return self._stopped(ahead.stopped(ahead.hardest))
@@ -519,7 +523,10 @@ class ScannerTwin:
         drives = dict(self._drives)
         for name, (speed, acceleration) in (paces or {}).items():
             drives = plan.with_settings(self.machine, drives, name, speed, acceleration)
-        moves = plan.plan_move(self.machine, drives, targets, now) if targets else {}
+        if targets:
+            moves = plan.plan_move(self.machine, drives, targets, now)
+        else:
+            moves = {}
         return StageChange(
             sample,
             correction,
@@ -730,7 +737,10 @@ class ScannerTwin:
         made_of = (tuple(positions.values()), self._stage)
         if self._judged[0] != made_of:
             least = self.machine.safety_margin_mm - 2.0 * rules.ROUNDING_MM
-            near = {} if self.guard is None else self.guard.touching(positions)
+            if self.guard is not None:
+                near = self.guard.touching(positions)
+            else:
+                near = {}
             found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
             self._judged = (
                 made_of,

@@ -334,8 +334,10 @@ def changed_tube(
     Raises:
         LimitError: outside the tube's range; the message names the setting.
     """
-    kV = tube.kV if kV is None else kV
-    power_W = tube.power_W if power_W is None else power_W
+    if kV is None:
+        kV = tube.kV
+    if power_W is None:
+        power_W = tube.power_W
     new = replace(tube, kV=kV, power_W=power_W)
     _require_within("tube", "kV", new.kV, spec.min_kV, spec.max_kV)
     _require_within("tube", "power_W", new.power_W, 0.0, spec.max_W)
@@ -385,14 +387,18 @@ def require_applicable(
     Raises:
         GeometryError: it does not; the message names the offset or the check.
     """
-    offsets = NOMINAL if correction is None else correction.parameters
+    offsets = NOMINAL
+    if correction is not None:
+        offsets = correction.parameters
     travels = (a.upper - a.lower for a in machine.axes.values() if a.unit == "mm")
     require_plausible(offsets, max(travels, default=math.inf))
     sensor = machine.detector.pixels
     nearest = motor_poses(machine, profile, camera, _nearest(machine))
     cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixels_mm(sensor))
     if readout(nearest, camera, sensor, offsets) is None:
-        what = "the machine file's travel" if correction is None else "the correction"
+        what = "the correction"
+        if correction is None:
+            what = "the machine file's travel"
         raise GeometryError(
             f"{what} puts the rotation axis behind the source somewhere",
             {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},

@@ -63,7 +63,10 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     """
     panel = machine.detector
     tube = machine.tube
-    exposure = panel.exposure_ms if request.exposure_ms is None else request.exposure_ms
+    if request.exposure_ms is None:
+        exposure = panel.exposure_ms
+    else:
+        exposure = request.exposure_ms
     change: CameraChange = {
         "mode": request.mode,
         "roi": request.roi,
@@ -280,7 +283,8 @@ class _Writer(MotorTargets):
             below = (w.rise_mm / 2 / abs(factor) + pace * lead_s - ramp) * math.copysign(
                 1, factor
             )
-            below = -below if quantity == "object_z" else below
+            if quantity == "object_z":
+                below = -below
             low, high = (check_target(m, motor, x) for x in (at - below, at + below))
             targets[motor] = (low, high, pace)
         yield from self.moves({motor: low for motor, (low, _, _) in targets.items()})
@@ -352,7 +356,10 @@ class _Writer(MotorTargets):
         self, *quantities: str, place: ScanPosition | None = None, shift: float = 0.0
     ) -> Iterator[str]:
         """Yield moves of the motors of `quantities` alone to their station."""
-        at = ScanPosition(self.request.sod_mm) if place is None else place
+        if place is None:
+            at = ScanPosition(self.request.sod_mm)
+        else:
+            at = place
         every = self.station(at.sod_mm, at.lateral_mm, shift)
         names = map(self.driver, quantities)
         yield from self.moves({name: every[name] for name in names})
@@ -402,7 +409,10 @@ class _Writer(MotorTargets):
             only = self.value(quantity, found)
             slack = _ROUNDED_MM
             if not self.has(quantity) and quantity not in ("object_y", "detector_y"):
-                size = rows * row_pixel if quantity.endswith("_z") else cols * pixel
+                if quantity.endswith("_z"):
+                    size = rows * row_pixel
+                else:
+                    size = cols * pixel
                 slack = (
                     BESIDE * size * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
                 )
@@ -449,7 +459,8 @@ class _Writer(MotorTargets):
         """Camera settings of the request, else the machine's."""
         w = self.request
         camera = self.machine.detector.camera
-        camera = camera if w.mode is None else replace(camera, mode=w.mode)
+        if w.mode is not None:
+            camera = replace(camera, mode=w.mode)
         if w.roi is None:
             return camera
         return replace(camera, roi=w.roi)

@@ -67,7 +67,10 @@ def check_script(
     else:
         text = content(text)
         script, problems = read_script(text)
-        shown = text if isinstance(text, str) else text.decode("utf-8", "replace")
+        if isinstance(text, str):
+            shown = text
+        else:
+            shown = text.decode("utf-8", "replace")
     bare = c.Script(script.commands, (), script.lines)
     plan = plan_script(bare, machine, profile, start=start, sample=sample)
     return check_plan(plan, problems, collision, shown, start is not None, physics)
@@ -93,11 +96,9 @@ def check_plan(
     """
     seen = [v for v in views(plan) if v.kind == "projection"]
     optics = tuple(_optics(v) for v in seen)
-    clearance = (
-        None
-        if collision is None
-        else collision(plan, plan.machine, plan.profile, plan.sample)
-    )
+    clearance = None
+    if collision is not None:
+        clearance = collision(plan, plan.machine, plan.profile, plan.sample)
     found = [*problems, *plan.problems, *_truncation_problems(seen)]
     found += open_beam_problems(plan, physics)
     if not start_known:

@@ -86,11 +86,10 @@ def _optics_facts(o: Optics) -> Facts:
     Args:
         o: of one camera setting.
     """
-    where = (
-        f"line {o.lines[0]}"
-        if o.lines[0] == o.lines[1]
-        else f"lines {o.lines[0]}-{o.lines[1]}"
-    )
+    if o.lines[0] == o.lines[1]:
+        where = f"line {o.lines[0]}"
+    else:
+        where = f"lines {o.lines[0]}-{o.lines[1]}"
     facts = [
         (
             f"projections, {where}",
@@ -119,7 +118,9 @@ def _collisions(report: CheckReport) -> str:
         return "not checked"
     nearest = ""
     if c.min_clearance_mm is not None and not c.collisions:
-        pair = f" ({' and '.join(c.min_clearance_pair)})" if c.min_clearance_pair else ""
+        pair = ""
+        if c.min_clearance_pair:
+            pair = f" ({' and '.join(c.min_clearance_pair)})"
         nearest = (
             f"; parts in relative motion stay {c.min_clearance_mm:.2f} mm apart{pair}"
         )
@@ -147,7 +148,9 @@ def _total(report: CheckReport) -> str:
     """Describe the 90 % range of the duration."""
     plan = report.plan
     text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
-    start = "" if report.start_known else ", if axes and X-rays start as assumed below"
+    start = ", if axes and X-rays start as assumed below"
+    if report.start_known:
+        start = ""
     if text:
         return f"{text} s{start}"
     return "unknown: no time of this machine is measured"

@@ -122,7 +122,10 @@ def _line(
         ArgumentError: the line cannot be read.
     """
     wait = _WAIT.search(record)
-    tail = [] if wait is None else record[wait.end() + 1 :].split(b"\t", 3)
+    if wait is not None:
+        tail = record[wait.end() + 1 :].split(b"\t", 3)
+    else:
+        tail = []
     if wait is None or len(tail) < 3:
         found = record.count(b"\t") + 2
         raise ArgumentError(

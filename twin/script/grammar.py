@@ -90,10 +90,17 @@ def number(text: str, what: str, index: int = 0) -> float:
         what: name of the argument, for the message.
         index: place of the argument, 0 or 1.
     """
-    value = float(text) if _NUMBER.fullmatch(text) else math.nan
+    if _NUMBER.fullmatch(text):
+        value = float(text)
+    else:
+        value = math.nan
     if not math.isfinite(value):
-        hint = "; decimals are written with a point" if "," in text else ""
-        problem = f"{shorten(text)!r} is not a number" if text else "it is missing"
+        hint = ""
+        if "," in text:
+            hint = "; decimals are written with a point"
+        problem = "it is missing"
+        if text:
+            problem = f"{shorten(text)!r} is not a number"
         raise ArgumentError(f"{what} must be a number: {problem}{hint}", index=index)
     if abs(value) > MAX_NUMBER:
         raise ArgumentError(
@@ -213,13 +220,17 @@ def _roi(a: str, _b: str) -> dict[str, object]:
 
 def _sequence(a: str, b: str) -> dict[str, object]:
     """Read the prefix and the first number of a sequence."""
-    first = whole(b, "first number of the sequence", 0, 999_999, 1) if b else 0
+    first = 0
+    if b:
+        first = whole(b, "first number of the sequence", 0, 999_999, 1)
     return {"prefix": a, "first": first}
 
 
 def _move(a: str, b: str) -> dict[str, object]:
     """Read the target and the trigger position of a move."""
-    trigger = number(b, "trigger position", 1) if b else None
+    trigger = None
+    if b:
+        trigger = number(b, "trigger position", 1)
     return {"target": number(a, "target"), "trigger": trigger}
 
 
@@ -336,7 +347,9 @@ def image_name(path: str) -> str | None:
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
     """List the file names of a sequence: prefix, six digits, `.tif`."""
-    name = bare_name(prefix) if not prefix.endswith(("\\", "/")) else ""
+    name = ""
+    if not prefix.endswith(("\\", "/")):
+        name = bare_name(prefix)
     return tuple([f"{name}{i:06d}.tif" for i in range(first, first + count)])
 
 
@@ -351,11 +364,9 @@ def kind_of(name: str) -> ImageKind:
 
 def _move_line(k: c.MoveAbsolute) -> str:
     """Describe a move."""
-    until = (
-        f", goes on at {k.trigger:g}"
-        if k.wait is c.Wait.POS and k.trigger is not None
-        else ""
-    )
+    until = ""
+    if k.wait is c.Wait.POS and k.trigger is not None:
+        until = f", goes on at {k.trigger:g}"
     return f"{k.component} to {k.target:.10g}{until}"
 
 

@@ -385,7 +385,9 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
     ]
     lower, upper, max_speed, max_acceleration = common
     last = agree[-1]
-    of = "" if len(agree) == len(replies) else f" of {len(replies)}"
+    of = ""
+    if len(agree) != len(replies):
+        of = f" of {len(replies)}"
     set_speed, set_acceleration = (
         any(isinstance(k, kind) for k in own) for kind in (c.SetSpeed, c.SetAcceleration)
     )
@@ -431,7 +433,10 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
             took = max(0.0, x.own_s - step.computed_s)
             if isinstance(command, c.WaitXrayReady):
                 kind = "xray_ready"
-                took = since if x.own_s > _MAX_READY_WAIT_S else math.nan
+                if x.own_s > _MAX_READY_WAIT_S:
+                    took = since
+                else:
+                    took = math.nan
             elif isinstance(command, c.XrayOn):
                 since = 0.0
             # An axis's place before its first move is unknown.
@@ -453,8 +458,12 @@ def _timing(
     """
     shifts = [fmean(found) for times in samples.values() if (found := _later(times))]
     shift = fmean(shifts) if shifts else 0.0
-    unsure = variance(shifts) / len(shifts) if len(shifts) > 1 else 0.0
-    sure = max(0.0, 1.0 - unsure / shift / shift) if shift else 0.0
+    unsure = 0.0
+    if len(shifts) > 1:
+        unsure = variance(shifts) / len(shifts)
+    sure = 0.0
+    if shift:
+        sure = max(0.0, 1.0 - unsure / shift / shift)
     # From the middle of the earlier half to that of the later it is half of the logs, from the
     # middle of all logs to that of the next scan half of them and half a scan.
     shift *= 1.0 + 1.0 / logs

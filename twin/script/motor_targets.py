@@ -178,4 +178,6 @@ def beside_beam(
         {name: round(min(max(middle + way, least), most), 6)} for way in (away, -away)
     )
     freer = middle - axis.lower > axis.upper - middle
-    return (lower, upper) if freer else (upper, lower)
+    if freer:
+        return (lower, upper)
+    return (upper, lower)

@@ -84,17 +84,19 @@ class CodeLine:
 def decode(data: str | bytes) -> str:
     """Decode a script's bytes; those that are not UTF-8 become lone surrogates
     (`encode` undoes it)."""
-    text = data.decode("utf-8", "surrogateescape") if isinstance(data, bytes) else data
+    if isinstance(data, bytes):
+        text = data.decode("utf-8", "surrogateescape")
+    else:
+        text = data
     return text.removeprefix("\ufeff")
 
 
 def is_utf16(data: str | bytes) -> bool:
     """Return whether the text was saved in two bytes a character, which no scanner does."""
-    head = (
-        data[:40]
-        if isinstance(data, bytes)
-        else data[:40].encode("utf-8", "surrogatepass")
-    )
+    if isinstance(data, bytes):
+        head = data[:40]
+    else:
+        head = data[:40].encode("utf-8", "surrogatepass")
     return head[:2] in (b"\xff\xfe", b"\xfe\xff") or (
         len(head) >= 4 and not (any(head[0::2]) and any(head[1::2]))
     )
@@ -180,7 +182,10 @@ def _columns(text: str) -> tuple[Field, ...]:
     fields: list[Field] = []
     start = 0
     for i, piece in enumerate(text.split("\t")):
-        cut = _TAIL_COMMENT.sub("", piece) if i >= 4 and piece else piece
+        if i >= 4 and piece:
+            cut = _TAIL_COMMENT.sub("", piece)
+        else:
+            cut = piece
         fields.append(_field(cut, start))
         if cut is not piece and cut != piece:
             break
@@ -225,7 +230,9 @@ def _field(piece: str, start: int, *, keep: bool = False) -> Field:
     if keep or not piece:
         return Field(piece, start + 1)
     stripped = piece.strip(_BLANK)
-    lead = len(piece) - len(piece.lstrip(_BLANK)) if stripped else 0
+    lead = 0
+    if stripped:
+        lead = len(piece) - len(piece.lstrip(_BLANK))
     return Field(stripped, start + lead + 1)
 
 
@@ -337,7 +344,10 @@ class _Line:
     def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
         self.row = row
         self.problems = problems
-        self.component = row.columns[0] if row.columns else row.words()[0]
+        if row.columns:
+            self.component = row.columns[0]
+        else:
+            self.component = row.words()[0]
         self.end = Field("", len(row.text) + 1)
 
     def error(self, code: str, column: int, message: str) -> None:
@@ -355,11 +365,10 @@ class _Line:
         try:
             if not self.component.text:
                 raise _Refused("syntax", 1, "the component (first column) is missing")
-            parts = (
-                self._padded()
-                if self.row.columns is None
-                else self._tabbed(self.row.columns)
-            )
+            if self.row.columns is None:
+                parts = self._padded()
+            else:
+                parts = self._tabbed(self.row.columns)
             if parts is None:
                 return self._unknown()
             return self._build(parts)
@@ -376,8 +385,13 @@ class _Line:
         Raises:
             _Refused: text in a column beyond the seventh.
         """
-        verb = columns[1] if len(columns) > 1 else self.end
-        spec = grammar.find(self.component.text, verb.text) if verb.text else None
+        if len(columns) > 1:
+            verb = columns[1]
+        else:
+            verb = self.end
+        spec = None
+        if verb.text:
+            spec = grammar.find(self.component.text, verb.text)
         if spec is None:  # a multi-word command may be split over columns here too
             return self._padded()
         rest = (*columns[2:], *[self.end] * 5)
@@ -412,7 +426,10 @@ class _Line:
             )
         tail = _until_comment(words[at + width : at + width + 3])[:2]
         # One number after the wait is in the place of the TAB form's expected duration.
-        timeout, expected = tail if len(tail) == 2 else (self.end, *tail, self.end)[:2]
+        if len(tail) == 2:
+            timeout, expected = tail
+        else:
+            timeout, expected = (self.end, *tail, self.end)[:2]
         first, second = self._arguments(spec, words[start:at])
         return _Parts(spec, first, second, wait, timeout, expected)
 
@@ -469,11 +486,10 @@ class _Line:
                 raise _Refused(
                     "syntax", self.end.column, f"{name} without a command{knows}"
                 )
-            asked = (
-                fields[0].text
-                if self.row.columns
-                else " ".join(f.text for f in fields[:3])
-            )
+            if self.row.columns:
+                asked = fields[0].text
+            else:
+                asked = " ".join(f.text for f in fields[:3])
             what = (
                 f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}{knows}"
             )
@@ -540,9 +556,10 @@ class _Line:
             ("expected_ms", parts.expected),
         ):
             try:
-                fields[key] = (
-                    grammar.not_negative(field.text, key) if field.text else None
-                )
+                if field.text:
+                    fields[key] = grammar.not_negative(field.text, key)
+                else:
+                    fields[key] = None
             except ArgumentError as error:
                 self.error("value", field.column, str(error))
         if any(p.severity == "error" for p in self.problems[before:]):

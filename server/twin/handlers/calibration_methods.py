@@ -125,5 +125,7 @@ async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> 
     result.
     """
     job = twin.jobs.current
-    running = "" if job is None else Path(job.folder).name
+    running = ""
+    if job is not None:
+        running = Path(job.folder).name
     return await twin.past_scans.ask(params, running, client.peer.codec)

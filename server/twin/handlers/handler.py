@@ -172,7 +172,10 @@ async def change_stage(
             has changed (see `ScannerTwin.take_stage`).
         DatasetWriteError: it cannot be written; nothing has changed.
     """
-    names = twin.corrections.history if history is None else history
+    if history is None:
+        names = twin.corrections.history
+    else:
+        names = history
     scanner = twin.scanner
     scanner.require_applicable(correction)  # before anything is built of it
     guard = await twin.guard(sample, correction, upload)
@@ -196,7 +199,8 @@ async def change_stage(
 
     def after(memory: Memory) -> Memory:
         trial = copy.copy(scanner)
-        trial.sample, trial.correction = sample, correction
+        trial.sample = sample
+        trial.correction = correction
         if scene is not None:
             apply_settings(scene, trial)
         return as_of(memory, trial, twin.corrections.in_state(names))

@@ -55,8 +55,11 @@ async def get_projection(
 
     def work() -> Encoded:
         """Compute and encode in a thread, as an image has some megabytes."""
-        view, way = ImageWish(params.kind, params.binning), twin.radiography
-        rng = None if elsewhere else np.random.default_rng()
+        view = ImageWish(params.kind, params.binning)
+        way = twin.radiography
+        rng = None
+        if not elsewhere:
+            rng = np.random.default_rng()
         made = image_of(radiograph, cone, shot, view, way, rng)
         if params.marks:
             marks = marks_of(way, radiograph, shot.camera, shot.exposure, params.binning)
@@ -68,7 +71,8 @@ async def get_projection(
 
 
 def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
-    machine, asked = twin.machine, params.tube or TubeSet()
+    machine = twin.machine
+    asked = params.tube or TubeSet()
     tube = changed_tube(machine.tube, shot.tube, asked.kV, asked.power_W)
     tube = switched(
         machine, tube, tube.on if asked.on is None else asked.on, None, warm=True
@@ -82,7 +86,8 @@ def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
     rows, cols = (n // params.binning for n in shape)
     size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
-    size = size if codec is Codec.MSGPACK else size * 4 // 3
+    if codec is not Codec.MSGPACK:
+        size = size * 4 // 3
     most = MAX_ANSWER[codec] - 4096  # beside the pixels
     if size > most:
         raise too_large("an image", size, most)
@@ -126,13 +131,17 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
     Raises:
         LimitError: the stage is empty, or a setting is beyond the machine's limits.
     """
-    sample, scanner = twin.scanner.sample, twin.scanner
+    sample = twin.scanner.sample
+    scanner = twin.scanner
     name = params.sample or sample.name
     if not name or name == EMPTY:
         raise LimitError("nothing stands on the stage", {"asked": "exposure.predict"})
-    material = sample.material if name == sample.name else None
+    material = None
+    if name == sample.name:
+        material = sample.material
     at = twin.state().geometry
-    lit, camera = scanner.tube, scanner.camera
+    lit = scanner.tube
+    camera = scanner.camera
     settings = {
         "kV": lit.kV if params.kV is None else params.kV,
         "power_W": lit.power_W if params.power_W is None else params.power_W,

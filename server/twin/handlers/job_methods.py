@@ -106,7 +106,10 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
         reason = from_root(str(error), twin.root)
         unsaved = f"the abort is not on the disk, and a killed server would not know it: {reason}"
     status = await _when(twin, job, lambda: job.phase in ENDED)
-    warnings = [*status.warnings, unsaved] if unsaved else status.warnings
+    if unsaved:
+        warnings = [*status.warnings, unsaved]
+    else:
+        warnings = status.warnings
     return status.model_copy(update={"warnings": warnings})
 
 
@@ -155,7 +158,9 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
 
 def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
     """Return the status of a job that is to continue, or raise if an obstacle blocks it."""
-    error = job.runner.progress.error if job.runner is not None else None
+    error = None
+    if job.runner is not None:
+        error = job.runner.progress.error
     if status.state == "paused" and isinstance(error, CollisionError):
         raise error
     return status

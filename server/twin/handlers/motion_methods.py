@@ -36,11 +36,13 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
         durations = twin.scanner.move(
             params.targets, now, relative=params.relative, shortest=params.shortest
         )
-    warnings, arrived = told, None
+    warnings = told
+    arrived = None
     if params.wait:
         wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
         short = await _unreached_targets(twin, wanted)
-        warnings, arrived = [*told, *short], not short
+        warnings = [*told, *short]
+        arrived = not short
     seconds = max(durations.values(), default=0.0)
     return p.MoveResult(
         duration_s=seconds, warnings=warnings, moves=None, arrived=arrived
@@ -93,14 +95,16 @@ async def _move_around_obstacles(
             twin.tell("warning", f"the way around ended early: {task.exception()}")
 
     task.add_done_callback(report)
-    warnings, arrived = [*told, *way.warnings], None
+    warnings = [*told, *way.warnings]
+    arrived = None
     moves = [dict(leg) for leg in way.legs]
     if params.wait:
         short = await finished(task)
         short += await _unreached_targets(
             twin, {m: t for leg in moves for m, t in leg.items()}
         )
-        warnings, arrived = warnings + short, not short
+        warnings = warnings + short
+        arrived = not short
     return p.MoveResult(
         duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived
     )
@@ -219,6 +223,8 @@ async def set_camera(
 
 def camera_change(params: p.CameraSet) -> CameraChange:
     """Convert the parameters to the twin's form."""
-    roi = None if params.roi is None else Roi(*params.roi)
+    roi = None
+    if params.roi is not None:
+        roi = Roi(*params.roi)
     change: CameraChange = {**params.model_dump(), "roi": roi}  # type: ignore[typeddict-item]
     return change

@@ -26,16 +26,18 @@ async def set_sample(
     twin: TwinServer, client: h.Client, params: p.SampleSet
 ) -> p.SampleResult:
     """Put a shipped phantom or an upload on the stage; without an offset it is centred."""
-    name = params.file if params.name is None else params.name
+    if params.name is None:
+        name = params.file
+    else:
+        name = params.name
     assert name is not None
     head = twin.samples.head(name)
     if params.file is not None and head is None:
         raise _unknown(twin, name)
-    offset = (
-        StagePlacement()
-        if params.offset is None
-        else StagePlacement(**params.offset.model_dump())
-    )
+    if params.offset is None:
+        offset = StagePlacement()
+    else:
+        offset = StagePlacement(**params.offset.model_dump())
     if name == EMPTY:
         sample = Sample()
     else:
@@ -151,7 +153,8 @@ async def delete(
     twin: TwinServer, client: h.Client, params: p.SampleDelete
 ) -> p.SampleDeleteResult:
     """Delete an upload, unless it is on the stage or in a scan that has not ended."""
-    name, ready = params.name, h.ensure_allowed(twin, client, "sample.delete")
+    name = params.name
+    ready = h.ensure_allowed(twin, client, "sample.delete")
     async with twin.samples.turn, twin.stage_turn:
         head = twin.samples.head(name)
         if head is None:
@@ -221,12 +224,12 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
 def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
     uploads = list(twin.samples.uploads)[-MAX_NAMED_UPLOADS:]
     older = len(twin.samples.uploads) - len(uploads)
-    more = f"{older} older ones and " if older else ""
-    there = (
-        f"there are: {more}{', '.join(uploads)}"
-        if uploads
-        else "nothing has been uploaded yet"
-    )
+    more = ""
+    if older:
+        more = f"{older} older ones and "
+    there = "nothing has been uploaded yet"
+    if uploads:
+        there = f"there are: {more}{', '.join(uploads)}"
     return UnknownNameError(
         f"no upload called {name!r}; {there}", {"asked": name, "allowed": uploads}
     )

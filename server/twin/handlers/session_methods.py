@@ -113,7 +113,8 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
     """Load a scene: check all of it, the motion included, then apply it and start the
     motors.
     """
-    scene, stops = params.document, twin.scanner.stops
+    scene = params.document
+    stops = twin.scanner.stops
     require_fit(scene, twin.scanner)
     sample = sample_of(scene)
     if sample.name:
@@ -130,11 +131,14 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
 
     ready()
     async with twin.stage_turn:
-        correction, in_force = None, twin.corrections.in_force
+        correction = None
+        in_force = twin.corrections.in_force
         if scene.correction is not None:
             c = scene.correction
             correction = twin.corrections.make(c.parameters, c.name, c.comment)
-        history = None if correction == in_force else twin.corrections.after(correction)
+        history = None
+        if correction != in_force:
+            history = twin.corrections.after(correction)
         warnings = await change_stage(
             twin, sample, correction, ready, history=history, source="scene", scene=scene
         )

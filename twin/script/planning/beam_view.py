@@ -91,7 +91,9 @@ def views(plan: ScanPlan) -> Iterator[View]:
         if g.files and min(g.camera.shape) > 0:
             camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
             index, lines = batches.setdefault((camera, g.kind), ([], []))
-            count = min(len(g), _SAMPLED_IMAGES) if g.moving else 1
+            count = 1
+            if g.moving:
+                count = min(len(g), _SAMPLED_IMAGES)
             probes = np.linspace(0, len(g) - 1, count).round().astype(int).tolist()
             index += [first + i for i in probes]
             lines += [g.line] * len(probes)
@@ -118,7 +120,9 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
 def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
     """Make one warning for all images of a view that are `bad`."""
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
-    more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
+    more = ""
+    if len(lines) > 1:
+        more = f" (and at {len(lines) - 1} more lines)"
     return ScriptProblem("warning", code, lines[0], 1, text + more)
 
 
@@ -129,7 +133,9 @@ def _outside_text(view: View) -> str:
     side = "above or below"
     sides = f"rows 0 to {rows - 1}"
     if view.right[i] < -0.5 or view.left[i] > cols - 0.5:
-        side = "left" if view.right[i] < -0.5 else "right"
+        side = "right"
+        if view.right[i] < -0.5:
+            side = "left"
         sides = f"columns 0 to {cols - 1}"
         side += " of"
     return (

@@ -48,7 +48,8 @@ _OF_STEP = (
     "what",
 )
 HOME_ASSUMED = "the machine's home, assumed"
-EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
+EMPTY = "none"
+EMPTY_ASSUMED = "empty stage assumed"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -264,7 +265,9 @@ class CheckReport(WithProblems):
 
     def __repr__(self) -> str:
         """One line."""
-        hits = len(self.clearance.collisions) if self.clearance else 0
+        hits = 0
+        if self.clearance:
+            hits = len(self.clearance.collisions)
         return (
             f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of "
             f"{self.plan!r}>"
@@ -291,7 +294,9 @@ class CheckReport(WithProblems):
             if self.start_known:
                 return EMPTY
             return f"{EMPTY} ({EMPTY_ASSUMED})"
-        high = f", {size.height_mm:g} mm high" if size.height_mm else ""
+        high = ""
+        if size.height_mm:
+            high = f", {size.height_mm:g} mm high"
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     def to_dict(self) -> dict[str, object]:

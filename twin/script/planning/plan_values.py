@@ -179,7 +179,10 @@ class SampleSize:
     ) -> SampleSize:
         """Make the cylinder that contains a box of `size_mm` (x, y, z) at `offset`,
         at every angle."""
-        at = StagePlacement() if offset is None else offset
+        if offset is None:
+            at = StagePlacement()
+        else:
+            at = offset
         x, y, z = size_mm
         radius = 0.5 * math.hypot(x, y)
         if at.rx or at.ry:

@@ -351,8 +351,12 @@ class ImageCollector:
             trigger.
         """
         camera = self.camera
-        averages = camera.settings.averages if "averages" in camera.said else None
-        frames = camera.settings.frames if "frames" in camera.said else None
+        averages = None
+        if "averages" in camera.said:
+            averages = camera.settings.averages
+        frames = None
+        if "frames" in camera.said:
+            frames = camera.settings.frames
         found = None
         if trigger is not None:
             exposure_s = camera.settings.exposure_ms / 1000.0
@@ -368,11 +372,9 @@ class ImageCollector:
             self._complained.add("averages")
         if frames is None:
             count = 1 if found is None else found.frames
-            how = (
-                "1 is assumed"
-                if found is None
-                else f"inferred from {found.notes['frames']}"
-            )
+            how = "1 is assumed"
+            if found is not None:
+                how = f"inferred from {found.notes['frames']}"
             self.findings.warn("frames_unsaid", f"the number of frames is not set; {how}")
             camera.assume("frames", count)
         return found
@@ -395,7 +397,9 @@ class ImageCollector:
         trajectory = trigger.trajectory
         unit = trigger.unit
         speed = trigger.speed
-        sign = 1.0 if trajectory.target >= trigger.position else -1.0
+        sign = -1.0
+        if trajectory.target >= trigger.position:
+            sign = 1.0
         count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
         if late > _TIME_TOLERANCE_S:
@@ -413,9 +417,10 @@ class ImageCollector:
                 "steps of "
                 f"{found.increment:.9g} {unit}",
             )
-        first = (
-            trigger.position if late <= _TIME_TOLERANCE_S else trajectory.position(start)
-        )
+        if late <= _TIME_TOLERANCE_S:
+            first = trigger.position
+        else:
+            first = trajectory.position(start)
         wanted = first + sign * found.increment * count
         starts = start + found.increment / speed * count
         off = np.abs(trajectory.positions(starts) - wanted) > _POSITION_TOLERANCE
@@ -451,7 +456,9 @@ class ImageCollector:
         if draft.kind == "dark" and draft.xrays_on:
             self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
         if draft.kind != "dark" and not draft.xrays_on:
-            what = "a flat image is" if draft.kind == "flat" else "projections are"
+            what = "projections are"
+            if draft.kind == "flat":
+                what = "a flat image is"
             self.findings.warn("xrays_off", f"{what} taken with X-rays off")
 
     def _unsaid(self, draft: ExposureGroup) -> None:

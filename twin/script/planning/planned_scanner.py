@@ -83,7 +83,9 @@ class Motor:
         self, target: float, time: float, speed: float, acceleration: float
     ) -> Trajectory:
         """Start a move to `target` at `time`, from the current position and velocity."""
-        v = self.moves[-1][1].velocity(time) if self.moves else 0.0
+        v = 0.0
+        if self.moves:
+            v = self.moves[-1][1].velocity(time)
         trajectory = motion.move(
             self.position(time), v, target, speed, acceleration, time
         )

@@ -61,8 +61,12 @@ def plan_script(
     """
     if not isinstance(script, c.Script):
         script = parse_script(script)
-    machine = builtin_machine() if machine is None else machine
-    begin = StartState.of(machine) if start is None else start
+    if machine is None:
+        machine = builtin_machine()
+    if start is None:
+        begin = StartState.of(machine)
+    else:
+        begin = start
     s = simulated(script.commands, machine, begin)
     end = s.end
     plan = ScanPlan(

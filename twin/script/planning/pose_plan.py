@@ -80,9 +80,15 @@ def plan_poses(
     for axis in (name for pose in (*poses, asked) for name in pose):
         if not machine.has(axis):
             raise unknown_axis(axis, machine)
-    begin = StartState.of(machine) if start is None else start
+    if start is None:
+        begin = StartState.of(machine)
+    else:
+        begin = start
     camera = begin.camera
-    exposure = camera.exposure_ms if exposure_ms is None else exposure_ms
+    if exposure_ms is None:
+        exposure = camera.exposure_ms
+    else:
+        exposure = exposure_ms
     commands: list[c.Command] = [
         c.SetMode(mode=camera.mode),
         c.SetRoi(roi=camera.roi),
@@ -99,7 +105,9 @@ def plan_poses(
     else:
         first = _arrival(begin.positions, poses[0], machine, begin)
         if flat is True:
-            radius = 0.0 if sample is None else sample.diameter_mm / 2
+            radius = 0.0
+            if sample is not None:
+                radius = sample.diameter_mm / 2
             sides = beside_beam(machine, profile, camera, first, radius)
             places = [{**first, **side} for side in sides]
         else:

@@ -134,7 +134,9 @@ def _predicted(
         made = replace(
             made, open_beam_fill=beam.fill, doubts=() if doubt is None else (doubt,)
         )
-        known = "saturated" if beam.saturated else "starved" if beam.starved else ""
+        known = "saturated"
+        if not beam.saturated:
+            known = "starved" if beam.starved else ""
     doubts = [text for name, text in _sentences(seen) if name != known]
     return replace(made, doubts=(*made.doubts, *doubts))
 

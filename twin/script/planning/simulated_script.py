@@ -247,7 +247,9 @@ class Simulation:
             changed_camera(self.machine.detector, now, change)
         except LimitError as error:
             region = "edge" in error.data or "binning" in error.data
-            code = "limit" if "setting" in error.data else "roi" if region else "mode"
+            code = "limit"
+            if "setting" not in error.data:
+                code = "roi" if region else "mode"
             self.findings.error(code, error.message)
             value = getattr(now, name)
         self.camera.set(name, value)
@@ -281,7 +283,9 @@ class Simulation:
         """
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
-        what: Rate = "speed" if isinstance(command, c.SetSpeed) else "acceleration"
+        what: Rate = "acceleration"
+        if isinstance(command, c.SetSpeed):
+            what = "speed"
         asked = getattr(command, what)
         found = rate(self.machine, command.component, what, asked)
         note = ""
@@ -334,7 +338,9 @@ class Simulation:
             release = self._pass(command, command.trigger, trajectories, begin, end)
         if command.wait is not c.Wait.ACK:
             return planned.Span(self.now, end, release=release, note=note)
-        kind = "move" if end > self.now else "move_standing"
+        kind = "move_standing"
+        if end > self.now:
+            kind = "move"
         return self.timed(kind, end - self.now, note)
 
     def _pass(
@@ -359,10 +365,13 @@ class Simulation:
             trigger.
         """
         virtual = self.machine.virtual_axes.get(command.component)
-        motor = command.component if virtual is None else virtual.of
-        position = (
-            trigger if virtual is None else (trigger - virtual.constant) / virtual.factor
-        )
+        if virtual is None:
+            motor = command.component
+        else:
+            motor = virtual.of
+        position = trigger
+        if virtual is not None:
+            position = (trigger - virtual.constant) / virtual.factor
         trajectory = made[motor]
         time = trajectory.time_at(position)
         if time is None:

@@ -51,7 +51,9 @@ def total_range(
     squares = [0.0, 0.0]
     common = 0.0
     for kind, count in Counter(step.kind for step in steps).items():
-        n = timing.spread[kind].n if kind in timing.spread else 1
+        n = 1
+        if kind in timing.spread:
+            n = timing.spread[kind].n
         common += count * timing.drift * timing.seconds(kind)
         for i, margin in enumerate(_margins(kind, timing)):
             squares[i] += (count + count**2 / n) / (1.0 + 1.0 / n) * margin**2
