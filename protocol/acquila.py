@@ -149,14 +149,20 @@ class AcquilaEvent:
 def parse_event(data: bytes | str) -> AcquilaEvent:
     """Parse one event from JSON.
 
-    Missing and null texts become "", numbers in arguments their text.
+    Missing and null texts become "", numbers in arguments their text. The component is
+    stripped, runs of blanks in the command become one, and the reply type is mapped to
+    the scanner's spelling.
 
     Args:
-        data: one JSON object, at most `MAX_BYTES`.
+        data: one JSON object, at most `MAX_BYTES`; control characters inside texts are
+            allowed.
+
+    Returns:
+        The event, with every field checked.
 
     Raises:
-        AcquilaError: not a JSON object with a component and a command, or a field that is
-            too long or has characters that no event can carry.
+        AcquilaError: not a JSON object with a component and a command, an unknown reply
+            type, or a field that is too long or has characters that no event can carry.
     """
     if len(data) > MAX_BYTES:
         raise AcquilaError(f"an event of {len(data)} bytes; allowed: {MAX_BYTES}")
@@ -236,10 +242,19 @@ def _attribute(name: str) -> str:
 
 
 def _text(content: Mapping[str, object], name: str) -> str:
-    """Read a text field; a number or a truth value becomes the text that scripts use.
+    """Read one text field of an event; a number becomes its text, a truth value TRUE or
+    FALSE.
+
+    Args:
+        content: the event's JSON object.
+        name: of the field; missing or null gives "".
+
+    Returns:
+        The text, checked by `_plain`.
 
     Raises:
-        AcquilaError: any other value.
+        AcquilaError: a list or an object, or a text that is too long or has characters
+            that no event can carry.
     """
     value = content.get(name, "")
     match value:
@@ -256,6 +271,11 @@ def _text(content: Mapping[str, object], name: str) -> str:
 
 def _plain(name: str, text: str) -> str:
     """Check a field's length and characters, and return the text unchanged.
+
+    Args:
+        name: of the field, which has its own limit in `MAX_CHARS`; binary fields may hold
+            control characters.
+        text: the field's value.
 
     Raises:
         AcquilaError: too long, or characters that no event can carry.
@@ -286,7 +306,11 @@ def _whole(value: object) -> int:
 
 
 def _uuid(value: object) -> int | float | str:
-    """Return a UUID unchanged, or 0 for null; raise AcquilaError for other types."""
+    """Return a UUID (a number below `MAX_UUID` or a text) unchanged, or 0 for null.
+
+    Raises:
+        AcquilaError: another type, a greater number, or a text that no event can carry.
+    """
     if isinstance(value, str):
         return _plain("UUID", value)
     if value is None:

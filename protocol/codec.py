@@ -86,10 +86,12 @@ def json_pieces(document: object) -> list[bytes]:
         document: plain data, with bytes where the wire has binary values.
 
     Returns:
-        The document's parts in order, as bytes.
+        The document's parts in order, as bytes: ASCII text, and base64 of at most
+        `PIECE_BYTES` of a value each.
 
     Raises:
-        ValueError, TypeError: as there.
+        ValueError, TypeError: as `write_json`, for NaN, infinity and types that JSON
+            lacks.
     """
     large: list[bytes | memoryview] = []
 
@@ -124,7 +126,8 @@ def read_msgpack(data: bytes | bytearray | memoryview) -> object:
         Plain data: dict, list, str, bytes, numbers, None.
 
     Raises:
-        ValueError: names the problem.
+        ValueError: incomplete, followed by more bytes, nested deeper than `MAX_DEPTH`, no
+            UTF-8, an extension type or a timestamp; the message says which.
     """
     size = len(data)
     # A first pass that builds nothing: every declared member must be there, or else a few bytes
@@ -191,7 +194,8 @@ def _no_extension(code: int, data: bytes) -> object:
 
 
 def _plain(value: object) -> object:
-    """Convert models, arrays, NumPy numbers, sets and mappings to plain Python values.
+    """Convert a value that an encoder does not know to plain Python: models, arrays,
+    NumPy numbers, sets (sorted lists) and mappings.
 
     Raises:
         TypeError: anything else.

@@ -172,7 +172,15 @@ class Connection:
             )
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
-        """Receive bytes without decoding them; `next_raw` returns the complete messages."""
+        """Divide received bytes into complete messages, which wait undecoded for
+        `next_raw`.
+
+        The first byte decides the codec if none was given: 0 begins a MessagePack frame.
+        After a fatal error, and once closed, bytes are ignored.
+
+        Args:
+            data: any part of the stream, also an empty one.
+        """
         self._fed = len(self._new)
         if self.closed or self._broken or not data:
             return
@@ -187,7 +195,12 @@ class Connection:
             self._feed_frames(data)
 
     def _feed_lines(self, data: bytes) -> None:
-        """Divide JSON lines; a chunk of many short lines is split at once."""
+        """Divide received bytes into JSON lines; a chunk of many short lines is split at
+        once.
+
+        Args:
+            data: received bytes, any part of the stream.
+        """
         first = data.find(b"\n") + 1
         last = data.rfind(b"\n") + 1
         if first == last or len(data) > self.max_message or _may_hold_http(data):
@@ -202,7 +215,8 @@ class Connection:
             self._begun += data[last:]
 
     def _feed_each_line(self, data: bytes) -> None:
-        """Divide JSON lines one by one; reject HTTP and lines that are too long.
+        """Divide JSON lines one by one; queue an error for HTTP (fatal) and for lines
+        that are too long.
 
         Args:
             data: received bytes, any part of the stream.
@@ -230,7 +244,11 @@ class Connection:
             self._refuse(too_large("a line", f"at least {came}", self.max_message))
 
     def _feed_frames(self, data: bytes | bytearray | memoryview) -> None:
-        """Divide MessagePack frames; skip the rest of one that is too long.
+        """Divide MessagePack frames; queue an error for one that is too long, and skip
+        its rest.
+
+        A length above `MAX_FRAME` is a fatal error, as the stream has no known next frame
+        then.
 
         Args:
             data: received bytes, any part of the stream.
@@ -297,7 +315,7 @@ class Connection:
     def overtake(
         self, names: Collection[bytes], wanted: Callable[[bytes], bool], most: int = 32
     ) -> list[bytes]:
-        """Take out urgent messages before their turn.
+        """Take urgent messages out of the queue before their turn.
 
         Every message up to `MAX_OVERTAKING_BYTES` is examined once: first its bytes are
         searched for `names`, which is fast, and only a message with a match is passed to
@@ -310,7 +328,7 @@ class Connection:
                 then true if more remain.
 
         Returns:
-            The bytes of the messages taken out, in order.
+            The bytes of the messages taken out, in order; `next_raw` never returns these.
         """
         out = list[bytes]()
         looked = 0
@@ -416,7 +434,18 @@ def encoded(result: object, codec: Codec) -> Encoded:
 
 
 def _body(codec: Codec, message: Message) -> list[bytes]:
-    """Encode a message without framing; an `Encoded` result is inserted as it is."""
+    """Encode a message without framing; an `Encoded` result is inserted as it is.
+
+    Args:
+        codec: of the connection.
+        message: an answer, a call or a batch.
+
+    Returns:
+        The parts of the message in order, as bytes.
+
+    Raises:
+        ValueError, TypeError, OverflowError: a value that the codec cannot hold.
+    """
     match message:
         case Response(id, Encoded(pieces)) if codec is Codec.JSON:
             return [
@@ -464,10 +493,15 @@ def frame_head(size: int) -> bytes:
 
 
 def pack(message: Message) -> tuple[bytes, memoryview | None]:
-    """Encode a frame as its length and head, and the payload that follows (or None).
+    """Encode a message as a frame: its length and head, and the payload that follows
+    without a copy.
 
     Args:
-        message: what the frame carries.
+        message: its innermost `data` may be bytes of any size.
+
+    Returns:
+        The first bytes of the frame, and a large `data` as a view; None where the first
+        bytes are the whole frame.
 
     Raises:
         RpcError: -32008, a frame of 16 MiB or more.
@@ -513,7 +547,7 @@ def _large(data: object) -> memoryview | None:
 
 
 def _split(body: memoryview) -> object | None:
-    """Decode a frame with `data` as a view of `body`, or return None.
+    """Decode a frame with a large `data` as a view of `body`, without a copy.
 
     The head of the frame is searched for `data` with a 32-bit length that reaches exactly
     to the end of the frame. The same bytes may occur inside another value, so each
@@ -545,7 +579,15 @@ def _split(body: memoryview) -> object | None:
 
 
 def _with_payload(head: bytes, payload: memoryview) -> object | None:
-    """Decode `head` and put `payload` in place of its last `data`; None if it lacks none."""
+    """Decode a frame's head and put `payload` in place of its last `data`.
+
+    Args:
+        head: MessagePack up to the type byte of `data`.
+        payload: the bytes of `data`.
+
+    Returns:
+        The document; None if `head` is no MessagePack with an innermost `data`.
+    """
     try:
         document = codecs.read_msgpack(head + _EMPTY_BIN)
     except ValueError:

@@ -73,7 +73,12 @@ def lines(value: str) -> str:
 
 
 def plain_name(value: str) -> str:
-    """Check that a name can become a file's name."""
+    """Check that a name can become a file's name, and return it.
+
+    Raises:
+        ValueError: a slash, backslash or control character, or more than `MAX_STEM` bytes
+            once percent-encoded.
+    """
     if "/" in value or "\\" in value or _CONTROL_CHARACTER.search(value):
         raise ValueError("a name may hold anything but /, \\ and control characters")
     if (size := len(encoded(value))) > MAX_STEM:

@@ -41,7 +41,12 @@ def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
 
 
 def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
-    """Convert an image value to an array, read-only, without a copy where `data` is bytes.
+    """Convert an image value to an array, read-only, without a copy where `data` is
+    bytes.
+
+    Args:
+        value: a mapping with dtype (one of `DTYPES`), shape (up to four sizes) and data
+            (bytes, or base64 text).
 
     Raises:
         RpcError: -32602, naming what does not fit.
@@ -62,7 +67,12 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
 def from_bytes(
     data: bytes | memoryview, dtype: str, shape: Sequence[int]
 ) -> npt.NDArray[np.generic]:
-    """View raw little-endian bytes as a read-only array of `shape`.
+    """View raw bytes as a read-only array of `shape`, without a copy.
+
+    Args:
+        data: little-endian values in C order.
+        dtype: name of `DTYPES`.
+        shape: sizes; their product gives the number of values.
 
     Raises:
         RpcError: -32602, the number of bytes does not match.

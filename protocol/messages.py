@@ -193,10 +193,14 @@ def _call(plain: dict[str, object], params: Params) -> dict[str, object]:
 
 
 def _single(document: object) -> Single:
-    """Convert one document; anything wrong becomes `Malformed` with its id.
+    """Convert one document of a codec to a message; raises nothing.
 
     Args:
         document: plain data; not a batch.
+
+    Returns:
+        A request, notification, response or failure; `Malformed` with the error and,
+        where known, the id for anything that JSON-RPC does not allow.
     """
     if not isinstance(document, dict):
         return Malformed(invalid_request(f"expected an object, got {_kind(document)}"))
@@ -483,7 +487,14 @@ class Correlation(Generic[_W]):
     def _receive_call(
         self, message: Message
     ) -> list[Answered[_W] | Request | Notification]:
-        """Register a client's call as open.
+        """Register a client's call as open, and return it in a list.
+
+        Args:
+            message: of a client; not a batch.
+
+        Returns:
+            The request or notification; an empty list for a malformed message, whose id
+            is owed an answer all the same.
 
         Raises:
             ProtocolError: an answer instead of a call.
@@ -522,7 +533,16 @@ def hello_params(client: str, token: str | None) -> dict[str, object]:
 
 
 def _require_text_names(value: object, where: str) -> None:
-    """Raise TypeError if a name in nested `value` is not text."""
+    """Check that all names in nested data are text, which JSON would silently make of
+    numbers.
+
+    Args:
+        value: parameters of a call.
+        where: path of `value`, for the message.
+
+    Raises:
+        TypeError: a name of another type; says where.
+    """
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if not isinstance(name, str):

@@ -88,8 +88,16 @@ def parse_params(
 ) -> _P:
     """Validate the parameters of a call, given by name, by position, or not at all.
 
+    Args:
+        method: the called method.
+        given: names and values, or values in the order of the method's fields, or None.
+
+    Returns:
+        The model of the method's parameters, with defaults filled in.
+
     Raises:
-        RpcError: -32602, every problem with its path and value.
+        RpcError: -32602, too many values, or every problem (at most 50) with its path and
+            value.
     """
     fields = method.params.model_fields
     if isinstance(given, list):
@@ -119,7 +127,11 @@ def parse_result(model: type[_M], given: object) -> _M:
 
 
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
-    """Convert a validation error to -32602; list at most 50 problems with path and value.
+    """Make the error -32602 of a validation error, with at most 50 problems; returned,
+    not raised.
+
+    Each problem in the error's data has the keys path, message, asked and, where there
+    are limits, allowed.
 
     Args:
         method: its name on the wire.

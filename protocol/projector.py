@@ -41,6 +41,15 @@ Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 
 
 def _rows(value: object) -> object:
+    """Convert rows of cone_vec to a float64 array (n, 12), contiguous.
+
+    Args:
+        value: an image value {dtype, shape, data}, or a list of rows of numbers.
+
+    Raises:
+        ValueError: another shape, truth values, no row or more than `MAX_VIEWS`, or a
+            number that is not finite or beyond `MAX_MM`.
+    """
     try:
         array = np.asarray(image.decode(value) if isinstance(value, Mapping) else value)
     except RpcError as error:
@@ -64,6 +73,11 @@ def _rows(value: object) -> object:
 
 
 def _stack(value: object) -> object:
+    """Convert an image value to projections, float32 of shape (n, rows, cols), read-only.
+
+    Raises:
+        ValueError: no image value, another type or shape, or an empty one.
+    """
     if not isinstance(value, Mapping):
         raise ValueError("projections must be an image value {dtype, shape, data}")
     try:
@@ -76,6 +90,11 @@ def _stack(value: object) -> object:
 
 
 def _buffer(value: object) -> object:
+    """View the bytes of a `data` field, raw or base64, as a read-only memoryview.
+
+    Raises:
+        ValueError: neither bytes nor base64.
+    """
     try:
         return memoryview(image.payload(value)).toreadonly()
     except RpcError as error:

@@ -169,11 +169,15 @@ def clip(value: object, limit: int = 200) -> str:
 
 
 def _brief(value: object, limit: int) -> str:
-    """Format like `repr`, but skip the parts that would be cut off.
+    """Format plain data like `repr`, but skip the parts that would be cut off.
 
     Args:
         value: plain data, of any size.
-        limit: number of characters that are needed.
+        limit: number of characters that are needed; the text may be longer.
+
+    Returns:
+        A text that agrees with `repr(value)` in about `limit` characters; "..." stands
+        for skipped members.
     """
     some = limit // 2
     match value:

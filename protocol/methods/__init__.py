@@ -88,12 +88,16 @@ def openrpc_document(
 
 
 def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
-    """Describe one method as OpenRPC does; `result` is the reference to its schema.
+    """Describe one method as OpenRPC does.
 
     Args:
         method: the method.
         schemas: model's name -> its JSON schema.
         result: reference to the schema of the result.
+
+    Returns:
+        A dict with the keys name, summary, paramStructure, params, result, x-control,
+        x-safe, x-urgent and, where it has limits, x-limits.
     """
     schema = schemas[method.params.__name__]
     required = schema.get("required", [])

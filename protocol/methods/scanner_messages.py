@@ -209,7 +209,12 @@ class SampleUpload(f.Params):
 
     @model_validator(mode="after")
     def _fits(self) -> SampleUpload:
-        """Check that the chunk fits into the total, and that format and kind agree."""
+        """Check that the chunk fits into the total, and that format, kind, material,
+        shape and voxel size agree.
+
+        Raises:
+            ValueError: names the first of these that does not.
+        """
         if self.start + len(self.data) > self.total:
             raise ValueError(
                 f"chunk ends at {self.start + len(self.data)}, total is {self.total}"

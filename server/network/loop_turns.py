@@ -32,8 +32,9 @@ class LoopTurns:
         await turn
 
     def _give(self) -> None:
-        """Give the first waiting connection of the lowest lane its turn, and
-        schedule the next."""
+        """Give the first waiting connection of the most urgent lane its turn; reschedule
+        if others wait.
+        """
         self._due = False
         for lane in self._lanes:
             while lane:

@@ -88,7 +88,15 @@ class Outbox:
         return body
 
     def event(self, message: m.Message | Prepared, slot: str | None) -> None:
-        """Send an event now, or keep it: newest of its slot, or (None) in order."""
+        """Send an event now, or keep it while the transport is full: newest of its slot,
+        or in order.
+
+        A connection with more than `max_events` unread is aborted.
+
+        Args:
+            message: notification, or its bytes.
+            slot: of which only the newest event is kept; None keeps all, in order.
+        """
         if self.over or self.link.transport.is_closing():
             return
         if slot is not None and not self.ready.is_set():
@@ -131,7 +139,9 @@ class Outbox:
         self.ready.clear()
 
     def resume(self) -> None:
-        """Write the queue, then the newest value of each slot: the transport takes more."""
+        """Mark the transport as ready; write the queue, then the newest value of each
+        slot, until it is full.
+        """
         self.ready.set()
         while self.queue and self.ready.is_set():
             data = self.queue.popleft()

@@ -32,15 +32,19 @@ async def answered(
     known: Collection[str],
     observe: Observe,
 ) -> m.Response | m.Failure:
-    """Await the answer to a request, count it, and log it at the level `debug`.
+    """Await the answer to a request, count it with its time, and log it at the level
+    `debug`.
 
     Args:
         work: makes the answer.
         method: requested.
         trace: id of the request in the logs.
         client: that sent it.
-        known: methods; others are counted together.
-        observe: counts.
+        known: methods; others are counted together, as "unknown".
+        observe: called with method, time taken [s], and error code or None.
+
+    Returns:
+        The answer of `work`, unchanged.
     """
     clock = asyncio.get_running_loop().time
     begun = clock()

@@ -110,7 +110,9 @@ class TcpServer(ListeningServer):
             asyncio.get_running_loop().call_soon(self._look)
 
     def _look(self) -> None:
-        """Search connections for urgent requests for up to `LOOK_S`; reschedule the rest."""
+        """Let waiting connections start their urgent requests, for up to `LOOK_S`;
+        reschedule the rest.
+        """
         until = time.perf_counter() + LOOK_S
         try:
             while self._to_look_at:
@@ -215,8 +217,10 @@ class _Link(asyncio.BufferedProtocol):
     # -- the transport's calls ---------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Set up a new connection, which waits for a place; open its session
-        without a token.
+        """Register a new connection in the waiting room and start serving it.
+
+        Without a token on the server, the application's session is opened at once; else a
+        deadline for the client's hello starts.
 
         Args:
             transport: of the connection.
@@ -239,8 +243,12 @@ class _Link(asyncio.BufferedProtocol):
         self.worker.add_done_callback(self._crashed)
 
     def _seat(self) -> bool:
-        """Give the connection a place, or a reserved one; return whether it has one
-        of its own."""
+        """Give the connection a place if one is free, else a reserved one, for urgent
+        requests alone.
+
+        Returns:
+            Whether it has a place of its own.
+        """
         server = self.server
         if self in server.links:
             return True
@@ -266,7 +274,11 @@ class _Link(asyncio.BufferedProtocol):
         self.data_received(bytes(self.read[:nbytes]))
 
     def data_received(self, data: bytes) -> None:
-        """Divide received bytes into messages; find E-stops at once, other urgent ones soon.
+        """Divide received bytes into messages; start E-stops at once, other urgent
+        requests soon.
+
+        Starts and stops the deadline of an incomplete message, and pauses reading while
+        too many messages wait.
 
         Args:
             data: any part of the stream.
@@ -339,7 +351,8 @@ class _Link(asyncio.BufferedProtocol):
         return self.transport.get_extra_info("ssl_object") is None
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel the work of an ended connection and close its session.
+        """Cancel the work of an ended connection, give back its place and close its
+        session.
 
         Args:
             exc: the reason, not used.
@@ -424,7 +437,7 @@ class _Link(asyncio.BufferedProtocol):
     # -- requests ----------------------------------------------------------------------------
 
     def _open(self) -> None:
-        """Admit the connection and open the application's session."""
+        """Admit the connection and open the application's session; abort if that fails."""
         self.let_in = True
         self.loop.call_soon(self.overtake)  # earlier messages were not examined
         self.deadlines.stop("hello")
@@ -464,8 +477,11 @@ class _Link(asyncio.BufferedProtocol):
         return self._lane(message) != loop_turns.ORDINARY
 
     async def _work(self) -> None:
-        """Serve the connection's messages in order, one in each turn, until its
-        stream has ended."""
+        """Serve the connection's messages in order, one in each turn; close after its
+        stream has ended.
+
+        A fatal error in the stream is answered and ends the connection at once.
+        """
         while True:
             while self.wire.whole:
                 await self.server.turns.take(
@@ -505,7 +521,15 @@ class _Link(asyncio.BufferedProtocol):
     async def _decoded(
         self, raw: bytes
     ) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
-        """Decode a message, a large one in another process; errors become `Malformed`."""
+        """Decode a message, a large one in another process; errors become `Malformed`,
+        nothing is raised.
+
+        Args:
+            raw: bytes of one message.
+
+        Returns:
+            The message; `Frozen` calls (a tuple for a batch) from the other process.
+        """
         read = self.server.read
         if not self.let_in and len(raw) > MAX_INLINE_BYTES:
             return m.Malformed(errors.not_authorised())
@@ -525,7 +549,13 @@ class _Link(asyncio.BufferedProtocol):
         *,
         urgent: bool = False,
     ) -> None:
-        """Answer one message or batch; an urgent one waits for a turn first."""
+        """Answer one message or batch and send the answer; an urgent one waits for a turn
+        first.
+
+        Args:
+            message: decoded, or read in another process (a tuple is a batch).
+            urgent: whether it was taken out of the queue before its turn.
+        """
         match message:
             case m.Batch(items):
                 await self._answer_batch(self._batch(items), waits=urgent)
@@ -558,7 +588,14 @@ class _Link(asyncio.BufferedProtocol):
     async def _items(
         self, batch: batches.Batch, *, waits: bool, urgent_alone: bool = False
     ) -> None:
-        """Serve each remaining item in a turn of its own; `waits`: the first one as well."""
+        """Serve the remaining items of a batch, each in a turn of its own, and keep their
+        answers.
+
+        Args:
+            batch: whose items are served.
+            waits: whether the first item waits for a turn, too.
+            urgent_alone: whether only urgent items are served.
+        """
         while (item := batch.next_item(urgent_alone=urgent_alone)) is not None:
             if waits:
                 await self._turn(item)
@@ -624,7 +661,13 @@ class _Link(asyncio.BufferedProtocol):
             self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
 
     async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
-        """Serve a call, and count and log it."""
+        """Serve a call by `_try`, and count and log it under a trace of its own.
+
+        Args:
+            id: of the request; None for a notification.
+            name: of the method.
+            given: parameters, or the error in them.
+        """
         self.served += 1
         trace = f"{self.number}.{self.served}"
         return await parts.answered(
@@ -639,7 +682,10 @@ class _Link(asyncio.BufferedProtocol):
     async def _try(
         self, id: m.Id, name: str, given: Given, trace: str
     ) -> m.Response | m.Failure:
-        """Check token, rate, place and parameters of a call, and have the session handle it.
+        """Check token, rate, place and parameters of a call, and have the session handle
+        it.
+
+        `Hello` with the right token opens the session. Unexpected errors are logged.
 
         Args:
             id: of the request; None for a notification.
@@ -688,7 +734,11 @@ class _Link(asyncio.BufferedProtocol):
             self._seat()
 
     def _check_rate(self) -> None:
-        """Raise RpcError if the client sends more than `requests_per_s`."""
+        """Count a request against the client's rate `requests_per_s`, if it has one.
+
+        Raises:
+            RpcError: -32003, more requests than that.
+        """
         rate = self.limits.requests_per_s
         if rate is None:
             return

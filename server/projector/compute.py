@@ -88,7 +88,11 @@ class ComputeJob:
             self._turn.cancel()
 
     async def run(self, compute: ComputeThread, step: Step) -> object:
-        """Compute a step in its turn and return its value.
+        """Compute a step in its turn on the compute thread and return its value.
+
+        Args:
+            compute: the thread.
+            step: function without arguments.
 
         Raises:
             Exception: the step's, or the one that the job was given up with.

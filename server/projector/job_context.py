@@ -129,8 +129,18 @@ class Context:
     async def send_parts(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
     ) -> int:
-        """Send an array as parts of a result, from its element `start` on;
-        return their number."""
+        """Send an array as `part` notifications of at most `PART_BYTES`, and wait until
+        each is written.
+
+        Args:
+            client: that asked.
+            id: of its request.
+            array: values, sent flat in C order.
+            start: index of the array's first value in the whole result.
+
+        Returns:
+            The number of parts.
+        """
         flat = np.ascontiguousarray(array).reshape(-1)
         step = PART_BYTES // flat.itemsize
         parts = 0

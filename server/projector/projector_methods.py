@@ -39,8 +39,20 @@ Answer = Callable[[Context, JobClient, Id, Any], Awaitable[object]]
 
 
 async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object:
-    """Check the token, admit the client and end its hello timeout; return the server's
-    version and instance."""
+    """Check the token, admit the client and end its hello timeout.
+
+    Args:
+        context: of the server.
+        client: that says hello.
+        id: of the request.
+        p: token.
+
+    Returns:
+        A dict with the keys protocol, server, machine (empty), instance and evicts.
+
+    Raises:
+        RpcError: not authorised, a wrong token.
+    """
     await client.token_check.check(p.token, client.link.peer)
     client.let_in = True
     client.link.deadlines.stop("hello")
@@ -56,7 +68,8 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
 async def volume_put(
     context: Context, client: JobClient, id: Id, p: wire.VolumePut
 ) -> object:
-    """Store a scene, or a chunk of voxels or of a mesh; prepare a complete volume.
+    """Store a scene, or a chunk of voxels or of a mesh; prepare and store a complete
+    volume.
 
     Args:
         context: of the server.
@@ -65,7 +78,10 @@ async def volume_put(
         p: parameters.
 
     Returns:
-        name, received and total [bytes], and complete.
+        A dict with the keys name, received [bytes], total [bytes] and complete.
+
+    Raises:
+        RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
     """
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene), evictable=p.evictable)
@@ -91,7 +107,17 @@ async def volume_put(
 async def volume_get(
     context: Context, client: JobClient, id: Id, p: wire.VolumeRef
 ) -> object:
-    """Send a volume's voxels.
+    """Send a volume's voxels to the client.
+
+    Args:
+        context: of the server.
+        client: that asks.
+        id: of the request.
+        p: name of the volume.
+
+    Returns:
+        As `Context.send_array`: the image value, or type, shape and number of the parts
+        sent.
 
     Raises:
         RpcError: no such volume, or one without voxels.
@@ -166,13 +192,14 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 async def backproject(
     context: Context, client: JobClient, id: Id, p: wire.Backproject
 ) -> object:
-    """Compute the adjoint, and answer it or add it to a named volume.
+    """Compute the adjoint of projections, and answer it or store it, added to a named
+    volume.
 
     Args:
         context: of the server.
         client: that asks.
         id: of the request.
-        p: parameters.
+        p: projections, cone_vec, grid, and perhaps the name of the volume.
 
     Returns:
         The image value; type, shape and number of parts where it was sent in parts or
@@ -198,7 +225,7 @@ async def backproject(
 
 
 async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """Return figures about the server.
+    """Return figures about the server as a dict, by the names of the wire.
 
     Args:
         context: of the server.

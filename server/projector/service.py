@@ -66,7 +66,9 @@ class ProjectorServer(ListeningServer):
         self.seated: set[JobClient] = set()
 
     async def close(self) -> None:
-        """Stop listening, end all connections and the compute thread."""
+        """Stop listening, abort all connections, cancel their work, and end the compute
+        thread.
+        """
         if self.server is not None:
             self.server.close()
         clients = self.context.clients
@@ -151,7 +153,10 @@ class ProjectorServer(ListeningServer):
     # -- requests ----------------------------------------------------------------------------
 
     async def _serve(self, client: JobClient, body: memoryview) -> None:
-        """Decode a frame, answer its request and release the client's lane.
+        """Decode a frame, answer its request, and release the client's lane and memory.
+
+        Reading resumes once little is pending. A violation of the protocol ends the
+        connection.
 
         Args:
             client: that sent it.
@@ -273,10 +278,10 @@ async def serve_projector(
     ssl: tls.SSLContext | None = None,
     observe: Observe = unobserved,
 ) -> ProjectorServer:
-    """Compile, then serve on `host`:`port` (0: any free port); connections wait until then.
+    """Listen, run `begin` in the compute thread, then serve; connections wait until then.
 
     Args:
-        host, port: where; others than loopback need a token.
+        host, port: where (port 0: any free one); others than loopback need a token.
         memory_limit: bytes that all volumes together may take.
         begin: run first in the compute thread: threads, warm-up.
         bound: called with the port as soon as it is taken.
@@ -285,6 +290,9 @@ async def serve_projector(
         token: clients must bring it.
         ssl: a server's TLS context.
         observe: called for every answered request.
+
+    Returns:
+        The running server; `close` ends it.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.

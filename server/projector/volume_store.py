@@ -86,6 +86,9 @@ class VolumeStore:
     def get(self, name: str) -> Body:
         """Look up the volume called `name`, which becomes the most recently used.
 
+        Returns:
+            The volume, mesh or scene itself, not a copy.
+
         Raises:
             RpcError: -32602, listing the names.
         """

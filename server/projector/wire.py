@@ -114,10 +114,11 @@ class FrameLink(asyncio.BufferedProtocol):
         return target[self._filled :]
 
     def buffer_updated(self, count: int) -> None:
-        """Count received bytes; pass a complete frame to `on_frame`.
+        """Count received bytes, restart the frame's deadline, and pass a complete frame
+        to `on_frame`.
 
         Args:
-            count: number of bytes.
+            count: number of bytes written into the buffer of `get_buffer`.
         """
         if self._over:
             return
@@ -135,8 +136,12 @@ class FrameLink(asyncio.BufferedProtocol):
             self.on_frame(self, body)
 
     def _begin(self, size: int) -> None:
-        """Reserve memory for a frame of `size` bytes; call `on_broken` for one that
-        is too large."""
+        """Reserve memory for a frame; an empty one goes to `on_frame`, one that is too
+        large to `on_broken`.
+
+        Args:
+            size: of the frame, from its head [bytes].
+        """
         self._filled = 0
         if size > self.max_frame:
             self._over = True
@@ -298,7 +303,15 @@ class ProjectorLink:
     async def ask_array(
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
     ) -> npt.NDArray[np.float32]:
-        """Request a float32 array of `shape`, which comes in one piece or in parts; read-only.
+        """Request a float32 array, which comes in one piece or in parts.
+
+        Args:
+            method: its name on the wire.
+            params: its parameters.
+            shape: of the array.
+
+        Returns:
+            The array, read-only.
 
         Raises:
             RpcError: the answer is an error, or no such array.
@@ -375,7 +388,9 @@ class ProjectorLink:
             note.exception()  # a connection that has ended needs no cancellation
 
     def _frame(self, link: FrameLink, body: memoryview) -> None:
-        """Pass the answers and parts of a frame to their requests."""
+        """Pass the answers and parts of a frame to their requests; close on a violation
+        of the protocol.
+        """
         try:
             received = self._calls.receive(frames.unpack(body))
         except ProtocolError:
@@ -394,7 +409,7 @@ class ProjectorLink:
         link.transport.abort()
 
     def _lost(self, link: FrameLink) -> None:
-        """Fail all open requests with `LinkLost`."""
+        """Fail all open requests with `LinkLost`; log a violation of the protocol."""
         if link.mid_frame and not self._closed:
             self._calls.violate(ProtocolError("the stream ended inside a frame"))
         why = "the connection ended"

@@ -67,7 +67,13 @@ class Acquisition:
     _trapping: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
-        """Make and store frames that share camera settings.
+        """Project, expose and store a batch of frames, and show the last one.
+
+        Files are written in a worker thread. A batch with X-rays on passes its last image
+        to `shown`.
+
+        Args:
+            batch: frames with files that share camera settings and X-rays on or off.
 
         Raises:
             ProjectorUnavailable: nothing of the batch was stored.
@@ -85,7 +91,16 @@ class Acquisition:
             self.shown(batch[-1], images[-1])
 
     async def _take(self, batch: Sequence[Exposure]) -> list[Radiograph]:
-        """Project a batch of frames and keep images that later frames may need."""
+        """Project a batch of frames; remember the last `KEPT_IMAGES` where the panel has
+        lag or traps.
+
+        Args:
+            batch: frames that share camera settings; with `moments` above 1 each is
+                projected alone.
+
+        Returns:
+            One radiograph for each frame, before noise.
+        """
         if self.moments > 1:
             images = [(await self._project([e]))[0] for e in batch]
         else:
@@ -98,10 +113,17 @@ class Acquisition:
         return images
 
     async def _before(self, frame: Exposure) -> Before:
-        """Return the earlier frames that are still on the panel.
+        """Collect the earlier frames whose afterglow is still on the panel.
 
         Missing ones are projected again, so that a frame does not depend on which were
         made before it.
+
+        Args:
+            frame: that is being made.
+
+        Returns:
+            Pairs of image and time from its end to the frame's start [s], oldest first;
+            empty for a panel without lag.
         """
         if not self.radiography.remembers:
             return ()
@@ -125,7 +147,14 @@ class Acquisition:
         frame on.
 
         It is the same wherever a scan was interrupted, and empty after a change of the
-        camera's settings.
+        camera's settings. Charges of the last `KEPT_IMAGES` frames are remembered;
+        missing images are projected again.
+
+        Args:
+            frame: that is being made.
+
+        Returns:
+            Charge (rows, cols); None for a panel without traps.
         """
         if not self.radiography.traps:
             return None
@@ -155,7 +184,18 @@ class Acquisition:
             return charge
 
     async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:
-        """Project one view a frame, or several views of one frame taken in motion."""
+        """Project one view a frame, or several views of one frame taken in motion.
+
+        Args:
+            batch: frames that share camera settings; one alone if it is taken in motion
+                and `moments` is above 1.
+
+        Returns:
+            One radiograph for each frame.
+
+        Raises:
+            Exception: as `ensure_same`, if the sample has changed since the scan began.
+        """
         frame = batch[0]
         if self.moments > 1 and frame.moving:
             positions = {n: table[frame.index] for n, table in self._moments.items()}
@@ -190,13 +230,17 @@ class Acquisition:
         before: Sequence[Before],
         trapped: Sequence[Float32Array | None],
     ) -> None:
-        """Convert images to counts, with noise by frame, and store them.
+        """Convert images to counts, with noise by the frame's number, and write each
+        frame's file.
 
         Args:
             batch: frames with files.
             images: one for each frame.
             before: earlier frames on the panel, for each frame.
-            trapped: charge in the panel's traps, for each frame.
+            trapped: charge in the panel's traps (rows, cols), for each frame.
+
+        Raises:
+            DatasetWriteError: as `put`; the files before are there.
         """
         for frame, image, earlier, traps in zip(
             batch, images, before, trapped, strict=True

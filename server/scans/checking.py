@@ -90,10 +90,14 @@ class CheckInput:
         return len(self.wish.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None) -> CheckReport:
-        """Compute the dry-run report; blocks.
+        """Parse, plan and check the scan, collisions included where the machine has
+        bodies; blocks.
 
         Args:
             bytes_at_most: largest size of the report; None for no limit.
+
+        Returns:
+            The dry-run report; problems of the scan are in it, not raised.
 
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
@@ -178,11 +182,18 @@ class Checks:
         return await self._workers.ask(_encoded, _bare(matter), codec)
 
     async def sound(self, matter: CheckInput) -> Checked:
-        """Parse, plan and sweep a scan and return it if it may run.
+        """Parse, plan and sweep a scan, here or in a worker process, and return it if it
+        may run.
 
         The last result is kept until it is requested again: if a job begins with the
         position, sample and correction that it was submitted with, the plan is the one
         checked then.
+
+        Args:
+            matter: the scan, with everything that its check depends on.
+
+        Returns:
+            The plan and its warnings.
 
         Raises:
             RpcError: -32005 or -32002, it may not run; -32008, it takes too long or too
@@ -248,6 +259,16 @@ def _bare(matter: CheckInput) -> CheckInput:
 
 
 def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
+    """Compute a dry-run report and encode it in pieces of `ANSWER_PIECE` bytes; runs in a
+    worker.
+
+    Args:
+        matter: the scan to be checked.
+        codec: of the connection that asked.
+
+    Raises:
+        RpcError: -32008, the report is larger than an answer may be.
+    """
     most = MAX_ANSWER[codec]
     report = matter.report(most).to_dict()
     if codec is Codec.JSON:
@@ -260,7 +281,15 @@ def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
 
 
 def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.CollisionCheck:
-    """Wrap a sweep so that it refuses plans whose report would be over `most` bytes."""
+    """Wrap a sweep so that it refuses plans whose report would be too large.
+
+    Args:
+        sweep: finds the collisions of a plan.
+        most: largest size of the report [bytes]; None for no limit.
+
+    Returns:
+        The wrapped sweep, which raises RpcError -32008 before it sweeps such a plan.
+    """
 
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
@@ -274,7 +303,10 @@ def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.Collisi
 
 
 def require_sound(report: CheckReport) -> None:
-    """Raise unless the plan may run.
+    """Raise an error with the report's problems unless the plan may run.
+
+    Args:
+        report: of the scan.
 
     Raises:
         RpcError: -32005 with its problems; -32002 where collisions are all that is wrong.
@@ -324,10 +356,15 @@ def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:
 
 
 def _pieces_of(plan: ScanPlan) -> list[bytes]:
-    """Pickle a plan without machine and profile in pieces small enough to be read at
+    """Pickle a plan, without machine and profile, in pieces small enough to be read at
     once.
 
-    Each piece is (field or axis, some of its parts); files are apart from their groups.
+    Args:
+        plan: of a scan.
+
+    Returns:
+        First the pickled dict of its short fields, then pickled pairs (field or axis,
+        some of its parts); the files of each group are apart from the group.
     """
     rest = {f.name: getattr(plan, f.name) for f in fields(plan)}
     for name in ("machine", "profile"):
@@ -350,7 +387,13 @@ def _pieces_of(plan: ScanPlan) -> list[bytes]:
 
 
 def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
-    """Rebuild the plan of `_pieces_of`; in a thread, so that others run between pieces."""
+    """Rebuild the plan that `_pieces_of` pickled; in a thread, so that others run between
+    pieces.
+
+    Args:
+        pieces: of `_pieces_of`, all and in order.
+        machine, profile: of the plan, which its pieces lack.
+    """
     with _no_collection():
         short = pickle.loads(pieces[0])
         long: dict[str, list[Any]] = {}

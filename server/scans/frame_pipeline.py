@@ -82,7 +82,9 @@ class FramePipeline(Generic[T]):
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _work(self) -> None:
-        """Process batches of waiting frames until cancelled."""
+        """Take batches of waiting frames and produce each until it succeeds; ends only by
+        cancellation.
+        """
         while True:
             async with self._changed:
                 await self._changed.wait_for(lambda: bool(self._waiting))
@@ -95,7 +97,9 @@ class FramePipeline(Generic[T]):
                 self._changed.notify_all()
 
     def _take(self) -> list[T]:
-        """Remove a batch of consecutive frames of one kind from the queue."""
+        """Remove the next batch from the queue: consecutive frames of one kind, at most
+        `batch`.
+        """
         batch = [self._waiting.popleft()]
         kind = self.kind(batch[0])
         while (
@@ -107,7 +111,9 @@ class FramePipeline(Generic[T]):
         return batch
 
     async def _until_made(self, batch: Sequence[T]) -> None:
-        """Produce a batch; after a failure report it, wait for `_go` and try again."""
+        """Produce a batch; after a failure call `failed`, hold all workers, and try again
+        on `retry`.
+        """
         while True:
             try:
                 await self.produce(batch)

@@ -133,8 +133,10 @@ class Jobs:
         return runner is None or not runner.idle or self._clock.speed_up == "max"
 
     def require_idle(self, what: str) -> None:
-        """Refuse a command that would disturb a job that runs, opens or was told to
-        resume.
+        """Refuse a command that would disturb a job that runs, opens or is being resumed.
+
+        A paused job disturbs nothing, and neither does one that was aborted while it
+        opened.
 
         Args:
             what: command, for the message.
@@ -158,9 +160,10 @@ class Jobs:
 
     @contextmanager
     def manual_control(self) -> Iterator[None]:
-        """Cancel the automatic resume of a paused job for a manual command.
+        """Cancel the automatic resume of a paused job for the manual command inside the
+        context.
 
-        It is kept if the command is refused before anything has moved.
+        If the command fails before anything has moved, the automatic resume is restored.
         """
         by_hand = self._by_hand
         programmes = self._scanner.programmes
@@ -200,7 +203,9 @@ class Jobs:
         return [j.sample for j in unended if j.sample is not None]
 
     def status(self, job: Job) -> JobStatus:
-        """Convert a job to its wire form."""
+        """Make the wire form of a job: its phase, progress, times [s], error and
+        warnings.
+        """
         p = job.where
         step = None if p is None else p.step
         return JobStatus(
@@ -240,12 +245,15 @@ class Jobs:
         job: Job | None = None,
         sample: Sample | None = None,
     ) -> Job:
-        """Prepare the next job, or a new state of one that has ended; `enqueue` makes it
-        known.
+        """Make a queued job, new or as the next state of one that has ended; nothing
+        knows it yet.
+
+        `enqueue` puts it in the list and in the queue.
 
         Args:
             name, folder: of the data set.
-            plan, prepare, speed_up, warnings: of the scan.
+            plan, prepare, speed_up, warnings: of the scan; `prepare` makes the job's
+                inputs at its turn.
             job: ended job to continue; None for a new one.
             sample: sample of the scan.
 
@@ -371,7 +379,20 @@ class Jobs:
         return [job for job in jobs if job.id not in forgotten]
 
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
-        """Restore the jobs of an earlier server; returns the unfinished ones."""
+        """Restore the jobs of an earlier server; those that had not ended are incomplete
+        now.
+
+        Changed jobs are noted for the next write, and the oldest ones beyond the limits
+        forgotten.
+
+        Args:
+            jobs: records of the jobs, oldest first.
+            made: number of jobs ever made, from which new ids continue.
+            root: data directory.
+
+        Returns:
+            The jobs that had not ended.
+        """
         self._count = max(self._count, made, *(number_of(memory.id) for memory in jobs))
         left = []
         for memory in jobs:
@@ -417,6 +438,7 @@ class Jobs:
         self.forget(self._older(self._today() - self._max_age))
 
     def _older(self, than: datetime) -> list[Job]:
+        """List the jobs, except the current one, that ended before a moment."""
         return [
             job
             for job in self._all.values()
@@ -432,7 +454,11 @@ class Jobs:
     # Running ------------------------------------------------------------------------------------
 
     async def work(self) -> None:
-        """Run jobs one after the other until cancelled."""
+        """Run queued jobs one after the other; ends only by cancellation.
+
+        Each job runs at its own speed of the clock; the speed from before is restored
+        after it, unless somebody changed it meanwhile. A job's error ends that job alone.
+        """
         while True:
             job = await self._queue.get()
             if job.phase != "queued":
@@ -464,7 +490,16 @@ class Jobs:
                 self._tell(job)
 
     async def _run(self, job: Job) -> JobPhase:
-        """Run one job to its end, whatever that is."""
+        """Prepare one job at rest, run it, and finish or mark its data set.
+
+        An aborted job switches X-rays off. Errors of the job are logged and stored in it.
+
+        Args:
+            job: at its turn.
+
+        Returns:
+            The job's last phase: done, aborted or failed.
+        """
         self._interrupted = None
         self._by_hand = False
         try:
@@ -512,7 +547,12 @@ class Jobs:
         return "done"
 
     async def _runner_of(self, job: Job, scan: JobInputs) -> ScanRunner:
-        """Create the runner in a thread, as it sorts the events of a long plan."""
+        """Create the runner of a job in a thread, as it sorts the events of a long plan.
+
+        Args:
+            job: whose progress the runner reports.
+            scan: plan, data set and producer of frames.
+        """
         self._preparing = True
         try:
             return await asyncio.to_thread(
@@ -532,6 +572,9 @@ class Jobs:
         return self._interrupted  # a call: it may change while others run
 
     def _mark(self, job: Job, scan: JobInputs, reason: str) -> None:
+        """Mark the data set of a job as incomplete, with the reason and the time reached;
+        log a failure.
+        """
         elapsed = 0.0
         if job.runner is not None:
             elapsed = job.runner.progress.tau
@@ -543,6 +586,9 @@ class Jobs:
             log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
 
     def _failed(self, job: Job, error: Exception) -> JobPhase:
+        """Store an error in its job, log it unless a user caused it, and return the phase
+        "failed".
+        """
         if not is_user_error(error):
             log("job failed", logging.ERROR, error=True, job=job.id)
         job.error = self._error(error)
@@ -558,13 +604,27 @@ class Jobs:
         return job.runner
 
     def _cannot(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
+        """Make the error -32003 for a command that a job's phase does not allow;
+        returned, not raised.
+
+        Args:
+            what: the command.
+            job: to which it was given.
+            phases: in which it is allowed.
+        """
         return busy(
             f"cannot {what} {job.id}: it is {job.phase}",
             {"asked": what, "state": job.phase, "allowed": list(phases)},
         )
 
     def _progress(self, job: Job) -> None:
-        """Take over the runner's progress and error, and publish them if due."""
+        """Copy the runner's progress and error into the job, count frames, and publish if
+        due.
+
+        A change of phase or error is published at once, progress every
+        `PUBLISH_INTERVAL_S`. New frames reset the delay of automatic retries, and a job
+        that a passing error stopped is scheduled to resume.
+        """
         assert job.runner is not None
         p = job.runner.progress
         phase = job.phase
@@ -602,7 +662,16 @@ class Jobs:
 
 
 def _logged(produce: Produce, job: str) -> Produce:
-    """Wrap `produce` so that programming errors go to the server's log."""
+    """Wrap a producer of frames: log its programming errors, and give log lines the
+    frames' trace.
+
+    Args:
+        produce: makes and stores a batch of frames.
+        job: id of the job.
+
+    Returns:
+        A function like `produce`, which raises the same errors.
+    """
 
     async def work(batch: Sequence[Exposure]) -> None:
         try:

@@ -39,8 +39,12 @@ class Rejoin:
     _motion: Mapping[str, tuple[float, float, float]]
 
     def programme(self) -> dict[str, tuple[Trajectory, ...]]:
-        """Compute trajectories on a clock that is 0 when a scanner at rest at `start`
-        sets off.
+        """Compute the motion of all axes from rest at `start`: a run-up, then the rest of
+        the plan.
+
+        Returns:
+            Axis -> trajectories, on a clock that is 0 when the motion begins [s]; the
+            plan is joined at `run_up_s`. Axes that stay are left out.
         """
         join = self.run_up_s
         out = {}
@@ -61,12 +65,13 @@ class Rejoin:
 
 
 def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Rejoin:
-    """Plan the way to `plan` at plan time `tau` [s].
+    """Compute from which pose at rest, and with which run-up, a scanner joins `plan` at
+    time `tau`.
 
     Args:
         plan: the scan.
         tau: time on the plan's clock [s].
-        accelerations: of each axis's run-up.
+        accelerations: axis -> acceleration of its run-up [mm/s^2, deg/s^2].
     """
     start = {}
     moving = {}

@@ -40,7 +40,16 @@ Phase = Literal["running", "paused", "done"]
 
 
 def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
-    """Set what `command` sets at `now`; the plan has checked that it may.
+    """Set tube, camera or an axis's rates as `command` says; motion and images are not
+    commands here.
+
+    Rates are limited to those that the axis allows now. Commands for components of other
+    packages do nothing.
+
+    Args:
+        scanner: to set.
+        command: of the plan, which has checked that it may.
+        now: the twin's time [s].
 
     Raises:
         SafetyError: X-rays on during an E-stop.
@@ -157,8 +166,11 @@ class ScanRunner:
     # Control ------------------------------------------------------------------------------------
 
     def pause(self, error: Exception | None = None) -> None:
-        """Stop motion and wait for `resume`; `error` is the reason if no user requested
-        it.
+        """Stop motion as soon as the run obeys, keep the settings in force, and wait for
+        `resume`.
+
+        Args:
+            error: reason, shown in `progress`; None if a user requested the pause.
         """
         if error is not None:
             self._set(error=error)
@@ -209,8 +221,11 @@ class ScanRunner:
     # Running ------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run the complete plan; existing frames are skipped without waiting for their
-        time.
+        """Run the complete plan on the clock: settings, motion and frames, with pauses
+        and steps.
+
+        Existing frames are skipped without waiting for their time. Motors are stopped if
+        the run ends by an error.
 
         Raises:
             JobAborted: it was ended before the end.
@@ -285,7 +300,12 @@ class ScanRunner:
         self._set(frames_done=self.progress.frames_done + made)
 
     async def _take_effect(self, step: PlanStep) -> None:
-        """Apply a command of the plan; after an error pause, and try again on resume."""
+        """Apply a command of the plan and show it in `progress`; after an error pause,
+        and try again on resume.
+
+        Raises:
+            Exception: the run is to end (`JobAborted`).
+        """
         self._set(step=step, what=step.what)
         while True:
             try:
@@ -299,12 +319,15 @@ class ScanRunner:
                 return
 
     async def _until(self, moment: float, exposing_since: float | None = None) -> None:
-        """Wait until plan time `moment`, obeying pause and abort.
+        """Wait until plan time `moment`, obeying pause and abort; set the progress to it.
 
         Args:
             moment: on the plan's clock [s].
-            exposing_since: where a run that is paused meanwhile goes on from; where it was, if
-                None.
+            exposing_since: plan time [s] to which a run that is paused meanwhile goes
+                back; None: it goes on from where it was.
+
+        Raises:
+            Exception: the run is to end (`JobAborted`).
         """
         while True:
             if self._told():
@@ -330,7 +353,18 @@ class ScanRunner:
             self._waiting.set_result(None)
 
     async def _obey(self, tau: float) -> None:
-        """Obey requests: end the run, or pause it until it is resumed."""
+        """Obey requests: raise if the run is to end; else stop, wait for `resume`, and
+        rejoin the plan.
+
+        After `resume` the settings of before the pause are restored. An error on the way
+        back pauses again.
+
+        Args:
+            tau: plan time at which the run goes on [s].
+
+        Raises:
+            Exception: the run is to end (`JobAborted`).
+        """
         if self._abort:
             raise self._end
         if not self._told():
@@ -388,7 +422,14 @@ class ScanRunner:
             await self._obey(tau)
 
     async def _rejoin(self, tau: float) -> None:
-        """Move to the plan's position at `tau`; ends early on a pause or an abort.
+        """Move to the plan's pose at `tau` and start the swept motion from there; ends
+        early on a pause or an abort.
+
+        A certificate that the stage or the motors have outdated is made again, up to
+        `MAX_SWEEPS` times. The plan's zero on the twin's clock is set anew.
+
+        Args:
+            tau: time on the plan's clock [s].
 
         Raises:
             CollisionError: on the way there, or in the rest of the plan.
@@ -420,7 +461,11 @@ class ScanRunner:
         self._set(tau=tau)
 
     async def _return_to(self, start: Mapping[str, float]) -> None:
-        """Move to the beginning of a programme; ends early on a pause or an abort.
+        """Move the motors to where a programme begins and wait for rest; ends early on a
+        pause or an abort.
+
+        Args:
+            start: axis -> position [mm, deg].
 
         Raises:
             CollisionError: the way there.
@@ -455,7 +500,15 @@ class ScanRunner:
             await self._held(self._pipeline.drained(), self.plan.duration_s)
 
     async def _held(self, work: Awaitable[None], moment: float) -> None:
-        """Await `work` with the clock held, obeying pause and abort meanwhile."""
+        """Await `work` with the clock held, obeying pause and abort meanwhile.
+
+        Args:
+            work: that takes real but no twin time; cancelled if the run ends.
+            moment: plan time at which a paused run goes on [s].
+
+        Raises:
+            Exception: of `work`, or the run is to end.
+        """
         task = asyncio.ensure_future(work)
         try:
             while not task.done():
@@ -473,6 +526,7 @@ class ScanRunner:
             task.cancel()
 
     def _set(self, **changes: object) -> None:
+        """Change fields of `progress`, and notify if any value is another one."""
         new = replace(self.progress, **changes)  # type: ignore[arg-type]
         if new != self.progress:
             self.progress = new

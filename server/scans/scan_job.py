@@ -95,7 +95,10 @@ class Job:
 
 
 def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
-    """Restore a job of an earlier server; one that had not ended is marked incomplete.
+    """Restore a job of an earlier server from its record.
+
+    One that had not ended is done if its data set is complete, else incomplete with an
+    error that says how to go on.
 
     Args:
         memory: its record.

@@ -151,7 +151,14 @@ class JobRecord:
             self.keep(changes, root, name)
 
     def keep(self, changes: Changes, root: Directory, name: str) -> None:
-        """Write the record as `write` does, as one of several changes."""
+        """Add the record, as JSON for the data set `name`, to changes that are written
+        together.
+
+        Args:
+            changes: files written as one.
+            root: data directory.
+            name: of the data set.
+        """
         wish = self.wish
         document = {
             "schema": SCHEMA,
@@ -208,7 +215,12 @@ class JobRecord:
 
     @classmethod
     def _of(cls, data: bytes) -> JobRecord:
-        """Decode a record from its bytes."""
+        """Decode a record from the bytes of its file, also of earlier servers.
+
+        Raises:
+            ValueError, KeyError, TypeError: another schema, or fields that are missing or
+                wrong.
+        """
         document: Any = read_json(data)
         if document["schema"] != SCHEMA:
             raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")

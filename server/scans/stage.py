@@ -83,11 +83,17 @@ class Stage:
     def pieces(
         self, sample: Sample, upload: ReceivedSample | None = None
     ) -> tuple[Polytope, ...]:
-        """Compute convex pieces that contain the sample, object frame; may take a second.
+        """Compute convex pieces that contain the sample, object frame [mm]; may take a
+        second.
+
+        The pieces of the last `KEPT` samples are remembered.
 
         Args:
             sample: on the stage.
             upload: next upload under the sample's name; None for the present one.
+
+        Returns:
+            The pieces; empty for an empty stage.
         """
         before = self._content(sample, upload)
         pieces = self._pieces.get(before)
@@ -124,13 +130,16 @@ class Stage:
         parameters: Offsets = NOMINAL,
         upload: ReceivedSample | None = None,
     ) -> CollisionScene | None:
-        """Build the scene of bodies that may collide; None for a machine without
-        components.
+        """Build the scene of bodies that may collide; the last `KEPT` scenes are
+        remembered.
 
         Args:
             sample: on the stage.
             parameters: applied correction, which moves the bodies.
             upload: as for `pieces`.
+
+        Returns:
+            The scene; None for a machine without components.
         """
         if not self._machine.components:
             return None
@@ -168,6 +177,7 @@ class Stage:
 
 
 def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
+    """Divide a phantom, placed as `offset` says, into convex pieces, object frame [mm]."""
     return convex_pieces(
         phantom.mesh(around=True),
         rotation=offset.rotation,
@@ -271,7 +281,22 @@ class ObstacleMoves:
     async def _plan(
         self, targets: Mapping[str, float], *, relative: bool, shortest: bool
     ) -> Way:
-        """Resolve targets and find a free way; see `plan`."""
+        """Resolve targets and find moves to them that touch nothing; the search runs in a
+        thread.
+
+        Args:
+            targets: axis -> target [mm, deg].
+            relative: whether targets are distances from where the motors will rest.
+            shortest: whether a rotation may take the shorter way.
+
+        Returns:
+            The way; with a warning where it goes around something.
+
+        Raises:
+            SafetyError: motion is not allowed now.
+            LimitError: a target beyond the travel.
+            CollisionError: no free way was found; names the bodies.
+        """
         scanner = self.scanner
         require_ready(scanner.safety, "motion")
         goal = scanner.resolve(
@@ -316,7 +341,8 @@ class ObstacleMoves:
         return self._task
 
     async def _legs(self, way: Way) -> None:
-        """Execute the legs of a way one by one.
+        """Move along the legs of a way one by one, each after the motors' rest; call
+        `changed` at each start.
 
         Raises:
             SafetyError: other motion has begun or motion was stopped.
@@ -343,7 +369,13 @@ class ObstacleMoves:
         legs: Sequence[Mapping[str, float]],
         *warnings: str,
     ) -> Way:
-        """Make the `Way` of legs from `start` with its total time."""
+        """Make the `Way` of legs from `start`, with its total time at the motors' rates.
+
+        Args:
+            start: axis -> position [mm, deg].
+            legs: targets of each leg, in order.
+            *warnings: for the requester.
+        """
         seconds = 0.0
         here = dict(start)
         for leg in legs:
@@ -358,7 +390,14 @@ class ObstacleMoves:
 
 
 async def finished(task: asyncio.Task[None]) -> list[str]:
-    """Wait for the end of a way; returns warnings if it ended early."""
+    """Wait for the end of the task that moves along a way.
+
+    Returns:
+        Warnings if it was cancelled or refused a leg; empty if it arrived.
+
+    Raises:
+        Exception: any error of the task but a TwinError.
+    """
     await asyncio.wait([task])
     if task.cancelled():
         return ["another command ended the way before its last leg"]

@@ -141,7 +141,19 @@ class Submissions:
         operator: str = "",
         ensure_allowed: Callable[[], None] = lambda: None,
     ) -> Job:
-        """Put a scan in the queue; `ensure_allowed` raises if the requester has lost control.
+        """Check a scan completely, write its record, and put it in the queue as a job.
+
+        A name of an interrupted data set resumes that scan with its start conditions.
+
+        Args:
+            wish: script or poses.
+            name: of the data set; None chooses a free one, date and number.
+            speed_up: of the twin's clock during the job; None keeps the present one.
+            operator: for the data set.
+            ensure_allowed: raises if the requester has lost control.
+
+        Returns:
+            The queued job, with warnings.
 
         Raises:
             RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken,
@@ -189,6 +201,10 @@ class Submissions:
     ) -> None:
         """Put a job that ended early into the queue again; only missing images are made.
 
+        Args:
+            job: that has ended.
+            ensure_allowed: raises if the requester has lost control.
+
         Raises:
             RpcError: as `submit`; -32602 if there is nothing to continue.
         """
@@ -231,10 +247,18 @@ class Submissions:
         ensure_allowed: Callable[[], None],
         make: Callable[[], Job],
     ) -> Job:
-        """Write a job's record, then put the job into the queue.
+        """Write the scan's and the job's records as one change, then put the job into the
+        queue.
+
+        Args:
+            asked: record of the scan.
+            name: of the data set.
+            ensure_allowed: raises if the requester has lost control.
+            make: drafts the job.
 
         Raises:
             DatasetWriteError: the record cannot be written; the job is not made.
+            RpcError: -32602, another job has taken the name.
         """
         drafts: list[Job] = []
 
@@ -263,10 +287,21 @@ class Submissions:
         resume: bool,
         ensure_allowed: Callable[[], None],
     ) -> tuple[ScanPlan, Prepare, list[str]]:
-        """Check a scan completely and prepare its start.
+        """Check a scan completely (text, plan, collisions, disk, memory, counts) and
+        prepare its start.
+
+        Args:
+            asked: record of the scan.
+            name: of the data set.
+            resume: whether the data set exists and is continued.
+            ensure_allowed: raises if the requester has lost control.
 
         Returns:
-            the plan, a function that makes the job's inputs at its turn, and warnings.
+            The plan, a function that checks again and makes the job's inputs at its turn,
+            and warnings.
+
+        Raises:
+            RpcError: as `submit`.
         """
         begin = asked.begin
         checked = await self.checks.sound(
@@ -321,8 +356,13 @@ class Submissions:
         return checked.plan, prepare, warnings
 
     async def _predicted(self, begin: StartConditions, plan: ScanPlan) -> Prediction:
-        """Predict the counts of a scan's projections; of the sample only if it can be
-        projected."""
+        """Predict the counts of a scan's projections; those behind the sample only if the
+        projector answers.
+
+        Args:
+            begin: sample and physics of the scan.
+            plan: of the scan.
+        """
         probes = sample_probes(plan)
         shares = await self._shares(begin, probes)
 
@@ -338,11 +378,18 @@ class Submissions:
     async def _shares(
         self, begin: StartConditions, probes: Sequence[SampleProbe]
     ) -> list[CountShares | None]:
-        """Predict the pixels of each probe; None if the projector does not answer in
-        time.
+        """Predict saturated and starved pixels of each probe of the sample.
 
         A failed prediction ends no submission: errors of the sample are reported by the
         scan itself.
+
+        Args:
+            begin: sample and physics of the scan.
+            probes: settings and views of the plan.
+
+        Returns:
+            Shares for each probe; all None if the projector fails or does not answer
+            within `PREDICTION_PATIENCE_S`.
         """
         radiography = replace(
             self.radiography, physics=begin.physics, scatter=begin.scatter
@@ -369,8 +416,13 @@ class Submissions:
     async def _matter(
         self, wish: ScanSource, start: StartState, shown: Sample
     ) -> CheckInput:
-        """Collect the input of a check: bodies of the sample on the stage, beam through
-        `shown`.
+        """Collect the input of a scan's check; shapes are computed in a thread.
+
+        Args:
+            wish: script or poses.
+            start: scanner before the scan.
+            shown: sample through which the beam passes; collisions are those of the
+                sample on the stage.
         """
         scanner = self.scanner
         stage = self.stage
@@ -419,7 +471,24 @@ class Submissions:
         resume: bool,
         predicted: tuple[PredictedExposure, ...],
     ) -> JobInputs:
-        """Create (or resume) the data set and the inputs of the run; in a worker thread."""
+        """Write the scan's record and create (or resume) its data set; in a worker
+        thread.
+
+        Args:
+            asked: record of the scan.
+            plan: checked at the job's turn.
+            name: of the data set.
+            resume: whether the data set exists and is continued.
+            predicted: exposures for its document.
+
+        Returns:
+            Plan, writer, producer of frames, and the function that removes the record at
+            the end.
+
+        Raises:
+            DatasetWriteError, GeometryError: the folder cannot be written; the geometry
+                is not usable.
+        """
         begin = asked.begin
         radiography = replace(
             self.radiography, physics=begin.physics, scatter=begin.scatter
@@ -477,11 +546,19 @@ class Submissions:
             )
 
     def _resumable(self, name: str, wish: ScanSource) -> StartConditions | None:
-        """Return the start conditions of an interrupted data set; None if there is none.
+        """Read the start conditions of the interrupted data set called `name`.
+
+        Args:
+            name: of the data set.
+            wish: scan that is to continue it.
+
+        Returns:
+            The conditions under which it began; None if there is no such data set.
 
         Raises:
             DatasetNameError: the name is not a plain one.
-            RpcError: -32602, the name is taken by a data set that cannot be resumed.
+            RpcError: -32602, the name is reserved or in use, or its data set is complete,
+                damaged or of another script.
         """
         refused = partial(name_conflict, name)
         plain_name(name, "data set")
@@ -527,7 +604,7 @@ class Submissions:
         return kept.begin
 
     def _free_name(self) -> str:
-        """Choose a name as the scanner does: date and number."""
+        """Choose the first free name of today as the scanner does: date and number."""
         used = {job.name for job in self.jobs.all()}
         now = self.now()
         if self._numbered[0] != dated_name(now, 0):

@@ -147,6 +147,7 @@ class TwinClock:
             self._arm()
 
     def _time(self) -> float:
+        """Compute the twin's time now [s]; from `LATE_S` on it runs at real time at most."""
         if self._holds or self._speed_up == "max":
             return self._base
         passed = self._wall() - self._base_wall
@@ -167,7 +168,9 @@ class TwinClock:
             self._samples.popleft()
 
     def _arm(self) -> None:
-        """Set the timer for the first future that waits."""
+        """Schedule the wake-up of the first future that waits, in place of the one
+        scheduled before.
+        """
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -188,7 +191,13 @@ class TwinClock:
             self._timer = loop.call_later(min(wait, 3600.0), self._ring)
 
     def _jump(self, patience: int) -> None:
-        """Jump to the first awaited time, and wake its task alone; for speed "max"."""
+        """Set the time to the first awaited moment, and wake its task alone; for speed
+        "max".
+
+        Args:
+            patience: number of loop rounds to wait first, in which tasks that are ready
+                may still ask for earlier moments.
+        """
         if patience > 0:
             self._timer = asyncio.get_running_loop().call_soon(self._jump, patience - 1)
             return
@@ -202,7 +211,7 @@ class TwinClock:
         self._arm()
 
     def _ring(self) -> None:
-        """Wake the tasks that are due while time flows."""
+        """Wake the tasks that are due while time flows, and schedule the next wake-up."""
         self._timer = None
         now = self._time()
         # The loop's timer may fire a hair early; what is due within a microsecond is due.
