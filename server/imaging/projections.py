@@ -90,7 +90,7 @@ class TrueGeometry:
 
 
 def load_truth(path: Path, data: Path) -> TrueGeometry:
-    """Read a truth file: TOML, parameter = value [mm, deg].
+    """Read the hidden misalignment from a truth file: TOML, parameter = value [mm, deg].
 
     Args:
         path: the file.
@@ -206,7 +206,9 @@ class Imaging:
         *,
         truth: TrueGeometry | None = None,
     ) -> Float32Array:
-        """Compute images of `sample` at n nominal poses.
+        """Compute line integrals of `sample` at n nominal poses, in the true geometry.
+
+        The sample is sent to the projector where it is new there.
 
         Args:
             sample, poses, camera: as `Radiography.take` has them.
@@ -377,13 +379,18 @@ class Imaging:
 
     @asynccontextmanager
     async def _sent(self, sample: Sample, pieces: Pieces) -> AsyncIterator[_Apart]:
-        """Divide a sample, send it to the projector where it is new or has changed, and
-        count its user.
+        """Divide a sample, send it to the projector where it is new, and keep it there
+        within the context.
+
+        Old samples beyond the limits are dropped, here and there.
 
         Args:
             sample: on the stage.
             pieces: "part" for what attenuates, (body, factor) each; "material" for
                 channels.
+
+        Yields:
+            The pieces, with their names on the projector.
         """
         async with self._sending:
             apart = await self._taken_apart(sample, pieces)
@@ -401,11 +408,12 @@ class Imaging:
             apart.users -= 1
 
     async def _taken_apart(self, sample: Sample, pieces: Pieces) -> _Apart:
-        """Divide the sample as it is now, or reuse its pieces; with `_sending` held.
+        """Divide the sample as it is now, in a thread, or reuse its pieces; with
+        `_sending` held.
 
         Args:
             sample: on the stage, or of a scan.
-            pieces: whether into materials or into parts.
+            pieces: "part" or "material", as in `_sent`.
         """
         key = (_name(sample), pieces)
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
@@ -435,7 +443,9 @@ class Imaging:
         return {key for key in self._known if key[0] in names}
 
     async def _forget_old(self) -> None:
-        """Drop the least recently used samples beyond the limits; with `_sending` held."""
+        """Drop the least recently used samples beyond the limits, here and on the
+        projector; with `_sending` held.
+        """
         stays = self._pinned_keys()
         if self.memory_limit is None:
             limit_bytes = math.inf
@@ -455,12 +465,18 @@ class Imaging:
                 del self._versions[name]
 
     async def _put(self, name: str, body: Body) -> str:
-        """Ensure that the projector has the present version of a body; return
-        its name there.
+        """Ensure that the projector has the present version of a body; old versions are
+        removed.
 
         Args:
             name: of the body here.
             body: scene, mesh or volume.
+
+        Returns:
+            Its name on the projector, which contains a hash of its content.
+
+        Raises:
+            RpcError: -32008, the projector has no room even without old versions.
         """
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])
@@ -498,7 +514,12 @@ def bytes_of(body: Body) -> int:
 
 
 def digest_of(body: Body) -> str:
-    """Hash everything that images depend on: equal for equal contents, in every process."""
+    """Hash everything of a body that images depend on: equal for equal contents, in every
+    process.
+
+    Returns:
+        16 hexadecimal digits.
+    """
     if isinstance(body, Scene):
         sha = hashlib.sha256(
             json.dumps(scene_to_dict(body), default=np.ndarray.tolist).encode()

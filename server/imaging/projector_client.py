@@ -148,10 +148,18 @@ class ProjectorClient:
     async def _ask(
         self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]
     ) -> _T:
-        """Do some work on a connection, made if there is none.
+        """Call `work` with a connection, which is made if there is none.
+
+        Args:
+            method: for the message.
+            work: sends requests and awaits their answers.
+
+        Returns:
+            The value of `work`.
 
         Raises:
             ProjectorUnavailable: no connection, or it was lost.
+            RpcError: the answer is an error.
         """
         async with self._connecting:
             if self._channel is None or self._channel.lost:
@@ -165,10 +173,12 @@ class ProjectorClient:
             ) from None
 
     async def _connect(self) -> ProjectorLink:
-        """Connect and introduce the client; a restarted server has no bodies.
+        """Connect and introduce the client; forget what was sent to a server that has
+        restarted.
 
         Raises:
             ProjectorUnavailable: the client is closed, or no projector answers.
+            RpcError: the projector refuses the client.
         """
         if self._closed:
             raise ProjectorUnavailable("the projector client is closed")
@@ -199,13 +209,17 @@ class ProjectorClient:
 async def _send(
     channel: ProjectorLink, name: str, value: Body, how: Mapping[str, object]
 ) -> None:
-    """Send a volume or mesh in chunks, or a scene; `how` are further parameters.
+    """Send a volume or mesh in chunks, or a scene as one message; each chunk waits for
+    its answer.
 
     Args:
         channel: connection to the projector.
         name: of the body there.
         value: the body.
         how: further parameters of `volume.put`.
+
+    Raises:
+        RpcError: the projector refuses it.
     """
     if isinstance(value, Scene):
         await channel.ask(

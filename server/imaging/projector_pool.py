@@ -123,8 +123,10 @@ class ProjectorPool:
     async def _deal(
         self, name: str, views: ConeVec | None, shape: tuple[int, int]
     ) -> Float32Array | None:
-        """Request something of a free projector, and of another one if it is late; take
-        the first answer.
+        """Request images of a free projector, and of another one if it is late; take the
+        first answer.
+
+        A projector that fails rests for a while, and the request goes to the next.
 
         Args:
             name: of the body.
@@ -132,7 +134,7 @@ class ProjectorPool:
             shape: detector (rows, cols).
 
         Returns:
-            Images, or None without views.
+            Images (n, rows, cols), or None without views.
 
         Raises:
             ProjectorUnavailable: none has answered within the patience.
@@ -204,7 +206,8 @@ class ProjectorPool:
     def _begin(
         self, member: _Member, asking: Coroutine[Any, Any, Float32Array | None]
     ) -> asyncio.Task[Float32Array | None]:
-        """Start a request in a task that releases the projector however it ends.
+        """Start a request in a task that counts as open until it ends, and then wakes a
+        waiting request.
 
         Args:
             member: the projector.
@@ -234,7 +237,10 @@ class ProjectorPool:
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> Float32Array | None:
-        """Send a request to one projector; measure its pace, or let it rest after a failure.
+        """Send a request to one projector; measure its pace, or let it rest for `REST_S`
+        after a failure.
+
+        A new member's version and backend are asked first and compared with the others'.
 
         Args:
             member: the projector.
@@ -245,6 +251,9 @@ class ProjectorPool:
 
         Returns:
             Line integrals (n, rows, cols); None without views.
+
+        Raises:
+            ProjectorUnavailable, RpcError: the projector's failure.
         """
         loop = asyncio.get_running_loop()
         try:

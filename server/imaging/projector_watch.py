@@ -70,7 +70,10 @@ class ProjectorWatch:
             await asyncio.sleep(self.every_s)
 
     async def _look(self, client: Watched) -> None:
-        """Ask once and wait for the answer; report a late one.
+        """Ask one projector for its health, and report silence, a failure, or that it
+        answers.
+
+        An answer later than `silent_s` is reported and waited for.
 
         Args:
             client: of the projector.

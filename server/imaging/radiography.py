@@ -77,6 +77,9 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
     A voltage without a spectrum is then an error wherever one outside the tube's limits
     is.
 
+    Returns:
+        The machine with narrower limits; unchanged for physics "ideal".
+
     Raises:
         LimitError: the voltage at start has none.
     """
@@ -173,7 +176,7 @@ class Radiography:
         *,
         truth: TrueGeometry | None = None,
     ) -> list[Radiograph]:
-        """Compute radiographs of `sample`, one for each of `exposures`.
+        """Compute radiographs of `sample`, without noise, one for each of `exposures`.
 
         Args:
             sample: on the stage.
@@ -181,6 +184,9 @@ class Radiography:
             camera: of all of them.
             exposures: tube and time of each image; taken as if X-rays were on.
             truth: instead of the hidden one.
+
+        Returns:
+            One radiograph for each exposure, the mean of its poses.
 
         Raises:
             ProjectorUnavailable: the projector does not answer.
@@ -356,11 +362,14 @@ def marks_of(
     exposure: ExposureSettings,
     binning: int = 1,
 ) -> npt.NDArray[np.uint8]:
-    """Mark every pixel with the sum of SATURATED, STARVED and CUT_OFF, uint8 (rows, cols).
+    """Mark every pixel with the sum of SATURATED, STARVED and CUT_OFF.
 
     Args:
         radiography, radiograph, camera, exposure: as in `flags_of`.
         binning: pixels a side; a mark of any of them is a mark of their mean.
+
+    Returns:
+        uint8 (rows, cols), binned.
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)
@@ -396,7 +405,7 @@ def flags_of(
         radiography: how images are made.
         radiograph: the image.
         camera, exposure: its settings.
-        time: of its pose [s].
+        time: of its pose [s]; None leaves it out.
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)[

@@ -111,8 +111,8 @@ class FramePipeline(Generic[T]):
         return batch
 
     async def _until_made(self, batch: Sequence[T]) -> None:
-        """Produce a batch; after a failure call `failed`, hold all workers, and try again
-        on `retry`.
+        """Produce a batch; after a failure call `failed`, wait for `retry`, and try
+        again.
         """
         while True:
             try:

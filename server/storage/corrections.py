@@ -140,6 +140,9 @@ class Corrections:
             note: for people.
             when: its date; None: now.
 
+        Returns:
+            The new correction, or the known one of this name with the same values.
+
         Raises:
             UnknownNameError: a name that is not a parameter.
             RpcError: -32602, the name is taken; corrections are never edited.
@@ -213,7 +216,8 @@ class Corrections:
             self._written = history
 
     def without(self, name: str) -> History:
-        """Return the history once the correction called `name` is deleted.
+        """Return the history as it is once the correction called `name` is deleted;
+        changes nothing.
 
         Raises:
             UnknownNameError: there is no such correction.

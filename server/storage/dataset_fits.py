@@ -23,14 +23,19 @@ PHANTOM_SUFFIXES: Final = (".toml", ".json")
 
 
 def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
-    """Calibrate from data sets; blocks.
+    """Calibrate from data sets as `calibration.fit` asks; blocks, for a worker process.
+
+    Args:
+        root: the data directory, against which names of data sets and phantom files are
+            resolved.
+        asked: parameters of `calibration.fit`.
+
+    Returns:
+        The calibration's document, with residuals [px], covariances by step and bead
+        tracks where asked for; paths are relative to the data directory.
 
     Raises:
         TwinError: there is no such data set or phantom, or nothing can be fitted.
-
-    Args:
-        root: the data directory.
-        asked: parameters of `calibration.fit`.
     """
     # Here, as only workers fit: the server's own process loads nothing of it.
     from flexdt.library.analysis import calibrate

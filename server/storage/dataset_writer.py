@@ -95,7 +95,7 @@ class DatasetWriter:
         return tuple(dict.fromkeys(f for f in self.record.files if f not in present))
 
     def put(self, name: str, image: npt.NDArray[np.uint16]) -> None:
-        """Write one image.
+        """Write one image as a TIFF file, atomically, and count it as present.
 
         Args:
             name: its file name; one of the record's.
@@ -124,13 +124,15 @@ class DatasetWriter:
             self._present.add(name)
 
     def finish(self, *, duration_s: float | None = None) -> None:
-        """Mark the data set complete.
+        """Mark the data set complete: write its texts anew, after the images are safe on
+        the disk.
 
         Args:
-            duration_s: of the scan as it ran [s].
+            duration_s: of the scan as it ran [s]; None keeps the planned one.
 
         Raises:
             DatasetMissingError: an image is not there; the data set stays incomplete.
+            DatasetWriteError: the system cannot write.
         """
         missing = self.missing
         if missing:
@@ -151,7 +153,14 @@ class DatasetWriter:
         self._files.close()
 
     def _begin(self, resume: bool) -> set[str]:
-        """Check and clean the folder; return the names of its complete images.
+        """Check that the folder is empty or holds this scan, and remove unfinished files
+        from it.
+
+        Args:
+            resume: whether the folder may have files.
+
+        Returns:
+            Names of the images that are complete.
 
         Raises:
             DatasetExistsError: it has files and the scan is not resumed, or those of
@@ -187,7 +196,8 @@ class DatasetWriter:
             return False
 
     def _check_same(self) -> None:
-        """Check that the folder holds this scan; take over its start and its correction.
+        """Check that the folder holds this scan, and adopt its start and its correction
+        in `record`.
 
         Raises:
             DatasetExistsError: it cannot be read, or holds another scan.
@@ -238,7 +248,14 @@ class DatasetWriter:
             )
 
     def _end(self, complete: bool, reason: str, duration_s: float | None) -> None:
-        """Write the texts with the end of the scan, after the images are safe on the disk."""
+        """Write the texts with the end of the scan, after the images are safe on the
+        disk.
+
+        Args:
+            complete: whether all images are there.
+            reason: why they are not, else "".
+            duration_s: of the scan as it ran [s]; None keeps the record's.
+        """
         if duration_s is None:
             length = self.record.duration_s
         else:

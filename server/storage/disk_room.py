@@ -90,7 +90,12 @@ class UsedBytes:
 
 
 def _read(folder: Directory, changed_ns: int) -> _Seen:
-    """Read a folder's files and folders."""
+    """Read the names of a folder's folders, and the sum of its files' sizes.
+
+    Args:
+        folder: to be read, without what its folders contain.
+        changed_ns: its time of modification [ns], kept with the result.
+    """
     nbytes = 0
     folders = list[str]()
     with folder.entries() as entries:
@@ -121,10 +126,10 @@ class DiskRoom:
         return UsedBytes(self.root)
 
     def require(self, what: str, size: int, there: int = 0) -> None:
-        """Check that the disk and the quota have room.
+        """Check that the disk and the quota have room for `size` and the reserve.
 
         Args:
-            what: that is about to begin.
+            what: that is about to begin, for the message.
             size: bytes it takes.
             there: of these, bytes that are there already.
 
@@ -147,7 +152,7 @@ class DiskRoom:
 
 
 def require_last(folder: Path, what: str, size: int) -> None:
-    """Check that writing leaves room for the state.
+    """Check that writing leaves `LAST_BYTES` of room for the state.
 
     Args:
         folder: on the disk.

@@ -236,10 +236,13 @@ class StateStore:
             self._at_once.set()
 
     async def run(self, moving: Callable[[], bool]) -> None:
-        """Write until cancelled; `moving` returns whether positions are changing.
+        """Write the state after each change, and while motors move; ends only by
+        cancellation.
+
+        A failure is logged and tried again after `FAR_S`.
 
         Args:
-            moving: function that tells it.
+            moving: returns whether positions are changing.
         """
         while True:
             if not moving():
@@ -262,7 +265,10 @@ class StateStore:
                     await self._at_once.wait()
 
     async def flush(self) -> None:
-        """Write now, so that everything answered later survives a kill.
+        """Write state and changed jobs now, so that everything answered later survives a
+        kill.
+
+        The outcome is kept in `problem`, and told by `noticed`.
 
         Raises:
             DatasetWriteError: the system cannot write.
@@ -307,7 +313,20 @@ class StateStore:
         after: Callable[[Memory], Memory] | None,
         files: Callable[[own.Changes], None] | None,
     ) -> T:
-        """Write a change, apply it, and restore the disk if either fails."""
+        """Write a change to the disk, then apply it; restore the disk if either fails.
+
+        Args:
+            take: applies the change in memory; may raise.
+            after: makes the state's document with the change from the present one; None
+                leaves the document.
+            files: adds further files to the change.
+
+        Returns:
+            The value of `take`.
+
+        Raises:
+            Exception: of writing or of `take`; nothing has changed.
+        """
         async with self._writing:
             document = None
             if after is not None:

@@ -46,10 +46,18 @@ def scene_apart(raw: bytes, *, name: str) -> Phantom:
 
 
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
-    """Read bytes in a worker process and return the phantom.
+    """Read a mesh or scene from bytes in a worker process with limits; blocks.
+
+    Args:
+        read: function of the worker.
+        how: its keyword arguments.
+        raw: bytes of the file.
+
+    Returns:
+        The phantom.
 
     Raises:
-        PhantomError: they cannot be read.
+        PhantomError: they cannot be read, or take too much time or memory.
     """
     worker = Worker(MEMORY_BYTES)
     try:

@@ -215,10 +215,18 @@ class _Scan:
 
 
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
-    """Find a data set's folder, and a key that changes with its files and its document.
+    """Find a data set's folder.
+
+    Args:
+        root: data directory.
+        name: of the data set.
+
+    Returns:
+        Its path, and a key that changes with its files and its document.
 
     Raises:
         DatasetMissingError: no such data set.
+        DatasetNameError: the name is not a plain one.
     """
     about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
@@ -310,7 +318,7 @@ def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
 
 
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
-    """Summarise a data set.
+    """Summarise a data set as a row of the list; nothing is read here.
 
     Args:
         path: of the data set.
@@ -378,13 +386,17 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 def _list(
     root: Directory, asked: p.DatasetList, around: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
-    """Answer dataset.list: the data sets that match the search, within the time limit.
+    """Answer dataset.list: the data sets that match the search, newest first, within the
+    time limit.
+
+    Summaries and thumbnails are cached. Data sets for which the time was too short are
+    listed as not read yet.
 
     Args:
         root: data directory.
         asked: search, range and thumbnails.
         around: jobs and machine of the twin.
-        codec: of the connection.
+        codec: of the connection, not used.
     """
     folders = []
     left_out = 0
@@ -450,7 +462,15 @@ def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
 
 
 def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
-    """Summarise a data set; "" for a folder that holds none."""
+    """Read and summarise a data set; a damaged one has its problem in the summary.
+
+    Args:
+        path: of its folder.
+        modified: its time of modification [s].
+
+    Returns:
+        The summary; "" for a folder that holds no data set.
+    """
     folder = files.list_folder(path)
     if folder.document is None and not folder.projections:
         return ""
@@ -520,7 +540,10 @@ def _get(
         root: data directory.
         asked: name and parts.
         around: jobs and machine of the twin.
-        codec: of the connection.
+        codec: of the connection, not used.
+
+    Raises:
+        DatasetError: no such data set, or one that cannot be read.
     """
     scan = _opened(root, asked.name)
     folder = scan.folder
@@ -553,7 +576,7 @@ def _get(
 
 
 def _same(scan: _Scan, around: TwinContext) -> bool:
-    """Return whether the twin has the machine and the profile of a data set."""
+    """Return whether the twin has the machine and the profile that a data set states."""
     document = scan.document
     texts = scan.texts
     if document:
@@ -624,14 +647,15 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 
 @lru_cache(4)
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
-    """Compute the smallest clearance of images [mm], and describe the scene.
+    """Compute the smallest clearance at images' poses [mm]; the last four results are
+    cached.
 
     Args:
         scan: with its document.
         at: indices of images.
 
     Returns:
-        Clearances, None where nothing is near, and a description of the scene.
+        Clearances [mm], None where nothing is near, and a description of the scene.
     """
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import UprightCylinder
@@ -751,7 +775,12 @@ def _there(folder: files.Folder, file: str) -> str:
 
 @lru_cache(4)
 def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
-    """Make the normalisation of a data set from its dark and flat images; cached.
+    """Make the conversion of a data set's counts to line integrals; the last four are
+    cached.
+
+    Args:
+        scan: whose dark and flat images are averaged.
+        shape: (rows, cols) of its images.
 
     Raises:
         DatasetMissingError: there is no flat image.

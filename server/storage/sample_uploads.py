@@ -78,15 +78,19 @@ class Incoming:
         self._lock = threading.Lock()
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Write a chunk; return the bytes received so far.
+        """Write a chunk of an upload to a nameless file.
 
         A chunk that has come before is passed over, so a client may send it again; a
-        chunk at 0 of another file under the same name begins a new upload.
+        chunk at 0 of another file under the same name begins a new upload. The oldest
+        uploads give way to new ones.
 
         Args:
             head: description of the upload.
             start: place of the chunk [bytes].
             data: the chunk.
+
+        Returns:
+            Number of bytes received so far.
 
         Raises:
             LimitError: a gap before this chunk, or the upload was dropped for newer ones.
@@ -123,8 +127,15 @@ class Incoming:
     def take(self, name: str) -> tuple[UploadHead, bytes]:
         """Read a complete upload and remove it from those under way.
 
+        Args:
+            name: of the sample.
+
+        Returns:
+            Its description and its bytes.
+
         Raises:
             LimitError: it is not complete, because another one was begun under its name.
+            DatasetWriteError: its file cannot be read.
         """
         with self._lock:
             known = self._open.get(name)
@@ -138,7 +149,13 @@ class Incoming:
                 self._close(name)
 
     def _begin(self, head: UploadHead) -> _Open:
-        """Begin an upload, in place of its namesake and of the oldest beyond `MAX_UPLOADS`."""
+        """Begin an upload, in place of its namesake and of the oldest beyond
+        `MAX_UPLOADS`.
+
+        Raises:
+            DiskFullError: no room for twice its size.
+            DatasetWriteError: the folder or the file cannot be made.
+        """
         self._close(head.name)
         if self._disk is not None:  # while it comes, and then under its name
             self._disk.require(f"the upload {head.name!r}", 2 * head.total)

@@ -78,7 +78,11 @@ def correction_of(part: p.CorrectionPart) -> NamedCorrection:
 
 
 def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Check that a scene fits this scanner.
+    """Check that all of a scene fits this scanner; the scanner itself is not changed.
+
+    Args:
+        scene: document.
+        scanner: on a copy of which the settings are tried.
 
     Raises:
         RpcError: -32602, another machine's.

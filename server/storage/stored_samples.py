@@ -143,16 +143,19 @@ class SampleStore:
         return _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
-        """Load the phantom called `name`; parsed once and cached.
+        """Load the phantom called `name`; parsed once and cached. Blocks.
 
         Args:
             name: a shipped phantom's or an upload's.
             material: instead of the one a mesh was uploaded with.
 
+        Returns:
+            The phantom, the same object until another file comes under the name.
+
         Raises:
             UnknownNameError: no such sample or material.
             LimitError: a material for a sample that has its own.
-            PhantomError: an upload that cannot be read any more.
+            PhantomError: an upload that cannot be read any more; it is set aside.
         """
         key = (name, material)
         with self._lock:
@@ -183,16 +186,21 @@ class SampleStore:
             del self._loaded[old]
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Receive a chunk, see `Incoming.receive`; return the bytes received so far.
+        """Check an upload's size and name, and write one chunk of it, see
+        `Incoming.receive`.
 
         Args:
             head: description of the upload.
             start: place of the chunk [bytes].
             data: the chunk.
 
+        Returns:
+            Number of bytes received so far.
+
         Raises:
             RpcError: -32008, larger than allowed.
-            LimitError: a gap before this chunk, or a name with another meaning.
+            LimitError: a gap before this chunk, too many uploads, or a name with another
+                meaning.
             DatasetWriteError: the disk does not take it.
         """
         if head.total > self._limit:
@@ -269,7 +277,13 @@ class SampleStore:
             self._replace(name, None)
 
     def _replace(self, name: str, new: UploadHead | None) -> None:
-        """Register another upload under a name, or none; with the lock held."""
+        """Register another upload under a name and forget what was loaded under it; with
+        the lock held.
+
+        Args:
+            name: of the sample.
+            new: description of the upload; None removes the name.
+        """
         old = self._heads.pop(name, None)
         if old is not None:
             self._replaced.add(_bytes_file(name, old.revision))
@@ -304,12 +318,16 @@ class SampleStore:
     def _load(
         self, head: UploadHead | None, name: str, material: str | None
     ) -> tuple[Phantom, str | None]:
-        """Load a phantom, and the revision of an upload.
+        """Load a phantom from the shipped ones or from an upload's file; nothing is
+        cached here.
 
         Args:
             head: description of the upload; None for a shipped phantom.
             name: of the sample.
             material: of an uploaded mesh; None: that of its description.
+
+        Returns:
+            The phantom, and the revision of an upload, else None.
 
         Raises:
             LimitError: a material for a shipped phantom.
@@ -332,10 +350,15 @@ class SampleStore:
         return phantom, _revision(head, raw)
 
     def _bytes(self, head: UploadHead) -> bytes:
-        """Read the bytes of an upload; a damaged one is set aside and raises.
+        """Read the bytes of an upload and compare them with its size and revision.
+
+        A damaged upload is removed from the list and its files are set aside.
 
         Args:
             head: description of the upload.
+
+        Raises:
+            PhantomError: it cannot be read, or its bytes are not those that were stored.
         """
         stored = head.revision
         file = _bytes_file(head.name, stored)
@@ -446,7 +469,15 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
 
 
 def sample_material(head: UploadHead | None, material: str | None) -> str | None:
-    """Return the material that a mesh is filled with; None for a sample that has its own."""
+    """Choose the material that a mesh is filled with.
+
+    Args:
+        head: description of the upload; None for a shipped phantom.
+        material: requested with the sample, if any.
+
+    Returns:
+        Name of the material; None for a sample that has its own.
+    """
     if head is None or head.kind != "mesh":
         return None
     if material is None:

@@ -37,10 +37,20 @@ class TwinSession:
         self._client = Client(peer)
 
     async def handle(self, method: AnyMethod, params: Params) -> object:
-        """Answer one call.
+        """Answer one call: take control where the method needs it, then call its handler.
+
+        Methods that move by hand are refused while a job runs, and cancel the automatic
+        resume of a paused one.
+
+        Args:
+            method: of the wire.
+            params: validated.
+
+        Returns:
+            The handler's result.
 
         Raises:
-            RpcError: the wire's form of any error.
+            RpcError: the wire's form of any error that a user can cause.
         """
         twin = self._twin
         client = self._client
@@ -71,6 +81,11 @@ class TwinSession:
         self._twin.feed.changed()
 
     def _take_control(self, what: str) -> None:
+        """Take control for the client if nobody holds it, and publish the new controller.
+
+        Raises:
+            RpcError: -32003, another client is the controller.
+        """
         before = self._twin.control.holder
         self._twin.control.require(self._client.name, what)
         if before != self._twin.control.holder:
@@ -83,7 +98,12 @@ def twin_pages(
     projector: ProjectorPool,
     requests: Requests,
 ) -> Pages:
-    """Make the web pages of a running twin server."""
+    """Make the pages /healthz and /metrics of a running twin server.
+
+    Args:
+        twin, server, projector: whose figures they show.
+        requests: counted calls.
+    """
 
     def health() -> dict[str, object]:
         job = twin.jobs.current
@@ -104,7 +124,9 @@ def twin_pages(
 def _figures(
     twin: TwinServer, server: TcpServer, projector: ProjectorPool
 ) -> list[Metric]:
-    """List the metrics of the twin server."""
+    """List the metrics of the twin server, read now; those of requests are not among
+    them.
+    """
     jobs = Counter(job.phase for job in twin.jobs.all())
     phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}
     events: dict[str, float] = {

@@ -136,6 +136,7 @@ class ControlLease:
         return loser
 
     def _taken(self, what: str) -> RpcError:
+        """Make the error -32003 that names the controller; returned, not raised."""
         return busy(
             f"{what}: {self.holder} is the controller; session.control with action force takes "
             "control over",
@@ -301,8 +302,13 @@ class TwinServer:
         """Awaited ends of motions."""
 
     async def start(self, sample: Sample | None = None) -> None:
-        """Start the services, with `sample` on the stage at the motors' present
-        positions.
+        """Put `sample` on the stage at the motors' present positions, and start the
+        services.
+
+        Contacts at the start are warnings in the log.
+
+        Args:
+            sample: None for an empty stage.
         """
         shown = sample or Sample()
         correction = self.scanner.correction
@@ -328,7 +334,11 @@ class TwinServer:
         self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
 
     async def stop(self) -> None:
-        """End all work; a running scan's data set is marked incomplete."""
+        """End all services and workers, and write the state as that of a server that
+        ended.
+
+        A running scan's data set is marked incomplete.
+        """
         for task in self._tasks:
             task.cancel()
         for task in self._tasks:
@@ -341,9 +351,12 @@ class TwinServer:
             self.keeper.end()
 
     def recall(self) -> Sample | None:
-        """Restore the state of the previous server, before `start`; returns its sample.
+        """Restore scanner and jobs of the previous server, before `start`; log a warning
+        if it was killed.
 
-        None if nothing is stored, or nothing that fits this machine.
+        Returns:
+            The sample for the stage; None if nothing is stored, or nothing that fits this
+            machine.
         """
         memory = self.remembered
         left = self._recall_jobs(memory)
@@ -365,7 +378,14 @@ class TwinServer:
         return self._readable(sample)
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
-        """Restore the jobs of earlier servers; returns the unfinished ones."""
+        """Restore the jobs of earlier servers, and write files for those that have none.
+
+        Args:
+            memory: state of the previous server, in which older ones kept their jobs.
+
+        Returns:
+            The jobs that had not ended.
+        """
         self._recalled = True
         jobs = self.job_files.read()
         if memory is None:
@@ -384,7 +404,10 @@ class TwinServer:
         return self.jobs.recall(known, memory.jobs_made, self.directory)
 
     def _apply_last(self) -> None:
-        """Apply the correction of the previous server at the start, if possible."""
+        """Put the previous server's correction in force at the start.
+
+        One that is lost or does not fit leaves none in force, with a warning in the log.
+        """
         last = self.corrections.in_force
         lost = self.corrections.lost
         if lost is not None:
@@ -470,6 +493,9 @@ class TwinServer:
         )
 
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
+        """Compute the smallest clearance at a state's positions; None for a machine
+        without components.
+        """
         guard = self.scanner.guard  # its scene is the one in force, and has been made
         motors = {
             name: axis.position
@@ -481,7 +507,9 @@ class TwinServer:
         return None
 
     def sample_state(self) -> w.SampleState:
-        """Describe the sample on the stage for the wire."""
+        """Describe the sample on the stage for the wire; the name is None for an empty
+        stage.
+        """
         sample = self.scanner.sample
         offset = w.SamplePlacement(**asdict(sample.offset))
         phantom = self.stage.phantom(sample)
@@ -530,6 +558,11 @@ class TwinServer:
         return self.scanner.rest_time(now) > now
 
     def _memory(self, ended: bool) -> kept.Memory:
+        """Record the twin's state for the file that a restarted server reads.
+
+        Args:
+            ended: whether the server ends now.
+        """
         history = self.corrections.in_state(self.corrections.history)
         self._unfiled = [job for job in self._unfiled if self.keeper.is_unwritten(job.id)]
         return kept.remember(
@@ -554,7 +587,9 @@ class TwinServer:
         return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
-        """Wait until `motors` are at rest, at any position."""
+        """Wait until `motors` are at rest, at any position, also after stops and further
+        moves.
+        """
         while True:
             now = self.clock.now()
             trajectories = self.scanner.trajectories(now)
@@ -580,8 +615,11 @@ class TwinServer:
         self._publish_log(level, message, data)
 
     def _noticed_disk(self, problem: str | None) -> None:
-        """Notify all clients that changes cannot be saved, or that they can be saved
-        again.
+        """Tell all clients, in log and state, that changes cannot be saved, or that they
+        can be saved again.
+
+        Args:
+            problem: None when it is over.
         """
         if problem is None:
             self.tell("info", "the state is on the disk again")
@@ -612,7 +650,13 @@ class TwinServer:
         self.changed()
 
     def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
-        """Publish the scan's latest image, with its public geometry."""
+        """Judge the scan's latest image and publish it, with its public geometry, to
+        subscribers.
+
+        Args:
+            frame: of the scan.
+            radiograph: its image, without noise.
+        """
         wanted = self.hub.wanted("projection")
         if not wanted and frame.kind != "projection":
             return

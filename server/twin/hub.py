@@ -57,6 +57,7 @@ class _Event:
         self._made: dict[ImageWish, Prepared] = {}
 
     def prepared(self, view: ImageWish) -> Prepared:
+        """Encode the event for a view; each view is encoded once."""
         if view not in self._made:
             if callable(self._data):
                 data = self._data(view)
@@ -116,9 +117,16 @@ class Hub:
         max_rate_hz: float | None = None,
         view: ImageWish | None = None,
     ) -> None:
-        """Send events of `topics` to `listener`, kept ones first.
+        """Subscribe `listener` to `topics`, and send it the kept events that it has not
+        had.
 
         A second call changes rate and view.
+
+        Args:
+            listener: connection.
+            topics: of the wire.
+            max_rate_hz: of events in slots; None for no limit.
+            view: kind and binning of images.
 
         Raises:
             RpcError: -32003, more subscriptions or views than there may be; nothing has
@@ -142,7 +150,12 @@ class Hub:
     def _require_room(
         self, listener: Peer, topics: set[TopicName], view: ImageWish
     ) -> None:
-        """Refuse subscriptions and views beyond the limits."""
+        """Check that a listener's subscriptions and view stay within the limits of the
+        hub.
+
+        Raises:
+            RpcError: -32003, there would be more.
+        """
         views = [
             s.view
             for topic, listeners in self._listeners.items()
@@ -248,6 +261,7 @@ class Hub:
         self._deliver(listener, subscription, new)
 
     def _flush(self, listener: Peer, subscription: _Subscription) -> None:
+        """Deliver the newest pending event of each slot, and begin the next interval."""
         subscription.timer = None
         subscription.next_at = (
             asyncio.get_running_loop().time() + subscription.min_interval_s
@@ -263,7 +277,9 @@ class Hub:
         self._drain()
 
     def _drain(self) -> None:
-        """Post as many events as one turn of the loop allows."""
+        """Post as many due events as one turn of the loop allows, and schedule the next
+        turn.
+        """
         while self._due and self._room:
             listener, subscription, new = self._due.popleft()
             if self._listeners.get(new.topic, {}).get(listener) is subscription:
@@ -276,6 +292,7 @@ class Hub:
             asyncio.get_running_loop().call_soon(self._refill)
 
     def _refill(self) -> None:
+        """Allow the events of a new turn, and post those that are due."""
         self._room = EVENTS_A_TURN
         self._refilling = False
         if self._due:

@@ -194,7 +194,12 @@ class LiveView:
         return Shot.of(scanner, self.clock.now(), self.revision(scanner.sample))
 
     async def run(self) -> None:
-        """Publish until cancelled."""
+        """Compute and publish images while the pose changes, one at a time; ends only by
+        cancellation.
+
+        Nothing is computed without subscribers or while a scan runs. A failure is logged
+        and tried again.
+        """
         loop = asyncio.get_running_loop()
         while True:
             await self._changed.wait()
@@ -218,11 +223,21 @@ class LiveView:
     async def shoot(
         self, shot: Shot, *, predicted: bool = False
     ) -> tuple[Radiograph, ConeVec]:
-        """Compute the image of a shot and its public geometry.
+        """Compute the image of a shot and its public geometry; the image is judged in the
+        state.
 
         Args:
             shot: pose, tube and camera.
-            predicted: use the public geometry for the image as well.
+            predicted: use the public geometry for the image as well, and keep it out of
+                the state.
+
+        Returns:
+            The radiograph without noise, and one row of cone_vec, nominal plus
+            correction.
+
+        Raises:
+            ProjectorUnavailable: the projector does not answer.
+            GeometryError: a geometry no scanner can have.
         """
         scanner = self.scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
@@ -261,7 +276,9 @@ class LiveView:
         await self._publish(radiograph, cone, shot)
 
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
-        """Publish an image to the subscribers in their views."""
+        """Make an image in each subscribed view, in a thread, and publish it; keep it for
+        the state.
+        """
         self._count += 1
         count = self._count
         views = self.hub.views("projection")
@@ -284,6 +301,7 @@ class LiveView:
             self._showing = asyncio.create_task(self._show_made())
 
     async def _show_made(self) -> None:
+        """Publish the newest image that was handed over, until there is none."""
         while self._made is not None:
             made = self._made
             self._made = None
@@ -312,7 +330,12 @@ class StateFeed:
         self._changed.set()
 
     async def run(self, settled: Callable[[], None]) -> None:
-        """Publish until cancelled; `settled` is called when motion has ended."""
+        """Publish the state after each change and during motion; ends only by
+        cancellation.
+
+        Args:
+            settled: called when motion has ended, or X-rays have become ready.
+        """
         while True:
             await self._changed.wait()
             self._changed.clear()
@@ -333,7 +356,12 @@ class StateFeed:
             await self._warmed_up(settled)
 
     async def _warmed_up(self, settled: Callable[[], None]) -> None:
-        """Say so when X-rays become ready, if nothing else happens before."""
+        """Wait until X-rays are ready and publish the state then, if nothing else changes
+        before.
+
+        Args:
+            settled: called then.
+        """
         tube = self.scanner.tube
         if tube.ready_in_s(self.clock.now()) and not self.job_runs():
             ready = self.clock.at(tube.ready_at)
@@ -347,6 +375,7 @@ class StateFeed:
                 settled()
 
     def _publish(self) -> None:
+        """Publish the state to its subscribers; log an error in place of raising it."""
         try:
             if self.hub.wanted("state"):
                 self.hub.publish("state", lambda _view: self.render())

@@ -32,7 +32,19 @@ PATIENCE_S = 10.0
 
 
 async def run(options: TwinSettings) -> int:
-    """Run the server until SIGTERM or SIGINT; returns the exit code."""
+    """Run the server until SIGTERM or SIGINT: lock the data directory, restore, serve,
+    and end.
+
+    Args:
+        options: of the process.
+
+    Returns:
+        The exit code: OK, or FAILED if a service of the twin failed for good.
+
+    Raises:
+        AccessError, TwinError, OSError: options that do not hold, or an address or a
+            directory that cannot be used.
+    """
     from flexdt.runtime.files.directory import memory_bytes, open_data
     from flexdt.runtime.files.own_documents import lock_folder
 

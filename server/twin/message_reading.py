@@ -52,7 +52,17 @@ class Reader:
 
 
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
-    """Decode in the worker: returns method and pickle of each item of a message or batch."""
+    """Decode a message or batch and validate its parameters; runs in the worker.
+
+    Args:
+        codec: of the connection.
+        most: largest number of items in a batch.
+        raw: bytes of the message.
+
+    Returns:
+        b"batch" or b"single", then for each item the method's name (b"" if unknown) and
+        its pickle.
+    """
     message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, m.Batch)
     if isinstance(message, m.Batch):
@@ -69,8 +79,8 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
 
 
 def _frozen(message: m.Single) -> bytes:
-    """Pickle a message as a call with its parameters read; too large ones become an
-    error.
+    """Pickle a message as a call with validated parameters; errors, and too large ones,
+    are pickled in place of parameters.
     """
     if not isinstance(message, m.Request | m.Notification):
         return pickle.dumps(message)

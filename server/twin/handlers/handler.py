@@ -70,6 +70,7 @@ def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_
     """Make a function the handler of `methods`, whose parameters and result it has."""
 
     def mark(handler: _Handler[_P, _R]) -> _Handler[_P, _R]:
+        """Register the handler for its methods, and return it unchanged."""
         for method in methods:
             assert method.name not in HANDLERS, f"{method.name} has a handler"
             HANDLERS[method.name] = handler
@@ -116,11 +117,12 @@ async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
 async def change_settings(
     twin: TwinServer, change: Callable[[ScannerTwin], None], ready: Callable[[], None]
 ) -> None:
-    """Change the scanner's settings.
+    """Try a change of settings on a copy of the scanner, write the state, then change the
+    scanner.
 
     Args:
         twin: whose scanner.
-        change: sets it; it is tried on a copy first.
+        change: sets it; it is tried on a copy first, and its errors are raised.
         ready: raises if the client has lost control.
 
     Raises:
@@ -151,7 +153,11 @@ async def change_stage(
     upload: ReceivedSample | None = None,
     scene: Scene | None = None,
 ) -> list[str]:
-    """Put a sample on the stage and a correction in force; hold `stage_turn` meanwhile.
+    """Put a sample on the stage and a correction in force: check, write, then change all
+    at once.
+
+    Hold `stage_turn` meanwhile. The sweep runs in a thread. Motion that is not free of
+    the new stage is halted, and a running job interrupted.
 
     Args:
         twin: whose stage.
@@ -160,7 +166,7 @@ async def change_stage(
         history: of corrections, with this one; None leaves it.
         source: origin of a new correction.
         upload: new content under the sample's name.
-        scene: settings and positions that come with it.
+        scene: settings and positions that come with it; its motion starts.
 
     Returns:
         Warnings: motion that was halted.
@@ -168,8 +174,8 @@ async def change_stage(
     Raises:
         UnknownNameError, LimitError, PhantomError: there is no such sample.
         GeometryError: a correction that no scanner can have.
-        CollisionError, SafetyError: what is under way, or stands, is not free of it; nothing
-            has changed (see `ScannerTwin.take_stage`).
+        CollisionError, SafetyError: what is under way, or stands, is not free of it;
+            nothing has changed (see `ScannerTwin.take_stage`).
         DatasetWriteError: it cannot be written; nothing has changed.
     """
     if history is None:

@@ -71,6 +71,12 @@ async def get_projection(
 
 
 def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
+    """Return the shot with the requested positions, tube and camera in place of the
+    present ones.
+
+    Raises:
+        LimitError, UnknownNameError: the machine does not have a motor or a setting.
+    """
     machine = twin.machine
     asked = params.tube or TubeSet()
     tube = changed_tube(machine.tube, shot.tube, asked.kV, asked.power_W)
@@ -84,6 +90,16 @@ def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
 
 
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
+    """Check that an image fits into one answer.
+
+    Args:
+        shape: (rows, cols) before binning.
+        params: kind, binning and marks.
+        codec: of the connection; JSON needs a third more.
+
+    Raises:
+        RpcError: -32008, it does not.
+    """
     rows, cols = (n // params.binning for n in shape)
     size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
     if codec is not Codec.MSGPACK:

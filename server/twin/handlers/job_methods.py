@@ -67,7 +67,10 @@ async def pause(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSt
 
 @h.answers(p.JOB_RESUME)
 async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """Back to the pose of the pause, and on; a job that ended early is queued once more.
+    """Return a paused job to its pose and continue it; queue one that ended early once
+    more.
+
+    The answer waits until the job runs or is refused.
 
     Raises:
         RpcError: -32002, a contact is ahead; the job stays paused.
@@ -96,7 +99,11 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
 
 @h.answers(p.JOB_ABORT)
 async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
-    """End the job with X-rays off; its data set stays, marked incomplete with the reason."""
+    """End the job with X-rays off; its data set stays, marked incomplete with the reason.
+
+    The answer waits until the state is on the disk and the job has ended; a disk that
+    fails is a warning in it.
+    """
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job, params.reason, client.name)
     unsaved = ""
@@ -126,7 +133,10 @@ async def list_jobs(
 async def forget(
     twin: TwinServer, client: h.Client, params: p.JobForget
 ) -> p.JobForgetResult:
-    """Remove ended jobs from the list; an incomplete one is resumed if submitted again."""
+    """Remove ended jobs, and their files, from the list.
+
+    An incomplete one whose data set exists is resumed if its scan is submitted again.
+    """
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 
     def files(changes: Changes) -> None:
@@ -167,7 +177,11 @@ def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
 
 
 def _source(params: ScanInput) -> ScanSource:
-    """Make the requested scan from a script or poses."""
+    """Make the requested scan from a script's text or bytes, or from poses.
+
+    Raises:
+        RpcError: -32602, no base64; -32008, the script is too large.
+    """
     if isinstance(params, p.TrajectoryInput):
         return ScanSource.of_poses(
             params.poses,

@@ -27,7 +27,10 @@ from flexdt.twin.scanner.state import CameraChange
 
 @answers(p.AXES_MOVE)
 async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
-    """Start a move; the answer is sent at once, or with `wait` when the motors rest."""
+    """Start a move; the answer is sent at once, or with `wait` when the motors rest.
+
+    A way around obstacles that is under way is cancelled. With `plan` a new one is found.
+    """
     if params.plan:
         return await _move_around_obstacles(twin, client, params)
     now = twin.clock.now()
@@ -80,7 +83,16 @@ def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
 async def _move_around_obstacles(
     twin: TwinServer, client: Client, params: p.Move
 ) -> p.MoveResult:
-    """Start free moves one by one; an earlier way ends with its present leg."""
+    """Find free moves to the targets and start them one by one; an earlier way ends with
+    its present leg.
+
+    With `wait` the answer comes at the end of the way; else its failure is told in the
+    log.
+
+    Raises:
+        CollisionError: no free way was found.
+        RpcError: the client has lost control meanwhile.
+    """
     twin.detours.cancel()
     now = twin.clock.now()
     told = twin.scanner.told_of(params.targets, now, relative=params.relative)
@@ -126,7 +138,9 @@ def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
 async def set_axis(
     twin: TwinServer, client: Client, params: p.AxisSet
 ) -> p.AxisSetResult:
-    """Set speed and acceleration of future motions."""
+    """Set speed and acceleration of an axis's future motions; the answer has those in
+    force.
+    """
 
     def change(scanner: ScannerTwin) -> None:
         scanner.set_axis(
@@ -181,7 +195,12 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
 
 @answers(p.TUBE_SET)
 async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
-    """Change the tube; omitted settings stay."""
+    """Change the tube: voltage, power, X-rays; omitted settings stay. Voltage and power
+    are saved.
+
+    Raises:
+        SafetyError: X-rays on after motion was stopped meanwhile.
+    """
 
     stops = twin.scanner.stops
 

@@ -25,7 +25,10 @@ MAX_NAMED_UPLOADS = 50
 async def set_sample(
     twin: TwinServer, client: h.Client, params: p.SampleSet
 ) -> p.SampleResult:
-    """Put a shipped phantom or an upload on the stage; without an offset it is centred."""
+    """Put a shipped phantom or an upload on the stage; without an offset it is centred.
+
+    The sample is read first, in a thread; the answer warns of motion that was halted.
+    """
     if params.name is None:
         name = params.file
     else:
@@ -107,7 +110,10 @@ async def mesh(
 async def upload(
     twin: TwinServer, client: h.Client, params: p.SampleUpload
 ) -> p.UploadResult:
-    """Store one chunk of an upload; the last one completes the sample."""
+    """Write one chunk of an upload; after the last one parse and store the sample.
+
+    A complete upload under the name of the sample on the stage replaces that one there.
+    """
     head = UploadHead.of(params)
     _ensure_idle_if_used(twin, client, head.name)
     received = await asyncio.to_thread(
@@ -206,6 +212,9 @@ def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
 
 
 def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> p.SampleInfo:
+    """Describe a sample for the list; `head` is the description of an upload, None for a
+    phantom.
+    """
     return p.SampleInfo(
         name=name,
         kind="phantom" if head is None else head.kind,
@@ -222,6 +231,9 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
 
 
 def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
+    """Make the error for an upload that does not exist, with the last names; returned,
+    not raised.
+    """
     uploads = list(twin.samples.uploads)[-MAX_NAMED_UPLOADS:]
     older = len(twin.samples.uploads) - len(uploads)
     more = ""

@@ -26,7 +26,13 @@ document = cache(openrpc_document)
 
 @answers(p.SESSION_HELLO)
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
-    """Answer a client's greeting; `network.shell_parts.TokenCheck` has checked its token."""
+    """Answer a client's greeting; `network.shell_parts.TokenCheck` has checked its token.
+
+    The client's program is noted, as control goes by its name.
+
+    Raises:
+        RpcError: another version of the protocol.
+    """
     require_compatible(params.protocol)
     client.program = client.program or params.client  # control goes by the name
     return p.HelloResult(
@@ -42,7 +48,14 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
 
 @answers(p.SESSION_CONTROL)
 def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlResult:
-    """Take or release control; there is one controller at a time."""
+    """Take, release or force control; there is one controller at a time.
+
+    A new controller cancels the last one's way around obstacles, and force is told in the
+    log.
+
+    Raises:
+        RpcError: -32003, another client is the controller.
+    """
     before = twin.control.holder
     match params.action:
         case "acquire":
@@ -110,8 +123,15 @@ def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult
 
 @answers(d.SCENE_LOAD)
 async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State:
-    """Load a scene: check all of it, the motion included, then apply it and start the
-    motors.
+    """Load a scene: check all of it, the motion included, then change stage and settings
+    and start the motors.
+
+    Returns:
+        The complete state afterwards; halted motion is told in the log.
+
+    Raises:
+        RpcError: -32602, another machine's; -32003, a job runs.
+        SafetyError: motion was stopped meanwhile.
     """
     scene = params.document
     stops = twin.scanner.stops
