@@ -54,7 +54,12 @@ class SceneParts:
         return tuple(m for q in ("mount_x", "mount_y") for m in geometry.get(q, {}))
 
     def at(self, positions: Mapping[str, float]) -> CollisionScene:
-        """Build the scene with these stages fixed at the motors' `positions` [mm]."""
+        """Build the scene with the stages on the turntable fixed at the motors'
+        `positions`.
+
+        Args:
+            positions: motor -> position [mm]; those left out are at home.
+        """
         axes = dict(self.machine.axes)
         for name in self.mounts:
             here = positions.get(name, axes[name].home)
@@ -174,7 +179,13 @@ class PairStack:
     def of(
         cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]
     ) -> PairStack:
-        """Stack pairs of `bodies`, which `axes` motors move."""
+        """Stack pairs of bodies as arrays, for bounds of all their clearances at once.
+
+        Args:
+            axes: number of motors that move them.
+            bodies: all bodies.
+            pairs: indices of the two bodies of each pair.
+        """
         chosen = [(bodies[i], bodies[j]) for i, j in pairs]
         slides = np.array([a.slides - b.slides for a, b in chosen]).reshape(
             len(pairs), axes, 3

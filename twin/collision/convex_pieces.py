@@ -54,6 +54,10 @@ def convex_pieces(
         offset: (3,) shift on the stage [mm].
         max_pieces: at most so many.
 
+    Returns:
+        The pieces, placed; the convex hull alone for a mesh of more than
+        `MAX_CUTTING_FACES`.
+
     Raises:
         GeometryError: the mesh has no faces or is not finite.
     """
@@ -94,13 +98,14 @@ class _Piece:
 
 
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
-    """Find the halves of the best of a few cuts; None if none is worthwhile.
+    """Find the halves of the least volume, from cuts at quarters along each axis.
 
     Args:
         piece: with its triangles and hull.
 
     Returns:
-        The two halves of the least volume, from cuts at quarters along each axis.
+        The two halves; None if no cut makes the volume less than `MAX_VOLUME_SHARE` of
+        the piece's.
     """
     points = piece.hull.vertices
     best = None
@@ -129,6 +134,9 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
         axis: number of the coordinate axis across the plane.
         at: position of the plane [mm].
         side: +1 keeps the part above it, -1 the part below.
+
+    Returns:
+        (m, 3, 3) corners of the kept part; empty if nothing is on that side.
     """
     height = side * (triangles[:, :, axis] - at)
     count = (height >= 0.0).sum(axis=1)
@@ -171,7 +179,9 @@ def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> Float
 
 
 def _cap(points: FloatArray, axis: int) -> FloatArray:
-    """Triangulate the convex hull of points of a plane across `axis`."""
+    """Triangulate the convex hull of points (k, 3) of a plane across `axis`, as corners
+    (m, 3, 3).
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     if len(points) < 3:

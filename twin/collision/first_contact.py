@@ -107,6 +107,10 @@ class PathSearch:
         Args:
             only_contacts: skip pairs too distant for a contact, so that clearances are
                 incomplete.
+
+        Returns:
+            The contact or None, the least clearance [mm] with its pair, and the number of
+            distance evaluations.
         """
         limits = self.scene.limits
         best = math.inf
@@ -140,6 +144,9 @@ class PathSearch:
 
         Args:
             guess: result of a sweep that found no contact.
+
+        Returns:
+            The result with the least clearance within the scene's accuracy.
         """
         best = guess.min_clearance_mm
         nearest = guess.nearest
@@ -209,7 +216,16 @@ def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, fl
 def clearance_trace(
     scene: CollisionScene, path: Path, times: Sequence[float] | FloatArray
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
-    """Compute (time [s], clearance [mm], pair) at each of `times`."""
+    """Compute the least clearance of the scene at moments of a path.
+
+    Args:
+        scene: bodies and pairs.
+        path: of all motors.
+        times: moments [s].
+
+    Returns:
+        (time [s], clearance [mm], nearest pair or None) for each moment.
+    """
     if len(times) == 0:
         return ()
     q = path.vectors(np.asarray(times, dtype=np.float64))

@@ -29,12 +29,17 @@ class SceneGuard:
     def __call__(
         self, trajectories: Mapping[str, Trajectory], now: float
     ) -> Contact | None:
-        """Find the first contact from `now` on; when nothing moves, the nearest
-        pair that touches.
+        """Find the first contact from `now` on; when nothing moves, the nearest pair that
+        touches.
+
+        Pairs that overlap already stop only motion that brings them closer.
 
         Args:
             trajectories: motor -> trajectory; motors left out are at home.
             now: since when [s].
+
+        Returns:
+            The contact, or None for a free motion.
         """
         scene = self.scene
         ends = [

@@ -27,6 +27,7 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
     """
 
     def wrong(what: str, **data: object) -> MachineFileError:
+        """Make the error of a machine file's axes; returned, not raised."""
         return MachineFileError(
             f"{file}: axes: {what}", {"file": file, "path": "axes", **data}
         )

@@ -95,7 +95,16 @@ class _Planner:
     def contact(
         self, moved: Mapping[str, float], step: Mapping[str, float]
     ) -> Contact | None:
-        """Sweep one move from the start with `moved` changed; return its first contact."""
+        """Sweep one move and count it; remember the bodies that it touches as obstacles.
+
+        Args:
+            moved: motor -> position before the move, where it is not that of the start
+                [mm, deg].
+            step: motor -> target of the move.
+
+        Returns:
+            The first contact, or None.
+        """
         trajectories = {}
         for axis in self.scene.axes:
             here = moved.get(axis, self.at(axis))
@@ -214,6 +223,9 @@ class _Planner:
         Args:
             way: (motor, position) in order, free.
             goal: motor -> target [mm, deg]; moves to it are not changed.
+
+        Returns:
+            The path with the same motors in the same order.
         """
         for i, (axis, value) in enumerate(way):
             earlier = [v for a, v in way[:i] if a == axis]
@@ -246,7 +258,14 @@ class _Planner:
         return True
 
     def joined(self, way: Sequence[tuple[str, float]]) -> list[dict[str, float]]:
-        """Join neighbouring moves where moving together is free as well."""
+        """Join neighbouring moves where moving together is free as well.
+
+        Args:
+            way: (motor, position) in order, free.
+
+        Returns:
+            Moves in order, each motor -> position.
+        """
         moves: list[dict[str, float]] = []
         moved: dict[str, float] = {}
         for axis, value in way:

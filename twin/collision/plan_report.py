@@ -44,6 +44,10 @@ def collision_check(
             cylinder that contains the sample by the script or the caller (as high as it
             is wide, where the height is unknown), or an empty stage.
         parameters: the correction in force.
+
+    Returns:
+        A function of plan, machine, profile and the sample's size that returns the plan's
+        clearances and collisions.
     """
 
     def check(
@@ -62,8 +66,12 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     """Sweep a plan for its contacts and clearances.
 
     Args:
-        plan: bodies and pairs that must not touch.
+        plan: of a scan, with the paths of its axes.
         scene: bodies and pairs that must not touch.
+
+    Returns:
+        All contacts in the order of time, the least clearance [mm] with its pair, and a
+        trace of clearances.
     """
     path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
     search = PathSearch(scene, path)

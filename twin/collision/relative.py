@@ -107,7 +107,8 @@ class Path:
 def path_of(
     axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float
 ) -> Path:
-    """Make the path of `axes` from `start` to `end` [s].
+    """Make the path of `axes` from `start` to `end`, cut wherever a motor changes its
+    law.
 
     Args:
         axes: names of the motors, in the order of the columns.
@@ -266,7 +267,8 @@ class _Bound:
 
 def _fall_time(above: float, rate: float, growth: float, length: float) -> float | None:
     """Solve for the first dt in [0, length] at which above + rate dt + growth dt^2 / 2 is
-    0, or None."""
+    0; None if there is none.
+    """
     if above <= 0.0:
         return 0.0
     square = rate * rate - 2.0 * growth * above
@@ -426,7 +428,16 @@ class RelativeMotion:
         return float(self.times[at.segment] + at.dt)
 
     def look(self, at: Moment, separate: Separate) -> Look:
-        """Compute the certified gap of the two bodies at a moment."""
+        """Compute the certified gap of the two bodies at a moment.
+
+        Args:
+            at: segment, and time in it [s].
+            separate: certified separation of the two solids in a pose.
+
+        Returns:
+            The moment, the gap [mm] (0 for an overlap), its direction, and the
+            orientations of the bodies.
+        """
         i = at.segment
         dt = at.dt
         offset = self._origin[i] + dt * (
@@ -549,7 +560,7 @@ def sweep_pair(
     start: Moment = START,
     until: float = math.inf,
 ) -> PairResult:
-    """Sweep one pair until it touches, the motion ends, or `until` [s].
+    """Sweep one pair until it touches, the motion ends, or `until`.
 
     A pair that starts within the tolerance of the margin, or nearer, may move, but not
     below its floor.
@@ -560,6 +571,10 @@ def sweep_pair(
         limits: margin, tolerance.
         start: where to begin.
         until: end of the sweep [s].
+
+    Returns:
+        The least gap that was evaluated [mm], the moment of the contact and the last free
+        one before it (None without them), and the number of evaluations.
     """
     level = floor(math.inf, limits.margin)
     near = limits.margin + limits.tolerance
@@ -598,8 +613,13 @@ def sweep_pair(
 def refine_pair(
     motion: RelativeMotion, separate: Separate, limits: Limits, best: float
 ) -> tuple[float, int]:
-    """Refine the least clearance of a pair that is known to be free, if it is
-    below `best` [mm].
+    """Refine the least clearance of a pair that is known to be free.
+
+    Args:
+        motion: of one body relative to the other.
+        separate: their certified clearance in a pose.
+        limits: margin, accuracy.
+        best: clearance of interest [mm]; greater ones are not refined.
 
     Returns:
         A clearance that occurs, not more than `limits.slack` above the least (`best` if

@@ -66,13 +66,16 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
 
 
 def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
-    """Find the contact that stops one overlapping pair: coming closer, or touching
-    again once free.
+    """Find the contact that stops one overlapping pair: coming closer, or touching again
+    once free.
 
     Args:
         scene: the bodies.
         path: of all motors.
         pair: of bodies that overlap at the beginning.
+
+    Returns:
+        The contact; None if the bodies only come apart.
     """
     a, b = (scene.bodies[i] for i in pair)
     motion = RelativeMotion(a, b, path)
@@ -154,7 +157,12 @@ class _Overlap:
 
     @classmethod
     def at(cls, a: Body, b: Body, q: FloatArray) -> _Overlap:
-        """Find the directions of an overlap with the motors at `q` (axes,)."""
+        """Find the directions in which two overlapping bodies are to come apart.
+
+        Args:
+            a, b: the bodies.
+            q: positions of all motors (axes,) [mm, deg].
+        """
         from scipy.spatial import ConvexHull
 
         (turn_a, at_a), (turn_b, at_b) = _pose(a, q), _pose(b, q)

@@ -89,8 +89,8 @@ def _improved(
     ra: FloatArray,
     rb: FloatArray,
 ) -> Separation:
-    """Improve a certificate by Gilbert's search for the nearest point of the hull
-    of all differences.
+    """Improve a certificate by Gilbert's search for the nearest point of the hull of all
+    differences.
 
     fcl is off by millimetres where two edges are parallel, as those of upright boxes are.
 
@@ -99,6 +99,9 @@ def _improved(
         found: certificate to improve.
         offset: from b's origin to a's (3,) [mm].
         ra, rb: orientations of a and b (3, 3).
+
+    Returns:
+        Gap [mm] and normal (3,); never a worse one than `found`.
     """
     from scipy.optimize import nnls
 
@@ -127,7 +130,13 @@ def _improved(
 
 
 def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
-    """Make fcl's shape, and its own centre in the solid's frame (3,) [mm].
+    """Make fcl's shape of a solid.
+
+    Args:
+        solid: in its own frame.
+
+    Returns:
+        The shape, and its own centre in the solid's frame (3,) [mm].
 
     Raises:
         TypeError: neither cylinder nor polytope.

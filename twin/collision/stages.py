@@ -192,6 +192,9 @@ def sample_bodies(
         profile: offsets of its motors.
         sample: convex pieces in the sample's frame [mm].
         parameters: offsets of the geometry.
+
+    Returns:
+        One body for each piece; none for a machine without a holder.
     """
     holder = next((c for c in machine.components if c.role == "sample_holder"), None)
     if holder is None:
@@ -262,8 +265,11 @@ def _wherever(
         machine: whose stage it is.
         part: the component, or the holder of a sample.
         solid: in the frame of the turntable.
-        place: of a sample, which is on top of every such stage: its turn on the
-            turntable.
+        place: of a sample, which is on top of every such stage: its turn on the turntable
+            (3, 3).
+
+    Returns:
+        The hull of all places; `solid` itself where no such stage carries it.
     """
     if part.anchor != "object":
         return solid
@@ -327,7 +333,7 @@ def _chain(
 
 
 def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | Polytope:
-    """Make the solid of a component; a panel follows its tilts."""
+    """Make the solid of a component, in its own frame [mm]; a panel follows its tilts."""
     if part.shape == "cylinder":
         return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
     if part.points_mm:

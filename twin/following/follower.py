@@ -105,12 +105,16 @@ class Follower:
     collision: CollisionCheck | None = None
 
     def hear(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        """Update the mirror with a message.
+        """Update the mirror with a message: command, feedback, acknowledgement or error.
 
         Args:
             mirror: before it.
             heard: the message.
             now: when it came [s].
+
+        Returns:
+            The mirror after it, with new lines of the log and alarms; doubled and late
+            messages change nothing else.
         """
         mirror = replace(mirror, heard_s=now, lines=(), connected=True)
         mirror = mirror.cleared("link")
@@ -137,7 +141,10 @@ class Follower:
         return self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
-        """Update the mirror after time without a message: raise alarms for overdue commands.
+        """Update the mirror after time without a message: raise alarms for overdue and
+        silent commands.
+
+        Commands without a sign of life for long are forgotten.
 
         Args:
             mirror: present state.
@@ -252,8 +259,11 @@ class Follower:
     # -- commands ----------------------------------------------------------------------------
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        """Update the mirror with a command: prediction, place in the script,
-        command under way.
+        """Update the mirror with a command: prediction, place in the script, command
+        under way.
+
+        A command that was heard before changes nothing; one that another has waited for
+        ends those.
 
         Args:
             mirror: present state.
@@ -287,7 +297,13 @@ class Follower:
         return replace(mirror, waiting={**kept, heard.identity: waiting})
 
     def _over(self, mirror: Mirror, component: str, now: float) -> Mirror:
-        """End the commands of a component, or of all, whose predicted time is over."""
+        """End the commands whose predicted time is over, and apply their settings.
+
+        Args:
+            mirror: present state.
+            component: whose commands end; "" for all.
+            now: moment [s].
+        """
         for waiting in mirror.waiting.values():
             over = now + waiting.heard.late_s - waiting.sent_s > (
                 waiting.predicted_s or 0.0
@@ -304,13 +320,18 @@ class Follower:
     def _predicted(
         self, mirror: Mirror, waiting: Waiting, command: c.Command, now: float
     ) -> tuple[Mirror, Waiting]:
-        """Predict one command, from the machine as it is now, and raise its alarms.
+        """Predict one command, from the machine as it is now, and raise alarms for its
+        problems.
 
         Args:
             mirror: the machine.
             waiting: the command under way; its prediction is added.
             command: the same, typed.
             now: time [s].
+
+        Returns:
+            The mirror, with the predicted paths of its axes, and the command with its
+            expected duration and bounds [s] and targets.
         """
         if isinstance(command, c.MoveAbsolute):
             command = replace(command, trigger=None)
@@ -526,6 +547,9 @@ class Follower:
             name: of the axis.
             motor: its reply.
             now: moment [s].
+
+        Returns:
+            The mirror with the motor's rates, and an alarm for each difference.
         """
         axis = self.machine.axes[name]
         for what, theirs, ours in (
@@ -558,6 +582,10 @@ class Follower:
             heard: feedback, or the answer to a question.
             waiting: the command it belongs to, or None.
             now: time [s].
+
+        Returns:
+            The mirror with the reading, and an alarm for an axis that is off its path,
+            slow, fast, or moved by nobody; repeated and old readings change nothing.
         """
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
         axis = heard.words[0]
@@ -696,7 +724,13 @@ def _bare(command: c.Command) -> c.Command:
 
 
 def _flushed(mirror: Mirror, now: float) -> Mirror:
-    """Record the commands that the sender has not waited for, now that another follows."""
+    """Add log lines for the commands that the sender has not waited for, now that another
+    follows.
+
+    Args:
+        mirror: present state.
+        now: moment of the next command [s].
+    """
     for waiting in mirror.waiting.values():
         if waiting.written or waiting.heard.asks:
             continue
@@ -734,11 +768,12 @@ def _number(text: str) -> float | None:
 def _after(
     mirror: Mirror, command: c.Command | None, machine: Machine, now: float
 ) -> Mirror:
-    """Apply the end of a command to the mirror's settings.
+    """Apply the end of a command to the mirror's settings: camera, tube, X-rays or an
+    axis's rates.
 
     Args:
         mirror: present state.
-        command: that has ended.
+        command: that has ended; other commands and None change nothing.
         machine: with the time that X-rays need.
         now: moment [s].
     """

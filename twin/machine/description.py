@@ -154,7 +154,11 @@ class Axis(_Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Axis:
-        """Check that home, speed and acceleration are within their limits."""
+        """Check that home, speed and acceleration are within their limits.
+
+        Raises:
+            PydanticCustomError: names the field, its value and the allowed ones.
+        """
         _refuse_if(
             self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}"
         )
@@ -184,7 +188,12 @@ class VirtualAxis(_Frozen):
 
     @model_validator(mode="after")
     def _reads_what_it_moves(self) -> VirtualAxis:
-        """Check that the axis reads a motor that it moves, at the inverse share."""
+        """Check that factor and shares are not 0, and that the axis reads a motor that it
+        moves, at the inverse share.
+
+        Raises:
+            PydanticCustomError: names the field, its value and the allowed ones.
+        """
         _refuse_if(self.factor == 0.0, "factor", self.factor, "a number other than 0")
         allowed = f"shares of motors, {self.of!r} (the `of`) among them"
         _refuse_if(self.of not in self.moves, "moves", self.moves, allowed)
@@ -280,7 +289,12 @@ class DetectorSpec(_Frozen):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
-        """Check that mode and ROI fit the panel, and that the response is physical."""
+        """Check that mode and ROI fit the panel, and that the response is physical: left
+        energies below the photon's, energies rising.
+
+        Raises:
+            PydanticCustomError: names the field, its value and the allowed ones.
+        """
         try:
             binning = binning_of(self.mode, self.modes)
         except LimitError:
@@ -401,7 +415,12 @@ class Component(_Frozen):
 
     @model_validator(mode="after")
     def _round(self) -> Component:
-        """Check that size and centre agree with the shape."""
+        """Check that size, centre and points agree with the shape: a round cylinder, a
+        hull's own box.
+
+        Raises:
+            PydanticCustomError: names the field, its value and the allowed ones.
+        """
         if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
             raise _refused(
                 "size_mm", self.size_mm, "as wide in x as in y, for a cylinder"
@@ -643,6 +662,10 @@ class Machine(_Frozen):
         a motor of the machine that drives its anchor and occurs once in its chain; a
         moved part has the anchor of its parent; a stage on the turntable is carried by
         it.
+
+        Raises:
+            PydanticCustomError: names the component's key, its value and the allowed
+                ones.
         """
         names = [c.name for c in self.components]
         for component in self.components:
@@ -702,10 +725,16 @@ class Machine(_Frozen):
             )
 
     def _check_roles(self) -> None:
-        """Check that focal spot, active area and holder are where the X-ray geometry has them.
+        """Check that focal spot, active area and holder are where the X-ray geometry has
+        them.
 
-        Otherwise a motor of `geometry` would move the image and leave the body behind,
-        and a collision would count as free.
+        Each role has one component, at its own anchor, carried by all motors of that
+        anchor, and large enough to hold its place. Otherwise a motor of `geometry` would
+        move the image and leave the body behind, and a collision would count as free.
+
+        Raises:
+            PydanticCustomError: names the component's key, its value and the allowed
+                ones.
         """
         across, up = self.detector.pixels.size_mm
         for role, anchor, half in (
@@ -827,7 +856,7 @@ def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
 def parse_machine(
     text: str, file: str = "<machine>", corners: Corners | None = None
 ) -> Machine:
-    """Parse a machine description.
+    """Parse and validate a machine description.
 
     `base = NAME` at the top of the text inherits everything else from a machine that
     ships, except its zero offsets and the axes and components that `without` lists.
@@ -841,8 +870,8 @@ def parse_machine(
             those beside the file).
 
     Raises:
-        MachineFileError: TOML or content is invalid; file, key path, value, allowed
-            values.
+        MachineFileError: TOML or content is invalid, a motor moves nothing, or none turns
+            the sample; file, key path, value, allowed values.
     """
     machine = _parse(Machine, lambda own: _inherited(_meshed(own, corners)), text, file)
     driving = {name for factors in machine.geometry.values() for name in factors}
@@ -955,11 +984,14 @@ def _data(kind: str, name: str) -> str:
 
 
 def _meshed(own: Raw, corners: Corners | None) -> Raw:
-    """Replace the meshes of components by their convex bodies.
+    """Replace the meshes of components by their convex bodies, in place.
 
     Args:
         own: content of a machine file; it is changed.
-        corners: reads the corners of a mesh file.
+        corners: reads the corners of a mesh file; None: no files may be read.
+
+    Returns:
+        `own` itself.
 
     Raises:
         UnknownNameError: names the component and its problem.
@@ -1076,7 +1108,16 @@ def _drop(base: Raw, name: object) -> None:
 
 
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
-    """Merge `own` into `base`; tables in `whole` are replaced, others merged."""
+    """Merge a machine's content into that of its base, key by key.
+
+    Args:
+        base: content of the base.
+        own: content that goes before it.
+        whole: tables that are replaced; others are merged.
+
+    Returns:
+        A new table; values of both are shared.
+    """
     out = dict(base)
     for key, value in own.items():
         old = out.get(key)
@@ -1093,9 +1134,16 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
 
 
 def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
-    """Merge the components `own` into those of `old` by name.
+    """Merge components by name.
 
     Two components of one name are both kept, so that the check of names finds them.
+
+    Args:
+        old: of the base machine.
+        own: of the file, which go before those.
+
+    Returns:
+        The base's components in their order, then the file's new ones.
     """
     first = {
         part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)
@@ -1125,6 +1173,9 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
         prepared: converts the content before it is validated.
         text: TOML.
         file: name for error messages.
+
+    Returns:
+        A value of `model`.
 
     Raises:
         MachineFileError: one line for each problem; data has file and problems.

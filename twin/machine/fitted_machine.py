@@ -51,6 +51,9 @@ def _replaced(text: str, blocks: Mapping[str, str]) -> str:
     Args:
         text: of a machine file.
         blocks: table's name -> its new text; those that the file lacks are appended.
+
+    Returns:
+        The new text.
     """
     left = dict(blocks)
     out: list[str] = []
@@ -86,7 +89,9 @@ def _axis_table(name: str, axis: Axis) -> str:
 
 
 def _timing_table(timing: Timing) -> str:
-    """Format times as TOML tables, with measured or assumed behind each."""
+    """Format times as the TOML tables [timing] and [timing.spread], with measured or
+    assumed behind each.
+    """
     lines = ["[timing]"]
     for line in _keys(timing, {"spread"}):
         kind = line.split("_s = ")[0]

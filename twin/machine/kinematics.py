@@ -214,7 +214,8 @@ def _too_far(
     *,
     relative: bool,
 ) -> LimitError:
-    """Convert a motor's limit error to one of the axis that was to move.
+    """Convert a motor's limit error to one of the axis that was to move; returned, not
+    raised.
 
     Args:
         machine: with the virtual axis.
@@ -223,6 +224,9 @@ def _too_far(
         positions: motor -> reading now [mm, deg].
         error: of one of its motors.
         relative: `value` is a step.
+
+    Returns:
+        The error with the range of the virtual axis; `error` itself for a motor.
     """
     if axis in machine.axes:
         return error

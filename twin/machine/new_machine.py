@@ -60,10 +60,13 @@ class Answers:
 
 
 def new_machine_text(answers: Answers) -> str:
-    """Write a machine file (TOML) from answers.
+    """Write a machine file (TOML) from answers; it is parsed before it is returned.
 
     Args:
         answers: name, base, and the values that differ from it.
+
+    Returns:
+        The file's text.
 
     Raises:
         UnknownNameError: no such base, or it has no such axis.
@@ -73,7 +76,8 @@ def new_machine_text(answers: Answers) -> str:
             values.
 
     Example:
-        >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0), max_kV=90.0))
+        >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0),
+        max_kV=90.0))
         >>> parse_machine(text).fixed["object_y"], len(text.splitlines()) < 20
         (80.0, True)
     """

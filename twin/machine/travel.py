@@ -51,12 +51,16 @@ class Arrival:
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
-    """Apply the rule to the targets of a move of `axis`.
+    """Apply the rule for targets beyond a limit to a move of `axis`; raises nothing.
 
     Args:
         machine: whose motors these are.
         axis: motor or virtual axis that is moved.
         targets: motor -> requested target [mm, deg].
+
+    Returns:
+        Targets within the travel, a message for each that lies beyond, and the error of
+        the first that lies beyond by more than its tolerance, or None.
     """
     messages = []
     beyond = None
@@ -72,14 +76,18 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
 
 
 def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
-    """Apply the rule to a speed or acceleration of `axis` that may be above
-    its motors' maximum.
+    """Apply the rule to a speed or acceleration of `axis` that may be above its motors'
+    maximum; raises nothing.
 
     Args:
         machine: whose motors these are.
         axis: motor or virtual axis.
         what: speed or acceleration.
         value: of the axis [mm or deg, per s or s2].
+
+    Returns:
+        Rates within the maximum, a message for each that is above, and the first one's
+        error or None.
     """
     motors = {}
     messages = []

@@ -266,8 +266,16 @@ class _State:
     until: float
 
     def slowing(self, rate: float, ahead: float) -> float:
-        """Compute how much programme time may slow over the next `ahead`
-        programme seconds [1/s]."""
+        """Compute by how much programme time may slow without exceeding the motor's
+        acceleration.
+
+        Args:
+            rate: of programme time, programme seconds a second.
+            ahead: programme seconds over which the slowing is constant.
+
+        Returns:
+            The greatest slowing [1/s]; inf for a motor at rest.
+        """
         speed = abs(self.velocity)
         a = abs(self.acceleration)
         if (

@@ -55,7 +55,7 @@ class Drive:
         return max(0, bisect_right(self._starts, now) - 1)
 
     def at(self, now: float) -> Trajectory:
-        """Return the trajectory in force at `now` [s]."""
+        """Return the trajectory in force at `now`, on the twin's clock [s]."""
         index = self._index(now)
         if not self.origin:
             return self.trajectories[index]
@@ -232,19 +232,19 @@ def with_settings(
 ) -> dict[str, Drive]:
     """Change speed and acceleration of the motors of `axis` for motions to come.
 
-    Raises:
-        UnknownNameError: no such axis.
-        LimitError: not within (0, maximum].
-
     Args:
         machine: whose motors these are.
-        drives: every motor.
+        drives: every motor; not changed.
         axis: motor or virtual axis.
         speed: [mm/s, deg/s] of the axis; None keeps it.
         acceleration: [mm/s2, deg/s2] of the axis; None keeps it.
 
     Returns:
         All drives, changed ones replaced.
+
+    Raises:
+        UnknownNameError: no such axis.
+        LimitError: not within (0, maximum].
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}

@@ -172,7 +172,14 @@ class Trajectory:
         return Trajectory(pieces, self.end + dt, self.target)
 
     def time_at(self, position: float) -> float | None:
-        """Find the first time at which the motor passes `position`, or None."""
+        """Find the first time at which the motor passes `position`.
+
+        Args:
+            position: of the motor [mm, deg].
+
+        Returns:
+            Time [s]; None if it never does.
+        """
         for i, piece in enumerate(self.pieces):
             if i + 1 < len(self.pieces):
                 stop = self.pieces[i + 1].start

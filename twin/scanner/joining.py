@@ -185,6 +185,9 @@ class Lookahead:
         Args:
             deep: measure overlaps.
             standing: of parts at their present places, as `Guard.standing` has them.
+
+        Returns:
+            Pair -> clearance [mm]; empty without a guard.
         """
         here = {
             name: d.at(self.now).position(self.now) for name, d in self.drives.items()
@@ -201,15 +204,19 @@ class Lookahead:
     # ------------------------------------------------------------------------------------
 
     def joined(self, new: Trajectories) -> Joined:
-        """Find the first certified programme of these three, or none.
+        """Find the first certified programme of these three, or none; nothing moves yet.
 
         1. The new motors follow the request, the others carry on.
         2. The new motors halt before the contact, the others carry on.
-        3. All halt along the new path, where the new motors are under way already and have
-           nothing else that is free.
+        3. All halt along the new path, where the new motors are under way already and
+        have nothing else that is free.
 
         Args:
             new: motor -> requested trajectory.
+
+        Returns:
+            Trajectories of the programme, empty if there is none, and the contact of the
+            request, or None.
         """
         contact = self.contact(new)
         if contact is None:
@@ -235,8 +242,15 @@ class Lookahead:
         return far or here.velocity(self.now) != 0.0
 
     def _alone(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
-        """Shorten the motion of a single motor to its last free position; None if
-        that is not free."""
+        """Shorten the motion of a single motor to its last free position.
+
+        Args:
+            new: motor -> requested trajectory.
+            contact: ahead on it.
+
+        Returns:
+            Motor -> trajectory; None for several motors, or if that is not free.
+        """
         if len(new) != 1:
             return None
         ((name, planned),) = new.items()
@@ -252,7 +266,16 @@ class Lookahead:
     def _halt_along(
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
-        """Slow `new` along its path as late as possible; the path is free up to the contact."""
+        """Slow `new` along its path as late as possible before the contact; the path is
+        free up to there.
+
+        Args:
+            new: motor -> requested trajectory.
+            contact: ahead on it.
+
+        Returns:
+            Motor -> trajectory that rests in time; None if none does.
+        """
         moving = {name: self.drives[name].following(t) for name, t in new.items()}
 
         def rests_in_time(at: float) -> bool:
@@ -269,7 +292,16 @@ class Lookahead:
     def _new_halt_swept(
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
-        """Slow `new` by itself as late as possible while the others carry on."""
+        """Slow `new` by itself as late as possible while the others carry on; each trial
+        is swept.
+
+        Args:
+            new: motor -> requested trajectory.
+            contact: ahead on it.
+
+        Returns:
+            Motor -> trajectory that is free; None if none is found.
+        """
 
         new_drives = {name: self.drives[name] for name in new}
 
@@ -287,7 +319,7 @@ class Lookahead:
     def _latest(
         self, holds: Callable[[float], bool], contact: Contact, halvings: int
     ) -> float | None:
-        """Find a late moment before the contact for which `holds`; None if none is found.
+        """Find a late moment before the contact for which `holds`.
 
         Steps back from the contact double until it holds, then bisection.
 
@@ -295,6 +327,9 @@ class Lookahead:
             holds: the condition on a moment [s].
             contact: the contact.
             halvings: number of steps of the bisection.
+
+        Returns:
+            The moment [s]; None if the condition does not hold even now.
         """
         late = contact.last_free_time
         back = FIRST_LEAD_S
@@ -400,6 +435,13 @@ class Lookahead:
         As late as can be along the path, which is free up to the contact; where the
         contact is too near for that, at once and as hard as the machine can, if a sweep
         shows that free.
+
+        Args:
+            under_way: motor -> present trajectory.
+            contact: ahead on them.
+
+        Returns:
+            Motor -> trajectory; None if no halt is free.
         """
         halted = self._alone(under_way, contact) or self._halt_along(under_way, contact)
         if halted is not None:
@@ -517,10 +559,17 @@ class StageChange:
         return replace(self, found=self.verdict())
 
     def renewed(self, before: StageChange) -> Joined:
-        """Judge the change at the takeover, reusing the verdict found `before`;
-        raises as `verdict`.
+        """Judge the change at the takeover, reusing the verdict found `before` where
+        nothing has changed.
+
+        Args:
+            before: the same change, as it was prepared and swept.
+
+        Returns:
+            The halting motion and its contact, both empty where motion carries on.
 
         Raises:
+            CollisionError: as `verdict`.
             SafetyError: a long programme has begun meanwhile; nothing changes.
         """
         still = before.version == self.version and not self.moves
@@ -537,8 +586,16 @@ class StageChange:
         raise SafetyError(what, {"allowed": "asking again"})
 
     def verdict(self) -> Joined:
-        """Judge whether what is under way may carry on, or how it is halted;
-        raises as `certified`."""
+        """Judge whether what is under way may carry on with the new stage, or how it is
+        halted.
+
+        Returns:
+            The halting motion and its contact, both empty where motion carries on.
+
+        Raises:
+            CollisionError: a pair is too near, a move of the change would collide, or no
+                halt is free.
+        """
         changed = self.ahead.on(self.guard)
         now = self.ahead.now
         under_way = self.ahead.ahead()
@@ -584,7 +641,7 @@ class StageChange:
     def _refused(
         self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]
     ) -> CollisionError:
-        """Make the error for a change that brings parts together.
+        """Make the error for a change that brings parts together; returned, not raised.
 
         Args:
             pair: the two parts.

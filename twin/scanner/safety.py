@@ -101,7 +101,12 @@ class Guard(Protocol):
 
 
 def require_ready(safety: Safety, what: str) -> None:
-    """Check that motion is allowed.
+    """Check that motion is allowed; a contact alone does not forbid motion that brings
+    parts apart.
+
+    Args:
+        safety: state in force.
+        what: command, for the message.
 
     Raises:
         SafetyError: E-stop in force, or blocked; the message includes the way out.
@@ -121,7 +126,15 @@ def require_ready(safety: Safety, what: str) -> None:
 
 
 def after_contact(safety: Safety, contact: Contact) -> Safety:
-    """Count a blocked attempt; at the maximum the state becomes blocked. An E-stop stays."""
+    """Count a blocked attempt; at the maximum the state becomes blocked. An E-stop stays.
+
+    Args:
+        safety: state before the attempt.
+        contact: that blocked it.
+
+    Returns:
+        The state after it.
+    """
     if safety.state == "estopped":
         return safety
     attempts = safety.blocked_attempts + 1
@@ -216,7 +229,7 @@ def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
 def collision_error(
     contact: Contact, now: float, safety: Safety, what: str, halts_at: Mapping[str, float]
 ) -> CollisionError:
-    """Make the error for a motion that a contact cut short.
+    """Make the error for a motion that a contact cut short; returned, not raised.
 
     Args:
         contact: the two parts and the time.
@@ -256,7 +269,8 @@ def would_touch(
     outcome: str,
     **data: object,
 ) -> CollisionError:
-    """Make the error for a command after which two parts meet, or are too near.
+    """Make the error for a command after which two parts meet, or are too near; returned,
+    not raised.
 
     Args:
         what: the command, for people.

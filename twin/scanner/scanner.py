@@ -225,6 +225,13 @@ class ScannerTwin:
         """Compute derived geometry, or return the last one if nothing has changed.
 
         It takes most of a state's time, and keeping it halves the answer to an E-stop.
+
+        Args:
+            now: twin time [s].
+
+        Returns:
+            Distances, magnification, voxel and field; None where SOD or SDD is not
+            positive.
         """
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self.camera, self.parameters)
@@ -308,7 +315,13 @@ class ScannerTwin:
     def told_of(
         self, targets: Mapping[str, float], now: float, *, relative: bool = False
     ) -> list[str]:
-        """List messages about targets beyond a limit that would arrive at it.
+        """List messages about targets beyond a limit that would arrive at the limit;
+        nothing moves.
+
+        Args:
+            targets: axis -> position [mm, deg].
+            now: twin time [s].
+            relative: targets are displacements from where the motors are bound for.
 
         Raises:
             UnknownNameError: no such axis.
@@ -369,11 +382,16 @@ class ScannerTwin:
     def estop(self, now: float, by: str = "") -> StopMotion:
         """Stop the motors by the machine's stop category; switch X-rays off.
 
-        Motion and X-rays are rejected until a reset.
+        Motion and X-rays are rejected until a reset. Motors that coast already go on
+        coasting.
 
         Args:
             now: time of the command [s].
             by: connection that pressed it.
+
+        Returns:
+            The stopping motion: path, duration, distances, and the contact that it cannot
+            avoid.
         """
         self.tube = switched(self.machine, self.tube, False, now, warm=True)
         self.safety = rules.estopped(self.safety, by)
@@ -457,7 +475,11 @@ class ScannerTwin:
         return certificate.prepared.version == (self._stage, self._stops)
 
     def follow(self, certificate: CertifiedProgramme, now: float) -> None:
-        """Take over a programme that was swept.
+        """Start a programme that was swept: all motors follow it from `now` on.
+
+        Args:
+            certificate: the programme with the verdict of its sweep.
+            now: twin time [s], the zero of the programme's clock.
 
         Raises:
             CollisionError: a contact anywhere along it; nothing moves, the attempt
@@ -719,7 +741,15 @@ class ScannerTwin:
         return Lookahead(self.machine, self.guard, dict(self._drives), now)
 
     def _require_power(self, what: str, now: float) -> None:
-        """Raise SafetyError while motors coast."""
+        """Check that no motor coasts.
+
+        Args:
+            what: command, for the message.
+            now: twin time [s].
+
+        Raises:
+            SafetyError: motors coast for a while.
+        """
         if now < self._coasts_until:
             left = self._coasts_until - now
             raise SafetyError(
@@ -732,7 +762,15 @@ class ScannerTwin:
             )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
-        """Find the nearest pair within the safety margin now; kept for a scanner at rest."""
+        """Find the nearest pair within the safety margin now; the result is kept for a
+        scanner at rest.
+
+        Args:
+            now: twin time [s].
+
+        Returns:
+            The two names; None if all pairs keep the margin.
+        """
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self._stage)
         if self._judged[0] != made_of:
@@ -760,7 +798,8 @@ class ScannerTwin:
     def _blocked(
         self, joined: Joined, now: float, what: str, zero: float = 0.0
     ) -> CollisionError:
-        """Halt before the contact, or stop everything when attempts were blocked too often.
+        """Count a blocked attempt and halt before the contact, or stop everything after
+        too many.
 
         Args:
             joined: the motion that is left, and the contact that cut it short.

@@ -255,13 +255,16 @@ def readout_of(
     pixels_mm: tuple[float, float],
     axis: FloatArray,
 ) -> Readout | None:
-    """Compute derived quantities of the first view of a geometry, or None as for `readout`.
+    """Compute derived quantities of the first view of a geometry.
 
     Args:
         cone: in the object's frame.
         shape: of the image, (rows, cols).
         pixels_mm: pitch along columns and along rows.
         axis: a point (3,) of the rotation axis, which is parallel to z [mm].
+
+    Returns:
+        Distances, magnification, voxel and field; None where SOD or SDD is not positive.
     """
     rows, cols = shape
     pixel, row_pixel = pixels_mm
@@ -349,8 +352,16 @@ def changed_camera(
 ) -> CameraSettings:
     """Change settings of a camera; those left out stay.
 
+    Args:
+        spec: the detector, with its ranges.
+        camera: settings before.
+        change: the new values; None and what is left out stay.
+
+    Returns:
+        The new settings.
+
     Raises:
-        LimitError: outside the detector's range. the message names the setting.
+        LimitError: outside the detector's range; the message names the setting.
     """
     stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
     new = replace(camera, **stated)

@@ -49,17 +49,20 @@ Zero offsets are of that kind, a machine built otherwise is not (assumed).
 def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> str:
     """Compose the text of a script for a requested scan.
 
+    Distances that the request leaves out are the usual ones where the machine allows
+    them, else those at home.
+
     Args:
         request: the scan; it is checked before anything is written.
         machine: whose axes, limits and camera these are.
         profile: zero offsets, so that source, detector and sample are centred.
 
+    Returns:
+        TAB separated lines with CRLF, as `parse_script` reads them.
+
     Raises:
         LimitError: a count, distance or speed that the machine does not allow, or a
             motion for which it has no motor; names the one.
-
-    Returns:
-        TAB separated lines with CRLF, as `parse_script` reads them.
     """
     panel = machine.detector
     tube = machine.tube
@@ -167,7 +170,9 @@ class _Writer(MotorTargets):
         yield _row("tube", "xrayoff")
 
     def settings(self) -> Iterator[str]:
-        """Yield the rows that set tube and camera."""
+        """Yield the rows that set tube and camera: voltage, power, mode, exposure and
+        ROI.
+        """
         w = self.request
         m = self.machine
         camera = self.camera
@@ -196,7 +201,9 @@ class _Writer(MotorTargets):
         yield from self.turn(360.0, self.request.frames, 0)
 
     def step(self) -> Iterator[str]:
-        """Yield a turn that stops for every image."""
+        """Yield the rows of a turn that stops for every image, the sample taken out of
+        the beam before.
+        """
         w = self.request
         name, rotation = self.rotation
         yield from self.go(*self.aside)
@@ -229,10 +236,11 @@ class _Writer(MotorTargets):
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def helical(self) -> Iterator[str]:
-        """Yield several turns while source and detector rise at constant speed.
+        """Yield the rows of several turns while source and detector rise at constant
+        speed.
 
         They rise from before the trigger to after the end. Where no motors raise them,
-        the sample sinks.
+        the sample sinks. Speeds are set back at the end.
 
         Raises:
             LimitError: no motors for it, or a rise that is too fast for the run-up.
@@ -318,7 +326,13 @@ class _Writer(MotorTargets):
         yield _row("scanner", "write settings file")
 
     def sweep(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield the move over `total` degrees and the image sequence that it triggers."""
+        """Yield the move over `total` degrees and the image sequence that it triggers.
+
+        Args:
+            total: angle from first to last image [deg]; a run-up follows.
+            frames: number of images, which decides the speed.
+            first: number in the first image's file name.
+        """
         name = self.rotation[0]
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
         yield _row(name, "move absolute", _f(end), "0.000000", "POS")
@@ -330,7 +344,7 @@ class _Writer(MotorTargets):
         )
 
     def turn_speed(self, total: float, frames: int) -> float:
-        """Compute the speed of a smooth scan [deg/s].
+        """Compute the rotation's speed for `frames` images over `total` degrees [deg/s].
 
         Raises:
             LimitError: faster than the axis turns.

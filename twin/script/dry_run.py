@@ -91,8 +91,12 @@ def check_plan(
         problems: of the text that it was made from, in addition to its own.
         collision: see `check_script`.
         text: that it was made from, for the page.
-        start_known: whether the start was given.
+        start_known: whether the start was given; if not, motors that nothing moves before
+            the first projection are a warning.
         physics: see `check_script`.
+
+    Returns:
+        The report, with problems in the order of lines; nothing is raised for them.
     """
     seen = [v for v in views(plan) if v.kind == "projection"]
     optics = tuple(_optics(v) for v in seen)
@@ -141,10 +145,15 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
 
 
 def _optics(view: View) -> Optics:
-    """Describe the images of a view: distances, magnification, field and truncation.
+    """Compute the figures of a view's images: distances [mm], magnification, voxel, field
+    and truncation.
 
     Args:
         view: images of one camera setting and kind.
+
+    Returns:
+        Ranges (least, greatest) over the images; truncation None if the sample's size is
+        unknown.
     """
     p = view.poses
     camera = view.camera
@@ -181,6 +190,12 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
 
     Positions of several scans of one script (tiles, helical turns) make up for each
     other.
+
+    Args:
+        seen: views of the projections.
+
+    Returns:
+        At most one warning for each view.
     """
     found = []
     for view in seen:

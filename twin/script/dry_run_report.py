@@ -112,7 +112,9 @@ def _optics_facts(o: Optics) -> Facts:
 
 
 def _collisions(report: CheckReport) -> str:
-    """Describe the collisions and the smallest clearance."""
+    """Format the number of collisions, or "none" with the smallest clearance, or "not
+    checked".
+    """
     c = report.clearance
     if c is None:
         return "not checked"

@@ -110,13 +110,17 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
 def _line(
     record: bytes, stamp: re.Match[bytes], number: int, problems: list[ScriptProblem]
 ) -> Executed:
-    """Read one line of a log; warn if the motor's reply does not fit its move.
+    """Read one line of a log; add a warning if the motor's reply does not fit its move.
 
     Args:
         record: the line without its moment.
         stamp: match of `LOG_STAMP` that ends the line.
         number: of the line, from 1.
         problems: list to which problems are added.
+
+    Returns:
+        The command with its own time [s], moment of the day [s], reply and, for a move,
+        the decoded reply or None.
 
     Raises:
         ArgumentError: the line cannot be read.

@@ -82,13 +82,13 @@ def encode(text: str) -> bytes:
 def number(text: str, what: str, index: int = 0) -> float:
     """Read a finite decimal number.
 
-    Raises:
-        ArgumentError: the text is not one.
-
     Args:
         text: of the argument.
         what: name of the argument, for the message.
         index: place of the argument, 0 or 1.
+
+    Raises:
+        ArgumentError: missing, no number, or beyond `MAX_NUMBER`.
     """
     if _NUMBER.fullmatch(text):
         value = float(text)
@@ -201,7 +201,7 @@ def _keep(a: str, _b: str) -> dict[str, object]:
 
 
 def _roi(a: str, _b: str) -> dict[str, object]:
-    """Read the four edges of a ROI.
+    """Read the four edges of a ROI from argument 1, as the keyword argument `roi`.
 
     Raises:
         ArgumentError: another number of edges, or no region.

@@ -87,7 +87,11 @@ class Fit:
         return total
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON document of `flexdt machine fit`."""
+        """Return the JSON document of `flexdt machine fit`.
+
+        Its keys are axes, timing, drift, frame_period_s, lines, sum_abs_error_s,
+        cross_validated_s, single and total_s.
+        """
         timing = self.machine.timing
         return {
             "axes": {
@@ -212,7 +216,9 @@ class LogComparison:
         ]
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON document of `flexdt check --against`."""
+        """Return the JSON document of `flexdt check --against`, the line with the
+        greatest error first.
+        """
         return {
             "machine": self.machine.name,
             "timing_source": self.machine.timing.source,
@@ -226,7 +232,15 @@ class LogComparison:
 
 
 def first_difference(script: Sequence[c.Command], log: Log) -> str | None:
-    """Describe where a script and a log differ; None if the log is of that script."""
+    """Describe the first command in which a script and a log differ, as one line of text.
+
+    Args:
+        script: its commands.
+        log: lines of the executed script.
+
+    Returns:
+        The description; None if the log is of that script.
+    """
     for i in range(max(len(script), len(log))):
         if i >= len(script) or i >= len(log):
             longer = "script" if i >= len(log) else "log"
@@ -241,19 +255,19 @@ def first_difference(script: Sequence[c.Command], log: Log) -> str | None:
 
 
 def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
-    """Fit a machine to executed scripts.
+    """Fit a machine to executed scripts: limits and rates of axes, and times of commands.
 
     Args:
         logs: lines of each log, from `read_log`, the oldest first.
         base: source of everything that the logs do not contain.
         source: names the logs, for the machine file.
 
+    Returns:
+        The machine, the times that it is fitted to, and how it agrees with the logs.
+
     Raises:
         MachineFileError: no line at all, or an axis's replies do not fit the base
             machine.
-
-    Returns:
-        The machine, and how it agrees with the logs.
     """
     if not any(logs):
         raise MachineFileError(
@@ -376,6 +390,9 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
         axis: of the base machine.
         replies: of its motor, oldest first; at least one.
         own: the commands to this axis.
+
+    Returns:
+        A copy of `axis` with these values and their source.
     """
     common = mode((r.lower, r.upper, r.max_speed, r.max_acceleration) for r in replies)
     agree = [
@@ -455,6 +472,9 @@ def _timing(
         before: times of the base machine.
         source: names the logs.
         logs: number of logs.
+
+    Returns:
+        A copy of `before` with the fitted times.
     """
     shifts = [fmean(found) for times in samples.values() if (found := _later(times))]
     shift = fmean(shifts) if shifts else 0.0
@@ -511,6 +531,9 @@ def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
         own: scale of the kind's logarithms.
         common: scale of all kinds' logarithms.
         shift: drift of the logarithms until the next scan.
+
+    Returns:
+        The quantiles [s], rounded outwards, and the number of times.
     """
     n = len(times)
     scale = (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)

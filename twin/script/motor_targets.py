@@ -47,7 +47,9 @@ class MotorTargets:
         return all(self.machine.geometry.get(quantity) for quantity in quantities)
 
     def constant(self, quantity: str) -> float:
-        """Return the part of a quantity that motors do not change [mm]."""
+        """Sum up the parts of a quantity that motors do not change: zero offset, sample
+        height, fixed [mm].
+        """
         p = self.profile
         offsets = {
             "source_z": p.src_ort,

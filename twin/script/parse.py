@@ -133,7 +133,9 @@ def line_count(data: str | bytes) -> int:
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (number, line); a binary argument that holds line ends stays in one piece."""
+    """Yield (number from 1, line); a binary argument that holds line ends stays in one
+    piece.
+    """
     parts = _END.split(text)
     ends = _END.findall(text)
     crlf = "\r\n" in ends
@@ -178,7 +180,9 @@ def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
 
 
 def _columns(text: str) -> tuple[Field, ...]:
-    """Split a row at TABs and drop a comment in its last columns."""
+    """Split a row at TABs into fields; drop a comment in its last columns, and empty
+    columns at the end.
+    """
     fields: list[Field] = []
     start = 0
     for i, piece in enumerate(text.split("\t")):
@@ -263,13 +267,15 @@ def parse_script(text: Source) -> c.Script:
 
 
 def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
-    r"""Read the commands of a script and every problem of its text, in line order.
+    r"""Read the commands of a script and every problem of its text, in line order; raises
+    nothing.
 
     Args:
         text: text or bytes of a script.
 
     Returns:
-        The script of the lines that could be read, and all problems.
+        The script of the lines that could be read, and all problems. A log or UTF-16 text
+        gives an empty script and one error.
 
     Example:
         >>> script, problems = read_script("camera\tset exposure\tlong\t\tACK\t\t\r\n")
@@ -361,7 +367,9 @@ class _Line:
         )
 
     def command(self) -> c.Command | None:
-        """Read the command; add an error and return None if it cannot be read."""
+        """Read the row's command; add an error to `problems` and return None if it cannot
+        be read.
+        """
         try:
             if not self.component.text:
                 raise _Refused("syntax", 1, "the component (first column) is missing")
@@ -405,7 +413,14 @@ class _Line:
         return _Parts(spec, *rest[:5])
 
     def _padded(self) -> _Parts | None:
-        """Divide a row padded with spaces; None for an unknown command."""
+        """Divide a row padded with spaces; drop its comment.
+
+        Returns:
+            The columns; None for an unknown command.
+
+        Raises:
+            _Refused: more words than the command has arguments.
+        """
         words = self.row.words()
         found = grammar.match(self.component.text, [w.text for w in words[1:6]])
         if found is None:
@@ -474,6 +489,9 @@ class _Line:
     def _unknown(self) -> c.Command:
         """Read a row as a custom command with a warning, or refuse it with a suggestion.
 
+        Returns:
+            The custom command, which has no effect.
+
         Raises:
             _Refused: no command, or one that can be meant for a known component.
         """
@@ -512,9 +530,13 @@ class _Line:
         )
 
     def _custom_form(self, fields: Sequence[Field]) -> bool:
-        """Return whether the line can be for a component that the user added to the scanner.
+        """Return whether the line can be for a component that the user added to the
+        scanner.
 
         A near miss of one of the scanner's own names with a command of its own is a slip.
+
+        Args:
+            fields: of the row after the component.
         """
         name = self.component.text
         if len(fields) < 2 or _CUSTOM_NAME.fullmatch(name) is None:
@@ -528,10 +550,14 @@ class _Line:
         )
 
     def _build(self, parts: _Parts) -> c.Command | None:
-        """Read arguments, wait and times into a command; None if an error was added.
+        """Read arguments, wait and times into a typed command; add an error for each that
+        cannot be read.
 
         Args:
             parts: columns of a known command.
+
+        Returns:
+            The command; None if an error was added.
         """
         before = len(self.problems)
         fields: dict[str, object] = {
@@ -567,10 +593,15 @@ class _Line:
         return parts.spec.type(**fields)  # type: ignore[arg-type]
 
     def _wait(self, parts: _Parts) -> c.Wait:
-        """Read the wait, or assume it with a warning; check it against the trigger position.
+        """Read the wait and check it against the trigger position; problems are added to
+        `problems`.
 
         Args:
             parts: columns of a known command.
+
+        Returns:
+            The wait; ACK (no wait for a move), with a warning, where none is written, and
+            ACK, with an error, for an unknown one.
         """
         is_move = parts.spec.type is c.MoveAbsolute
         text = parts.wait.text
@@ -611,7 +642,16 @@ def _until_comment(words: Sequence[Field]) -> list[Field]:
 
 
 def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
-    """Find the first wait that only numbers or a comment follow, as (index, words)."""
+    """Find the first wait that only numbers or a comment follow.
+
+    Args:
+        words: of a row.
+        start: index from which to search.
+
+    Returns:
+        Index and number of its words (1, or 2 for "no wait"); `len(words)` and 0 if there
+        is none.
+    """
     for i in range(start, len(words)):
         text = words[i].text.lower()
         width = 1 if text in ("ack", "pos", "rcv") else 0

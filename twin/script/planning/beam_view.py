@@ -80,10 +80,11 @@ def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
 
 
 def views(plan: ScanPlan) -> Iterator[View]:
-    """Group the saved images of `plan` by camera setting and kind; sample long sequences.
+    """Group the saved images of `plan` by camera setting and kind; yield a view of each
+    group.
 
     Args:
-        plan: of a script.
+        plan: of a script; of long moving sequences `_SAMPLED_IMAGES` are taken.
     """
     batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
     first = 0
@@ -127,7 +128,9 @@ def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProble
 
 
 def _outside_text(view: View) -> str:
-    """Describe the first image that shows no sample."""
+    """Describe, for a warning, on which side the first image without the sample has lost
+    it.
+    """
     i = int(np.argmax(view.outside))
     rows, cols = view.camera.shape
     side = "above or below"
@@ -191,8 +194,15 @@ def _view(
 
 
 def _tangents(p: Poses, radius: float) -> list[FloatArray]:
-    """Compute the points where rays touch the cylinder, at the source's height, two of
-    (n, 3) [mm]."""
+    """Compute the points where rays touch the sample's cylinder, at the source's height.
+
+    Args:
+        p: n poses.
+        radius: of the cylinder about the rotation axis [mm].
+
+    Returns:
+        Two arrays of (n, 3) [mm], one for each side.
+    """
     to_source = p.source - p.axis
     flat = to_source[:, :2]
     distance = np.linalg.norm(flat, axis=1, keepdims=True)

@@ -95,7 +95,9 @@ class Optics:
         )
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON form."""
+        """Return the JSON form: the fields by name, with rows and cols for the shape, and
+        units in the names.
+        """
         names = {
             "field_mm": "field_of_view_mm",
             "turn_field_mm": "full_turn_diameter_mm",

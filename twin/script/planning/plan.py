@@ -190,10 +190,16 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         return out
 
     def subframe_positions(self, samples: int) -> dict[str, FloatArray]:
-        """Compute axis -> (n, samples) positions spread over each image's exposure.
+        """Compute positions spread over each image's exposure.
 
         The samples are symmetric about the nominal pose (assumed: the trigger's place
         within the exposure is not published), so their mean has no bias against it.
+
+        Args:
+            samples: number of moments in an exposure.
+
+        Returns:
+            Axis -> (n, samples) positions [mm, deg].
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         of_group = [
@@ -300,7 +306,7 @@ class CheckReport(WithProblems):
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON document of `flexdt check --json`."""
+        """Return the JSON document of `flexdt check --json`; times in s, lengths in mm."""
         plan = self.plan
         clearance = self.clearance
         size = plan.sample

@@ -28,7 +28,9 @@ class StartState:
 
     @classmethod
     def of(cls, machine: Machine) -> StartState:
-        """Make the state of a machine at home with its defaults; X-rays are unknown."""
+        """Make the state of a machine at home with its default settings; whether X-rays
+        are on is unknown.
+        """
         return cls(
             {n: a.home for n, a in machine.axes.items()},
             {n: a.speed for n, a in machine.axes.items()},

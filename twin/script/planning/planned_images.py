@@ -205,12 +205,16 @@ class ImageCollector:
         return self._busy(now, length, "take_image_overhead")
 
     def save(self, command: c.SaveImage, now: float, _step: int) -> planned.Span:
-        """Simulate `save image`: name the last image, which determines its kind.
+        """Simulate `save image`: name the last image, which determines its kind; report
+        problems.
 
         Args:
             command: with the file's name.
             now: moment of the script [s].
             _step: not used.
+
+        Returns:
+            The time that the command takes.
         """
         name = image_name(command.path)
         if name is None:
@@ -239,10 +243,16 @@ class ImageCollector:
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
         """Simulate `take and save image sequence`: back to back, during any motion.
 
+        The images are added, with positions of a fly scan where a trigger is armed, which
+        is used up. Inferred settings and unsafe motion are reported.
+
         Args:
             command: with number of images and file names.
             start: moment of the first exposure [s].
             step: index of the command's step.
+
+        Returns:
+            The time that the command takes, with a note of the number of images.
         """
         trigger = self._active(start)
         moving = self.motors.moving(start)
@@ -294,8 +304,8 @@ class ImageCollector:
         files: tuple[str, ...] = (),
         exact: Mapping[str, FloatArray] | None = None,
     ) -> ExposureGroup:
-        """Add images taken from `start` on with the settings in force; make them
-        the last ones.
+        """Add images taken from `start` on with the settings in force, and remember them
+        as the last.
 
         Args:
             starts: of the exposures, (n,) [s].
@@ -305,6 +315,9 @@ class ImageCollector:
             kind: of the images.
             files: their names; empty until they are saved.
             exact: axis -> positions (n,), where these are known better than by time.
+
+        Returns:
+            The group of images.
         """
         tube = self.tube
         self.moved = self.motors.moving(start)
@@ -340,7 +353,8 @@ class ImageCollector:
         return None
 
     def _infer(self, trigger: planned.Trigger | None, start: float) -> Inference | None:
-        """Infer frames and averages that the script leaves out; warn of both.
+        """Infer frames and averages that the script leaves out, set them in the camera,
+        and warn of both.
 
         Args:
             trigger: of the sequence, or None.
@@ -382,7 +396,8 @@ class ImageCollector:
     def _fly(
         self, trigger: planned.Trigger, found: Inference, start: float, period: float
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Compute the nominal moments of a fly scan's images, and positions by the rule.
+        """Compute the nominal moments of a fly scan's images, and positions by the rule;
+        report deviations.
 
         Args:
             trigger: the motion during the scan.
@@ -445,7 +460,9 @@ class ImageCollector:
     # findings about a saved image ----------------------------------------------------------
 
     def _saved(self, draft: ExposureGroup) -> None:
-        """Check saved images: name, stated settings and X-rays."""
+        """Note the names of saved images; warn of repeated names, missing settings and
+        X-rays that do not fit the kind.
+        """
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
             self.findings.warn(
@@ -462,7 +479,9 @@ class ImageCollector:
             self.findings.warn("xrays_off", f"{what} taken with X-rays off")
 
     def _unsaid(self, draft: ExposureGroup) -> None:
-        """Warn of each setting that a saved image takes from the machine's defaults."""
+        """Warn, once each, of the settings that a saved image takes from the machine's
+        defaults.
+        """
         s = draft.camera
         self._default("mode", "the camera mode", s.mode)
         self._default("exposure_ms", "the exposure", f"{s.exposure_ms:g} ms")

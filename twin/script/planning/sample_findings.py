@@ -66,6 +66,10 @@ def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
 
     Args:
         plan: with the saved images, their settings and positions.
+
+    Returns:
+        A probe for each of the first `PROBE_SETTINGS` settings: `PROBE_VIEWS` views on a
+        coarse grid of rays.
     """
     settings = lit_settings(plan, kinds=("projection",))
     probes: list[SampleProbe] = []
@@ -124,7 +128,15 @@ def predicted_exposures(
 def _predicted(
     plan: ScanPlan, probe: SampleProbe, seen: CountShares | None, physics: Physics
 ) -> PredictedExposure:
-    """Predict one setting."""
+    """Predict the exposure of one setting: open beam, pixels behind the sample, and
+    doubts about both.
+
+    Args:
+        plan: of the scan.
+        probe: the setting, and its images.
+        seen: predicted pixels behind the sample; None if unknown.
+        physics: how counts are predicted.
+    """
     lit = probe.exposure
     made = PredictedExposure(lit.kV, lit.power_W, lit.exposure_ms, shares=seen)
     beam = brightest_beam(plan, lit, probe.camera, list(probe.indices), physics)

@@ -93,10 +93,10 @@ class Simulation:
         return max(self.now, self.motors.end, self.camera.free_at)
 
     def run(self, commands: tuple[c.Command, ...]) -> None:
-        """Simulate all commands in order; add a step for each.
+        """Simulate all commands in order: advance the clock, and add a step for each.
 
         Args:
-            commands: of the script, in order.
+            commands: of the script, in order; problems go to `findings`.
         """
         axes = (*self.machine.axes, *self.machine.virtual_axes)
         for command in commands:
@@ -173,10 +173,13 @@ class Simulation:
         return self.timed("command")
 
     def _write_settings(self, _command: c.WriteSettingsFile) -> planned.Span:
-        """Record positions, rates and settings of this moment.
+        """Record positions, rates and settings of this moment in `settings`.
 
         Args:
             _command: not used; it has no arguments.
+
+        Returns:
+            The time that the command takes.
         """
         motors = self.motors.all
         self.settings = Settings(
@@ -222,7 +225,14 @@ class Simulation:
         return planned.Span(self.now, self.now + left, left, "xray_ready")
 
     def _tube(self, change: Mapping[str, float]) -> planned.Span:
-        """Set voltage or power; report a value that is not allowed and keep the old one."""
+        """Set voltage or power; report a value that is not allowed and keep the old one.
+
+        Args:
+            change: one setting, kV or power_W, and its value.
+
+        Returns:
+            The time that the command takes.
+        """
         [(name, value)] = change.items()
         now = TubeSettings(self.tube.kV, self.tube.power_W)
         try:
@@ -239,7 +249,10 @@ class Simulation:
         """Set a camera setting; report a value that is not allowed and keep the old one.
 
         Args:
-            change: command with the setting.
+            change: one setting and its value.
+
+        Returns:
+            The time that the command takes; the camera is busy until its end.
         """
         [(name, value)] = change.items()
         now = self.camera.settings
@@ -260,7 +273,9 @@ class Simulation:
     # motors --------------------------------------------------------------------------------
 
     def _axis(self, command: c.MotorCommand) -> bool:
-        """Return whether the machine has the axis; report it if not."""
+        """Return whether the machine has the command's axis; report it if not (a custom
+        one as a warning).
+        """
         name = command.component
         if self.machine.has(name):
             return True
@@ -276,10 +291,14 @@ class Simulation:
         return False
 
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
-        """Set an axis's speed or acceleration, limited to those of its motors.
+        """Set an axis's speed or acceleration, limited to those of its motors; report
+        what lies beyond.
 
         Args:
             command: with axis and value [mm/s, deg/s, per s].
+
+        Returns:
+            The time that the command takes, with a note of limited motors.
         """
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
@@ -309,10 +328,15 @@ class Simulation:
                 self.findings.error("limit", message)
 
     def _move(self, command: c.MoveAbsolute) -> planned.Span:
-        """Start a move of an axis within its travel; register its trigger.
+        """Start a move of an axis within its travel; register its trigger, and report
+        what lies beyond.
 
         Args:
             command: with axis, target [mm, deg] and wait.
+
+        Returns:
+            The time span of the motion, the moment at which the script goes on, and a
+            note of limited motors.
         """
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
