@@ -64,7 +64,8 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     code = INVALID
     match error:
         case CommandError():
-            lines, code = error.lines, error.exit_code
+            lines = error.lines
+            code = error.exit_code
         case twin.LimitError() | twin.CollisionError():
             code = LIMIT
         case twin.SafetyError():
@@ -74,9 +75,11 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
         case twin.TwinError():
             pass
         case ConnectionError() | TimeoutError():
-            lines, code = [_first_line(error)], REFUSED
+            lines = [_first_line(error)]
+            code = REFUSED
         case OSError() if error.errno in UNREACHABLE:
-            lines, code = [str(error.strerror)], REFUSED
+            lines = [str(error.strerror)]
+            code = REFUSED
         case OSError():
             where = f"{_asked(error.filename)}: " if error.filename else ""
             lines = [f"{where}{error.strerror or _first_line(error)}"]

@@ -154,7 +154,8 @@ def own_first(
     words: Sequence[str], flags: Collection[str]
 ) -> tuple[list[str], list[str]]:
     """Split words into these options of `COMMON`, with their values, and the other words."""
-    first, rest = list[str](), list[str]()
+    first = list[str]()
+    rest = list[str]()
     more = iter(words)
     for word in more:
         if word == "--":

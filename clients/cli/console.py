@@ -155,7 +155,9 @@ class ProgressBar:
         clock: Callable[[], float] = time.monotonic,
         terminal: bool | None = None,
     ) -> None:
-        self._title, self._unit, self._clock = title, unit, clock
+        self._title = title
+        self._unit = unit
+        self._clock = clock
         self._terminal = sys.stderr.isatty() if terminal is None else terminal
         self._bar: Progress | None = None
         self._task: TaskID | None = None
@@ -197,7 +199,8 @@ class ProgressBar:
         now = self._clock()
         if now - self._spoken < PLAIN_INTERVAL_S or (done, total or 0.0) == self._last:
             return
-        self._spoken, self._last = now, (done, total or 0.0)
+        self._spoken = now
+        self._last = (done, total or 0.0)
         note(self._line(text or self._title, done, total, now - self._begun))
 
     def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:

@@ -236,7 +236,8 @@ def home_of(command: str, flag: str) -> str | None:
     """Return the place in the file of a former option `flag`; None if the file has no
     such key."""
     name = "_".join(command.split()[1:])
-    table, key = SHARED_TABLES.get(name, name), flag.lstrip("-").replace("-", "_")
+    table = SHARED_TABLES.get(name, name)
+    key = flag.lstrip("-").replace("-", "_")
     if table not in TABLES or key not in {f.name for f in fields(TABLES[table])}:
         return None
     return f"`{key}` in [{table}] of {config_file(os.environ)}"

@@ -187,7 +187,8 @@ class Core:
 
     async def disconnect(self) -> None:
         """End the connection; another one may be made, with the same subscriptions."""
-        link, self.link = self.link, None
+        link = self.link
+        self.link = None
         if link is not None:
             await link.close()
 

@@ -119,7 +119,9 @@ class Event:
         Raises:
             RpcError: they are not an event of the protocol.
         """
-        topic, seq, time = params.get("topic"), params.get("seq"), params.get("time")
+        topic = params.get("topic")
+        seq = params.get("seq")
+        time = params.get("time")
         if (
             not isinstance(topic, str)
             or topic not in MODELS
@@ -156,7 +158,9 @@ class AsyncSubscription:
     ) -> None:
         self.topics = topics
         self.dropped = 0
-        self._start, self._keep_alive, self._cancel = start, keep_alive, cancel
+        self._start = start
+        self._keep_alive = keep_alive
+        self._cancel = cancel
         self._max_queue = max_queue
         self._events: deque[Mapping[str, object]] = deque()
         self._stirred = asyncio.Event()
@@ -256,7 +260,8 @@ class Subscription:
     def __init__(
         self, events: AsyncSubscription, wait: Callable[[Coroutine[Any, Any, Any]], Any]
     ) -> None:
-        self._events, self._wait = events, wait
+        self._events = events
+        self._wait = wait
 
     @property
     def dropped(self) -> int:

@@ -85,7 +85,8 @@ def ask(
 def sample_shape() -> Flow[scanner.SampleMeshResult]:
     """Fetch the mesh of the sample on the stage, with its name and revision."""
     while True:
-        content, first = b"", None
+        content = b""
+        first = None
         while first is None or len(content) < first.total:
             part = yield from ask(scanner.SAMPLE_MESH, start=len(content))
             first = part if first is None else first

@@ -77,9 +77,11 @@ class KeptConnection:
         on_change: Callable[[], None] = lambda: None,
         subscription: Mapping[str, object] | None = None,
     ) -> None:
-        self.address, self.name = address, name
+        self.address = address
+        self.name = name
         self.problem = "not connected yet"
-        self._on_event, self._on_change = on_event, on_change
+        self._on_event = on_event
+        self._on_change = on_change
         self._client = AsyncTwinClient(
             address.host,
             address.port,

@@ -99,8 +99,11 @@ class TcpTransport:
     ) -> None:
         if type(port) is not int or not 1 <= port <= 65535:
             raise ValueError(f"port {port!r} is not a number from 1 to 65535")
-        self.host, self.port, self.codec = host, port, codec
-        self.timeout_s, self.ssl = timeout_s, ssl
+        self.host = host
+        self.port = port
+        self.codec = codec
+        self.timeout_s = timeout_s
+        self.ssl = ssl
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._wire = Connection(codec)
 
@@ -125,7 +128,8 @@ class TcpTransport:
                     limit=MAX_FRAME,
                 )
         except OSError as error:  # TimeoutError is one
-            why, number = error.strerror or str(error) or "no answer in time", error.errno
+            why = error.strerror or str(error) or "no answer in time"
+            number = error.errno
             if number is None and f"[Errno {errno.ECONNREFUSED}]" in why:
                 number = errno.ECONNREFUSED  # of each of the addresses that a name has
             if number == errno.ECONNREFUSED or (
@@ -184,7 +188,8 @@ class TcpTransport:
 
     def close(self) -> None:
         """Close the streams."""
-        streams, self._streams = self._streams, None
+        streams = self._streams
+        self._streams = None
         if streams is not None:
             with contextlib.suppress(RuntimeError):  # the loop it belonged to is gone
                 streams[1].close()
@@ -210,7 +215,9 @@ class Link:
         on_event: Callable[[Mapping[str, object]], None],
         on_end: Callable[[], None],
     ) -> None:
-        self._transport, self._on_event, self._on_end = transport, on_event, on_end
+        self._transport = transport
+        self._on_event = on_event
+        self._on_end = on_end
         self.calls: Correlation[asyncio.Future[Answered[Any]]] = Correlation(Role.CLIENT)
         self.alive = True
         self._reader = asyncio.create_task(self._read(), name="flexdt-link")

@@ -432,7 +432,8 @@ def upload_voxels(
 def _upload(
     head: Mapping[str, object], data: bytes, progress: Callable[[int, int], object] | None
 ) -> Flow[scanner.UploadResult]:
-    total, done = len(data), None
+    total = len(data)
+    done = None
     for start in range(0, total, CHUNK):
         part = data[start : start + CHUNK]
         done = yield from ask(

@@ -74,7 +74,8 @@ class FramesBeside:
         """
         shape = mirror.camera.shape
         real, white = line_integrals(path, shape)
-        machine, profile = self.follower.machine, self.follower.profile
+        machine = self.follower.machine
+        profile = self.follower.profile
         poses = motor_poses(machine, profile, mirror.camera, mirror.positions)
         virtual = projected(self.phantom, poses.cone_vec(), shape)[0]
         columns, rows = shift(virtual, real)
@@ -110,7 +111,8 @@ def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, st
     """
     counts = read_image(path, shape).astype(np.float32)
     folder = list_folder(path.parent)
-    dark, white = np.zeros_like(counts), np.full_like(counts, np.percentile(counts, 99.5))
+    dark = np.zeros_like(counts)
+    white = np.full_like(counts, np.percentile(counts, 99.5))
     what = "99.5 % of the frame"
     if folder.darks and folder.flats:
         dark = mean_image(folder.paths(folder.darks), shape)

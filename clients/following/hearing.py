@@ -35,7 +35,8 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
     command, asks = _read(event, axes)
     words = (event.component, event.command, event.arg1, event.arg2)
     what: What = event.reply_type.value or "SEND"  # type: ignore[assignment]
-    tick, reply = event.tick_count, event.reply
+    tick = event.tick_count
+    reply = event.reply
     return Heard(event.key, what, words, command, reply, asks, stamp, tick, late_s)
 
 

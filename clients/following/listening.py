@@ -77,7 +77,8 @@ async def listen(
     Raises:
         ValueError, zmq.ZMQError: no address that can be connected to.
     """
-    tell, ended = asyncio.get_running_loop().call_soon_threadsafe, threading.Event()
+    tell = asyncio.get_running_loop().call_soon_threadsafe
+    ended = threading.Event()
 
     def read(socket: zmq.Socket[bytes], monitor: zmq.Socket[bytes]) -> None:
         """Read messages and changes of the connection, and pass them to the event loop,

@@ -64,7 +64,8 @@ def read_recording(data: bytes) -> Iterator[Recorded]:
         >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
         [(86400.0, 1.0), (86401.5, 0.002)]
     """
-    stamps, last = list(STAMP.finditer(data)), 0.0
+    stamps = list(STAMP.finditer(data))
+    last = 0.0
     for stamp, end in zip(
         stamps, [*(s.start() for s in stamps[1:]), len(data)], strict=True
     ):

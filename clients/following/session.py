@@ -68,7 +68,8 @@ class FollowSession:
     unread_example: str = ""
 
     def __post_init__(self) -> None:
-        machine, now = self.follower.machine, datetime.now()
+        machine = self.follower.machine
+        now = datetime.now()
         self.mirror = Mirror.of(machine)
         self._axes = (*machine.axes, *machine.virtual_axes)
         self._looked: object = None
@@ -116,7 +117,8 @@ class FollowSession:
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
-        new, self.mirror = mirror.raised - self.mirror.raised, mirror
+        new = mirror.raised - self.mirror.raised
+        self.mirror = mirror
         for alarm in mirror.alarms[len(mirror.alarms) - new :] if new else ():
             self.tell(alarm)
         self.changed(mirror)
@@ -169,10 +171,12 @@ class FollowSession:
         done = seen = newest_frame(folder)
         while True:
             await asyncio.sleep(FRAMES_S)
-            before, seen = seen, await asyncio.to_thread(newest_frame, folder)
+            before = seen
+            seen = await asyncio.to_thread(newest_frame, folder)
             if seen is None or seen == done or seen != before:  # it may still be written
                 continue
-            done, mirror = seen, self.mirror
+            done = seen
+            mirror = self.mirror
             path, written = seen
             try:
                 await asyncio.to_thread(beside.write, path, mirror, time.time() - written)
@@ -197,10 +201,8 @@ class FollowSession:
     def _is_new(self) -> bool:
         """Determine whether targets or the next line have changed since the last call."""
         key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
-        before, self._looked = (
-            self._looked,
-            key if self.mirror.heard_s is not None else None,
-        )
+        before = self._looked
+        self._looked = key if self.mirror.heard_s is not None else None
         return self._looked not in (None, before)
 
 

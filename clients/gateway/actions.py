@@ -105,7 +105,8 @@ async def wait_ready(
     if not state.tube.on:
         raise Refusal("X-rays are off, so they will not be ready; tube xrayon first")
     clock = asyncio.get_running_loop().time
-    end, patience = state.time + READY_S, clock() + READY_S
+    end = state.time + READY_S
+    patience = clock() + READY_S
     while not state.tube.ready:
         if state.time > end or (clock() > patience and state.clock.speed_up == "max"):
             raise Refusal(f"X-rays are not ready after {READY_S:g} s")
@@ -163,7 +164,8 @@ async def move(
     if command.trigger is None:
         return await _go(twin, command.component, command.target, progress)
     armed = Armed(command.component, command.target, command.trigger)
-    twin.armed, progress.text = armed, "POS"
+    twin.armed = armed
+    progress.text = "POS"
     try:
         async with asyncio.timeout(ARMED_S):
             await armed.taken.wait()
@@ -231,7 +233,8 @@ def rate_setting(what: Rate, digits: int) -> Action:
     """Make the action that sets an axis's speed or acceleration for later moves."""
 
     async def send(twin: ConnectedTwin, command: Any, progress: CommandProgress) -> str:
-        axis, machine = command.component, twin.machine
+        axis = command.component
+        machine = twin.machine
         value: float = getattr(command, what)
         if machine is not None and machine.has(axis):
             found = rate(machine, axis, what, value)
@@ -274,7 +277,8 @@ async def sequence(
     The twin decides by its own clock when each image is taken, so the frames are where the
     scanner's rule puts them, however slow the network is.
     """
-    armed, twin.armed = twin.armed, None
+    armed = twin.armed
+    twin.armed = None
     if armed is not None:
         armed.ended = asyncio.get_running_loop().create_future()
         armed.taken.set()
@@ -330,7 +334,8 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
         for what, value in (("speed", axis.speed), ("acceleration", axis.acceleration)):
             if value is not None:
                 lines.append((armed.axis, f"set {what}", repr(value), "", "ACK"))
-        to, at = repr(armed.target), repr(armed.trigger)
+        to = repr(armed.target)
+        at = repr(armed.trigger)
         lines.append((armed.axis, "move absolute", to, at, "POS"))
     prefix = bare_name(command.prefix)
     first = str(command.first)

@@ -77,8 +77,10 @@ class ConnectedTwin:
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
-        self.link, self.root = link, root
-        self._machine, self._profile = machine, profile
+        self.link = link
+        self.root = root
+        self._machine = machine
+        self._profile = profile
         self.image: Image | None = None
         self.armed: Armed | None = None
         self.job: str | None = None
@@ -191,7 +193,8 @@ class ConnectedTwin:
         if not fresh:
             del old.transcript[-1:]
         old.close()
-        self.path, self.recording = path, None
+        self.path = path
+        self.recording = None
         self.record().transcript += lines
 
     def motor_text(self, axis: str, at: AxisState) -> str:
@@ -221,7 +224,8 @@ class ConnectedTwin:
         return self._scanner()[0]
 
     def _scanner(self) -> tuple[Machine | None, Profile | None]:
-        hello, machine = self.link.hello, self._machine
+        hello = self.link.hello
+        machine = self._machine
         try:
             if machine is None and hello is not None:
                 machine = builtin_machine(hello.machine)

@@ -136,7 +136,9 @@ class Echoes:
         """
         if status.state != "queued" and status.job != self._job:
             text = script(status)
-            self._job, self._next, self._line = status.job, 0, None
+            self._job = status.job
+            self._next = 0
+            self._line = None
             self._script = None if text is None else script_lines(text)
         if status.job != self._job or self._script is None:
             return
@@ -150,7 +152,8 @@ class Echoes:
             words = (grammar.own_name(line.words[0], state.axes), *line.words[1:])
             self._line, *begun = self._begin(words, state, now)
             if component_type(words[0], state.axes) is None:  # whose own it is replies
-                self._line, begun = None, begun[:1]
+                self._line = None
+                begun = begun[:1]
             yield from begun
             if not line.waits:
                 yield from self._end(state, "command sent")
@@ -164,13 +167,15 @@ class Echoes:
                 yield from self._end(state)
             elif self._line is not None:
                 yield self._line.failed(f"the scan ended {status.state}")
-            self._line, self._script = None, None
+            self._line = None
+            self._script = None
 
     def _begin(
         self, words: tuple[str, ...], state: State, now: float
     ) -> tuple[Exchange, AcquilaEvent, AcquilaEvent]:
         kind = component_type(words[0], state.axes) or "other"
-        uuid, tick = self.uuids.getrandbits(52) + 1, int(now * 1000) % 2**32
+        uuid = self.uuids.getrandbits(52) + 1
+        tick = int(now * 1000) % 2**32
         component, name, arg1, arg2 = words[:4]
         command = AcquilaEvent(
             component, name, arg1, arg2, comp_type=kind, tick_count=tick, uuid=uuid
@@ -179,7 +184,8 @@ class Echoes:
         return exchange, command, exchange.received(now)
 
     def _end(self, state: State, reply: str | None = None) -> Iterator[AcquilaEvent]:
-        line, self._line = self._line, None
+        line = self._line
+        self._line = None
         if line is None:
             return
         if reply is None:
@@ -201,7 +207,8 @@ def told(state: State) -> Mapping[Key, str]:
     Returns:
         (component, command) -> argument; `xrays` has the command itself.
     """
-    tube, camera = state.tube, state.camera
+    tube = state.tube
+    camera = state.camera
     made = {
         ("tube", "xrays"): "xrayon" if tube.on else "xrayoff",
         ("tube", "set kV"): f"{tube.kV:.6f}",

@@ -78,7 +78,8 @@ class Gateway:
         self, twin: ConnectedTwin, host: str, port: int, inbound: int | None = None
     ) -> None:
         check_loopback(host)
-        self.twin, self.host = twin, host
+        self.twin = twin
+        self.host = host
         self._context = zmq.asyncio.Context()
         try:
             self._out, self._in, self.port, self.inbound = self._bind(port, inbound)
@@ -167,7 +168,8 @@ class Gateway:
         while True:
             await self.twin.news()
             try:
-                state, now = await self.twin.state(), clock()
+                state = await self.twin.state()
+                now = clock()
                 own = [name for name, count in self._busy.items() if count]
                 for status in self.twin.told_jobs(state):
                     for event in self._echoes.follow(

@@ -70,10 +70,13 @@ class Recording:
         started: datetime,
         version: str = "",
     ) -> None:
-        self.root, self.name = root, bare_name(path.rstrip("\\/ ")) or UNNAMED
+        self.root = root
+        self.name = bare_name(path.rstrip("\\/ ")) or UNNAMED
         self.transcript: list[str] = []
-        self._machine, self._profile = machine, profile
-        self._started, self._version = started, version
+        self._machine = machine
+        self._profile = profile
+        self._started = started
+        self._version = version
         self._blocks: list[FrameBlock] = []
         self._states: list[State] = []
         self._settings: State | None = None

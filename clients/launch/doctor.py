@@ -82,7 +82,8 @@ def python() -> CheckOutcome:
 
 def packages() -> CheckOutcome:
     """Check that all required packages of flexdt are installed; extras are left out."""
-    have, lack = [], []
+    have = []
+    lack = []
     for name in needed():
         try:
             have.append(f"{name} {version(name)}")
@@ -115,9 +116,13 @@ def kernels() -> CheckOutcome:
     from flexdt.twin.projection import project_scene
     from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
-    radius, mu, source, detector = 10.0, 0.02, -400.0, 600.0
+    radius = 10.0
+    mu = 0.02
+    source = -400.0
+    detector = 600.0
     scene = Scene((Solid(Sphere((0.0, 0.0, 0.0), radius), "test", mu),))
-    shape, pitch = (33, 47), 1.0
+    shape = (33, 47)
+    pitch = 1.0
     row = np.array(
         [[0, source, 0, 0, detector, 0, pitch, 0, 0, 0, 0, -pitch]], dtype=np.float64
     )

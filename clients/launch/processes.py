@@ -110,7 +110,8 @@ class Servers:
         Returns:
             The supervisor's exit code; None if it was not running.
         """
-        process, self._process = self._process, None
+        process = self._process
+        self._process = None
         if process is None:
             return None
         with contextlib.suppress(ProcessLookupError):
@@ -207,7 +208,8 @@ class LocalTwin:
         self._options = {
             name: value for name, value in options.items() if value is not None
         }
-        self._viewer, self._folder = viewer, None if data is None else Path(data)
+        self._viewer = viewer
+        self._folder = None if data is None else Path(data)
         self._running: tuple[ExitStack, Servers, TwinClient, Path] | None = None
 
     def __enter__(self) -> TwinClient:
@@ -241,7 +243,8 @@ class LocalTwin:
 
     def stop(self) -> None:
         """End the client and the servers, and delete a temporary data folder."""
-        running, self._running = self._running, None
+        running = self._running
+        self._running = None
         if running is not None:
             atexit.unregister(self.stop)
             running[0].close()

@@ -27,7 +27,8 @@ class ClusterWatch(threading.Thread):
 
     def __init__(self, client: Any, tend: Tend) -> None:
         super().__init__(name="cluster watch", daemon=True)
-        self._client, self._tend = client, tend
+        self._client = client
+        self._tend = tend
         self._over = threading.Event()
         self.error: CommandError | None = None
 

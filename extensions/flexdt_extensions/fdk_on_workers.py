@@ -71,7 +71,8 @@ def move(made: Path, path: Path) -> None:
 def slabs(grid: Grid) -> list[tuple[int, int]]:
     """List the layers (first, last) of each slab: a power of two, so that slabs can be
     halved."""
-    each, (nz, ny, nx) = CHUNK, grid.shape
+    each = CHUNK
+    (nz, ny, nx) = grid.shape
     while each > 1 and 4 * each * ny * nx > max(SLAB_BYTES, grid.bytes // SLABS):
         each //= 2
     return [(first, min(first + each, nz)) for first in range(0, nz, each)]
@@ -188,7 +189,8 @@ class VolumeFormat:
             path: of the volume.
             grid: of the volume.
         """
-        group, todo = create(part, grid), list(enumerate(slabs(grid)))
+        group = create(part, grid)
+        todo = list(enumerate(slabs(grid)))
         held: list[Float32Array] = []
 
         def take(layers: Float32Array) -> None:

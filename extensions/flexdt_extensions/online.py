@@ -223,7 +223,8 @@ def _rows(state: Online, poses: Poses) -> FloatArray:
     p)."""
     assert state.fit is not None
     shape = state.detections[-1].shape
-    n, k = len(poses), len(state.model)
+    n = len(poses)
+    k = len(state.model)
     problem = build_problem(
         np.zeros((n, k, 2)),
         state.model,

@@ -59,7 +59,8 @@ class SlurmJobs:
     """
 
     def __init__(self, script: str, count: int) -> None:
-        self._script, self._count = script, count
+        self._script = script
+        self._count = count
         self.jobs: list[Job] = []
         self._made = self._barren = 0
 
@@ -186,7 +187,8 @@ def lifetime_s(walltime: str) -> int | None:
     if days is not None or len(given) == 3:
         hours, minutes, seconds = (*given, 0, 0)[:3]
     else:
-        hours, (minutes, seconds) = 0, (*given, 0)[:2]
+        hours = 0
+        (minutes, seconds) = (*given, 0)[:2]
     total = ((days or 0) * 24 + hours) * 3600 + minutes * 60 + seconds
     return total - max(60, total // 20) if total > 180 else None
 

@@ -87,7 +87,8 @@ def watch(
         model, free, priors=_machine_priors(client) if priors is None else priors
     )
     sigmas: dict[str, float | None] = {}
-    due, goal = 0, dict.fromkeys(tolerance, math.inf)
+    due = 0
+    goal = dict.fromkeys(tolerance, math.inf)
     status = client.job_status(job)
     for name, image, row in _frames(client, status.job):
         pose = Poses.from_cone_vec(ConeVec(np.array([row])))
@@ -107,7 +108,8 @@ def watch(
             )
             reason = f"sigmas reached after {seen} frames: {words}"
             return Watched(client.abort_job(status.job, reason), seen, sigmas, True)
-        due, now = seen + 1 + seen // 8, state.sigmas()
+        due = seen + 1 + seen // 8
+        now = state.sigmas()
         goal = {
             n: most * now[n] / (sigmas.get(n) or now[n]) for n, most in tolerance.items()
         }

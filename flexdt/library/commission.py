@@ -271,7 +271,8 @@ def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
         folder: of the scan.
         ask: takes each warning as a question.
     """
-    content, warnings = list_folder(folder), list[str]()
+    content = list_folder(folder)
+    warnings = list[str]()
     scan = PastScan(str(folder), images=len(content.projections))
     try:
         if content.xre_settings is not None:
@@ -336,7 +337,8 @@ def _fitted(
         n: a if n in turning else _stated(a, n, scans, shipped)
         for n, a in shipped.axes.items()
     }
-    machine, fit = shipped.model_copy(update={"axes": axes}), None
+    machine = shipped.model_copy(update={"axes": axes})
+    fit = None
     logs = [
         [
             x

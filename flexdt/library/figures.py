@@ -107,11 +107,13 @@ def plot(
         equal: one unit is as long in x as in y.
         marks: x and text of vertical lines; browsers show the text under the pointer.
     """
-    figure, marked = blank(width, height), list(marks)
+    figure = blank(width, height)
+    marked = list(marks)
     axes = axes_of(figure, title, x_label, y_label)
     for s, colour in zip(series, cycle(COLOURS), strict=False):
         style = {"lw": 1.2} if s.line else {"ls": "", "marker": ".", "ms": 3.2}
-        x, y = np.asarray(s.x, dtype=np.float64), np.asarray(s.y, dtype=np.float64)
+        x = np.asarray(s.x, dtype=np.float64)
+        y = np.asarray(s.y, dtype=np.float64)
         axes.plot(x, y, color=colour, label=s.name, gid=_id(title, s.name), **style)
     for k, (at, _) in enumerate(marked):
         axes.axvline(at, color=MARK, lw=1.2, gid=_id(title, "mark", k))
@@ -149,7 +151,8 @@ def arrows(
     axes.set(xlim=(0, cols), ylim=(rows, 0), aspect="equal")
     for (name, places, vectors), colour in zip(groups, cycle(COLOURS), strict=False):
         keep = np.isfinite(places).all(axis=1) & np.isfinite(vectors).all(axis=1)
-        start, stop = places[keep], places[keep] + factor * vectors[keep]
+        start = places[keep]
+        stop = places[keep] + factor * vectors[keep]
         # One line for all vectors of a group, interrupted by nan after each.
         ends = np.stack([start, stop, np.full_like(start, np.nan)], axis=1).reshape(-1, 2)
         gid = _id(title, name)

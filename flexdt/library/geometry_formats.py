@@ -166,7 +166,8 @@ def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
     if like is not None:
         blank = _voxels(like)
         edges = np.array(blank.voxel_xyz[::-1])
-        geometry.nVoxel, geometry.dVoxel = np.array(blank.shape), edges
+        geometry.nVoxel = np.array(blank.shape)
+        geometry.dVoxel = edges
         geometry.sVoxel = geometry.nVoxel * edges
         # TIGRE moves the volume; a scan that moves it by itself does so in every view.
         geometry.offOrigin = geometry.offOrigin + np.array(blank.center_mm[::-1])

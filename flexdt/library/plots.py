@@ -83,7 +83,8 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
         raise TwinError(f"what: {what!r} is not there; there is {', '.join(allowed)}")
     axes = _pyplot().figure().add_subplot() if axes is None else axes
     x, y, z = volume.centers()
-    middle, half = len(z) // 2, volume.voxel_xyz[0] / 2
+    middle = len(z) // 2
+    half = volume.voxel_xyz[0] / 2
     ends = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
     shown = axes.imshow(values[middle], cmap="gray", origin="lower", extent=ends)
     axes.figure.colorbar(shown, ax=axes, label=f"{LAYERS[what]} [1/mm]")

@@ -134,7 +134,8 @@ class Truth:
     def radiographs(self) -> Iterator[Radiograph]:
         """Simulate the noise-free radiograph of each view."""
         rows, cols = self.camera.shape
-        chain, moments = self.chain, self.rays**2 * self.spot_points
+        chain = self.chain
+        moments = self.rays**2 * self.spot_points
         spot_mm = chain.tube.focal_spot_mm(self.exposure.power_W)
         if self.spot_points > 1:
             chain = without_spot(chain)
@@ -426,7 +427,8 @@ def _pitch(cone: ConeVec) -> tuple[float, float]:
     u, v = lengths[:, 0].tolist()
     for name, values, first in zip("uv", lengths, (u, v), strict=True):
         if np.abs(values - first).max() > SAME_PITCH * first:
-            least, most = float(values.min()), float(values.max())
+            least = float(values.min())
+            most = float(values.max())
             said = f"pixels measure {least:.6g} to {most:.6g} mm along {name}"
             raise GeometryError.instead(said, [least, most], "alike in all views")
     return u, u if abs(v - u) <= SAME_PITCH * u else v
@@ -480,7 +482,8 @@ def _panel(
                     "allowed": [spec.rows // binning, spec.columns // binning],
                 },
             )
-        left, top = (spec.columns - cols) // 2, (spec.rows - rows) // 2
+        left = (spec.columns - cols) // 2
+        top = (spec.rows - rows) // 2
         roi = Roi(left, top, left + cols - 1, top + rows - 1)
         mode = spec.mode if camera.binning == binning else f"HW{binning}SW1High"
         camera = replace(camera, mode=mode, roi=roi)

@@ -28,7 +28,8 @@ MIN_SIGMA_PX = 0.02
 """Standard deviation below which an image is not blurred [pixels]."""
 MAX_SIGMA_PX = 1000.0
 """Largest standard deviation of a blur [pixels]."""
-FREQUENCIES, FOLDS = 512, 20
+FREQUENCIES = 512
+FOLDS = 20
 """Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
 
 

@@ -27,7 +27,9 @@ from numba import prange
 from flexdt.twin.attenuation.scattering import ELECTRON_KEV, HC_KEV_A
 from flexdt.twin.projection.kernels.compiling import inline, kernel, parallel
 
-SINGLE, MULTIPLE, NOISE = 0, 1, 2
+SINGLE = 0
+MULTIPLE = 1
+NOISE = 2
 """Channels of the images: signal after one and after more interactions, variance of both."""
 TALLIES = 6
 """Number of sums over the histories: photons that interact, are absorbed, escape; then
@@ -43,7 +45,10 @@ MAX_ORDERS = 100
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
-_30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_30 = np.uint64(30)
+_27 = np.uint64(27)
+_31 = np.uint64(31)
+_11 = np.uint64(11)
 
 
 @inline
@@ -89,26 +94,34 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
     for m in range(materials):
         paths[m] = 0.0
     # Distances at which the ray is inside the grid, slab by slab of x, y and z.
-    near, far = 0.0, np.inf
+    near = 0.0
+    far = np.inf
     for a in range(3):
         n = amounts.shape[2 - a]
-        low, high = lower[a] - p[a], lower[a] + n * edge[a] - p[a]
+        low = lower[a] - p[a]
+        high = lower[a] + n * edge[a] - p[a]
         if abs(d[a]) < 1e-12:
             if low > 0.0 or high < 0.0:
                 return -1.0
         else:
-            one, other = low / d[a], high / d[a]
-            near, far = max(near, min(one, other)), min(far, max(one, other))
+            one = low / d[a]
+            other = high / d[a]
+            near = max(near, min(one, other))
+            far = min(far, max(one, other))
     if far <= near:
         return -1.0
     # Voxel of the entry, distance to the next plane and between planes, along x, y, z.
-    nx, ny, nz = amounts.shape[2], amounts.shape[1], amounts.shape[0]
+    nx = amounts.shape[2]
+    ny = amounts.shape[1]
+    nz = amounts.shape[0]
     gx = (p[0] + near * d[0] - lower[0]) / edge[0]
     gy = (p[1] + near * d[1] - lower[1]) / edge[1]
     gz = (p[2] + near * d[2] - lower[2]) / edge[2]
-    i, j = min(max(int(gx), 0), nx - 1), min(max(int(gy), 0), ny - 1)
+    i = min(max(int(gx), 0), nx - 1)
+    j = min(max(int(gy), 0), ny - 1)
     k = min(max(int(gz), 0), nz - 1)
-    si, sj = 1 if d[0] > 0.0 else -1, 1 if d[1] > 0.0 else -1
+    si = 1 if d[0] > 0.0 else -1
+    sj = 1 if d[1] > 0.0 else -1
     sk = 1 if d[2] > 0.0 else -1
     dx = edge[0] / max(abs(d[0]), 1e-12)
     dy = edge[1] / max(abs(d[1]), 1e-12)
@@ -116,7 +129,9 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
     tx = near + (i + 1 - gx if d[0] > 0.0 else gx - i) * dx
     ty = near + (j + 1 - gy if d[1] > 0.0 else gy - j) * dy
     tz = near + (k + 1 - gz if d[2] > 0.0 else gz - k) * dz
-    here, depth, ends = near, 0.0, stop < np.inf
+    here = near
+    depth = 0.0
+    ends = stop < np.inf
     while True:
         onward = min(tx, min(ty, tz))
         length = max(onward - here, 0.0)
@@ -231,7 +246,8 @@ def coherent_cosine(state, energy, cumulated, root_step):
     while True:
         state, number = draw(state)
         wanted = number * last
-        low, high = 0, len(cumulated) - 1
+        low = 0
+        high = len(cumulated) - 1
         while high - low > 1:
             middle = (low + high) // 2
             if cumulated[middle] <= wanted:
@@ -239,7 +255,8 @@ def coherent_cosine(state, energy, cumulated, root_step):
             else:
                 high = middle
         part = (wanted - cumulated[low]) / max(cumulated[high] - cumulated[low], 1e-300)
-        x2_low, x2_high = (low * root_step) ** 4, (high * root_step) ** 4
+        x2_low = (low * root_step) ** 4
+        x2_high = (high * root_step) ** 4
         x2 = x2_low + part * (x2_high - x2_low)
         cosine = 1.0 - 2.0 * min(x2 / (greatest * greatest), 1.0)
         state, number = draw(state)
@@ -276,11 +293,16 @@ def turn(d, cosine, azimuth):
         azimuth: [rad].
     """
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
-    a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
-    x, y, z = d[0], d[1], d[2]
+    a = sine * math.cos(azimuth)
+    b = sine * math.sin(azimuth)
+    x = d[0]
+    y = d[1]
+    z = d[2]
     # Along z the azimuth has no zero of its own, and q below would be lost to rounding.
     if abs(z) > 0.9999:
-        d[0], d[1], d[2] = a, b, math.copysign(cosine, z)
+        d[0] = a
+        d[1] = b
+        d[2] = math.copysign(cosine, z)
     else:
         q = math.sqrt(1.0 - z * z)
         d[0] = cosine * x + (a * x * z - b * y) / q
@@ -328,14 +350,13 @@ def detect(
     number = len(nodes)
     share = weight * number / fan / mu[m]
     from_bin = (energy - first_keV) / step_keV
-    same_signal, same_spread = between(response, from_bin), between(spread, from_bin)
+    same_signal = between(response, from_bin)
+    same_spread = between(spread, from_bin)
     for f in range(fan):
         node = (start + f * number // fan) % number
-        v[0], v[1], v[2] = (
-            nodes[node, 0] - p[0],
-            nodes[node, 1] - p[1],
-            nodes[node, 2] - p[2],
-        )
+        v[0] = nodes[node, 0] - p[0]
+        v[1] = nodes[node, 1] - p[1]
+        v[2] = nodes[node, 2] - p[2]
         square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
         scale = 1.0 / math.sqrt(square)
         v[0], v[1], v[2] = v[0] * scale, v[1] * scale, v[2] * scale
@@ -358,7 +379,8 @@ def detect(
         # k of it and is weakened more: one walk gives the lengths for both.
         travel(amounts, lower, edge, p, v, mu, np.inf, paths)
         to_bin = (energy * k - first_keV) / step_keV
-        depth, softer = 0.0, 0.0
+        depth = 0.0
+        softer = 0.0
         for other in range(len(paths)):
             if paths[other] > 0.0:
                 depth += paths[other] * mu[other]
@@ -429,11 +451,16 @@ def histories(
             history.
         tallies: (b, TALLIES) float64, added to.
     """
-    materials, number = amounts.shape[3], len(nodes)
+    materials = amounts.shape[3]
+    number = len(nodes)
     for batch in prange(len(images)):
-        image, tally = images[batch], tallies[batch]
-        mu, paths, v = np.empty(materials), np.empty(materials), np.empty(3)
-        p, d = np.empty(3), np.empty(3)
+        image = images[batch]
+        tally = tallies[batch]
+        mu = np.empty(materials)
+        paths = np.empty(materials)
+        v = np.empty(3)
+        p = np.empty(3)
+        d = np.empty(3)
         # `scale` is what the history stands for in the open beam and stays; `weight`
         # begins at 1 and changes with absorption and forced flights: the roulette
         # compares it with one number.
@@ -476,7 +503,8 @@ def histories(
                 state, pick = draw(state)
                 state, turned = draw(state)
                 if order == 0:
-                    pick, turned = sobol[4], sobol[5]
+                    pick = sobol[4]
+                    turned = sobol[5]
                 m = chosen_material(amounts, lower, edge, p, mu, pick)
                 detect(
                     amounts,
@@ -510,10 +538,8 @@ def histories(
                     break
                 # Absorption is a loss of weight; the rest goes on, coherent or incoherent.
                 from_bin = (energy - first_keV) / step_keV
-                elastic, inelastic = (
-                    between(coherent[m], from_bin),
-                    between(incoherent[m], from_bin),
-                )
+                elastic = between(coherent[m], from_bin)
+                inelastic = between(incoherent[m], from_bin)
                 survives = min((elastic + inelastic) / mu[m], 1.0)
                 tally[1] += scale * weight * (1.0 - survives)
                 tally[4] += scale * weight * (1.0 - survives) * energy

@@ -340,7 +340,8 @@ def _check_closed(faces: IntArray, vertices: int) -> None:
     """Check that every edge is passed as often in one direction as in the other."""
     start = faces.ravel()
     end = faces[:, [1, 2, 0]].ravel()
-    there, back = start * vertices + end, end * vertices + start
+    there = start * vertices + end
+    back = end * vertices + start
     values, counts = np.unique(np.concatenate([there, back]), return_counts=True)
     ways, along = np.unique(there, return_counts=True)
     runs = np.zeros(len(values), np.int64)

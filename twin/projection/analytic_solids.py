@@ -134,7 +134,8 @@ def as_convex(shape: Shape) -> Convex:
         case Box(center, size, axes):
             _positive(shape, *size)
             a = _orthonormal(shape, axes)
-            middle, half = np.array(center), np.array(size) / 2
+            middle = np.array(center)
+            half = np.array(size) / 2
             at = a @ middle
             slabs = np.column_stack([a, at - half, at + half])
             return Convex(
@@ -203,9 +204,11 @@ def shadows(
         f = inverse @ one.semi_axes.T
         d = q[:, :, None] * q[:, None] - f @ f.transpose(0, 2, 1)
         with np.errstate(all="ignore"):
-            middle, end = d[:, :2, 2], np.stack([d[:, 0, 0], d[:, 1, 1]], axis=1)
+            middle = d[:, :2, 2]
+            end = np.stack([d[:, 0, 0], d[:, 1, 1]], axis=1)
             half = np.sqrt(np.maximum(middle * middle - end * d[:, 2:, 2], 0.0))
-            low, high = (middle - half) / d[:, 2:, 2], (middle + half) / d[:, 2:, 2]
+            low = (middle - half) / d[:, 2:, 2]
+            high = (middle + half) / d[:, 2:, 2]
         ahead = q[:, 2] > np.linalg.norm(f[:, 2], axis=1) * (1 + 1e-9)
         result[:, i] = _pixels(low, high, ahead, shape)
     return result

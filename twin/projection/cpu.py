@@ -76,11 +76,15 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
         _project_alone(box, views, np.arange(len(views)), out)
         return
     for some, turned in runs(views, shape):
-        rays, images, seen = views[some], out[some], shape
+        rays = views[some]
+        images = out[some]
+        seen = shape
         if turned:
-            rays, seen = exchanged(rays), shape[::-1]
+            rays = exchanged(rays)
+            seen = shape[::-1]
             images = np.empty((len(rays), *seen), np.float32)
-        plan, workers = plan_fans(rays, counts, seen), threads()
+        plan = plan_fans(rays, counts, seen)
+        workers = threads()
         if len(plan.jobs):
             shadows = box_shadows(box, rays, (0, box.nz), seen)
             times = fan_job_ns(
@@ -129,12 +133,11 @@ def spread(
     """
     shape = (values.shape[1], values.shape[2])
     for some, turned in runs(views, shape) if fans else [(slice(None), False)]:
-        rays, images = views[some], values[some]
+        rays = views[some]
+        images = values[some]
         if turned:
-            rays, images = (
-                exchanged(rays),
-                np.ascontiguousarray(images.transpose(0, 2, 1)),
-            )
+            rays = exchanged(rays)
+            images = np.ascontiguousarray(images.transpose(0, 2, 1))
         _spread(box, rays, images, clean, fans)
         clean = True  # from now on it holds what is added to
 
@@ -146,7 +149,8 @@ def _spread(
 
     shape = (values.shape[1], values.shape[2])
     counts = (box.nx, box.ny, box.nz)
-    plan, workers = plan_fans(views if fans else views[:0], counts, shape), threads()
+    plan = plan_fans(views if fans else views[:0], counts, shape)
+    workers = threads()
     alone = plan.alone if fans else np.arange(len(views))
     turns = plan_turns(plan, views, counts, shape, workers)
     slices = z_slices(box.nz, turns.slices)

@@ -87,7 +87,8 @@ class DeviceArray(NDArrayOperatorsMixin):
         def gather() -> DeviceArray:
             from numba import cuda
 
-            there, each = self.images, self.size // max(1, self.shape[0])
+            there = self.images
+            each = self.size // max(1, self.shape[0])
             some = cuda.device_array(len(views) * each, np.float32)
             for k, view in enumerate(views):
                 some[k * each : (k + 1) * each].copy_to_device(

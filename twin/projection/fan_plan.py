@@ -191,17 +191,16 @@ def _tilted(
         apart = (np.array([[0], [rows - 1]]) - pole) / ((rows - 1) / 2 - pole)
         good = np.isfinite(meeting).all(axis=1) & (np.abs(slope) <= 1)
         good &= ~(apart < MIN_GAP_SHARE).any(axis=0)
-        begin, end = meeting.min(axis=1) - 0.5, meeting.max(axis=1) + 0.5
+        begin = meeting.min(axis=1) - 0.5
+        end = meeting.max(axis=1) + 0.5
         good &= (end - begin) / step < MAX_FANS_A_PIXEL_LINE * (rows + cols)
     use = np.flatnonzero(good)
-    begin, end, along, first, u, v = (
-        begin[use],
-        end[use],
-        along[use],
-        first[use],
-        u[use],
-        v[use],
-    )
+    begin = begin[use]
+    end = end[use]
+    along = along[use]
+    first = first[use]
+    u = u[use]
+    v = v[use]
     fans = np.maximum(np.ceil((end - begin) / step[use]), 1).astype(np.int64)
     view, number = _counted(fans + 1)
     b = begin[view] + (end - begin)[view] * number / fans[view]
@@ -313,7 +312,8 @@ def plan_turns(
             else:
                 turns.append((len(units), len(units) + 1))
                 units.append((first, stop))
-            alone, fewest = True, 1
+            alone = True
+            fewest = 1
             continue
         alone = False
         pairs = [(first + a, first + b) for a, b in pairwise(cuts)]
@@ -328,7 +328,8 @@ def _cuts(width: FloatArray) -> list[int]:
     """List ends of runs of jobs that are at least MIN_UNIT_WIDTH wide; a remainder joins the
     last run.
     """
-    cuts, gathered = [0], 0.0
+    cuts = [0]
+    gathered = 0.0
     for i, w in enumerate(width.tolist()):
         gathered += w
         if gathered >= MIN_UNIT_WIDTH:
@@ -353,7 +354,8 @@ def _image_widths(
         flat = of[:, 3:5] + c[:, None] * of[:, 6:8] + r * of[:, 9:11]
         return np.asarray(flat / np.linalg.norm(flat, axis=1)[:, None])
 
-    a, b = towards(first), towards(last)
+    a = towards(first)
+    b = towards(last)
     sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     source = of[:, :2]
     outside = source - np.clip(source, 0.0, np.array(counts[:2], dtype=np.float64))

@@ -43,7 +43,8 @@ def odl_operator(
 
         def __init__(self, domain: Any, range: Any, project: _Map, spread: _Map) -> None:
             super().__init__(domain, range, linear=True)
-            self._project, self._spread = project, spread
+            self._project = project
+            self._spread = spread
 
         def _call(self, x: Any) -> Any:
             # ODL's elements want memory in C order.
@@ -54,7 +55,8 @@ def odl_operator(
             """The transpose."""
             return Pair(self.range, self.domain, self._spread, self._project)
 
-    centre, size = np.array(like.center_mm[::-1]), np.array(like.size_mm[::-1])
+    centre = np.array(like.center_mm[::-1])
+    size = np.array(like.size_mm[::-1])
     voxels = odl.uniform_discr(
         centre - size / 2, centre + size / 2, like.shape, dtype="float32", weighting=1.0
     )
@@ -110,10 +112,8 @@ def cil_operator(
         voxel_size_z=z,
     )
     n, rows, cols = image_shape
-    source, whole = (
-        np.linalg.norm(geometry.source[0]),
-        abs(geometry.source_detector_distance[0]),
-    )
+    source = np.linalg.norm(geometry.source[0])
+    whole = abs(geometry.source_detector_distance[0])
     images = AcquisitionGeometry.create_Cone3D(
         [0, -float(source), 0], [0, float(whole - source), 0]
     )

@@ -211,7 +211,8 @@ def _each(
     Before and after, it waits for PyTorch's streams and for the kernels' own, which do
     not know each other.
     """
-    batch, device = values.shape[:-3], values.device
+    batch = values.shape[:-3]
+    device = values.device
     members = values.detach().to(torch.float32).reshape(-1, *values.shape[-3:])
     if _is_there(values):
         with gpu.on(device.index or 0):

@@ -321,9 +321,12 @@ def spread_there(
 
     from flexdt.twin.projection.kernels import gpu_kernels
 
-    factor, sums, shape = 1.0, voxels, values.shape[1:]
+    factor = 1.0
+    sums = voxels
+    shape = values.shape[1:]
     if deterministic:
-        factor, sums = whole_factor(box, values), zeros(voxels.size, np.int64)
+        factor = whole_factor(box, values)
+        sums = zeros(voxels.size, np.int64)
     if is_there(values):
         flat = values.reshape(values.size)
         _launch(box, sums, views, flat, shape, transposed=True, factor=factor)
@@ -424,7 +427,8 @@ def clear_of(
     farthest = behind + np.maximum(spans, 0.0).sum(axis=1)
     depth = (first * normal).sum(axis=1)
     turned = depth < 0.0
-    low, high = np.where(turned, -farthest, nearest), np.where(turned, -nearest, farthest)
+    low = np.where(turned, -farthest, nearest)
+    high = np.where(turned, -nearest, farthest)
     depth = np.abs(depth)
     return np.asarray(
         (low > MIN_CLEARANCE * depth) & (high < (1.0 - MIN_CLEARANCE) * depth)

@@ -63,10 +63,13 @@ ORDERS: tuple[Order, Order, Order] = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 NO_FANS = 3
 """Code of single rays, after the indices into ORDERS: fans would hold too few rays to
 pay."""
-FAN_CROSSING_NS, FAN_LEVEL_NS, FAN_SLAB_NS = (10.5, 15.5), (0.1, 1.0), 35.0
+FAN_CROSSING_NS = (10.5, 15.5)
+FAN_LEVEL_NS = (0.1, 1.0)
+FAN_SLAB_NS = 35.0
 """Time of a ray of a fan at a level, of a fan in a slab at each level, and of a fan in
 a slab apart from its levels [ns]. Pairs: fans of rays in one plane, and others."""
-RAY_VOXEL_NS, PLAN_VIEW_NS = 2.75, 5e5
+RAY_VOXEL_NS = 2.75
+PLAN_VIEW_NS = 5e5
 """Time of a single ray at a voxel, and of planning the fans of a view [ns]. All of
 these were fitted to drawn geometries, each timed all four ways
 (`tests/studies/walks.py`), on two busy cores; only their ratios count."""
@@ -138,8 +141,10 @@ def level_axes(
         # Fans follow the images of planes along w: columns, or rows where those lie closer to
         # them.
         lying = across(v) > across(u)
-        steps, columns = np.where(lying, rows, cols), np.where(lying[:, None], v, u)
-        along, length = np.where(lying[:, None], u, v), np.where(lying, cols, rows)
+        steps = np.where(lying, rows, cols)
+        columns = np.where(lying[:, None], v, u)
+        along = np.where(lying[:, None], u, v)
+        length = np.where(lying, cols, rows)
         flat = np.abs(along[:, [a, b]]).max(axis=1) * length < fan_plan.LEVEL
         far = np.hypot(source[:, a], source[:, b]) + 0.5 * math.hypot(
             counts[2 - a], counts[2 - b]
@@ -201,7 +206,8 @@ def forward(
                 "out is of the host; allowed: None for a volume on a device", {}
             )
         geometry = run_through(geometry, corners_of(volume))
-        there, rays = volume.layout, voxel_rays(geometry, volume.layout, shape)
+        there = volume.layout
+        rays = voxel_rays(geometry, volume.layout, shape)
         # Arrays on a device have no type of their own.
         images: Float32Array = gpu.demand(
             lambda: gpu.project_there(box_of(there), there.flat, rays, shape)
@@ -229,10 +235,12 @@ def _on_device(
     if not gpu.availability().present or len(geometry) == 0 or volume.layout.empty:
         return False
     layout = volume.layout
-    views, box = voxel_rays(geometry, layout, shape), box_of(layout)
+    views = voxel_rays(geometry, layout, shape)
+    box = box_of(layout)
     copy = layout.device_copy
     to_move = layout.flat.nbytes if copy.there is None else 0
-    before, copy.views = copy.views, copy.views + len(views)
+    before = copy.views
+    copy.views = copy.views + len(views)
     return gpu.usable(to_move, out, cpu.threads(), before) and gpu.attempt(
         lambda: gpu.project(box, copy.uploaded(), views, out)
     )
@@ -291,7 +299,8 @@ def back(
                 "out is of the host; allowed: None for images on a device", {}
             )
         target = DeviceVolume.blank(like)
-        there, rays = target.layout, voxel_rays(geometry, target.layout, shape)
+        there = target.layout
+        rays = voxel_rays(geometry, target.layout, shape)
         gpu.demand(
             lambda: gpu.spread_there(
                 box_of(there), there.flat, rays, values, deterministic=deterministic
@@ -301,7 +310,9 @@ def back(
     layout = blank_layout(like, out)
     if len(geometry):
         views = voxel_rays(geometry, layout, shape)
-        box, clean, done = box_of(layout), out is None, False
+        box = box_of(layout)
+        clean = out is None
+        done = False
         need = layout.flat.nbytes * (3 if deterministic else 1)
         if gpu.usable(need, values, cpu.threads()):
             if out is not None:
@@ -335,7 +346,8 @@ def _spread(
     for some, order, fans in by_level_axis(
         like, geometry, (values.shape[1], values.shape[2])
     ):
-        turned, target = like.in_order(order), layout
+        turned = like.in_order(order)
+        target = layout
         if order != ORDERS[0]:
             if order not in rooms:
                 rooms[order] = room_like(turned)
@@ -394,7 +406,8 @@ def check_projections(projections: npt.ArrayLike, n: int) -> Any:
     else:
         values = np.ascontiguousarray(projections, dtype=np.float32)
     if values.ndim != 3 or len(values) != n or 0 in values.shape[1:]:
-        wanted, why = (n, "rows", "cols"), ", one for each row of cone_vec"
+        wanted = (n, "rows", "cols")
+        why = ", one for each row of cone_vec"
         raise GeometryError.of_shape("projections", values.shape, wanted, why)
     return values
 
@@ -583,7 +596,8 @@ def geometry_change(
         views = voxel_rays(geometry, layout, shape)
         each = np.broadcast_to(moved, (len(geometry), 12))
         steps = np.ascontiguousarray(stretched_steps(each, times))
-        box, jobs = box_of(layout), len(geometry) * -(-shape[1] // TILE)
+        box = box_of(layout)
+        jobs = len(geometry) * -(-shape[1] // TILE)
         job_ns = DERIVATIVE_COST * cpu.tile_ns(box, shape[0])
         for first, last in equal_portions(jobs, job_ns, cpu.threads()):
             siddon_kernels.follow(box, views, steps, TILE, result, first, last)

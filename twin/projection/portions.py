@@ -45,7 +45,8 @@ def layer_portions(volume: Float32Array) -> Iterator[tuple[int, int]]:
 def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
     """Yield ranges (first, last) of jobs whose times are `job_ns` (n,)."""
     ends = np.cumsum(job_ns)
-    first, most = 0, PORTION_NS * threads
+    first = 0
+    most = PORTION_NS * threads
     while first < len(ends):
         before = ends[first - 1] if first else 0.0
         last = max(first + 1, int(np.searchsorted(ends, before + most, side="right")))

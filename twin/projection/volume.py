@@ -244,7 +244,8 @@ class Volume:
             object.__setattr__(self, "voxel_mm", _vector((size,) * 3, "voxel_mm")[0])
         object.__setattr__(self, "center_mm", _vector(self.center_mm, "center_mm"))
         if any(size <= 0 for size in self.voxel_xyz):
-            said, sizes = f"voxel_mm is {self.voxel_mm}", list(self.voxel_xyz)
+            said = f"voxel_mm is {self.voxel_mm}"
+            sizes = list(self.voxel_xyz)
             raise GeometryError.instead(said, sizes, "positive sizes (x, y, z) in mm")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
@@ -275,7 +276,8 @@ class Volume:
 
     def _repr_html_(self) -> str:
         size = " x ".join(f"{side:g}" for side in self.size_mm)
-        least, most = float(self.data.min()), float(self.data.max())
+        least = float(self.data.min())
+        most = float(self.data.max())
         return (
             f"<table><caption>{escape(repr(self)[1:-1])}</caption><tr><th>size (x, y, "
             "z)</th><td>"
@@ -512,7 +514,8 @@ class Volume:
             return self
         if order not in self._orders:
             x, y, z = order
-            size, center = self.voxel_xyz, self.center_mm
+            size = self.voxel_xyz
+            center = self.center_mm
             self._orders[order] = Volume(
                 self.data.transpose(2 - z, 2 - y, 2 - x),
                 (size[x], size[y], size[z]),
@@ -535,7 +538,8 @@ class Volume:
         plane, row = (s // self.data.itemsize for s in self.data.strides[1:])
         if self.data.strides[0] == self.data.itemsize and plane > 0 and row > 0:
             flat = _flat_alias(self.data, (ny - 1) * plane + (nx - 1) * row + nz)
-            stride_x, stride_y = row, plane
+            stride_x = row
+            stride_y = plane
         else:
             stride_x = math.ceil(nz / LANES) * LANES
             stride_y = nx * stride_x
@@ -545,14 +549,19 @@ class Volume:
             layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last, y0, y1)
         filled = last > first
         if not filled.any():
-            none, origin = np.zeros(0, np.int32), (0.0, 0.0, 0.0)
+            none = np.zeros(0, np.int32)
+            origin = (0.0, 0.0, 0.0)
             return Layout(
                 flat, 0, stride_x, stride_y, (0, 0, 0), origin, self.voxel_xyz, none
             )
         # Only offsets and counts change.
         ys, xs = (np.flatnonzero(filled.any(axis=axis)) for axis in (1, 0))
-        x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
-        z0, z1 = int(first[filled].min()), int(last[filled].max())
+        x0 = int(xs[0])
+        x1 = int(xs[-1]) + 1
+        y0 = int(ys[0])
+        y1 = int(ys[-1]) + 1
+        z0 = int(first[filled].min())
+        z1 = int(last[filled].max())
         box = (slice(y0, y1), slice(x0, x1))
         low = self.boxes[0, 0] + np.array([x0, y0, z0]) * self.voxel_xyz
         ends = np.stack([first[box], last[box]], axis=-1) - z0
@@ -748,7 +757,8 @@ def bring_over(
     if (
         data.strides[1] < data.strides[2]
     ):  # blocks are of z and of what is contiguous in data
-        data, stride_x, stride_y = data.transpose(0, 2, 1), stride_y, stride_x
+        data = data.transpose(0, 2, 1)
+        stride_x, stride_y = stride_y, stride_x
     nz, ny, nx = data.shape
     for y0, y1 in equal_portions(ny, PASS_NS * nz * nx, 1):
         layout_kernels.transpose(data, flat, stride_x, stride_y, adding, y0, y1)

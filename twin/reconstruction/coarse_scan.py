@@ -98,14 +98,16 @@ class CoarseScan:
         circle = circle_of(cone_vec)
         flip = on_its_side(cone_vec)
         if flip:
-            cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+            cone_vec = swapped(cone_vec)
+            shape = (shape[1], shape[0])
         at, same = distinct_angles(circle)
         chosen = np.arange(0, len(at), -(-len(at) // VIEWS))
         low, high = reach(fan_angles(circle, upright(cone_vec), shape[1]))
         overlap = min(low, high) / (low + high) * shape[1]
         across = min(-(-shape[1] // NODES), max(1, int(overlap / MIN_AXIS_COLUMNS)))
         down = max(min(-(-shape[1] // NODES), shape[0] // 2), -(-shape[0] // NODES), 1)
-        rows, cols = shape[0] // down, shape[1] // across
+        rows = shape[0] // down
+        cols = shape[1] // across
         part = window(cone_vec[at[chosen]], shape, (0, rows * down), (0, cols * across))
         images = np.empty((len(chosen), rows, cols), np.float32)
         for k, place in enumerate(chosen.tolist()):
@@ -173,14 +175,16 @@ class CoarseScan:
     def grid(self) -> Volume:
         """Grid of the field of view without values, in layers as high as rows."""
         x, y = self.circle.centre.tolist()
-        scan, away = self.cone_vec, np.array([x, y, 0.0])
+        scan = self.cone_vec
+        away = np.array([x, y, 0.0])
         scan = ConeVec.from_vectors(
             scan.source - away, scan.detector - away, scan.u, scan.v
         )
         view = field_of_view(scan, self.images.shape[1:])
         pitches = np.linalg.norm([self.cone_vec.u[0], self.cone_vec.v[0]], axis=1)
         tall = view.voxel_mm * float(pitches[1] / pitches[0])
-        layers, height = self.images.shape[1], view.shape[0] * view.voxel_mm
+        layers = self.images.shape[1]
+        height = view.shape[0] * view.voxel_mm
         if (
             self.circle.rise
         ):  # far more than a panel's height, in layers as few as its rows
@@ -291,7 +295,8 @@ class CoarseScan:
         centre = np.append(self.circle.centre, self.grid.center_mm[2])
         far = PARALLEL_SOURCE_RADII * self.circle.radius * away
         # As far behind the object as the source is before it: twice as large.
-        panel, down = centre - far + u * (ends[1] - ends[0]), (0.0, 0.0, -2.0 * tall)
+        panel = centre - far + u * (ends[1] - ends[0])
+        down = (0.0, 0.0, -2.0 * tall)
         views = ConeVec.from_vectors(centre + far, panel, 2.0 * side * u, [down] * len(u))
         cols = int(sum(ends) / side + 1e-6) + 2  # often an integer, except for rounding
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))

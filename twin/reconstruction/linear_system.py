@@ -38,7 +38,8 @@ MIN_WEIGHT_SHARE = 1e-6
 """Least sum of weights that is divided by, as a share of the largest."""
 MAX_VOXEL_RATIO = 100
 """Largest number of voxels about a region, in multiples of the requested number."""
-STACKS, VOLUMES = 4, 5
+STACKS = 4
+VOLUMES = 5
 """Largest number of stacks of images, and of volumes, that a method holds at a time."""
 
 
@@ -130,7 +131,8 @@ class LinearSystem:
                 raise GeometryError.instead(said, list(spread.shape), wanted)
             weights = 1.0 / spread
         system = cls(values, geometry, as_volume(like), weights, hardening)
-        box, given = system.like.boxes[0], np.asarray(projections) if on_host else None
+        box = system.like.boxes[0]
+        given = np.asarray(projections) if on_host else None
         found = examine(Operation.ITERATE, geometry, system.shape, images=given, grid=box)
         warn_of(found, GeometryError, stacklevel=4)
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
@@ -152,10 +154,8 @@ class LinearSystem:
         if start.shape != self.like.shape or not np.allclose(
             [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
         ):
-            said, wanted = (
-                f"the first guess is {start!r}",
-                f"on the grid of {self.like!r}",
-            )
+            said = f"the first guess is {start!r}"
+            wanted = f"on the grid of {self.like!r}"
             raise GeometryError.instead(said, list(start.shape), wanted)
         return np.array(start.data, dtype=np.float32)
 
@@ -175,7 +175,8 @@ class LinearSystem:
         if self.hardening is None:
             return measured - self.project(x, views), np.float32(1)
         paths = np.stack([self.project(one, views) for one in self.hardening.amounts(x)])
-        rest, more = np.empty_like(measured), np.empty_like(measured)
+        rest = np.empty_like(measured)
+        more = np.empty_like(measured)
         for view, image in enumerate(measured):
             expected, more[view] = self.hardening.line_integrals(paths[:, view])
             rest[view] = image - expected
@@ -277,7 +278,8 @@ class RegionSystem(LinearSystem):
             GeometryError: `about` does not reach beyond the region, or that is too thin
                 for voxels of nearly that size.
         """
-        wanted, (low, high) = as_volume(about), inner.like.boxes[0]
+        wanted = as_volume(about)
+        (low, high) = inner.like.boxes[0]
         parts = np.maximum(np.round((high - low) / wanted.voxel_xyz), 1.0)
         edge = (high - low) / parts
         beyond = np.stack([low - wanted.boxes[0, 0], wanted.boxes[0, 1] - high]) / edge
@@ -309,7 +311,8 @@ class RegionSystem(LinearSystem):
         """Split x into the voxels of region and surroundings, (z, y, x), z contiguous, no
         copy.
         """
-        (nz, ny, nx), (mz, my, mx) = self.like.shape, self.outer.shape
+        (nz, ny, nx) = self.like.shape
+        (mz, my, mx) = self.outer.shape
         fine, coarse = np.split(x, [nz * ny * nx])
         return (
             fine.reshape(ny, nx, nz).transpose(2, 0, 1),

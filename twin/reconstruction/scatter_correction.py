@@ -46,7 +46,8 @@ from flexdt.twin.signatures import public
 DEPTHS = 400
 THIN: Final = 1e-3
 """Line integral below which a spectrum attenuates as its mean does."""
-THICKEST_MM, FINE = 1e4, 2e-4
+THICKEST_MM = 1e4
+FINE = 2e-4
 """Largest path through a material for effective energies [mm] (tables end where
 nothing gets through), and the largest relative error of the signal."""
 
@@ -202,7 +203,8 @@ class Polychromatic:
             seen / np.float32(self.beam.signal.sum()), np.float32(np.exp(-BLACK))
         )
         found = np.where(thin > THIN, -np.log(dark), thin)
-        none, light = thin < THIN * THIN, int(np.argmin(self.mu))
+        none = thin < THIN * THIN
+        light = int(np.argmin(self.mu))
         limit = np.float32(self.mu[light] / mean[light])
         ratio = np.where(none, limit, straight / np.where(none, np.float32(1), found))
         total = np.tensordot(self.mu.astype(np.float32), paths_mm, 1)
@@ -226,14 +228,18 @@ def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
             raise LimitError.instead(said, names, f"{100 * APART:g} % apart")
 
 
-ROUNDS, SETTLED = 8, 0.01
+ROUNDS = 8
+SETTLED = 0.01
 """Largest number of simulations and reconstructions, and the mean relative change of
 the scatter at which they end."""
-ROUND_DEG, ROUND_NODES, ROUND_ERROR = 20.0, 240, 0.05
+ROUND_DEG = 20.0
+ROUND_NODES = 240
+ROUND_ERROR = 0.05
 """Least angle step [deg], largest number of nodes and relative error of the
 simulations in a round, which only have to find the object. The scatter that is
 subtracted in the end is simulated by the settings."""
-MOST, OFTEN = 0.9, 0.001
+MOST = 0.9
+OFTEN = 0.001
 """Largest part of a pixel's signal that counts as scatter, and the share of pixels
 that may reach it without a warning."""
 BLACK: Final = 80.0
@@ -353,14 +359,17 @@ def scatterer_of(
     whole = field_of_view(cone_vec, shape)
     coarser = (math.prod(whole.shape) / (FINER * wanted.voxels)) ** (1.0 / 3.0)
     grid = field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
-    (mu, straighten), beam = attenuations(chain, kV), Beam.of(chain, kV)
+    (mu, straighten) = attenuations(chain, kV)
+    beam = Beam.of(chain, kV)
     in_rounds = replace(
         wanted,
         step_deg=max(wanted.step_deg, ROUND_DEG),
         nodes=min(wanted.nodes, ROUND_NODES),
         error=max(wanted.error, ROUND_ERROR),
     )
-    direct, before, changes = stack, np.zeros(()), list[float]()
+    direct = stack
+    before = np.zeros(())
+    changes = list[float]()
     while True:
         volume = volume_of(straighten(direct), cone_vec, grid)
         thing = object_in(volume, chain, mu)
@@ -427,7 +436,8 @@ def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
     occupied = np.argwhere(values)
     size = np.array(values.shape)
     box = occupied if len(occupied) else np.array([0 * size, size - 1])
-    low, high = box.min(axis=0), box.max(axis=0) + 1
+    low = box.min(axis=0)
+    high = box.max(axis=0) + 1
     values = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     amounts = np.empty((*values.shape, len(mu)), np.float32)
     for knot, material in enumerate(order, 1):
@@ -456,7 +466,8 @@ def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> l
         return [*out, "nothing in the field of view attenuates, so no scatter was found"]
     ratio = float(np.percentile(filled, 99)) / float(mu.max())
     if abs(ratio - 1.0) > UNLIKE:
-        name, voxel = chain.substances[int(np.argmax(mu))].name, volume.voxel_xyz[0]
+        name = chain.substances[int(np.argmax(mu))].name
+        voxel = volume.voxel_xyz[0]
         out.append(
             f"the densest part attenuates {ratio:.2g} times as much as {name}: either it "
             "is not "

@@ -227,14 +227,18 @@ def _minimised(
             count //= 2
     little = 0
     done = False
-    ahead, t, last = at, 1.0, at
+    ahead = at
+    t = 1.0
+    last = at
     while not done and len(costs) <= iterations:
         tried = objective.at(objective.step(ahead, step))
         if tried.cost > at.cost and ahead is not at:
             # Momentum has led astray: once more from the best point, without it.
-            ahead, t = at, 1.0
+            ahead = at
+            t = 1.0
             continue
-        last, at = at, tried if tried.cost <= at.cost else at
+        last = at
+        at = tried if tried.cost <= at.cost else at
         done = tell(at)
         t, further = momentum(t)
         ahead = at.beyond(last, further)
@@ -346,7 +350,8 @@ class Regular:
             return self.allow(z)
         if isinstance(z, np.ndarray):
             z = np.ascontiguousarray(z)
-        x, ahead = z.copy(), self.dual.copy()
+        x = z.copy()
+        ahead = self.dual.copy()
         # The squared norm of the differences is at most 4 sum(scale^2).
         rate = np.float32(1.0 / (4.0 * theta * float((self.scale**2).sum())))
         t = 1.0

@@ -364,7 +364,8 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
         heads = ("parameter", "value", "sigma", "of images", "unit")
         yield table(parameter_rows(document), heads)
         yield "(name): not asked for; of images: the part of sigma that is the images' noise"
-    rms, seconds = _number(document["rms_px"], 4), _number(document["seconds"], 2)
+    rms = _number(document["rms_px"], 4)
+    seconds = _number(document["seconds"], 2)
     yield f"{seen}, {len(document['outliers'])} of these left out, rms {rms} px, {seconds} s"
     from flexdt.library.calibration.calibrate import ranges
 

@@ -358,7 +358,8 @@ def moved(data: DataSet, report: Report) -> DataSet:
     Raises:
         CommandError: the report's motion is not valid.
     """
-    path, told = report.path, report.document.get("motion")
+    path = report.path
+    told = report.document.get("motion")
     if told is None:
         return data
     from flexdt.twin.errors import TwinError

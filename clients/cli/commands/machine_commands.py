@@ -38,7 +38,8 @@ def show(name: NameOrFile) -> Answer:
     yield f"{found.name}: {found.description}\n"
     yield _axes({n: (a, a.source or COMMENTS) for n, a in found.axes.items()})
     yield "\n" + _places(found)
-    panel, tube = found.detector, found.tube
+    panel = found.detector
+    tube = found.tube
     yield (
         f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
         f"{panel.bits} bits, mode {panel.mode}"

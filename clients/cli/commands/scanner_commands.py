@@ -67,7 +67,10 @@ def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
 def _facts(state: State) -> list[tuple[str, str]]:
     """List the facts of a state as label and text: geometry, tube, camera, sample,
     safety and so on."""
-    g, c, t, s = state.geometry, state.camera, state.tube, state.sample
+    g = state.geometry
+    c = state.camera
+    t = state.tube
+    s = state.sample
     rows, cols = c.shape
     facts = [
         (
@@ -257,7 +260,9 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
         speed: [mm/s, deg/s], signed.
         seconds: on the twin's clock [s]; the end of the travel ends it earlier.
     """
-    now, left, shown = client.state(), seconds, ""
+    now = client.state()
+    left = seconds
+    shown = ""
     while left > 0:
         pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
         lease = min(JOG_LEASE_S * pace, LONGEST_LEASE_S, left)

@@ -75,7 +75,8 @@ def batch(
     folder = Path(wanted.batch.name) if out is None else out
     if folder.exists() and not folder.is_dir():
         raise CommandError(f"{folder}: is a file")
-    whole, free = wanted.batch.items * item_bytes(wanted), free_bytes(folder)
+    whole = wanted.batch.items * item_bytes(wanted)
+    free = free_bytes(folder)
     more = f"; {size(free)} are free" if whole > free else ""
     note(f"{wanted.batch.items} items, {size(whole)} before compression{more}")
     last = 0.0

@@ -55,7 +55,8 @@ class Store:
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
-        self.folder, self.plan = folder, plan
+        self.folder = folder
+        self.plan = plan
         self._log_path = folder / "items.jsonl"
         self.records: dict[int, dict[str, Any]] = {}
         self._head = {
@@ -163,7 +164,8 @@ class Store:
         lines = kept.splitlines()
         if not lines:
             return False
-        found, head = json.loads(lines[0]), self._head
+        found = json.loads(lines[0])
+        head = self._head
         if found != head:
             wrong = next(k for k in head if found.get(k) != head[k])
             raise CommandError(
@@ -190,7 +192,8 @@ class Store:
             Name -> Zarr array (items, ...).
         """
         zarr = _zarr()
-        where, wanted = self.folder / "data.zarr", layout(self.plan)
+        where = self.folder / "data.zarr"
+        wanted = layout(self.plan)
         if known:
             for leftover in where.rglob("*.partial"):  # files that Zarr left at a crash
                 leftover.unlink()
@@ -370,7 +373,8 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
     Raises:
         CommandError: a worker died.
     """
-    text, todo = store.plan.text, store.missing()
+    text = store.plan.text
+    todo = store.missing()
     in_flight = max(4, min(MAX_IN_FLIGHT, MAX_WAITING_BYTES // item_bytes(store.plan)))
     begun = len(store.records)
     flying: set[Future[ItemOutcome]] = set()

@@ -102,7 +102,10 @@ class TrainingData:
         self, folder: Path | str, augment: Augment | None = None, seed: int = 0
     ) -> None:
         """Read the manifest and check that `augment` fits the images; see the class."""
-        self.folder, self.augment, self.seed, self.epoch = Path(folder), augment, seed, 0
+        self.folder = Path(folder)
+        self.augment = augment
+        self.seed = seed
+        self.epoch = 0
         file = self.folder / "manifest.json"
         if not file.is_file():
             raise CommandError(

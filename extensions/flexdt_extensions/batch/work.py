@@ -52,7 +52,9 @@ from flexdt.twin.projection import Scene, Solid, Sphere, Volume, project_body
 from flexdt.twin.reconstruction import fdk
 from flexdt_extensions.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
 
-VALUES, NOISE, SHAPES = 0, 1, 2
+VALUES = 0
+NOISE = 1
+SHAPES = 2
 """Streams of an item's seed: scalar draws in the plan's order, noise, the phantom's parts."""
 MAX_TRIES: Final = 2000
 """Largest number of places tried for a sphere before a phantom counts as impossible."""
@@ -103,7 +105,9 @@ def draw_item(plan: Plan, index: int) -> Item:
         TwinError: a draw that no phantom or machine can be, e.g. beads that do not fit.
     """
     rng = np.random.default_rng(seed_of(plan, index, VALUES))
-    g, images, calibrate = plan.geometry, plan.images, plan.calibrate
+    g = plan.geometry
+    images = plan.images
+    calibrate = plan.calibrate
     drawn: dict[str, Any] = {
         name: getattr(g, name).sample(rng)
         for name in ("sod_mm", "sdd_mm", "height_mm", "lateral_mm", "start_deg")
@@ -181,7 +185,8 @@ def _camera(
     wanted = plan.camera
     if wanted.shape is not None and wanted.pixel_mm is not None:
         return None, (wanted.shape[0], wanted.shape[1]), wanted.pixel_mm, (0.0, 0.0)
-    standard, sensor = machine.detector.camera, machine.detector.pixels
+    standard = machine.detector.camera
+    sensor = machine.detector.pixels
     roi = standard.roi if wanted.roi is None else Roi(*wanted.roi)
     camera = replace(
         standard,
@@ -247,7 +252,8 @@ def _spheres(
     Raises:
         TwinError: a sphere found no free place in `MAX_TRIES` tries.
     """
-    wide, high = table.within_radius_mm, table.within_height_mm / 2.0
+    wide = table.within_radius_mm
+    high = table.within_height_mm / 2.0
     solids: list[Solid] = []
     listed: list[dict[str, Any]] = []
     for number in range(int(table.count.sample(rng))):
@@ -468,7 +474,8 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     """
     assert item.camera is not None
     parts = channels(item.phantom)
-    panel, tube = detector_of(item.machine.detector), tube_of(item.machine.tube)
+    panel = detector_of(item.machine.detector)
+    tube = tube_of(item.machine.tube)
     mono_keV = stated_keV() if plan.images.physics == "mono" else None
     chain = chain_through(parts, panel, tube, mono_keV)
     paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])
@@ -562,7 +569,9 @@ def _judged(
     """
     truth = item.truth.to_edge()
     estimates = {} if fit is None else fit.certificate.estimates
-    values, errors, sigmas = {}, {}, {}
+    values = {}
+    errors = {}
+    sigmas = {}
     for name in free:
         found = estimates.get(name) if identifiable else None
         value = None if found is None else _finite(found.value)

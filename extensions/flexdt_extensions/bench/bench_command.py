@@ -41,7 +41,8 @@ def bench(
         raise CommandError(
             f"no case {', '.join(unknown)}; there are: {known}", INVALID_OPTIONS
         )
-    text, name = "", "bench"
+    text = ""
+    name = "bench"
     if device:
         found = gpu.availability()
         if not found.present:
@@ -49,7 +50,8 @@ def bench(
                 f"--device needs a CUDA device: {found.reason}", INVALID_OPTIONS
             )
         document = run_device_bench(to_stderr)
-        text, name = page(document), "device"
+        text = page(document)
+        name = "device"
     else:
         # Here and in the processes that this one starts.
         os.environ["NUMBA_DISABLE_CUDA"] = "1"

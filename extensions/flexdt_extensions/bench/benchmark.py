@@ -36,9 +36,12 @@ from flexdt.twin.geometry.conventions import (
 from flexdt.twin.projection import Volume, forward, warm_up
 from flexdt_extensions.bench.peers import Peer, Runner, peers
 
-SOD, SDD = 600.0, 1059.0
-C1_SHAPE, C2_SHAPE = (498, 240, 160), (512, 512, 512)
-BINNED, FULL = (760, 956), (1944, 1536)
+SOD = 600.0
+SDD = 1059.0
+C1_SHAPE = (498, 240, 160)
+C2_SHAPE = (512, 512, 512)
+BINNED = (760, 956)
+FULL = (1944, 1536)
 PITCH = {BINNED: 0.1496, FULL: 0.0748}
 TILT_DEG = (0.4, 0.7, 0.3)
 """Rotation in the detector's plane, and two out of it [deg]."""
@@ -94,10 +97,13 @@ def circle(
             object [deg].
     """
     pixel = PITCH[shape] if pitch is None else pitch
-    u, v, beam = np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), np.array([0, 1.0, 0])
+    u = np.array([1.0, 0, 0])
+    v = np.array([0, 0, -1.0])
+    beam = np.array([0, 1.0, 0])
     for axis, angle in zip((beam, u, v), tilt_deg, strict=True):
         turn = rotation_about(axis, math.radians(angle))
-        u, v = turn @ u, turn @ v
+        u = turn @ u
+        v = turn @ v
     raise_ = rotation_about(np.array([1.0, 0, 0]), -math.radians(above_deg))
     rows = []
     for i in range(views):
@@ -132,7 +138,8 @@ def ball(side: int) -> Volume:
 def peer_cases() -> list[Case]:
     """List the cases that have targets: C1, C2, C3, tilted, from above, one row,
     small."""
-    c1, c2 = partial(noise, C1_SHAPE), partial(noise, C2_SHAPE)
+    c1 = partial(noise, C1_SHAPE)
+    c2 = partial(noise, C2_SHAPE)
     above = [
         Case(
             f"above-{e}",
@@ -144,7 +151,8 @@ def peer_cases() -> list[Case]:
         )
         for e in (30, 45, 60, 75)
     ]
-    row, small = (1, 956), (95, 120)
+    row = (1, 956)
+    small = (95, 120)
     single = Case(
         "row", c1, circle(8, row, pitch=0.1496), row, True, "C1, 8 views, one row"
     )
@@ -175,12 +183,15 @@ def peer_cases() -> list[Case]:
 
 def untuned_cases() -> list[Case]:
     """List cases that no code was tuned for: exact, and without a cliff in speed."""
-    s, cube, strong = BINNED, (256, 256, 256), (45.0, 45.0, 45.0)
+    s = BINNED
+    cube = (256, 256, 256)
+    strong = (45.0, 45.0, 45.0)
     # 60 degrees across the detector's diagonal.
     wide = 2 * math.tan(math.radians(30)) * 80.0 / math.hypot(*s)
     cone: dict[str, Any] = {"sod": 40.0, "sdd": 80.0, "pitch": wide}
     aslant = (LYING_TILT_DEG[0] + TILT_DEG[0], *TILT_DEG[1:])
-    near, small = {"sod": 19.2, "sdd": 60.0, "pitch": 0.08}, (95, 120)
+    near = {"sod": 19.2, "sdd": 60.0, "pitch": 0.08}
+    small = (95, 120)
     # Nearly parallel rays pass no z level: only the walk through the voxel columns remains.
     far = {"sod": FAR_RATIO * SOD, "sdd": FAR_RATIO * SDD}
     rows: list[tuple[str, tuple[int, int, int], dict[str, Any], str]] = [
@@ -194,7 +205,8 @@ def untuned_cases() -> list[Case]:
         ("long", (2000, 32, 32), {}, "a rod 2000 voxels long"),
         ("far", C1_SHAPE, far, "C1, 100 times as far"),
     ]
-    c1, aniso = partial(noise, C1_SHAPE), partial(noise, C1_SHAPE, (0.1, 0.2, 0.05))
+    c1 = partial(noise, C1_SHAPE)
+    aniso = partial(noise, C1_SHAPE, (0.1, 0.2, 0.05))
     many = circle(1000, small, pitch=1.2)
     return [
         Case("ball", partial(ball, 512), circle(1, s), s, False, "a ball in empty 512^3"),
@@ -224,9 +236,11 @@ def on_axis(shape: tuple[int, int]) -> ConeVec:
 
 BUDGET_S = 6.0
 """Time limit of a contestant: no more rounds after it [s]."""
-MIN_ROUNDS, MAX_ROUNDS = 3, 15
+MIN_ROUNDS = 3
+MAX_ROUNDS = 15
 """Least and largest number of rounds."""
-SHORT_S, MAX_SHORT_ROUNDS = 1.5, 150
+SHORT_S = 1.5
+MAX_SHORT_ROUNDS = 150
 """Limit of total time [s] below which a contestant runs up to so many rounds: other
 load hides the best of a few short calls."""
 
@@ -302,7 +316,8 @@ def exact_images(
 
     out = np.zeros((len(geometry), *shape), np.float32)
     views = voxel_rays(geometry, volume.layout, shape)
-    every, tile = np.arange(len(geometry)), 8
+    every = np.arange(len(geometry))
+    tile = 8
     jobs = len(every) * -(-shape[1] // tile)
     siddon_kernels.project_rays(box_of(volume.layout), views, every, out, tile, 0, jobs)
     return out
@@ -318,7 +333,8 @@ def sorted_crossings(
         pixels: (k, 3) view, row, column.
     """
     data = volume.data
-    size, counts = np.array(volume.voxel_xyz), np.array(volume.shape[::-1])
+    size = np.array(volume.voxel_xyz)
+    counts = np.array(volume.shape[::-1])
     low = np.array(volume.center_mm) - counts * size / 2
     result = np.zeros(len(pixels))
     for i, (view, r, c) in enumerate(pixels):
@@ -443,7 +459,8 @@ def run_bench(
         if only and case.name not in only:
             continue
         entry = run_case(case, [p for p in found if p.missing is None and case.peers])
-        entry["load"], entry["measured"] = load(), began
+        entry["load"] = load()
+        entry["measured"] = began
         document["cases"].append(entry)
         tell(line_of(entry))
     return document

@@ -134,11 +134,14 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
         tell(row(lines[-1]))
 
     cases = {name: case(name, tell) for name in SIZES}
-    most, some = COUNTS[-1], COUNTS[1]
+    most = COUNTS[-1]
+    some = COUNTS[1]
     for name, seen in cases.items():
-        top, middle = seen[most], seen[some]
+        top = seen[most]
+        middle = seen[some]
         which, accepted, wanted = AGAINST_ASTRA[name]
-        views, beside = COUNTS[which], seen[COUNTS[which]]
+        views = COUNTS[which]
+        beside = seen[COUNTS[which]]
         astra = beside["astra_ms"]
         share = None if astra is None else beside["kernel_ms"] / astra
         line(f"{name}: forward kernel / ASTRA, {views} views", share, accepted, wanted)
@@ -146,7 +149,8 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
         line(
             f"{name}: part of the bound, {most} views", part, *OF_THE_BOUND[name], sign=-1
         )
-        copy, kernel = middle["image_bytes"] / 1e6, middle["kernel_ms"]
+        copy = middle["image_bytes"] / 1e6
+        kernel = middle["kernel_ms"]
         limits = 1.5 * kernel + copy / 15, max(kernel, copy / 50)
         line(f"{name}: {some} views end to end [ms]", middle["call_ms"], *limits)
         line(f"{name}: adjoint / forward kernel", middle["adjoint_ms"] / kernel, 2.0, 1.5)
@@ -177,13 +181,16 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
     """
     shape, voxel = SIZES[name]
     volume = noise((shape[0], shape[1], shape[2]), voxel)
-    there, seen = volume.to("cuda"), {}
+    there = volume.to("cuda")
+    seen = {}
     for views in COUNTS:
         scan = circle(views, PANEL)
         images: Any = forward(there, scan, PANEL)
         out = np.empty((views, *PANEL), np.float32)
-        flat, box = images.reshape(images.size), box_of(there.layout)
-        rays, voxels = voxel_rays(scan, there.layout, PANEL), there.layout.flat
+        flat = images.reshape(images.size)
+        box = box_of(there.layout)
+        rays = voxel_rays(scan, there.layout, PANEL)
+        voxels = there.layout.flat
         ahead = gpu.launcher(box, voxels, rays, flat, PANEL, transposed=False)
         sums = gpu.zeros(voxels.size)
         behind = gpu.launcher(box, sums, rays, flat, PANEL, transposed=True)
@@ -232,7 +239,8 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
     name = list(SIZES)[1]
     (nz, ny, nx), voxel = SIZES[name]
     like = Volume(np.zeros((nz, ny, nx), np.float32), voxel)
-    scan, block = circle(COUNTS[-1], PANEL), gpu_fdk_kernels.BLOCK
+    scan = circle(COUNTS[-1], PANEL)
+    block = gpu_fdk_kernels.BLOCK
     columns = cuda.device_array(len(scan) * PANEL[1] * PANEL[0], np.float32)
     arrays = (
         columns,
@@ -269,7 +277,8 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
             MAX_ERRORS_RATIO,
             MAX_ERRORS_RATIO,
         )
-    scan, seen = circle(COUNTS[1], PANEL), cases[name][COUNTS[1]]
+    scan = circle(COUNTS[1], PANEL)
+    seen = cases[name][COUNTS[1]]
     for kind, images_of in KINDS.items():
         some = images_of(scan, PANEL)
         times = [
@@ -428,7 +437,8 @@ class Resident:
         self._images = astra.data3d.link("-sino", panel, _link(astra, self._views))
         options = astra.astra_dict(algorithm)
         into = "VolumeDataId" if algorithm == "FP3D_CUDA" else "ReconstructionDataId"
-        options[into], options["ProjectionDataId"] = self._volume, self._images
+        options[into] = self._volume
+        options["ProjectionDataId"] = self._images
         self._algorithm = astra.algorithm.create(options)
 
     def compute(self) -> None:

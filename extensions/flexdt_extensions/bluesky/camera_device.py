@@ -73,7 +73,8 @@ class Announcements(StreamResourceDataProvider):
         """Count the events whose images the emitted documents name; dropped ones are
         due again."""
         if self._last is not None and not self._last["descriptor"]:
-            self.last_emitted, self._last = self._last["indices"]["start"], None
+            self.last_emitted = self._last["indices"]["start"]
+            self._last = None
         return self.last_emitted
 
     async def make_stream_docs(
@@ -159,7 +160,8 @@ class _Triggering(DetectorTriggerLogic):
     """Exposure and number of images."""
 
     def __init__(self, exposure_ms: SignalRW[float]) -> None:
-        self.exposure_ms, self.images = exposure_ms, 1
+        self.exposure_ms = exposure_ms
+        self.images = 1
 
     def config_sigs(self) -> set[SignalR[float]]:
         return {self.exposure_ms}
@@ -177,7 +179,9 @@ class _Acquiring(DetectorAcquireLogic):
     """The task that takes the images; its failure reaches the caller of the trigger."""
 
     def __init__(self, link: LabConnection, triggering: _Triggering, roll: Roll) -> None:
-        self.link, self.triggering, self.roll = link, triggering, roll
+        self.link = link
+        self.triggering = triggering
+        self.roll = roll
 
     async def start_acquiring(self) -> None:
         for _ in range(max(1, self.triggering.images)):
@@ -196,7 +200,9 @@ class _Files(DetectorDataLogic):
     """The images, as a stream of TIFF files."""
 
     def __init__(self, link: LabConnection, where: PathProvider, roll: Roll) -> None:
-        self.link, self.where, self.roll = link, where, roll
+        self.link = link
+        self.where = where
+        self.roll = roll
         self.announcements: Announcements | None = None
 
     async def prepare_unbounded(self, datakey_name: str) -> StreamableDataProvider:

@@ -147,7 +147,9 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
         collisions: bool = True,
     ) -> None:
         """Make position, speed and acceleration of the axis as signals; see the class."""
-        self._link, self._axis, self._collisions = link, axis, collisions
+        self._link = link
+        self._axis = axis
+        self._collisions = collisions
         client = link.client
 
         def member(name: str, put: Put[float], units: str) -> SignalRW[float]:

@@ -143,7 +143,9 @@ class TwinFlyer(
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
-        self._link, self._machine, self._profile = link, machine, profile
+        self._link = link
+        self._machine = machine
+        self._profile = profile
         self._prepared: _Prepared | None = None
         self._images: Announcements | None = None
         self._written, self._set_written = soft_signal_r_and_setter(int, 0)
@@ -160,7 +162,9 @@ class TwinFlyer(
     async def stage(self) -> None:
         """Connect; forget an earlier scan."""
         await self._link.connect()
-        self._prepared, self._images, self.job = None, None, None
+        self._prepared = None
+        self._images = None
+        self.job = None
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
@@ -189,14 +193,16 @@ class TwinFlyer(
             if not report.ok:
                 raise _refused(report)
             self._prepared = _planned(value, text, report, machine, profile)
-            self._images, self.job = None, None
+            self._images = None
+            self.job = None
             self._set_written(0)
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
         """Start the scan: submit its job."""
         ready = self._ready()
-        client, scan = self._link.client, ready.scan
+        client = self._link.client
+        scan = ready.scan
         async with self._submitting:
             submitted = await client.submit_script(
                 ready.text,
@@ -224,7 +230,8 @@ class TwinFlyer(
         """
         if self.job is None:
             raise RuntimeError(f"{self.name}: kickoff() must be called before complete()")
-        start, job = time.monotonic(), self.job.job
+        start = time.monotonic()
+        job = self.job.job
         async for _ in self._link.states():
             self.job = status = await self._link.client.job_status(job)
             self._set_written(status.frames_done)
@@ -320,7 +327,8 @@ class TwinFlyer(
 
     async def describe_configuration(self) -> dict[str, DataKey]:
         """Describe the values of `read_configuration`."""
-        source, keys = self.source("script.check"), dict[str, DataKey]()
+        source = self.source("script.check")
+        keys = dict[str, DataKey]()
         for name, (value, dtype, numpy, units) in self._settings().items():
             shape: list[int | None] = [len(value)] if isinstance(value, list) else []
             key = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=numpy)
@@ -483,7 +491,8 @@ def fly_scan(
         )
 
     def images() -> MsgGenerator[None]:
-        ending, done = (yield from bps.complete(flyer)), False
+        ending = yield from bps.complete(flyer)
+        done = False
         while not done:
             yield from bps.checkpoint()  # where a deferred pause begins
             done = yield from _done(ending, flush_s)

@@ -224,8 +224,12 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         limits: Callable[[State], tuple[float, float]] | None = None,
     ) -> None:
         super().__init__(datatype)
-        self._link, self._path, self._get = link, path, get or self._member
-        self._put, self._units, self._limits = put, units, limits
+        self._link = link
+        self._path = path
+        self._get = get or self._member
+        self._put = put
+        self._units = units
+        self._limits = limits
         self._end: Callable[[], None] | None = None
 
     def _member(self, state: State) -> _T:

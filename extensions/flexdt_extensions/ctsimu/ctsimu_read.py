@@ -26,7 +26,8 @@ MAX_MINOR: Final = 2
 MM: Final = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "dm": 100.0, "um": 1e-3, "nm": 1e-6}
 _RAD: Final = {"rad": 1.0, "deg": math.pi / 180.0}
 NUMBER: Final = {None: 1.0}
-WORLD, STAGE = "xyz", "uvw"
+WORLD = "xyz"
+STAGE = "uvw"
 _SAMPLE = "rst"
 """A sample's own axes; for source, detector and stage CTSimU takes them for the local ones."""
 _AXES: Final = {
@@ -99,7 +100,9 @@ class ScenarioReader:
     def __init__(
         self, document: Mapping[str, Any], file: str, beside: Beside | None = None
     ) -> None:
-        self._document, self._file, self._beside = document, file, beside
+        self._document = document
+        self._file = file
+        self._beside = beside
         self._check_version()
         self._count = self._size("acquisition", "number_of_projections")
 
@@ -176,7 +179,8 @@ class ScenarioReader:
         for i in range(self._count):
             source, _ = place(parts["source"], still, i, real)
             detector, panel = place(parts["detector"], still, i, real)
-            u, v = panel[:, 0] * pitch[0], panel[:, 1] * pitch[1]
+            u = panel[:, 0] * pitch[0]
+            v = panel[:, 1] * pitch[1]
             out.append((source, detector, u, v, *place(parts["stage"], angle, i, real)))
         return out
 
@@ -277,12 +281,14 @@ class ScenarioReader:
         turn = value["type"] == "rotation"
         axis = value.get("axis")
         if isinstance(axis, str) and axis in _AXES:
-            reference, direction = _AXES[axis][0], np.array(_AXES[axis][1])
+            reference = _AXES[axis][0]
+            direction = np.array(_AXES[axis][1])
         elif isinstance(axis, dict):
             reference, direction = self._vector(axis, f"{where}.axis")
         else:
             raise self._error(f"{where}.axis", "x, y, z, u, v, w or a vector of them")
-        pivot_reference, pivot = _SAMPLE, np.zeros(3)
+        pivot_reference = _SAMPLE
+        pivot = np.zeros(3)
         if value.get("pivot") is not None:
             pivot_reference, pivot = self._vector(value["pivot"], f"{where}.pivot", MM)
         amount = self._frames(
@@ -423,7 +429,8 @@ class ScenarioReader:
         about = self._at("file")
         version = about.get("file_format_version")
         said = version if isinstance(version, dict) else {}
-        major, minor = said.get("major"), said.get("minor")
+        major = said.get("major")
+        minor = said.get("minor")
         fits = major == 1 and isinstance(minor, int) and minor <= MAX_MINOR
         if about.get("file_type") != "CTSimU Scenario" or not fits:
             asked = f"file_type {about.get('file_type')!r}, format {major}.{minor}"
@@ -476,7 +483,8 @@ def place(
         real: include deviations unknown to reconstruction.
         stage: centre and axes of the stage, for a sample.
     """
-    center, axes = part.center.copy(), part.axes
+    center = part.center.copy()
+    axes = part.axes
     if turn[frame] != 0.0:
         axes = rotation_about(axes[:, 2], float(turn[frame])) @ axes
 
@@ -496,8 +504,10 @@ def place(
             center = center + amount * axis
             continue
         origin, base = seen(deviation.pivot_reference)
-        pivot, rotation = origin + base @ deviation.pivot, rotation_about(axis, amount)
-        center, axes = pivot + rotation @ (center - pivot), rotation @ axes
+        pivot = origin + base @ deviation.pivot
+        rotation = rotation_about(axis, amount)
+        center = pivot + rotation @ (center - pivot)
+        axes = rotation @ axes
     return center + np.array([m.of(real)[frame] for m in part.moves]), axes
 
 
@@ -505,7 +515,8 @@ def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
     lengths = np.linalg.norm(u), np.linalg.norm(w)
     if min(lengths) == 0.0 or abs(u @ w) > 1e-6 * lengths[0] * lengths[1]:
         return None
-    u, w = u / lengths[0], w / lengths[1]
+    u = u / lengths[0]
+    w = w / lengths[1]
     v = np.cross(w, u)
     return np.stack([u, v / np.linalg.norm(v), w], axis=1)
 

@@ -270,7 +270,8 @@ class _ScanReader(ScenarioReader):
         mAs = self._series(_MA, "source", "current", default=1.0)
         mAs = mAs * self._series(_S, "detector", "integration_time", default=1.0)
         rows, cols = (n // b * b for n, b in zip(size, bins, strict=True))
-        response, grey = self._response(), self._grey()
+        response = self._response()
+        grey = self._grey()
         scan = ScenarioScan(
             geometry,
             views,
@@ -342,14 +343,16 @@ class _ScanReader(ScenarioReader):
             raise self._error(f"{where}.scaling_factor", "above 0")
         substance = self._material(given.get("material_id"), f"{where}.material_id")
         part = self._placed(given["position"], f"{where}.position", (STAGE, WORLD))
-        still, views = np.zeros(self._count), np.empty((self._count, 12))
+        still = np.zeros(self._count)
+        views = np.empty((self._count, 12))
         there: list[tuple[FloatArray, FloatArray]] = []
         for i, pose in enumerate(poses):
             stage, turn = pose[4:]
             center, axes = place(part, still, i, True, (stage, turn))
             if part.on_stage:
                 there.append((center, axes))
-                center, axes = stage + turn @ center, turn @ axes
+                center = stage + turn @ center
+                axes = turn @ axes
             else:
                 there.append((turn.T @ (center - stage), turn.T @ axes))
             views[i] = seen_from(pose, center, axes)
@@ -751,7 +754,8 @@ class _ScanReader(ScenarioReader):
         self, units: Mapping[Any, float], *path: str, default: float | None = None
     ) -> FloatArray:
         """Read a positive number for each frame."""
-        where, given = ".".join(path), self._given(*path)
+        where = ".".join(path)
+        given = self._given(*path)
         value = given.get("value") if isinstance(given, dict) else given
         if value is None and default is not None:
             return np.full(self._count, default)
@@ -779,7 +783,8 @@ def _line(energy_keV: float) -> Spectrum:
     at = int(low.fluence.argmax())
     other = min(max(at + (1 if energy_keV > bins[at] else -1), 0), len(bins) - 1)
     part = abs(energy_keV - bins[at]) / (bins[1] - bins[0])
-    low.fluence[at], low.fluence[other] = 1.0 - part, part if other != at else 1.0
+    low.fluence[at] = 1.0 - part
+    low.fluence[other] = part if other != at else 1.0
     return low
 
 

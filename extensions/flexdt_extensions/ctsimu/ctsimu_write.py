@@ -82,7 +82,8 @@ def scenario_of(
         parameters = (
             NOMINAL if dataset.correction is None else dataset.correction.parameters
         )
-    doc, machine = dataset.document, dataset.machine
+    doc = dataset.document
+    machine = dataset.machine
     geometry_of(dataset, NOMINAL)  # raises for frames of several shapes
     scan = Scenario(
         dataset.poses,
@@ -136,8 +137,10 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
     start, stop, direction, uneven = _stage_motion(np.degrees(poses.angle))
     real = scan.known if scan.real is None else scan.real
     pairs = _Deviations(scan.known, real)
-    u, v = TO_CTSIMU @ poses.u[0], TO_CTSIMU @ poses.v[0]
-    ahead, right = TO_CTSIMU @ [0.0, 1.0, 0.0], TO_CTSIMU @ [1.0, 0.0, 0.0]
+    u = TO_CTSIMU @ poses.u[0]
+    v = TO_CTSIMU @ poses.v[0]
+    ahead = TO_CTSIMU @ [0.0, 1.0, 0.0]
+    right = TO_CTSIMU @ [1.0, 0.0, 0.0]
     return {
         "file": {
             "name": scan.name,
@@ -215,7 +218,8 @@ def _stage_motion(
 
     Deviations from equal steps become a drift of a turn about the stage's own axis.
     """
-    first, last = float(angles_deg[0]), float(angles_deg[-1])
+    first = float(angles_deg[0])
+    last = float(angles_deg[-1])
     forward = first <= last
     start, stop = (first, last) if forward else (-first, -last)
     # Growing angles turn the object clockwise seen from above: negative about the stage's w.
@@ -245,7 +249,8 @@ class _Deviations:
     """Deviations of all parameters: the known amount, then the unknown addition to it."""
 
     def __init__(self, known: Offsets, real: Offsets) -> None:
-        self._known, self._real = known.to_edge(), real.to_edge()
+        self._known = known.to_edge()
+        self._real = real.to_edge()
 
     def stage(
         self, motion: list[dict[str, Any]], angles_deg: FloatArray
@@ -269,7 +274,8 @@ class _Deviations:
         """List the deviations of a table of axes and parameters."""
         out = []
         for axis, name in (pair.split() for pair in parameters.split(", ")):
-            turn, sign = UNITS[name] == "deg", -1.0 if axis.startswith("-") else 1.0
+            turn = UNITS[name] == "deg"
+            sign = -1.0 if axis.startswith("-") else 1.0
             kind, amount = ("rotation", _deg) if turn else ("translation", _mm)
             for known, value in self._amounts(name):
                 out.append(_deviation(kind, axis[-1], amount(sign * value), known, name))

@@ -75,7 +75,9 @@ class ScenarioImages:
         if not 0 <= (seed or 0) <= 2**63:
             raise LimitError(f"seed is {seed}; allowed: 0 to 2^63", {"asked": seed})
         check_rays(rays)
-        self.path, self._seed, self._rays = Path(path), seed, rays
+        self.path = Path(path)
+        self._seed = seed
+        self._rays = rays
         self.scan = read_scenario(text_of(self.path), str(self.path), self._beside)
         self._meshes = [self._mesh(sample) for sample in self.scan.samples]
         found: dict[Substance, float] = {}
@@ -103,7 +105,8 @@ class ScenarioImages:
     @cached_property
     def _beams(self) -> list[EffectiveBeam]:
         """Of each spectrum."""
-        substances, thick = list(self._thickest), list(self._thickest.values())
+        substances = list(self._thickest)
+        thick = list(self._thickest.values())
         if self.scan.environment is not None:
             substances.append(self.scan.environment)
             thick.append(max(float(self._distance(i).max()) for i in range(len(self))))
@@ -114,14 +117,16 @@ class ScenarioImages:
 
     def _distance(self, frame: int) -> Float32Array:
         """Compute the distance from the source to each pixel, (rows, cols) [mm]."""
-        row, (rows, cols) = self.scan.views[frame], self.scan.shape
+        row = self.scan.views[frame]
+        (rows, cols) = self.scan.shape
         v = np.arange(rows)[:, None, None] - (rows - 1) / 2
         u = np.arange(cols)[None, :, None] - (cols - 1) / 2
         pixels = row[3:6] - row[0:3] + u * row[6:9] + v * row[9:12]
         return np.asarray(np.linalg.norm(pixels, axis=2), dtype=np.float32)
 
     def _paths(self, frame: int, ray: int, samples: bool) -> Float32Array:
-        shape, order = self.scan.shape, {one: i for i, one in enumerate(self._thickest)}
+        shape = self.scan.shape
+        order = {one: i for i, one in enumerate(self._thickest)}
         air = self.scan.environment is not None
         out = np.zeros((len(order) + air, *shape), np.float32)
         for sample, mesh in (
@@ -148,7 +153,8 @@ class ScenarioImages:
         Returns:
             Mean [keV] and variance [keV^2], (rows, cols) each.
         """
-        scan, n = self.scan, self._rays if samples else 1
+        scan = self.scan
+        n = self._rays if samples else 1
         beam = self._beams[scan.spectrum_of[frame]]
         # In double precision: rays that meet nothing then average to the open beam's very
         # value.
@@ -176,7 +182,8 @@ class ScenarioImages:
         scan = self.scan
         if not scan.scattering or not scan.samples:
             return None
-        parts, reach = [], np.zeros(3)
+        parts = []
+        reach = np.zeros(3)
         for sample, mesh in zip(scan.samples, self._meshes, strict=True):
             assert sample.on_stage is not None
             center, axes = sample.on_stage
@@ -228,7 +235,8 @@ class ScenarioImages:
         Returns:
             The blurred image; a Gaussian leaves out the pixel's own width.
         """
-        grey, view = self.scan.grey, self.scan.views[0]
+        grey = self.scan.grey
+        view = self.scan.views[0]
         u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
         if grey.mtf is None:
             # The resolution of a detector is that with its pixels.
@@ -278,7 +286,8 @@ class ScenarioImages:
                 values.shape, dtype=np.float32
             )
             values = values + draw * (sigma / np.sqrt(averages)).astype(np.float32)
-        top, (b, c) = 2.0**grey.bits - 1.0, self.scan.binning
+        top = 2.0**grey.bits - 1.0
+        (b, c) = self.scan.binning
         rows, cols = (n // k for n, k in zip(self.scan.shape, (b, c), strict=True))
         blocks = np.clip(values, 0.0, top).reshape(rows, b, cols, c)
         return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64))
@@ -315,7 +324,8 @@ class ScenarioImages:
         Yields:
             uint16 (rows, cols); corrected by dark and flat where the scenario has it.
         """
-        scan, lag = self.scan, self.scan.grey.lag
+        scan = self.scan
+        lag = self.scan.grey.lag
         dark = np.mean(self.darks(), axis=0) if scan.dark.correction else 0.0
         gain = None
         if scan.flat.correction:
@@ -344,15 +354,15 @@ class ScenarioImages:
 
         Without dark or flat images in the scenario the data set has none either.
         """
-        scan, darks, flats = self.scan, self.darks(), self.flats()
+        scan = self.scan
+        darks = self.darks()
+        flats = self.flats()
         dark: Any = np.stack(darks) if darks else None
         flat: Any = np.stack(flats) if flats else None
         counts = np.stack(list(self.projections()))
         if scan.dark.correction and dark is not None:
-            dark, flat = (
-                np.zeros_like(dark),
-                None if flat is None else flat - np.mean(darks, axis=0),
-            )
+            dark = np.zeros_like(dark)
+            flat = None if flat is None else flat - np.mean(darks, axis=0)
         if scan.flat.correction:
             flat = np.full(counts.shape[1:], round(self.brightest), np.uint16)
         if flat is not None:
@@ -378,7 +388,8 @@ class ScenarioImages:
             ExchangeError: the folder exists and is not empty.
             OSError: it cannot be written.
         """
-        folder, stem = Path(folder).absolute(), self.path.stem
+        folder = Path(folder).absolute()
+        stem = self.path.stem
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ExchangeError(
                 f"{folder} exists; allowed: a new folder, or an empty one",
@@ -420,7 +431,8 @@ class ScenarioImages:
             names: file pattern of dark and flat images; None for none.
         """
         own = Path(os.path.relpath(self.path.absolute(), folder)).as_posix()
-        scan, today = self.scan, datetime.now(UTC).date().isoformat()
+        scan = self.scan
+        today = datetime.now(UTC).date().isoformat()
         rows, cols = scan.geometry.shape or (0, 0)
         pitch = scan.geometry.pitch_mm
 

@@ -254,24 +254,21 @@ def delft(files: list[Path]) -> Iterator[Told]:
             sod=945, sdd=1215, angles=turn, shape=(1548, 550), pixel=PITCH
         )
         free, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
-        few, sigma = (
-            not free["identifiable"],
-            free["parameters"]["dD_z"]["sigma"] or np.inf,
-        )
+        few = not free["identifiable"]
+        sigma = free["parameters"]["dD_z"]["sigma"] or np.inf
         ours = f"{'refused' if few else 'an answer'}, sigma {sigma:.0f} mm"
         yield Figure(f"{k}: SDD", "three views are too few", ours, few)
         held, places = _calibrated(seen, frames, start, "dO_x")
-        rms, (aside, up) = (
-            held["rms_px"],
-            (held["parameters"][key] for key in ("dO_x", "dD_y")),
-        )
+        rms = held["rms_px"]
+        (aside, up) = (held["parameters"][key] for key in ("dO_x", "dD_y"))
         yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
         # Theirs are cm; columns grow to the left, seen from the source, and a panel's middle is
         # at half their number: its mirror image is stored.
         source, panel = (
             10 * getattr(stored[k], name) for name in ("_source", "_detector")
         )
-        here, there = complex(source[0], -source[1]), complex(panel[0], -panel[1])
+        here = complex(source[0], -source[1])
+        there = complex(panel[0], -panel[1])
         axis = (here * there.conjugate()).imag / abs(here) + 0.5 * PITCH[0]
         above = panel[2] - source[2] + 0.5 * PITCH[1]
         values = aside["value"], aside["sigma"], up["value"]  # None where refused
@@ -329,7 +326,8 @@ def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
     line = normals @ np.stack([u, v, first + foot @ [u, v]], axis=1)
     line /= np.linalg.norm(line[:, :2], axis=1, keepdims=True)
     x, y, at = line.T[..., None, None]
-    along, beside = np.arange(-sum(image.shape), sum(image.shape)), [[-1.0], [1.0]] - at
+    along = np.arange(-sum(image.shape), sum(image.shape))
+    beside = [[-1.0], [1.0]] - at
     places = [foot[1] + beside * y + along * x, foot[0] + beside * x - along * y]
     low, high = map_coordinates(weighted, places, order=1).sum(axis=2).T
     return np.asarray((1 + (line[:, 2] / far) ** 2) * (high - low) / 2)
@@ -345,7 +343,9 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
     Yields:
         Points and planes, as stored and for a matrix shifted by 5 px.
     """
-    matrices, images, pixel = [], [], 1.0
+    matrices = []
+    images = []
+    pixel = 1.0
     for file in files:
         head, _, raw = file.read_bytes().partition(b"\n\n")
         said = dict(re.findall(r"^([^#:]+):=? *(.*?) *$", head.decode(), re.MULTILINE))
@@ -435,11 +435,10 @@ def tooth(files: list[Path]) -> Iterator[Told]:
     h5py = package("h5py", "HDF5 files", "io")
     with h5py.File(files[0]) as stored:
         scan = stored["exchange"]
-        counts, white = (
-            scan["data"][:].astype(np.uint16),
-            scan["data_white"][:].mean(axis=0),
-        )
-        dark, turn = scan["data_dark"][:].mean(axis=0), scan["theta"][:]  # deg
+        counts = scan["data"][:].astype(np.uint16)
+        white = scan["data_white"][:].mean(axis=0)
+        dark = scan["data_dark"][:].mean(axis=0)
+        turn = scan["theta"][:]  # deg
     far = fx.ConeVec.circular(
         sod=1e5, sdd=1.001e5, angles=turn, shape=counts.shape[1:], pixel=0.01
     )

@@ -65,17 +65,17 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     ) -> None:
         require_positive(attempts=attempts)
         require_positive(or_zero=True, work_weight=work_weight)
-        self.attempts, self.work_weight, self.render_mode = (
-            attempts,
-            work_weight,
-            render_mode,
-        )
+        self.attempts = attempts
+        self.work_weight = work_weight
+        self.render_mode = render_mode
         self.action_space = gymnasium.spaces.MultiDiscrete(
             [len(ALGORITHMS), len(WINDOWS), 2]
         )
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (13,), np.float32)
         self._lab = Lab((SIDE_MM, SIDE_MM, SIDE_MM))
-        self._views, self._photons, self._left = VIEWS[0], PHOTONS[0], attempts
+        self._views = VIEWS[0]
+        self._photons = PHOTONS[0]
+        self._left = attempts
         self._images = np.zeros((0, 1, 1), np.float32)
         self._cone: ConeVec | None = None
         self._truth = self._volume = blank()
@@ -112,7 +112,8 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         self._images = noisy(clean, self._photons, rng)
         self._truth = thing.volume(SIDE_MM / GRID)
         self._volume = blank()
-        self._best, self._left = 0.0, self.attempts
+        self._best = 0.0
+        self._left = self.attempts
         self._last = np.zeros(10, np.float32)
         return self._observe(), {"quality": 0.0, "best": 0.0, "work": 0.0}
 
@@ -186,13 +187,13 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
             The volume, and the work in projections of all views.
         """
         assert self._cone is not None
-        images, cone, like = self._images, self._cone, blank()
+        images = self._images
+        cone = self._cone
+        like = blank()
         match ALGORITHMS[algorithm]:
             case "fdk":
-                volume, work = (
-                    fdk(images, cone, like, window=WINDOWS[strength], errors=False),
-                    1.0,
-                )
+                volume = fdk(images, cone, like, window=WINDOWS[strength], errors=False)
+                work = 1.0
             case "sirt":
                 count = SIRT_ITERATIONS[strength]
                 volume = sirt(
@@ -201,7 +202,8 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
                 work = 2.0 * count
             case _:
                 count = CGLS_ITERATIONS[strength]
-                volume, work = cgls(images, cone, like, iterations=count), 2.0 * count
+                volume = cgls(images, cone, like, iterations=count)
+                work = 2.0 * count
         if nonnegative:
             volume = Volume(
                 np.maximum(volume.data, 0.0), volume.voxel_mm, volume.center_mm

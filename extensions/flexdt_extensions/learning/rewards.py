@@ -138,7 +138,8 @@ class InformationTask:
             poses: n frames.
             at: offsets.
         """
-        n, k = len(poses), len(self._model)
+        n = len(poses)
+        k = len(self._model)
         sizes = np.broadcast_to(np.asarray(lab.shape, dtype=np.float64), (n, 2))
         problem = build_problem(
             np.zeros((n, k, 2)),
@@ -178,7 +179,8 @@ class QualityTask:
         self._start(blank(), Scene(()))
 
     def _start(self, truth: Volume, scene: Scene) -> None:
-        self._truth, self._scene = truth, scene
+        self._truth = truth
+        self._scene = scene
         self.volume = blank()
         self.images: list[Float32Array] = []
         self._cones: list[ConeVec] = []
@@ -223,7 +225,8 @@ class QualityTask:
 
     def judge(self) -> float:
         """Compute the gain in quality of the last reconstruction."""
-        before, self._quality = self._quality, quality(self.volume, self._truth)
+        before = self._quality
+        self._quality = quality(self.volume, self._truth)
         return self._quality - before
 
     def state(self) -> Float32Array:
@@ -258,7 +261,8 @@ def random_object(rng: np.random.Generator) -> Phantom:
     )
     solids = [Solid(body, "water", water)]
     for _ in range(int(rng.integers(4, 8))):
-        along, across = rng.uniform(-12, 12), rng.uniform(-4, 4)
+        along = rng.uniform(-12, 12)
+        across = rng.uniform(-4, 4)
         x = along * math.cos(turn) - across * math.sin(turn)
         y = along * math.sin(turn) + across * math.cos(turn)
         a, b, c = rng.uniform(2.0, 4.5, 3)
@@ -274,9 +278,11 @@ def random_object(rng: np.random.Generator) -> Phantom:
 def random_plates(rng: np.random.Generator) -> Phantom:
     """Draw one or two parallel upright plates, turned by any angle: a few views see
     them edge-on."""
-    water, axes = material("water").mu_per_mm, _turned(rng.uniform(0.0, math.pi))
+    water = material("water").mu_per_mm
+    axes = _turned(rng.uniform(0.0, math.pi))
     count = int(rng.integers(1, 3))
-    apart, start = rng.uniform(12.0, 18.0), rng.uniform(-4.0, 4.0)
+    apart = rng.uniform(12.0, 18.0)
+    start = rng.uniform(-4.0, 4.0)
     solids = []
     for i in range(count):
         across = start + apart * (i - (count - 1) / 2.0)
@@ -302,7 +308,8 @@ def quality(volume: Volume, truth: Volume) -> float:
 
 
 def _turned(angle: float) -> tuple[Vector, Vector, Vector]:
-    c, s = math.cos(angle), math.sin(angle)
+    c = math.cos(angle)
+    s = math.sin(angle)
     return ((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))
 
 

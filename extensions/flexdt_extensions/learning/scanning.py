@@ -102,7 +102,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         )
         self.kind: Kind = action
         self.frames = frames
-        self.time_weight, self.dose_weight = time_weight, dose_weight
+        self.time_weight = time_weight
+        self.dose_weight = dose_weight
         self.collision_penalty = collision_penalty
         self.render_mode = render_mode
         self.task: Task = TASKS[task]()
@@ -112,7 +113,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self.lab = self.new_lab()
         self._last: Poses | None = None
         self._sectors = np.zeros(SECTORS, np.float32)
-        self._taken, self._over = 0, True
+        self._taken = 0
+        self._over = True
         self.action_space = (
             gymnasium.spaces.Discrete(SECTORS)
             if action == "discrete"
@@ -137,7 +139,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self.task.reset(self.lab, self.np_random)
         self._last = None
         self._sectors = np.zeros(SECTORS, np.float32)
-        self._taken, self._over = 0, False
+        self._taken = 0
+        self._over = False
         return self._observe(), self._info(0.0, 0.0)
 
     def step(

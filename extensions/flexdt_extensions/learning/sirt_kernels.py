@@ -61,7 +61,8 @@ def solve(
             for i in range(counts[k]):
                 view = taken[k, i]
                 for ray in range(rays):
-                    begin, end = first[view, ray], first[view, ray + 1]
+                    begin = first[view, ray]
+                    end = first[view, ray + 1]
                     total = np.float32(0)
                     for p in range(begin, end):
                         total += length[p] * x[voxel[p]]

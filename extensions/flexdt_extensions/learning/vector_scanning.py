@@ -49,7 +49,8 @@ class Turntable:
     """
 
     def __init__(self, size_mm: tuple[float, float, float], exposure_s: float) -> None:
-        self.still, self._moved = Lab(size_mm, exposure_s), Lab(size_mm, exposure_s)
+        self.still = Lab(size_mm, exposure_s)
+        self._moved = Lab(size_mm, exposure_s)
         self._ways: dict[tuple[float, float], tuple[Taken, float]] = {}
         self._poses: dict[float, Poses] = {}
 
@@ -90,12 +91,11 @@ class TurnedLab(Lab):
 
     def __init__(self, table: Turntable) -> None:
         still = table.still
-        self.machine, self.scanner, self.exposure_s = (
-            still.machine,
-            still.scanner,
-            still.exposure_s,
-        )
-        self.table, self.angle = table, still.position("rot_obj")
+        self.machine = still.machine
+        self.scanner = still.scanner
+        self.exposure_s = still.exposure_s
+        self.table = table
+        self.angle = still.position("rot_obj")
         self.now = self.dose = 0.0
 
     def position(self, axis: str) -> float:
@@ -354,7 +354,8 @@ def _lengths(cone: ConeVec, shape: tuple[int, int]) -> tuple[VoxelArray, Float32
     ends = cone.detector + (
         rows[:, None, None] * cone.v + cols[:, None] * cone.u
     ).reshape(-1, 3)
-    way, edge = ends - cone.source, SIDE_MM / GRID
+    way = ends - cone.source
+    edge = SIDE_MM / GRID
     planes = np.arange(GRID + 1) * edge - SIDE_MM / 2.0
     with np.errstate(
         divide="ignore", invalid="ignore"

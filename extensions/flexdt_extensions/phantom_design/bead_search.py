@@ -152,7 +152,8 @@ def _shadows(
     """Simulate detections in random order, and the bead of each."""
     tracks = _tracks(model, planned, truth)
     radii = spot_radii(model, planned.poses.cone_vec(truth))
-    out, owners = [], []
+    out = []
+    owners = []
     for frame, points in enumerate(tracks):
         seen = rng.permutation(np.flatnonzero(np.isfinite(points[:, 0])))
         noisy = points[seen] + rng.normal(0.0, planned.noise_px, (len(seen), 2))
@@ -334,7 +335,8 @@ def design(
                 resolution_mm,
             )
         order = np.lexsort((beads[:, 1], beads[:, 0], beads[:, 2]))
-        beads, index = beads[order], index[order]
+        beads = beads[order]
+        index = index[order]
         model = BeadModel(beads, np.array(radius_mm))
         if share_identified(model, planned, seed=seed) == 1.0:
             return Design(beads, index, forecast(model, planned, criterion), discarded)
@@ -359,7 +361,8 @@ def turned_likeness(beads: FloatArray) -> float:
         beads: (k, 3) [mm].
     """
     centred = beads - beads.mean(axis=0)
-    cos, sin = np.cos(_TURNS), np.sin(_TURNS)
+    cos = np.cos(_TURNS)
+    sin = np.sin(_TURNS)
     turned = np.empty((len(_TURNS), *centred.shape))
     turned[..., 0] = cos[:, None] * centred[:, 0] - sin[:, None] * centred[:, 1]
     turned[..., 1] = sin[:, None] * centred[:, 0] + cos[:, None] * centred[:, 1]
@@ -450,7 +453,9 @@ def _exchanged(
                 trial = chosen.copy()
                 trial[k] = seat
                 if turned_likeness(table.places[trial]) >= rules.unlike:
-                    chosen, best, improved = trial, float(scores[seat]), True
+                    chosen = trial
+                    best = float(scores[seat])
+                    improved = True
                     break
     return chosen, best
 
@@ -496,7 +501,8 @@ def _polished(
     Returns:
         Beads and seats after the moves.
     """
-    beads, index = beads.copy(), index.copy()
+    beads = beads.copy()
+    index = index.copy()
     steps = (
         np.array([s for s in np.ndindex(3, 3, 3) if s != (1, 1, 1)], dtype=np.float64)
         - 1.0
@@ -521,7 +527,8 @@ def _polished(
                 scores[best] < scores[0] * (1.0 - 1e-6)
                 and turned_likeness(trial) >= rules.unlike
             ):
-                beads[k], moved = near[best], True
+                beads[k] = near[best]
+                moved = True
                 index[k] = -1
         if not moved:
             size /= 2.0

@@ -168,7 +168,8 @@ class SeatTable:
     ) -> npt.NDArray[np.bool_]:
         """Compare the spots of two seats, (a, b, n): True if they touch, by
         `identify.overlapping`."""
-        first, second = self.pixels[a], self.pixels[b]
+        first = self.pixels[a]
+        second = self.pixels[b]
         across = first[:, None, :, 0] - second[None, :, :, 0]
         down = first[:, None, :, 1] - second[None, :, :, 1]
         reach = 1.12 * (self.radii[a][:, None] + self.radii[b][None]) + 2.0
@@ -220,7 +221,8 @@ def _edge_px(seen: FloatArray, shape: tuple[int, int]) -> FloatArray:
 
 def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
     """Build the problem of the planned scans of some beads, every spot of them seen."""
-    n, k = len(planned.poses), len(model)
+    n = len(planned.poses)
+    k = len(model)
     return build_problem(
         np.zeros((n, k, 2)),
         model,

@@ -242,7 +242,8 @@ def run_design(
 
 def verdict(document: dict[str, Any]) -> str:
     """Compare the design with the spiral in a sentence."""
-    name, gain = document["spiral"]["name"], document["gain"]
+    name = document["spiral"]["name"]
+    gain = document["gain"]
     if gain is None:
         return f"{name} does not determine the geometry in this scan (its shadows hide each other)"
     return f"score {document['criterion_text']}: {gain:.2f} times better than {name}"
@@ -259,7 +260,8 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
         Name, unit, predicted and measured of both, and the ratio of the predictions, as
         text.
     """
-    ours, theirs = document["design"], document["spiral"]
+    ours = document["design"]
+    theirs = document["spiral"]
     return [
         (
             f"{name} (optimised)" if kind == "image_sigmas" else name,
@@ -302,15 +304,11 @@ def write(
     (out / "phantom.json").write_text(json.dumps(phantom.to_dict()), encoding="utf-8")
     _solid(phantom, body).export(out / "phantom.stl", file_type="stl")
     if body.bricks is None:
-        word, drawings = (
-            "level",
-            level_drawings(body.size_mm, phantom.beads, request.radius_mm),
-        )
+        word = "level"
+        drawings = level_drawings(body.size_mm, phantom.beads, request.radius_mm)
     else:
-        word, drawings = (
-            "brick",
-            brick_drawings(body.bricks, phantom.beads, request.radius_mm),
-        )
+        word = "brick"
+        drawings = brick_drawings(body.bricks, phantom.beads, request.radius_mm)
     sections: list[str] = []
     for k, drawing in enumerate(drawings, 1):
         names.append(f"{word}-{k}.png")
@@ -329,13 +327,12 @@ def write(
 
 
 def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
-    radius, where = request.radius_mm, dict[str, Any]()
+    radius = request.radius_mm
+    where = dict[str, Any]()
     if body.bricks is not None:
         seats = seats_of(body.bricks, radius)
-        places, where = (
-            seats.places,
-            {"slots": seats.brick, "per_slot": request.per_brick},
-        )
+        places = seats.places
+        where = {"slots": seats.brick, "per_slot": request.per_brick}
     else:
         # A skin of a bead's radius stays round the beads, so that they are held.
         places = grid_seats(body.size_mm, 2.0 * radius, GRID_STEP_MM)
@@ -448,7 +445,10 @@ def _of(measured: dict[str, float] | None, name: str) -> str:
 SCALE_PX_MM = 12.0
 """Scale of the drawings [pixels/mm]."""
 MARGIN_MM = 5.5
-BRICK, HOLE, TUBE, LINE = "#f2d16b", "#fffaf0", "#e3b93f", "#7a6420"
+BRICK = "#f2d16b"
+HOLE = "#fffaf0"
+TUBE = "#e3b93f"
+LINE = "#7a6420"
 BEAD = COLOURS[1]
 
 
@@ -547,7 +547,8 @@ def level_drawings(
 def _sheet(wide: float, deep: float, top: str, bottom: str) -> Axes:
     """Draw the outline of a brick or block, its edges named, on axes that fill a
     figure."""
-    w, h = wide + 2 * MARGIN_MM, deep + 2 * MARGIN_MM
+    w = wide + 2 * MARGIN_MM
+    h = deep + 2 * MARGIN_MM
     figure = blank(w * SCALE_PX_MM, h * SCALE_PX_MM)
     figure.set_layout_engine("none")
     axes = figure.add_axes((0, 0, 1, 1), xlim=(-w / 2, w / 2), ylim=(h / 2, -h / 2))

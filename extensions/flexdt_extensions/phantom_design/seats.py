@@ -104,7 +104,8 @@ def seats_of(work: Brickwork, radius_mm: float) -> Seats:
                 "allowed": (roof + radius_mm - v["stud_height_mm"]) / 2.0,
             },
         )
-    local, count = np.array(rows), len(rows)
+    local = np.array(rows)
+    count = len(rows)
     places = np.concatenate(
         [local + [0.0, 0.0, work.floor(b)] for b in range(work.bricks)]
     )
@@ -139,7 +140,8 @@ def stack_phantom(
                 {"bead": k, "asked": center.tolist()},
             )
     assumed = lego_data()["assumed"]
-    plastic, metal = material(assumed["material"]), material(bead_material)
+    plastic = material(assumed["material"])
+    metal = material(bead_material)
     return Phantom(
         name,
         f"{work.bricks} hollow {work.studs[0]} x {work.studs[1]} LEGO bricks of "

@@ -27,7 +27,8 @@ from flexdt.twin.geometry.offsets import Offsets
 
 CONVERGENCE = 1e-6
 """Limit of convergence, eta_conv, on the norm of a step, mm and degrees mixed."""
-STEP, SMALL_STEP = 0.1, 0.01
+STEP = 0.1
+SMALL_STEP = 0.01
 """Steps of finite differences: positions [mm]; tau [mm] and angles [deg]."""
 MAX_ITERATIONS = 200
 STALL_WINDOW = 5
@@ -142,7 +143,9 @@ def iterate(
         trial = residual(x + delta)
         new = _half_square(trial)
         if new < cost:
-            x, r, cost = x + delta, trial, new
+            x = x + delta
+            r = trial
+            cost = new
             lam = max(lam / 3.0, 1e-6) if lam > 0 else 0.0
         else:
             lam = min(5.0 * lam, 1e6)

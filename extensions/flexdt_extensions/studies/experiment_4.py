@@ -196,7 +196,8 @@ def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
     x, y = np.moveaxis(centres - base, -1, 0)[..., None]
     rows = np.arange(-math.ceil(radius_px), math.ceil(radius_px) + 2)
     half = np.sqrt(np.maximum(radius_px**2 - (rows - y) ** 2, -1.0) + 0j)
-    first, last = np.ceil(x - half.real), np.floor(x + half.real)
+    first = np.ceil(x - half.real)
+    last = np.floor(x + half.real)
     number = np.where(half.imag > 0, 0.0, np.maximum(last - first + 1.0, 0.0))
     total = number.sum(axis=-1)
     across = (number * (first + last) / 2.0).sum(axis=-1) / total
@@ -278,7 +279,8 @@ def real_runs(
             "tau_z": -shift[1],
         }
     )
-    rows, runs = {}, []
+    rows = {}
+    runs = []
     for n in counts() if used is None else used:
         points = spots(name, truth.values, n, model)
         radius = None
@@ -525,7 +527,8 @@ def image_runs(
         counts: numbers of images to calibrate from.
     """
     really, _ = hidden_phantom(scene, model, seed)
-    poses, truth = nominal_poses(name, frames), hidden(name)
+    poses = nominal_poses(name, frames)
+    truth = hidden(name)
     printed = from_printed_reading(truth, Reading.MOUNT_SHIFT)
     images = radiographs(really, poses.cone_vec(truth), beam, [seed, int(name[4:])])
 

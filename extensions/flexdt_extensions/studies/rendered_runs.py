@@ -127,7 +127,8 @@ class RenderedFrames:
 
     def image(self, index: int) -> Float32Array:
         """Compute the line integrals of one frame, (rows, cols)."""
-        kept, (top, left) = self.kept[index], self.corner[index]
+        kept = self.kept[index]
+        (top, left) = self.corner[index]
         if self.camera.counts is not None:
             return line_integrals(kept, self.camera.counts)
         full = np.zeros(self.shape, dtype=np.float32)
@@ -176,10 +177,8 @@ def render(
     looks: list[FrameSpots] = []
     for image in exposures(scene, model, poses.cone_vec(truth), camera, seed, shape):
         if camera.counts is None:
-            rows, cols = (
-                np.nonzero(image.any(axis=1))[0],
-                np.nonzero(image.any(axis=0))[0],
-            )
+            rows = np.nonzero(image.any(axis=1))[0]
+            cols = np.nonzero(image.any(axis=0))[0]
             box = (
                 slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 1),
                 slice(int(cols[0]), int(cols[-1]) + 1) if len(cols) else slice(0, 1),

@@ -204,10 +204,8 @@ def fitted_run(
     """
     weak = () if fit is None else fit.certificate.weak
     if fit is None or not fit.identifiable or note:
-        iterations, note = (
-            0 if fit is None else fit.iterations,
-            note or "not identifiable",
-        )
+        iterations = 0 if fit is None else fit.iterations
+        note = note or "not identifiable"
         return Run(
             setting,
             scenario,

@@ -197,7 +197,8 @@ def _solve(method: str, draw: _Draw) -> _Found:
 
 
 KILOVOLTS = 90.0
-LOOP_RADIUS_MM, LOOP_INSET_MM = 2.0, 3.0
+LOOP_RADIUS_MM = 2.0
+LOOP_INSET_MM = 3.0
 """Radius of the beads of the author's code, and their distance from the faces [mm]."""
 FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(EXPERIMENTS, ALL_FIDELITIES),
@@ -275,7 +276,8 @@ def run_study(
                     experiment, fidelity, counts=counts, seed=seed, variant=variant
                 )
                 names = [f"{task.setting} {task.scenario}" for task in work]
-                runs, more = _collected(spread(run_task, work), names, say), {}
+                runs = _collected(spread(run_task, work), names, say)
+                more = {}
     document = {**summary(experiment, fidelity, runs), "variant": variant, **more}
     if out is not None:
         from flexdt_extensions.studies.study_report import write_study

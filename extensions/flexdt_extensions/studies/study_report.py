@@ -265,7 +265,8 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
     shown = [
         i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)
     ]
-    head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
+    head = [head[i] for i in shown]
+    rows = [[row[i] for i in shown] for row in rows]
     body = [
         heading(f"Study: {document['experiment']}, {document['fidelity']}"),
         table(head, rows),

@@ -118,7 +118,8 @@ def export_dataset(
     Raises:
         ExchangeError: the format cannot carry it; nothing is written.
     """
-    out, form = Path(out), _to_write(Path(out), format, exported())
+    out = Path(out)
+    form = _to_write(out, format, exported())
     if real is not None and not form.states_unknown:
         able = " and ".join(name for name, one in FORMATS.items() if one.states_unknown)
         raise ExchangeError(

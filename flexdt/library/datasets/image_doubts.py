@@ -90,8 +90,10 @@ def image_doubts(
     """
     if scan.arrays is not None and scan.arrays.integrals is not None:
         return []  # they were given, not exposed
-    flat, dark = scan.flat, scan.dark
-    alive, wanted = flat > dark, scan.present
+    flat = scan.flat
+    dark = scan.dark
+    alive = flat > dark
+    wanted = scan.present
     if scan.interpolated is not None and (alive & ~scan.interpolated).any():
         alive &= ~scan.interpolated
     in_files = scan.arrays is None or scan.arrays.counts is None

@@ -194,7 +194,8 @@ class ImageSet:
             doubts = settled(integral_findings(some_of(values)), DatasetFormatError, name)
             integrals = np.asarray(values, dtype=np.float32)
             values, opened, lost = _counts_of(values)
-            dark, flat = np.zeros(values.shape[1:]), np.full(values.shape[1:], opened)
+            dark = np.zeros(values.shape[1:])
+            flat = np.full(values.shape[1:], opened)
             warnings = [*lost, *doubts, *warnings]
         if (
             values.dtype.kind in "ui"
@@ -221,7 +222,8 @@ class ImageSet:
                 f"{len(values)} images and {len(cone)} views; allowed: as many of both",
                 {"asked": len(values), "allowed": len(cone)},
             )
-        darks, flats = _several("dark", dark, shape), _several("flat", flat, shape)
+        darks = _several("dark", dark, shape)
+        flats = _several("flat", flat, shape)
         arrays = Arrays(values, darks, flats, integrals)
         placed = settled(examine(Operation.OPEN, cone, shape), DatasetFormatError, name)
         blank = _blank(values)
@@ -571,7 +573,8 @@ def _normalised(
 ) -> Float32Array:
     """Compute line integrals of images that are no counts, by their dark and flat images."""
     shape = values.shape[1], values.shape[2]
-    darks, flats = _several("dark", dark, shape), _several("flat", flat, shape)
+    darks = _several("dark", dark, shape)
+    flats = _several("flat", flat, shape)
     opened = np.zeros(shape) if flats is None else flats.mean(axis=0)
     return of_intensities(values, 0.0 if darks is None else darks.mean(axis=0), opened)
 

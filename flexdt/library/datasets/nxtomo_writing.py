@@ -18,7 +18,9 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.tube import tube_spectrum, voltages
 from flexdt.twin.signatures import File
 
-PROJECTION, FLAT, DARK = 0, 1, 2
+PROJECTION = 0
+FLAT = 1
+DARK = 2
 """Image keys of NXtomo."""
 INVALID: Final = 3
 HALF_SEEN: Final = 0.5
@@ -60,7 +62,8 @@ def _write(data: ImageSet, out: Any) -> None:
 
     instrument = _group(entry, "instrument", "NXinstrument")
     source = _group(instrument, "source", "NXsource")
-    source["type"], source["probe"] = "Fixed Tube X-ray", "x-ray"
+    source["type"] = "Fixed Tube X-ray"
+    source["probe"] = "x-ray"
     detector = _group(instrument, "detector", "NXdetector")
     images = detector.create_dataset("data", (count, *data.shape), "u2")
     keys = [*(KEYS[name[:2]] for name, _ in before), *[PROJECTION] * len(data)]
@@ -103,7 +106,8 @@ def _write(data: ImageSet, out: Any) -> None:
 
 def _field_of_view(axis_column: float, columns: int) -> str:
     """Return `Full`, or `Half` where the rotation axis is near a side of the panel."""
-    left, right = axis_column + 0.5, columns - 0.5 - axis_column
+    left = axis_column + 0.5
+    right = columns - 0.5 - axis_column
     return "Half" if min(left, right) < HALF_SEEN * max(left, right) else "Full"
 
 

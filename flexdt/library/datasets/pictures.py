@@ -24,7 +24,8 @@ MARKS: Final = (
 """Bits of a pixel's mark, each with its colour (red, green, blue), the colour's name and
 the mark's meaning."""
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-PNG_GREY, PNG_COLOUR = 0, 2
+PNG_GREY = 0
+PNG_COLOUR = 2
 """Colour types of a PNG: grey, and red, green and blue."""
 PNG_FILTER_UP: Final = 2
 """Filter type of a row that holds differences from the row above."""

@@ -144,7 +144,8 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
         the sample's reference point, with equal steps and an upright panel of square
         pixels.
     """
-    geometry, shape = data.geometry, data.shape
+    geometry = data.geometry
+    shape = data.shape
     try:
         poses = Poses.from_cone_vec(geometry)
     except GeometryError:

@@ -89,7 +89,8 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
         TwinError: the window is not two growing numbers.
     """
     low, high = window_of(volume.data, window)
-    data, centers = volume.data, volume.centers()
+    data = volume.data
+    centers = volume.centers()
     parts = []
     for name, axis, across in AXES:
         places = centers["xyz".index(name)]
@@ -201,7 +202,8 @@ class _Drawing:
         ends = np.concatenate([cone_vec.source, cone_vec.detector, np.zeros((1, 3))])
         if cone_vec.detector_shape is not None:
             ends = np.concatenate([ends, *panel_corners(cone_vec)])
-        low, high = ends.min(axis=0), ends.max(axis=0)
+        low = ends.min(axis=0)
+        high = ends.max(axis=0)
         half = np.linalg.norm(cone_vec.source, axis=1).min()
         wide = cone_vec.detector_shape or (1, 1)
         panel = 0.5 * wide[1] * float(np.linalg.norm(cone_vec.u[0]))

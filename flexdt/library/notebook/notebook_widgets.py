@@ -44,7 +44,8 @@ def volume_widgets(
         readout_format=".4f",
         continuous_update=False,
     )
-    sliders, pictures = {}, {}
+    sliders = {}
+    pictures = {}
     for name, axis, _ in AXES:
         count = volume.shape[axis]
         sliders[name] = widgets.IntSlider(
@@ -59,7 +60,8 @@ def volume_widgets(
         for name, axis, across in AXES:
             layer = layer_of(volume.data, axis, places[name])
             pixels = np.repeat(grey_of(layer, black, white)[:, :, None], 3, axis=2)
-            right, up = across[0], across[1]
+            right = across[0]
+            up = across[1]
             pixels[:, places[right], 0] = 255
             pixels[len(pixels) - 1 - places[up], :, 0] = 255
             pictures[name].value = png_of(pixels)

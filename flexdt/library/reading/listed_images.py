@@ -42,10 +42,8 @@ def in_order(
         DatasetFormatError: two have one number.
     """
     found = ordered(names)
-    kept, told = (
-        [*found.names],
-        settled(found.findings, DatasetFormatError, str(content.path)),
-    )
+    kept = [*found.names]
+    told = settled(found.findings, DatasetFormatError, str(content.path))
     if found.others:
         doubt = other_name(found.others, kept)
         without = [name for name in kept if name not in found.others]
@@ -111,10 +109,12 @@ def listed(
         geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
         shapes = [(rows, cols)] * len(names)
     warnings = [*warnings, *doubts_of(content, geometry, shapes[0])]
-    lost, blank = content.lost((*darks, *flats, *names)), blank_images(content, names)
+    lost = content.lost((*darks, *flats, *names))
+    blank = blank_images(content, names)
     reasons = [reason for reason in (*reasons, lost, nothing_in(blank)) if reason]
     content = replace(content, names=content.names.difference(blank))
-    frames, flat_paths = content.frames(names, shapes), content.paths(flats)
+    frames = content.frames(names, shapes)
+    flat_paths = content.paths(flats)
     if not any(SATURATED in told for told in warnings):
         warnings = [*warnings, *_first_look(frames, flat_paths, full_scale)]
     return DataSet(

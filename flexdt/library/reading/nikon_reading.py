@@ -128,7 +128,8 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     numbers = {int(part[2]): part for part in parts if part is not None}
     if len(numbers) < len(names) or len(names) >= views or not names:
         return names, told
-    first, last = min(numbers), max(numbers)
+    first = min(numbers)
+    last = max(numbers)
     start = next((at for at in (1, 0, first) if at <= first and last < at + views), None)
     if start is None:
         return names, told
@@ -171,7 +172,8 @@ def _number(
 def _axis(roll: float, tilt: float) -> FloatArray:
     """Return the matrix that takes row vectors into the frame whose z is the axis: rolled about
     y, tilted about x."""
-    c, s = np.cos([roll, tilt]), np.sin([roll, tilt])
+    c = np.cos([roll, tilt])
+    s = np.sin([roll, tilt])
     rolled = np.array([[c[0], 0.0, s[0]], [0.0, 1.0, 0.0], [-s[0], 0.0, c[0]]])
     tilted = np.array([[1.0, 0.0, 0.0], [0.0, c[1], -s[1]], [0.0, s[1], c[1]]])
     return np.asarray(tilted @ rolled)

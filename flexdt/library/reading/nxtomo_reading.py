@@ -143,7 +143,8 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     Raises:
         DatasetFormatError: they do not fit each other, are missing, or exceed the memory.
     """
-    data, keys = group["data"], np.asarray(group["image_key"])
+    data = group["data"]
+    keys = np.asarray(group["image_key"])
     if data.ndim != 3 or keys.ndim != 1:
         said = f"{path}: data of shape {data.shape}, image_key {keys.shape}"
         raise DatasetFormatError.instead(
@@ -155,7 +156,8 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
         raise DatasetFormatError.instead(
             said, len(keys), f"one for each of {len(data)} images"
         )
-    size, held = data.size * data.dtype.itemsize, path.stat().st_size
+    size = data.size * data.dtype.itemsize
+    held = path.stat().st_size
     gone = [name for name in _sources(data) if not (path.parent / name).exists()]
     if gone:
         said = f"{path}: its images lie in {', '.join(gone[:3])}, which is not there"
@@ -273,7 +275,8 @@ def _angles(
     file: Any, name: str, projections: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float64] | None:
     """Read angles of the projections [rad]; None unless the file has one for each image."""
-    entry, near = file[name.split("/")[0]], file[name]
+    entry = file[name.split("/")[0]]
+    near = file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
     for place in places:
         for at in ("rotation_angle", "sample/rotation_angle"):
@@ -287,7 +290,8 @@ def _angles(
 
 def _length(file: Any, name: str, *members: str) -> float | None:
     """Read a length [mm] from the first of some places that has it; None without any."""
-    entry, near = file[name.split("/")[0]], file[name]
+    entry = file[name.split("/")[0]]
+    near = file[name]
     for place in (entry, near):
         for member in members:
             found = _member(place, member)
@@ -320,7 +324,8 @@ def _stated(
     turn = _angles(file, name, projections)
     if turn is not None:
         yield from angle_findings(geometry, turn)
-    entry, near = file[name.split("/")[0]], file[name]
+    entry = file[name.split("/")[0]]
+    near = file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
     for place in (near, *(_member(p, "instrument/detector") for p in places)):
         size = None if place is None else _member(place, "x_pixel_size")

@@ -47,7 +47,8 @@ def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
     olefile = package("olefile", "Zeiss's .txrm")
     try:
         with opened(path) as raw:
-            head, size = raw.read(76), os.fstat(raw.fileno()).st_size
+            head = raw.read(76)
+            size = os.fstat(raw.fileno()).st_size
             if (
                 512 * int.from_bytes(head[44:48], "little") > size
             ):  # of these a list is made
@@ -90,10 +91,8 @@ class _Streams:
         there = self.ole.exists(name)
         if not there and default is not None:
             return np.full(count, default)
-        wanted, held = (
-            count * np.dtype(kind).itemsize,
-            self.ole.get_size(name) if there else 0,
-        )
+        wanted = count * np.dtype(kind).itemsize
+        held = self.ole.get_size(name) if there else 0
         if not wanted <= held <= self.size:
             said = f"has {held} bytes" if there else "is missing"
             raise DatasetFormatError(
@@ -161,7 +160,8 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
             )
         with np.errstate(all="ignore"):  # what is not finite is refused by its name
             images = images / np.maximum(flats.mean(axis=0), 1e-6 * flats.max())
-            images, flats = -np.log(np.maximum(images, np.finfo(np.float32).tiny)), None
+            images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
+            flats = None
     elif flats is None:
         doubts.append(
             "no reference: DataSet.from_arrays(data.counts(), data.geometry, flat=FLAT)"
@@ -205,7 +205,8 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
         raise DatasetFormatError(
             "XrayGeometry says a parallel beam; allowed: a cone beam"
         )
-    near, far = file.lengths("StoRADistance", views), file.lengths("DtoRADistance", views)
+    near = file.lengths("StoRADistance", views)
+    far = file.lengths("DtoRADistance", views)
     size = file.lengths("PixelSize", 1) / 1000.0
     rise = np.ptp(file.values("ImageInfo/YPosition", "<f4", views, 0.0)) / 1000.0
     if (
@@ -230,7 +231,8 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
     ]
     if center[0]:
         doubts.append(f"CenterShift of {center[0]:g} pixels is applied")
-    o, p = np.zeros(views), np.full(views, pixel)
+    o = np.zeros(views)
+    p = np.full(views, pixel)
     place = np.stack([o, -near, o, right, far, up, p, o, o, o, o, p], axis=-1).reshape(
         -1, 4, 3
     )

@@ -51,7 +51,8 @@ class ImagesOnDisk:
     """
 
     def __init__(self, folder: Path, most_pixels: int) -> None:
-        self._folder, self._most_bytes = folder, 4 * most_pixels
+        self._folder = folder
+        self._most_bytes = 4 * most_pixels
         self._shapes: dict[int, tuple[int, int]] = {}
         # Without a buffer: images are larger than one.
         self._file: IO[bytes] = TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 (see close)
@@ -162,7 +163,9 @@ class KeptImages:
         store: ImagesInMemory | ImagesOnDisk,
         told: Callable[[], None],
     ) -> None:
-        self._read, self._store, self._told = read, store, told
+        self._read = read
+        self._store = store
+        self._told = told
         self._as_read: set[int] = set()
         self._prepared: set[int] = set()
 

@@ -96,7 +96,8 @@ FREE_SHARE: Final = 0.5
 """Share of the free memory that FDK uses by default."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
-SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
+SCATTER_VIEWS = 180
+SCATTER_PIXELS = 100
 """Number of frames, and about their pixels a side, to find the scattering object."""
 
 
@@ -259,9 +260,11 @@ def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
         across = field_of_view(views.cone_vec, views.shape)
         seen_mm = across.voxel_mm * across.shape[2]
         settled(voxel_findings(request.voxel_mm, seen_mm), GeometryError)
-    shape, center = whole.shape, whole.center_mm
+    shape = whole.shape
+    center = whole.center_mm
     if request.shape is not None:
-        shape, center = request.shape, (0.0, 0.0, 0.0)
+        shape = request.shape
+        center = (0.0, 0.0, 0.0)
     chosen = center if request.center_mm is None else request.center_mm
     return Grid(shape, whole.voxel_mm, chosen)
 
@@ -295,7 +298,8 @@ class ReconstructionTask:
     @cached_property
     def again(self) -> int:
         """Images that are needed more than once even of a single slab."""
-        count, panel = len(self.views.indices), self.views.dataset.panel
+        count = len(self.views.indices)
+        panel = self.views.dataset.panel
         if self.request.rings or (panel is not None and panel.lag):
             return count
         some = 0 if self.request.scatter_correction is None else SCATTER_VIEWS + 1
@@ -315,11 +319,9 @@ class ReconstructionTask:
             LimitError: too little memory.
         """
         given = FREE_SHARE * free_memory_bytes() if memory is None else memory
-        images, pixels, again = (
-            len(self.views.indices),
-            math.prod(self.views.shape),
-            self.again,
-        )
+        images = len(self.views.indices)
+        pixels = math.prod(self.views.shape)
+        again = self.again
         if not self.direct:
             return plan_whole(self.grid, again, pixels, int(given))
         pixels = max(pixels, math.prod(self.standing.shape))
@@ -454,7 +456,8 @@ def _here(
     Returns:
         The views, the bias of FDK (None of other algorithms), and doubts.
     """
-    folder, grid = out.absolute().parent, task.grid
+    folder = out.absolute().parent
+    grid = task.grid
     _require_room_for_images(folder, plan, grid.bytes)
     with (
         _reading_once(task, plan, folder, tell) as (kept, work),
@@ -467,7 +470,8 @@ def _here(
             slices.take(volume.data)
             return views, None, []
         # Before images are prepared: this looks at images as they were recorded.
-        bias, lost = _bias(views), 0
+        bias = _bias(views)
+        lost = 0
         for slab in _fdk_slabs(task, views, kept, plan, work):
             write(slab.data)
             slices.take(slab.data)
@@ -527,7 +531,8 @@ def _reading_once(
         folder: of that file.
         tell: called with the work done and the total, in images; by FDK only.
     """
-    views, fdk = task.views, task.direct
+    views = task.views
+    fdk = task.direct
     dataset = task.counts.read_by(views.dataset)
     work = (
         Work.of(task.standing, task.grid, plan.slabs, tell)
@@ -559,9 +564,11 @@ def reconstruct_volume(
     Raises:
         TwinError: as `reconstruct_dataset`.
     """
-    tell, folder = progress or _untold, Path(gettempdir())
+    tell = progress or _untold
+    folder = Path(gettempdir())
     task = _task(dataset, request, parameters)
-    grid, fdk = task.grid, task.direct
+    grid = task.grid
+    fdk = task.direct
     in_memory = not fdk or 3 * grid.bytes <= memory_bytes()
     if in_memory:
         _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
@@ -802,7 +809,8 @@ def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) 
     """
     if not plan.on_disk:
         return
-    need, free = plan.disk_bytes + volume_bytes, free_bytes(folder)
+    need = plan.disk_bytes + volume_bytes
+    free = free_bytes(folder)
     if need > free:
         raise LimitError(
             f"{plan.kept} images that are needed again take {plan.disk_bytes / 2**30:.3g} GiB "
@@ -829,9 +837,11 @@ def _iterative(
 ) -> Volume:
     """Reconstruct by an iterative algorithm, after checking that the memory suffices."""
     algorithm = ALGORITHMS[request.algorithm]
-    stacks, grids = algorithm.stacks, algorithm.grids
+    stacks = algorithm.stacks
+    grids = algorithm.grids
     if views.mixture is not None:
-        stacks, grids = stacks + 2 * len(views.mixture.mu), grids + 3
+        stacks = stacks + 2 * len(views.mixture.mu)
+        grids = grids + 3
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
     _require(f"of memory for {request.algorithm}", need, int(0.8 * memory_bytes()), grid)
     asked = {

@@ -63,14 +63,16 @@ def _axis_column(
         return None
     if circle.rise or not circle.full or not _evenly_turned(circle):
         return None
-    around, height = np.tile(circle.centre, (2, 1)), cone_vec.source[0, 2]
+    around = np.tile(circle.centre, (2, 1))
+    height = cone_vec.source[0, 2]
     axis = np.column_stack(
         [around, height + 0.01 * circle.radius * np.array([-1.0, 1.0])]
     )
     columns, rows = np.median(cone_vec.project_points(axis, shape), axis=0).T
     tall = shape[0]
     if lies:
-        columns, rows, tall = rows, columns, shape[1]
+        columns, rows = rows, columns
+        tall = shape[1]
     lean_px = tall * np.ptp(columns) / np.ptp(rows)
     middle = float(columns.mean())
     return middle if np.isfinite(middle) and lean_px <= MOST_LEAN_PX else None

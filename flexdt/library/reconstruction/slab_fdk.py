@@ -35,7 +35,9 @@ from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, narrow_
 MARGIN: Final = 6
 """Rows around the shadow that a slab takes too, so that a panel of many rows never seems
 to have few (`fdk_plan.FEW_ROWS`)."""
-VOXEL, FILTERED_PIXEL, READ_PIXEL = 1.0, 25.0, 12.0
+VOXEL = 1.0
+FILTERED_PIXEL = 25.0
+READ_PIXEL = 12.0
 """Work of FDK a voxel and view, a pixel that is filtered and one that is read and prepared, in
 units of the first (`tests/studies/full_size.py --costs`)."""
 
@@ -77,8 +79,10 @@ class StandingImages:
         circle = circle_of(cone_vec)
         turned = on_its_side(cone_vec)
         if turned:
-            cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
-        rises, rows, cols = bool(circle.rise), *shape
+            cone_vec = swapped(cone_vec)
+            shape = (shape[1], shape[0])
+        rises = bool(circle.rise)
+        rows, cols = shape
         wide = round(FINER * cols) if leans(cone_vec) else cols
         level = cone_vec if is_upright(cone_vec) else upright(cone_vec, wide / cols)
         if wide != cols and narrow_overlap(circle, level, wide):
@@ -185,13 +189,12 @@ class Work:
         slabs: Sequence[float],
         tell: Callable[[float, float], None],
     ) -> None:
-        self._images, self._reading, self._slabs, self._tell = (
-            images,
-            reading,
-            slabs,
-            tell,
-        )
-        self._read, self._done = 0, [0.0] * len(slabs)
+        self._images = images
+        self._reading = reading
+        self._slabs = slabs
+        self._tell = tell
+        self._read = 0
+        self._done = [0.0] * len(slabs)
 
     @classmethod
     def of(
@@ -209,7 +212,8 @@ class Work:
             slabs: layers (first, last) of each.
             tell: called with the work done and the total.
         """
-        count, (rows, cols) = len(images.cone_vec), images.shape
+        count = len(images.cone_vec)
+        (rows, cols) = images.shape
         work = []
         for first, last in slabs:
             slab = grid.slab(first, last)

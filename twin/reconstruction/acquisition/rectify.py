@@ -148,7 +148,8 @@ def field_of_view(
     if voxel_mm is not None and not 0.0 < voxel_mm < math.inf:
         raise GeometryError.instead(f"voxels of {voxel_mm:g} mm", voxel_mm, "more than 0")
     if on_its_side(cone_vec):
-        cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+        cone_vec = swapped(cone_vec)
+        shape = (shape[1], shape[0])
     if not is_upright(cone_vec):
         cone_vec = upright(cone_vec)
     rows, cols = shape

@@ -38,7 +38,8 @@ MAX_CIRCLE_RISE = 1e-3
 """Largest rise over a circular scan, relative to the radius."""
 MAX_HELIX_DEVIATION = 0.05
 """Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
-GAP_STEPS, RANDOM_GAP_STEPS = 3.0, 8.0
+GAP_STEPS = 3.0
+RANDOM_GAP_STEPS = 8.0
 """Steps between neighbouring views, relative to the usual one, from which on they are
 gaps. The first holds where the views behind cover all of them, as in a scan that left
 some out; else the second, as for random views."""
@@ -111,7 +112,8 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     (a, b, c), _, rank, _ = np.linalg.lstsq(rows, (s[:, :2] ** 2).sum(axis=1), rcond=None)
     if rank < 3:
         raise GeometryError("the sources of all views lie on a line; FDK needs a circle")
-    centre, radius = np.array([a, b]), float(np.sqrt(c + a * a + b * b))
+    centre = np.array([a, b])
+    radius = float(np.sqrt(c + a * a + b * b))
     azimuth = np.arctan2(s[:, 1] - b, s[:, 0] - a)
     helix = _helix(azimuth, s[:, 2], centre, radius)
     worst = float(np.abs(np.linalg.norm(s[:, :2] - centre, axis=1) - radius).max())
@@ -243,7 +245,8 @@ def redundancy(
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
     _check_covered(circle, float(np.abs(fan).max()))
-    column, overlap = (low + high) / cols, min(low, high)
+    column = (low + high) / cols
+    overlap = min(low, high)
     least = 0.0 if circle.full else MIN_CONFIDENCE
     alone = np.zeros_like(
         fan
@@ -319,7 +322,8 @@ def _check_covered(circle: Circle, widest: float) -> None:
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
     """Compute the overlap of gaps with the opposites of others, up to a fan angle [rad]."""
-    width, middle = np.diff(gaps)[:, 0], gaps.mean(axis=1)
+    width = np.diff(gaps)[:, 0]
+    middle = gaps.mean(axis=1)
     apart = np.abs(
         (middle[:, None] - middle) % TURN - np.pi
     )  # of a gap and what is behind another
@@ -344,13 +348,16 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
     """
     widest = max(reach(fan_angles(circle, cone_vec, cols)))
     source = cone_vec.source[:, :2]
-    inward, panel = circle.centre - source, cone_vec.detector[:, :2] - source
+    inward = circle.centre - source
+    panel = cone_vec.detector[:, :2] - source
     ends = []
     for angle in (-widest, widest):
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         ray = inward @ np.array([[c, s], [-s, c]])
         ends.append(-_cross(ray, panel) / _cross(ray, cone_vec.u[:, :2]) + (cols - 1) / 2)
-    before, after = -float(np.min(ends)), float(np.max(ends)) - (cols - 1)
+    before = -float(np.min(ends))
+    after = float(np.max(ends)) - (cols - 1)
     # Rounded first: sources in another order differ in the last bits, which must not decide.
     needed = np.ceil(np.round([before - 0.5, after - 0.5], 6))
     first, last = np.clip(needed, 0, MAX_PANEL_WIDTHS * cols)

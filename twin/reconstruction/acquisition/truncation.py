@@ -55,7 +55,8 @@ tenth of it at the edges is nothing."""
 
 EDGE_BINS = 2
 """Bins of columns at either edge that have one value where no object is."""
-MAX_SPREAD, MAX_SLOPE = 0.02, 0.003
+MAX_SPREAD = 0.02
+MAX_SLOPE = 0.003
 """Largest standard deviation of a view's edges over the contrast of the object, and largest
 step between these bins over their values: a cylinder of four times the panel has just that
 slope."""
@@ -92,8 +93,10 @@ class Prism:
         """Compute line integrals (...) in the plane, of `rays` (..., 2) from `source`
         (..., 2) [mm].
         """
-        start, along = (source - self.centre) @ self.to_disc.T, rays @ self.to_disc.T
-        squared, middle = (along * along).sum(axis=-1), (start * along).sum(axis=-1)
+        start = (source - self.centre) @ self.to_disc.T
+        along = rays @ self.to_disc.T
+        squared = (along * along).sum(axis=-1)
+        middle = (start * along).sum(axis=-1)
         inside = middle * middle - squared * ((start * start).sum(axis=-1) - 1.0)
         length = (
             2.0
@@ -172,15 +175,15 @@ class Truncation:
         """Count the columns before the first and after the last that the object's shadow
         reaches.
         """
-        most, before, after = 2.0 * cols, 0.5 * cols, 0.5 * cols
+        most = 2.0 * cols
+        before = 0.5 * cols
+        after = 0.5 * cols
         middle_row = ConeVec(cone_vec.rows)  # without the shape of the panel
         for prism in (one for one in self.prisms if one is not None):
             at = middle_row.project_points(prism.rim(), (1, cols))[..., 0]
             at = np.where(np.isfinite(at), at, most)
-            before, after = (
-                max(before, -float(at.min())),
-                max(after, float(at.max()) - cols + 1),
-            )
+            before = max(before, -float(at.min()))
+            after = max(after, float(at.max()) - cols + 1)
         return int(min(before + 2.0, most)), int(min(after + 2.0, most))
 
     def continuation(
@@ -285,7 +288,8 @@ def truncation_of(
     images = [mean_image(image, np.flatnonzero(same == i)) for i in chosen]
     cone_vec = cone_vec[places[chosen]]
     if on_its_side(cone_vec):
-        images, shape = [image.T for image in images], (shape[1], shape[0])
+        images = [image.T for image in images]
+        shape = (shape[1], shape[0])
         cone_vec = swapped(cone_vec)
     panels = cone_vec if is_upright(cone_vec) else upright(cone_vec)
     if panels is not cone_vec:
@@ -364,7 +368,8 @@ def _fitted(
         return None
     prisms: list[Prism | None] = [None] * len(middles)
     others: list[Prism | None] = [None] * len(middles)
-    cut_off, known = np.zeros(len(middles), dtype=bool), None
+    cut_off = np.zeros(len(middles), dtype=bool)
+    known = None
     # Bands above and below the object hold nothing that could be off.
     least = 0.1 * ACCURACY * float(np.abs(seen).mean())
     met = seen[seen > max(0.1 * float(seen.mean()), least)]
@@ -482,7 +487,8 @@ def _fit(
         ]
     )
     middle = np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.log(usual / field)])
-    least, most = middle - limit, middle + limit
+    least = middle - limit
+    most = middle + limit
 
     def rest(x: FloatArray) -> FloatArray:
         return np.asarray(Prism.of(x, field).integrals(source, rays) - seen)
