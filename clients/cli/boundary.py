@@ -98,7 +98,10 @@ def _usage(error: Exception) -> tuple[str, ...]:
     if message.startswith("Usage:"):  # no command was given: the message is the help page
         return tuple(message.splitlines())
     context = getattr(error, "ctx", None)
-    command = context.command_path if context is not None else "flexdt"
+    if context is not None:
+        command = context.command_path
+    else:
+        command = "flexdt"
     flag = getattr(error, "option_name", None)
     if flag is not None and message.startswith("No such option"):
         from flexdt.clients.cli.settings_file import home_of
@@ -155,11 +158,16 @@ def positions(data: object, file: str = "") -> list[str]:
         if isinstance(problem, Mapping) and "message" in problem and "line" in problem:
             place = [str(problem[key]) for key in ("line", "column") if problem.get(key)]
             prefix = ":".join([file or "script", *place])
-            severity = f"{problem['severity']}: " if "severity" in problem else ""
+            if "severity" in problem:
+                severity = f"{problem['severity']}: "
+            else:
+                severity = ""
             out.append(f"{prefix}: {severity}{problem['message']}")
     return out
 
 
 def _first_line(error: Exception) -> str:
     text = str(error).strip()
-    return text.splitlines()[0] if text else type(error).__name__
+    if text:
+        return text.splitlines()[0]
+    return type(error).__name__

@@ -320,11 +320,10 @@ def _add(
     """Add a command; its help page ends with the options of `flexdt` that it heeds."""
     complete, heeds = completed(command)
     complete.heeds = heeds  # type: ignore[attr-defined]
-    also = (
-        f"Also, of flexdt itself: {', '.join(COMMON[flag] for flag in heeds)}"
-        if heeds
-        else None
-    )
+    if heeds:
+        also = f"Also, of flexdt itself: {', '.join(COMMON[flag] for flag in heeds)}"
+    else:
+        also = None
     app.command(name, context_settings=context, epilog=also)(complete)
 
 

@@ -77,7 +77,11 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
     )
     has_parameters(complete, [context, *offered])
     heeds = ("--json",) if yields or "json" in own else ()
-    reaches = ("--server", "--token-file") if "twin" in own else ()
+    reaches: tuple[str, ...]
+    if "twin" in own:
+        reaches = ("--server", "--token-file")
+    else:
+        reaches = ()
     return complete, (*heeds, *reaches, *VERBOSITY_OPTIONS)
 
 

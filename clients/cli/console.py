@@ -89,7 +89,9 @@ def as_json(document: object) -> str:
     from pydantic_core import to_jsonable_python
 
     def plain(value: Any) -> object:
-        return value.tolist() if hasattr(value, "tolist") else str(value)
+        if hasattr(value, "tolist"):
+            return value.tolist()
+        return str(value)
 
     known = to_jsonable_python(
         document, by_alias=False, inf_nan_mode="null", fallback=plain
@@ -129,7 +131,9 @@ def size(count: float) -> str:
     """Format a number of bytes for people: 1.2 GB."""
     for unit in ("B", "kB", "MB", "GB"):
         if abs(count) < 1000:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+            if unit == "B":
+                return f"{count:.0f} {unit}"
+            return f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} TB"
 
@@ -158,7 +162,10 @@ class ProgressBar:
         self._title = title
         self._unit = unit
         self._clock = clock
-        self._terminal = sys.stderr.isatty() if terminal is None else terminal
+        if terminal is None:
+            self._terminal = sys.stderr.isatty()
+        else:
+            self._terminal = terminal
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         self._begun = self._spoken = clock()
@@ -206,9 +213,10 @@ class ProgressBar:
     def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:
         if not total:
             return f"{text}: {done:g} {self._unit}"
-        counted = (
-            f"{done:g} of {total:g} {self._unit} " if float(done).is_integer() else ""
-        )
+        if float(done).is_integer():
+            counted = f"{done:g} of {total:g} {self._unit} "
+        else:
+            counted = ""
         line = f"{text}: {counted}({100 * done / total:.0f} %)"
         if 0 < done < total:
             line += f", about {duration(elapsed * (total - done) / done)} left"

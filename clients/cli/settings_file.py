@@ -126,11 +126,10 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
         found.pop("token_file", None)
     found |= own
     if "token" in found and "token_file" in found:
-        where = (
-            "FLEXDT_TOKEN and FLEXDT_TOKEN_FILE"
-            if own
-            else f"{path}: token and token_file"
-        )
+        if own:
+            where = "FLEXDT_TOKEN and FLEXDT_TOKEN_FILE"
+        else:
+            where = f"{path}: token and token_file"
         raise CommandError(f"{where} are both set; allowed: one of them")
     tables = {name: found.pop(name) for name in TABLES if name in found}
     given = {key: value for key, value in found.items() if value}
@@ -206,11 +205,10 @@ def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
         Exception: typer's usage errors of `more`.
     """
     own = configuration()
-    data = (
-        {"data": own.data or TwinSettings.data}
-        if issubclass(kind, UpSettings | TwinSettings)
-        else {}
-    )
+    if issubclass(kind, UpSettings | TwinSettings):
+        data = {"data": own.data or TwinSettings.data}
+    else:
+        data = {}
     name = kind.command.replace(" ", "_")
     given = words({**data, **own.tables.get(name, {})})
     try:

@@ -38,7 +38,10 @@ def connect(server: str | None = None, token_file: str | None = None) -> TwinCli
     from flexdt.runtime.access import AccessError, client_tls, read_token
 
     try:
-        token = own.token if shown is None else read_token(Path(shown))
+        if shown is None:
+            token = own.token
+        else:
+            token = read_token(Path(shown))
         context = client_tls(None if own.tls_ca is None else Path(own.tls_ca))
     except AccessError as error:
         raise CommandError(str(error)) from None

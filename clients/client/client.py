@@ -262,7 +262,11 @@ class Core:
 def _require_same(
     topic: str, asked: Mapping[str, object], known: Mapping[str, object]
 ) -> None:
-    view = ("projection_kind", "projection_binning") if topic == "projection" else ()
+    view: tuple[str, ...]
+    if topic == "projection":
+        view = ("projection_kind", "projection_binning")
+    else:
+        view = ()
     for name in ("max_rate_hz", *view):
         if asked.get(name) != known.get(name):
             raise ValueError(
@@ -422,7 +426,11 @@ class AsyncTwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        link = TcpTransport(host, port, ssl=ssl) if transport is None else transport
+        link: Transport
+        if transport is None:
+            link = TcpTransport(host, port, ssl=ssl)
+        else:
+            link = transport
         self.core = Core(link, name, token, timeout_s, reconnect_s, wait_s)
 
     async def connect(self) -> AsyncTwinClient:

@@ -61,7 +61,10 @@ class Projection:
         """
         pixels = image.from_bytes(value.data, value.dtype, value.shape)
         m = value.marks
-        marks = None if m is None else image.from_bytes(m.data, m.dtype, m.shape)
+        if m is None:
+            marks = None
+        else:
+            marks = image.from_bytes(m.data, m.dtype, m.shape)
         return cls(
             image=pixels,
             cone_vec=tuple(value.cone_vec),
@@ -80,7 +83,10 @@ class Projection:
 
     def __repr__(self) -> str:
         rows, cols = self.image.shape
-        at = "" if self.time is None else f", t = {self.time:.3f} s"
+        if self.time is None:
+            at = ""
+        else:
+            at = f", t = {self.time:.3f} s"
         return f"<Projection {cols} x {rows} {self.image.dtype}, {self.kind}{at}>"
 
     def _repr_png_(self) -> bytes:

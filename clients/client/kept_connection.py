@@ -105,7 +105,9 @@ class KeptConnection:
     @property
     def hello(self) -> HelloResult | None:
         """The twin's answer to the greeting; None while there is no connection."""
-        return self._client.core.hello if self.connected else None
+        if self.connected:
+            return self._client.core.hello
+        return None
 
     async def run(self) -> None:
         """Keep the connection until cancelled; may be called again after that."""

@@ -49,7 +49,10 @@ class ConnectionLost(ConnectionError):
         one is known."""
         if calls.violation is not None:
             return cls(f"the server broke the protocol: {calls.violation}", sent=sent)
-        why = "" if calls.reason is None else f": {calls.reason.message}"
+        if calls.reason is None:
+            why = ""
+        else:
+            why = f": {calls.reason.message}"
         return cls(f"the server ended the connection{why}", sent=sent)
 
 
@@ -119,7 +122,10 @@ class TcpTransport:
         self.close()
         try:
             async with asyncio.timeout(self.timeout_s):
-                name = None if self.ssl is None else self.host
+                if self.ssl is None:
+                    name = None
+                else:
+                    name = self.host
                 self._streams = await asyncio.open_connection(
                     self.host,
                     self.port,
@@ -136,7 +142,10 @@ class TcpTransport:
                 isinstance(error, ConnectionError) and number
             ):
                 why = os.strerror(number)  # asyncio has put the address there
-            hint = ": start one with `flexdt up`" if number == errno.ECONNREFUSED else ""
+            if number == errno.ECONNREFUSED:
+                hint = ": start one with `flexdt up`"
+            else:
+                hint = ""
             raise ConnectionLost(
                 f"no server at {self.host}:{self.port} ({why}){hint}"
             ) from error

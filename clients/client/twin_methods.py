@@ -344,7 +344,8 @@ def upload_mesh(
         path = Path(source)
         data = path.read_bytes()
         name = path.stem if name is None else name
-        format = path.suffix.lower().lstrip(".") if format is None else format
+        if format is None:
+            format = path.suffix.lower().lstrip(".")
     if name is None or format not in MESH_FORMATS:
         raise ValueError(
             f"a mesh needs a name and a format of {', '.join(MESH_FORMATS)}; "
@@ -385,9 +386,15 @@ def upload_scene(
     from flexdt.phantoms.files.phantom_files import read_phantom_file
 
     # A scene file is read here, as its mesh files are on this machine; the upload is complete.
-    phantom = source if isinstance(source, Phantom) else read_phantom_file(Path(source))
+    if isinstance(source, Phantom):
+        phantom = source
+    else:
+        phantom = read_phantom_file(Path(source))
     if name is None:
-        name = source.name if isinstance(source, Phantom) else Path(source).stem
+        if isinstance(source, Phantom):
+            name = source.name
+        else:
+            name = Path(source).stem
     head = {"name": name, "kind": "scene", "format": "json"}
     return _upload(head, json.dumps(phantom.to_dict()).encode(), progress)
 
@@ -416,7 +423,10 @@ def upload_voxels(
         >>> twin.upload_voxels(np.full((4, 4, 4), 0.02), 0.5, "block").complete
         True
     """
-    size = (voxel_mm,) * 3 if isinstance(voxel_mm, (int, float)) else voxel_mm
+    if isinstance(voxel_mm, (int, float)):
+        size = (voxel_mm,) * 3
+    else:
+        size = voxel_mm
     raw = np.ascontiguousarray(data, dtype="<f4")
     head = {
         "name": name,
@@ -693,7 +703,9 @@ def jobs() -> Flow[scans.JobListResult]:
 
 def _name_of(job: Job | None) -> str | None:
     """Return the job's name; None is the current or last one."""
-    return job.job if isinstance(job, scans.SubmitResult | s.JobStatus) else job
+    if isinstance(job, scans.SubmitResult | s.JobStatus):
+        return job.job
+    return job
 
 
 def job_status(job: Job | None = None) -> Flow[s.JobStatus]:
@@ -811,7 +823,10 @@ def wait_job(
         >>> twin.wait_job(twin.submit_trajectory([{"rot_obj": 0.0}], 100.0, speed_up="max")).state
         'done'
     """
-    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    if timeout_s is None:
+        deadline = None
+    else:
+        deadline = time.monotonic() + timeout_s
     own = progress if callable(progress) else None
     shown = False if callable(progress) else progress
     with long_work.during("scanning", shown) as advance:
@@ -1032,11 +1047,10 @@ def fit_calibration(
     for i, row in enumerate(markers or ()):
         if len(row) != len(fields):
             raise ValueError(f"mark {i} is {row!r}; allowed: ({', '.join(fields)})")
-    marks = (
-        None
-        if markers is None
-        else [dict(zip(fields, row, strict=True)) for row in markers]
-    )
+    if markers is None:
+        marks = None
+    else:
+        marks = [dict(zip(fields, row, strict=True)) for row in markers]
     return ask(
         corrections.CALIBRATION_FIT,
         datasets=list(datasets),

@@ -48,7 +48,10 @@ def endpoint(address: str) -> str:
         ('tcp://scanner:50000', 'tcp://10.0.0.7:5555')
     """
     match = _ADDRESS.fullmatch(address.strip())
-    port = PORT if match is None or match[2] is None else int(match[2])
+    if match is None or match[2] is None:
+        port = PORT
+    else:
+        port = int(match[2])
     if match is None or not 0 < port < 65536:
         raise ValueError(
             f"{address!r} is no address; allowed: tcp://HOST[:PORT], PORT 1 to 65535"

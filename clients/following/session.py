@@ -149,7 +149,10 @@ class FollowSession:
             now = now or message.at_s
             while now + TICK_S < message.at_s:
                 idle = not self.mirror.waiting and self.mirror.due_s is None
-                now = message.at_s if idle else now + TICK_S
+                if idle:
+                    now = message.at_s
+                else:
+                    now = now + TICK_S
                 self.tick(now)
             now = max(now, message.at_s)
             if message.data.startswith(LINK):
@@ -202,7 +205,10 @@ class FollowSession:
         """Determine whether targets or the next line have changed since the last call."""
         key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
         before = self._looked
-        self._looked = key if self.mirror.heard_s is not None else None
+        if self.mirror.heard_s is not None:
+            self._looked = key
+        else:
+            self._looked = None
         return self._looked not in (None, before)
 
 

@@ -251,7 +251,9 @@ def rate_setting(what: Rate, digits: int) -> Action:
 
 def _why(state: State) -> str:
     safety = state.safety
-    return f" ({safety.message or safety.state})" if safety.state != "ok" else ""
+    if safety.state != "ok":
+        return f" ({safety.message or safety.state})"
+    return ""
 
 
 async def question(
@@ -260,7 +262,10 @@ async def question(
     """Answer with a part of the twin's state as text."""
     value: object = (await twin.state()).model_dump(mode="json")
     for key in command.path:
-        value = value.get(key) if isinstance(value, Mapping) else None
+        if isinstance(value, Mapping):
+            value = value.get(key)
+        else:
+            value = None
     if isinstance(value, bool):
         return "TRUE" if value else "FALSE"
     return f"{value:.{10 if command.path[-1] == 'position' else 6}f}"
@@ -400,7 +405,10 @@ async def _run(
 
 def _name_taken(refusal: Refusal) -> bool:
     data = getattr(refusal.__cause__, "data", None)
-    problems = data.get("problems") if isinstance(data, Mapping) else None
+    if isinstance(data, Mapping):
+        problems = data.get("problems")
+    else:
+        problems = None
     return any(problem.get("path") == "name" for problem in problems or ())
 
 

@@ -189,7 +189,10 @@ class ConnectedTwin:
         """Save later images in another folder, with the commands since the last image."""
         old = self.record()
         fresh = old.folder is None
-        lines = list(old.transcript) if fresh else old.transcript[-1:]
+        if fresh:
+            lines = list(old.transcript)
+        else:
+            lines = old.transcript[-1:]
         if not fresh:
             del old.transcript[-1:]
         old.close()
@@ -204,7 +207,10 @@ class ConnectedTwin:
         know reply with their position.
         """
         machine = self.machine
-        known = None if machine is None else machine.axes.get(axis)
+        if machine is None:
+            known = None
+        else:
+            known = machine.axes.get(axis)
         if known is None or at.speed is None or at.acceleration is None:
             return f"{at.position:.10f}"
         motor = MotorReply(

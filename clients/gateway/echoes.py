@@ -51,7 +51,10 @@ def _texts(row: CodeLine) -> tuple[str, ...]:
     """Split a row into component, command and two arguments, also in the space-padded
     form."""
     texts = [f.text for f in (row.columns if row.columns is not None else row.words())]
-    matched = None if row.columns is not None else grammar.match(texts[0], texts[1:])
+    if row.columns is not None:
+        matched = None
+    else:
+        matched = grammar.match(texts[0], texts[1:])
     if matched is not None:
         spec, count = matched
         arguments = texts[1 + count :][: spec.arguments]
@@ -100,11 +103,10 @@ class Echoes:
             component, command = key
             if component in self._moves:
                 yield self._moves.pop(component).failed("stopped or sent elsewhere")
-            words = (
-                (component, value, "")
-                if command == "xrays"
-                else (component, command, value)
-            )
+            if command == "xrays":
+                words = (component, value, "")
+            else:
+                words = (component, command, value)
             exchange, *begun = self._begin((*words, "")[:4], state, now)
             yield from begun
             if command == MOVE:
@@ -139,11 +141,17 @@ class Echoes:
             self._job = status.job
             self._next = 0
             self._line = None
-            self._script = None if text is None else script_lines(text)
+            if text is None:
+                self._script = None
+            else:
+                self._script = script_lines(text)
         if status.job != self._job or self._script is None:
             return
         over = status.state not in (*ACTIVE_STATES, "queued")
-        reached = len(self._script) if status.state == "done" else 1 + (status.step or 0)
+        if status.state == "done":
+            reached = len(self._script)
+        else:
+            reached = 1 + (status.step or 0)
         if status.step is None and status.state != "done":
             reached = self._next
         while self._next < min(reached, len(self._script)):
@@ -160,7 +168,10 @@ class Echoes:
             self._next += 1
         if self._line is not None and now >= self._line.next_feedback:
             axis = state.axes.get(self._line.command.component)
-            what = status.what if axis is None else f"{axis.position:.10f}"
+            if axis is None:
+                what = status.what
+            else:
+                what = f"{axis.position:.10f}"
             yield self._line.feedback(what, now)
         if over:
             if status.state == "done":
@@ -196,8 +207,10 @@ class Echoes:
                 and line.command.component != "scanner"
             )
             reply = line.command.arg1 if echoed else ""
-            reply = "TRUE" if line.command.command.startswith("REPEAT UNTIL") else reply
-            reply = self.reply(line.command.component, axis) if moved and axis else reply
+            if line.command.command.startswith("REPEAT UNTIL"):
+                reply = "TRUE"
+            if moved and axis:
+                reply = self.reply(line.command.component, axis)
         yield line.done(reply)
 
 

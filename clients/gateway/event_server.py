@@ -158,7 +158,10 @@ class Gateway:
         self._running.add(key)
         self._send(event)  # subscribers see commands as well as replies
         kind = component_type(event.component, self.twin.axes)
-        work = self._foreign(event) if kind is None else self._execute(event, kind)
+        if kind is None:
+            work = self._foreign(event)
+        else:
+            work = self._execute(event, kind)
         self._start(self._guarded(work, event), key)
 
     async def _echo(self) -> None:
@@ -401,7 +404,12 @@ def check_loopback(host: str) -> None:
 
 def bind_endpoint(host: str, port: int) -> str:
     """Format an address as ZeroMQ's endpoint; port 0 is any free port."""
-    place = f"[{host}]" if ":" in host else ("127.0.0.1" if host == "localhost" else host)
+    if ":" in host:
+        place = f"[{host}]"
+    elif host == "localhost":
+        place = "127.0.0.1"
+    else:
+        place = host
     return f"tcp://{place}:{port or '*'}"
 
 
@@ -414,10 +422,9 @@ def transcript_line(event: AcquilaEvent, command: c.Command) -> str | None:
     """Write the command as a line of a script; None if it cannot occur in one."""
     if type(command).__module__ != c.__name__:
         return None
-    wait = (
-        "POS"
-        if isinstance(command, c.MoveAbsolute) and command.trigger is not None
-        else "ACK"
-    )
+    if isinstance(command, c.MoveAbsolute) and command.trigger is not None:
+        wait = "POS"
+    else:
+        wait = "ACK"
     words = (event.component, event.command, event.arg1, event.arg2, wait, "", "")
     return "\t".join(" ".join(word.split()) for word in words)

@@ -89,7 +89,9 @@ class Recording:
     @property
     def folder(self) -> Path | None:
         """Where the files are; None before the first one."""
-        return None if self._folder is None else self._folder.path
+        if self._folder is None:
+            return None
+        return self._folder.path
 
     def suggest(self, path: str) -> None:
         """Name the folder after the folder in a file's path, where no output path is
@@ -219,7 +221,10 @@ class Recording:
         if self._machine is None or self._profile is None:
             return None
         last = self._states[-1]
-        at = last if self._settings is None else self._settings
+        if self._settings is None:
+            at = last
+        else:
+            at = self._settings
         modes = self._machine.detector.camera.modes
         blocks = [replace(b, camera=replace(b.camera, modes=modes)) for b in self._blocks]
         scans = [b for b in blocks if b.kind == "projection"]
@@ -278,11 +283,9 @@ def _positions(state: State) -> Mapping[str, float]:
 
 def _correction(state: State) -> NamedCorrection | None:
     c = state.correction
-    return (
-        None
-        if c is None
-        else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.comment)
-    )
+    if c is None:
+        return None
+    return NamedCorrection.from_edge(c.name, c.date, c.parameters, c.comment)
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:

@@ -177,9 +177,10 @@ def gpu() -> CheckOutcome:
     from flexdt.twin.projection.gpu import availability
 
     found = availability()
-    computes = (
-        f"{found.reason} computes" if found.present else f"the processor: {found.reason}"
-    )
+    if found.present:
+        computes = f"{found.reason} computes"
+    else:
+        computes = f"the processor: {found.reason}"
     return CheckOutcome("gpu", "warning" if "failed" in found.reason else "ok", computes)
 
 
@@ -247,6 +248,8 @@ def _greeting(port: int) -> str:
         with TwinClient(port=port, name="flexdt doctor", timeout_s=2.0) as twin:
             return f"{twin.server.server} (protocol {twin.server.protocol})"
     except RpcError as error:
-        return "a twin that wants a token" if error.code == Code.NOT_AUTHORISED else ""
+        if error.code == Code.NOT_AUTHORISED:
+            return "a twin that wants a token"
+        return ""
     except OSError:
         return ""

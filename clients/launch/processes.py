@@ -69,7 +69,9 @@ class Servers:
     def viewer_url(self) -> str | None:
         """Where a browser finds the viewer; None without one."""
         viewer = self.ready.get("viewer")
-        return str(viewer["url"]) if isinstance(viewer, dict) else None
+        if isinstance(viewer, dict):
+            return str(viewer["url"])
+        return None
 
     @property
     def pid(self) -> int:
@@ -229,7 +231,10 @@ class LocalTwin:
                 own = stack.enter_context(
                     tempfile.TemporaryDirectory(prefix="flexdt-twin-")
                 )
-                data = Path(own) / "data" if self._folder is None else self._folder
+                if self._folder is None:
+                    data = Path(own) / "data"
+                else:
+                    data = self._folder
                 options = {**self._options, "data": data}
                 log = Path(own) / LOG
                 with long_work.during("starting the servers", self._progress):

@@ -169,9 +169,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         pair = (options.gateway_port, options.gateway_port + 1)
         wanted += [("--gateway-port", LOOPBACK, port) for port in pair]
     # Checked before any start: a server would find it only after compiling, and end all.
-    missing = (
-        lacking("zmq", "pyzmq", "gateway") if options.gateway_port is not None else None
-    )
+    if options.gateway_port is not None:
+        missing = lacking("zmq", "pyzmq", "gateway")
+    else:
+        missing = None
     if missing is not None:
         print(f"flexdt up: --gateway-port: {missing}", file=sys.stderr)
         return INVALID

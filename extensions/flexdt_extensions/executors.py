@@ -56,9 +56,10 @@ def problems_of(name: str, error: ValidationError) -> list[str]:
     for e in error.errors(include_url=False, include_context=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"
         message = message_of(e)
-        shown = (
-            "" if isinstance(e["input"], dict | BaseModel) else f" (got {e['input']!r})"
-        )
+        if isinstance(e["input"], dict | BaseModel):
+            shown = ""
+        else:
+            shown = f" (got {e['input']!r})"
         lines.append(f"{name}: {path}: {message}{'' if 'got' in message else shown}")
     return lines
 
@@ -78,7 +79,9 @@ def executor(
     for this process."""
     if scheduler is not None:
         return dask_executor(scheduler)
-    return nullcontext() if _count(jobs) <= 1 else processes(jobs)
+    if _count(jobs) <= 1:
+        return nullcontext()
+    return processes(jobs)
 
 
 def _count(jobs: int | None) -> int:

@@ -169,7 +169,10 @@ def halved(values: Float32Array) -> Float32Array:
     """Compute means of 2 x 2 x 2 voxels; where a side is odd, its last layer counts
     twice."""
     odd = [(0, n % 2) for n in values.shape]
-    even = np.pad(values, odd, "edge") if any(n for _, n in odd) else values
+    if any(n for _, n in odd):
+        even = np.pad(values, odd, "edge")
+    else:
+        even = values
     halves = slice(0, None, 2), slice(1, None, 2)
     # One after the other, so that the sums do not depend on the order of values in memory.
     total = sum((even[a, b, c] for a, b, c in product(halves, repeat=3)), np.float32(0.0))
@@ -197,7 +200,10 @@ class VolumeFormat:
             held.append(layers)
             while todo and sum(map(len, held)) >= todo[0][1][1] - todo[0][1][0]:
                 number, (first, last) = todo.pop(0)
-                whole = held[0] if len(held) == 1 else np.concatenate(held)
+                if len(held) == 1:
+                    whole = held[0]
+                else:
+                    whole = np.concatenate(held)
                 put(group, grid, number, whole[: last - first])
                 held[:] = [whole[last - first :]]
 

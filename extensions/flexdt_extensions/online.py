@@ -153,7 +153,10 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
     """
     if len(pose) != 1:
         raise TwinError(f"one frame at a time: got {len(pose)} poses")
-    poses = pose if state.poses is None else Poses.concatenate([state.poses, pose])
+    if state.poses is None:
+        poses = pose
+    else:
+        poses = Poses.concatenate([state.poses, pose])
     seen = (*state.detections, detections)
     grown = replace(state, poses=poses, detections=seen)
     if state.fit is None or not state.fit.identifiable:
@@ -300,5 +303,8 @@ def _noise_px(fit: FitResult) -> float:
     and enlargement."""
     whiten = fit.problem.whiten[fit.certificate.used]
     stated = float(np.median(1.0 / np.sqrt(whiten[:, 0] * whiten[:, 2])))
-    noise = fit.certificate.noise if math.isfinite(fit.certificate.noise) else 1.0
+    if math.isfinite(fit.certificate.noise):
+        noise = fit.certificate.noise
+    else:
+        noise = 1.0
     return max(stated * noise * math.sqrt(fit.certificate.enlargement), 1e-4)

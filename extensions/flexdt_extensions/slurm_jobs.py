@@ -138,7 +138,10 @@ class SlurmJobs:
             if any(map(job.has, workers)):
                 continue  # it is about to end
             self.jobs.remove(job)
-            self._barren = 0 if job.seen else self._barren + 1
+            if job.seen:
+                self._barren = 0
+            else:
+                self._barren = self._barren + 1
             why = _outcome(job.id)
             if self._barren >= MAX_BARREN:
                 raise CommandError(
@@ -190,7 +193,9 @@ def lifetime_s(walltime: str) -> int | None:
         hours = 0
         (minutes, seconds) = (*given, 0)[:2]
     total = ((days or 0) * 24 + hours) * 3600 + minutes * 60 + seconds
-    return total - max(60, total // 20) if total > 180 else None
+    if total > 180:
+        return total - max(60, total // 20)
+    return None
 
 
 def _outcome(job: str) -> str:
@@ -199,11 +204,9 @@ def _outcome(job: str) -> str:
         "sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}"
     )
     lines = said.stdout.split()
-    return (
-        lines[0].replace("|", ", exit code ")
-        if not said.returncode and lines
-        else "left the queue"
-    )
+    if not said.returncode and lines:
+        return lines[0].replace("|", ", exit code ")
+    return "left the queue"
 
 
 def _words(said: subprocess.CompletedProcess[str]) -> str:

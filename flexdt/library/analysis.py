@@ -91,10 +91,16 @@ def _calibrated(
     if data is None:
         if geometry is None or markers is None:
             raise TwinError("no data: allowed with geometry and markers")
-        name = Path(markers).stem if isinstance(markers, str | PathLike) else "marks"
+        if isinstance(markers, str | PathLike):
+            name = Path(markers).stem
+        else:
+            name = "marks"
         sets = [markers_alone(geometry, name)]
     else:
-        several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
+        if isinstance(data, DataSet | str | PathLike):
+            several = [data]
+        else:
+            several = list(data)
         sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]
     return calibrate_with(sets, phantom, options)
 
@@ -221,4 +227,6 @@ def _posed(data: Data, geometry: ConeVec) -> DataSet:
 
 
 def _opened(data: Data) -> DataSet:
-    return data if isinstance(data, DataSet) else load_dataset(data)
+    if isinstance(data, DataSet):
+        return data
+    return load_dataset(data)

@@ -204,11 +204,10 @@ def commission(
                 one := tells.scanner_of(_script(s, shipped, read_log, _nothing), known)
             ).machine
         ]
-        taken = (
-            f"{by_limits[0].machine} is taken by {by_limits[0].by}"
-            if by_limits
-            else ("the FleX-ray is taken")
-        )
+        if by_limits:
+            taken = f"{by_limits[0].machine} is taken by {by_limits[0].by}"
+        else:
+            taken = "the FleX-ray is taken"
         ask(Question("which scanner it is", f"no text names one that ships; {taken}"))
         shipped = machines.machine(by_limits[0].machine if by_limits else None)
     scans = sorted(
@@ -233,7 +232,10 @@ def commission(
     scans = [_measured(s, machine, ask) for s in scans]
     offsets = tells.zero_offsets(scans, machine, d.profile_of(shipped))
     unseen = [f"limits of {n}" for n in machine.axes if fit is None or n not in fit.axes]
-    times = {k: x.n for k, x in machine.timing.spread.items()} if fit else {}
+    if fit:
+        times = {k: x.n for k, x in machine.timing.spread.items()}
+    else:
+        times = {}
     unseen += [
         f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < MIN_DURATIONS
     ]
@@ -278,7 +280,10 @@ def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
         if content.xre_settings is not None:
             xre = parse_xre(read_text(folder / content.xre_settings))
             start = xre.text("Scan info", "Start") or ""
-            date = datetime.fromisoformat(start[:19]) if start else None
+            if start:
+                date = datetime.fromisoformat(start[:19])
+            else:
+                date = None
             scan = replace(scan, second=xre.settings, date=date)
         settings = read_settings(content, warnings)
         if settings is not None:
@@ -379,9 +384,11 @@ def _stated(
         asked = tells.scripted(scan, machine).get(name, 0.0)
         if abs(asked) > 1.0 and abs(abs(asked) - abs(motor.value)) <= rebuild.MATCH_MM:
             signs[1 if asked * motor.value > 0 else -1] += 1
-    changes: dict[str, Any] = (
-        {"settings_sign": signs.most_common(1)[0][0]} if signs else {}
-    )
+    changes: dict[str, Any]
+    if signs:
+        changes = {"settings_sign": signs.most_common(1)[0][0]}
+    else:
+        changes = {}
     for rate in ("speed", "acceleration"):
         values = [v for _, m in told if (v := getattr(m, rate))]
         if values:
@@ -389,7 +396,9 @@ def _stated(
             changes |= {rate: values[-1], f"max_{rate}": most}
     stated = axis.model_copy(update=changes)
     source = f"rates: settings texts, n = {len(told)}; limits as shipped"
-    return axis if stated == axis else stated.model_copy(update={"source": source})
+    if stated == axis:
+        return axis
+    return stated.model_copy(update={"source": source})
 
 
 def _measured(

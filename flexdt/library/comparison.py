@@ -148,9 +148,10 @@ def _figures(
     residual: FloatArray, images: Float32Array | None
 ) -> dict[str, float | None]:
     length = np.linalg.norm(residual, axis=2)
-    of_images = (
-        None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2)))
-    )
+    if images is None:
+        of_images = None
+    else:
+        of_images = float(np.sqrt(np.mean(images.astype("f8") ** 2)))
     return dict(
         zip(
             FIGURES,
@@ -195,7 +196,10 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
         np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
     )
     frames = np.arange(len(before))
-    verdict = marked("within", "good") if comparison.within else marked("exceeded", "bad")
+    if comparison.within:
+        verdict = marked("within", "good")
+    else:
+        verdict = marked("exceeded", "bad")
     body: list[str] = [
         heading(f"{comparison.outcome.datasets[0].name} beside the twin"),
         paragraph(

@@ -87,7 +87,10 @@ class DataSet(ImageSet):
         """
         from flexdt.library.calibration.calibrate import calibrate_with
 
-        posed = self if geometry is None else with_geometry(self, geometry)
+        if geometry is None:
+            posed = self
+        else:
+            posed = with_geometry(self, geometry)
         with long_work.during("calibrating", progress):
             return calibrate_with([posed], phantom, options)
 
@@ -287,4 +290,6 @@ def _names(materials: str | Sequence[str] | None) -> tuple[str, ...] | None:
     """Return the names of several materials, or of one."""
     if materials is None:
         return None
-    return (materials,) if isinstance(materials, str) else tuple(materials)
+    if isinstance(materials, str):
+        return (materials,)
+    return tuple(materials)

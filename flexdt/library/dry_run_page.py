@@ -38,7 +38,10 @@ def html_report(report: CheckReport, name: str = "script") -> str:
         name: of the script.
     """
     title = f"Dry run of {name}"
-    verdict = marked("ok", "good") if report.ok else marked("not ok", "bad")
+    if report.ok:
+        verdict = marked("ok", "good")
+    else:
+        verdict = marked("not ok", "bad")
     body = [
         heading(title, " ", verdict),
         facts(summary(report)),

@@ -44,7 +44,10 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
     Raises:
         DatasetFormatError: no pixel of its flat image is brighter than the dark one.
     """
-    scan = data if isinstance(data, DataSet) else load_dataset(data)
+    if isinstance(data, DataSet):
+        scan = data
+    else:
+        scan = load_dataset(data)
     wanted = np.unique(np.linspace(0, len(scan.present) - 1, SIMULATED_VIEWS).astype(int))
     counts = np.stack([scan.counts(scan.present[i]) for i in wanted])
     alive = scan.flat > scan.dark

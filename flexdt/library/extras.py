@@ -39,9 +39,9 @@ def lacking(module: str, name: str, extra: str) -> str | None:
         name: of its distribution.
         extra: of flexdt that brings it.
     """
-    return (
-        None if find_spec(module) else f"{name} is missing: pip install 'flexdt[{extra}]'"
-    )
+    if find_spec(module):
+        return None
+    return f"{name} is missing: pip install 'flexdt[{extra}]'"
 
 
 def offered(name: str, group: str) -> Any:

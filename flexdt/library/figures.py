@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -111,7 +111,11 @@ def plot(
     marked = list(marks)
     axes = axes_of(figure, title, x_label, y_label)
     for s, colour in zip(series, cycle(COLOURS), strict=False):
-        style = {"lw": 1.2} if s.line else {"ls": "", "marker": ".", "ms": 3.2}
+        style: dict[str, Any]
+        if s.line:
+            style = {"lw": 1.2}
+        else:
+            style = {"ls": "", "marker": ".", "ms": 3.2}
         x = np.asarray(s.x, dtype=np.float64)
         y = np.asarray(s.y, dtype=np.float64)
         axes.plot(x, y, color=colour, label=s.name, gid=_id(title, s.name), **style)

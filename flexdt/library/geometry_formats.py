@@ -114,7 +114,10 @@ def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
 def from_tomosipo(geometry: Any) -> ConeVec:
     """Convert a cone geometry of tomosipo; see `ConeVec.from_tomosipo`."""
     if not isinstance(geometry, Mapping):
-        vectors = geometry.to_vec() if hasattr(geometry, "to_vec") else geometry
+        if hasattr(geometry, "to_vec"):
+            vectors = geometry.to_vec()
+        else:
+            vectors = geometry
         names = ("det_shape", *TOMOSIPO_NAMES[1:])
         lost = [name for name in names if not hasattr(vectors, name)]
         if lost:
@@ -256,7 +259,9 @@ def _json(path: Path, given: Given) -> ScanGeometry:
     if given.shape is not None:
         own.cone_vec.with_shape(own.shape).of_shape(given.shape)
     given.check_pitch(own, path)
-    return own if own.shape is not None else ScanGeometry(own.cone_vec, given.shape)
+    if own.shape is not None:
+        return own
+    return ScanGeometry(own.cone_vec, given.shape)
 
 
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:

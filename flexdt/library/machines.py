@@ -29,7 +29,10 @@ def machine(word: str | PathLike[str] | None = None) -> Machine:
     """
     from flexdt.twin.machine.description import builtin_machine
 
-    name = DEFAULT_MACHINE if word is None else fspath(word)
+    if word is None:
+        name = DEFAULT_MACHINE
+    else:
+        name = fspath(word)
     if is_file(name):
         return parsed(Path(name).read_text(encoding="utf-8"), name)
     return builtin_machine(name)
@@ -75,7 +78,10 @@ def profile(
         parse_profile,
     )
 
-    name = of.default_profile if word is None else str(word)
+    if word is None:
+        name = of.default_profile
+    else:
+        name = str(word)
     if isinstance(word, Profile):
         found = word
     elif is_file(name):

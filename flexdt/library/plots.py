@@ -64,7 +64,8 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
 
 def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
     """Plot line integrals of one projection, as the source sees it; returns the axes."""
-    axes = _pyplot().figure().add_subplot() if axes is None else axes
+    if axes is None:
+        axes = _pyplot().figure().add_subplot()
     shown = axes.imshow(data.line_integrals(index), cmap="gray")
     axes.figure.colorbar(shown, ax=axes, label="line integral")
     axes.set(
@@ -77,11 +78,15 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
     """Plot the middle layer of a volume, or of its `sigma` or `bias_bound`; returns the
     axes.
     """
-    values = getattr(volume, what, None) if what in LAYERS else None
+    if what in LAYERS:
+        values = getattr(volume, what, None)
+    else:
+        values = None
     if values is None:
         allowed = [name for name in LAYERS if getattr(volume, name) is not None]
         raise TwinError(f"what: {what!r} is not there; there is {', '.join(allowed)}")
-    axes = _pyplot().figure().add_subplot() if axes is None else axes
+    if axes is None:
+        axes = _pyplot().figure().add_subplot()
     x, y, z = volume.centers()
     middle = len(z) // 2
     half = volume.voxel_xyz[0] / 2
@@ -111,7 +116,10 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
     for i, (name, path) in enumerate(plan.paths.items()):
         if len(path.times) > 1:
             axis = plan.machine.axes[name]
-            axes = turning if axis.unit == "deg" else motors
+            if axis.unit == "deg":
+                axes = turning
+            else:
+                axes = motors
             axes.plot(times, places[name], f"C{i}", label=f"{name} [{axis.unit}]")
     motors.set(ylabel="position [mm]", title=repr(plan).strip("<>"))
     turning.set(ylabel="angle [deg]")

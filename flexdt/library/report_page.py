@@ -142,11 +142,9 @@ def cell_text(value: object) -> str:
         case float() if not math.isfinite(value):
             return "-"
         case float():
-            return (
-                f"{value:.2g}"
-                if 0 < abs(value) < 0.01 or abs(value) >= 1e4
-                else f"{value:.4g}"
-            )
+            if 0 < abs(value) < 0.01 or abs(value) >= 1e4:
+                return f"{value:.2g}"
+            return f"{value:.4g}"
         case _:
             return str(value)
 

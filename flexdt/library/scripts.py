@@ -62,15 +62,24 @@ def plan(
     """
     if isinstance(script, str) and "\n" not in script and _names_a_file(script):
         script = Path(script)
-    chosen = machine if isinstance(machine, Machine) else find_machine(machine)
+    if isinstance(machine, Machine):
+        chosen = machine
+    else:
+        chosen = find_machine(machine)
     size = size_of(None if sample is None else as_phantom(sample))
     return plan_script(script, chosen, find_profile(profile, chosen), sample=size)
 
 
 def check(plan: ScanPlan, sample: object = None) -> CheckReport:
     """Check a plan, with its collisions and exposures; see `ScanPlan.check`."""
-    phantom = None if sample is None else as_phantom(sample)
-    collision = collisions(phantom) if plan.machine.components else None
+    if sample is None:
+        phantom = None
+    else:
+        phantom = as_phantom(sample)
+    if plan.machine.components:
+        collision = collisions(phantom)
+    else:
+        collision = None
     known = plan.start != StartState.of(plan.machine)
     return with_exposures(check_plan(plan, (), collision, "", known), phantom)
 
@@ -92,7 +101,9 @@ def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
 
 def size_of(phantom: Phantom | None) -> SampleSize | None:
     """Return the size of a phantom on the stage; None leaves it to the script."""
-    return None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name)
+    if phantom is None:
+        return None
+    return SampleSize.around(phantom.size_mm, phantom.name)
 
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:

@@ -111,7 +111,10 @@ class Truth:
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
         """Return the truth of some of the views."""
-        scatter = None if self.scatter is None else self.scatter.of_views(chosen)
+        if self.scatter is None:
+            scatter = None
+        else:
+            scatter = self.scatter.of_views(chosen)
         return replace(self, geometry=self.geometry[chosen], scatter=scatter)
 
     @property
@@ -146,11 +149,10 @@ class Truth:
             views = slice(start, min(start + each, len(self.geometry)))
             exposures = [self.exposure] * (views.stop - views.start)
             known = self.scatter
-            added = (
-                []
-                if known is None
-                else [known[i] for i in range(views.start, views.stop)]
-            )
+            if known is None:
+                added = []
+            else:
+                added = [known[i] for i in range(views.start, views.stop)]
             cone = self.geometry.rows[views]
             if self.spot_points > 1:
                 cone = spot_views(cone, spot_mm, self.spot_points)
@@ -212,9 +214,11 @@ def project(
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
     plain = isinstance(sample, Volume) and material is None
-    body: Any = (
-        sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    )
+    body: Any
+    if plain:
+        body = sample
+    else:
+        body = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     found = examine(
         Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes
     )
@@ -374,7 +378,10 @@ def simulate(
         def read(
             number: int, expected: Expected, lit: ExposureSettings = exposure
         ) -> Counts:
-            rng = None if noise is None else frame_rng(noise, number)
+            if noise is None:
+                rng = None
+            else:
+                rng = frame_rng(noise, number)
             return read_out(panel, expected, camera, lit, rng)
 
         dark = read(0, Expected(nothing, nothing), replace(exposure, xrays_on=False))
@@ -399,7 +406,9 @@ def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
     if isinstance(body, Volume):
         return body.data
     voxels = body.voxels
-    return None if voxels is None or voxels.labels is not None else voxels.data
+    if voxels is None or voxels.labels is not None:
+        return None
+    return voxels.data
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
@@ -485,7 +494,10 @@ def _panel(
         left = (spec.columns - cols) // 2
         top = (spec.rows - rows) // 2
         roi = Roi(left, top, left + cols - 1, top + rows - 1)
-        mode = spec.mode if camera.binning == binning else f"HW{binning}SW1High"
+        if camera.binning == binning:
+            mode = spec.mode
+        else:
+            mode = f"HW{binning}SW1High"
         camera = replace(camera, mode=mode, roi=roi)
     return detector_of(spec), camera
 

@@ -233,7 +233,10 @@ def parse_formula(formula: str) -> dict[str, float]:
         if match is None or (match[1] == "(" and match[2]):
             raise _unreadable(formula, at)
         symbol = match[1]
-        count = 1.0 if match[2] is None else float(match[2])
+        if match[2] is None:
+            count = 1.0
+        else:
+            count = float(match[2])
         if symbol == "(":
             levels.append({})
         elif symbol == ")":

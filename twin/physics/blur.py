@@ -40,11 +40,10 @@ def kernel(sigma_px: float) -> Float32Array:
     t = sigma_px * sigma_px
     reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
     n = np.arange(-reach, reach + 1)
-    weights = (
-        np.exp(n * n / (-2.0 * t))
-        if sigma_px >= MIN_SAMPLED_SIGMA_PX
-        else ive(np.abs(n), t)
-    )
+    if sigma_px >= MIN_SAMPLED_SIGMA_PX:
+        weights = np.exp(n * n / (-2.0 * t))
+    else:
+        weights = ive(np.abs(n), t)
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 

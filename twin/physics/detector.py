@@ -244,7 +244,10 @@ class Detector:
             Roi(left=0, top=0, right=199, bottom=99)
         """
         roi = Roi(0, 0, shape[1] - 1, shape[0] - 1)
-        time = USUAL_MS if self.exposure_ms is None else float(self.exposure_ms)
+        if self.exposure_ms is None:
+            time = USUAL_MS
+        else:
+            time = float(self.exposure_ms)
         return CameraSettings(CAMERA_MODE, roi, time, self.averages)
 
     @property
@@ -302,7 +305,10 @@ class Detector:
             >>> panel.dark_charge(panel.camera((4, 4)))
             100.0
         """
-        each = DARK_E_PER_S if self.dark_e_per_s is None else self.dark_e_per_s
+        if self.dark_e_per_s is None:
+            each = DARK_E_PER_S
+        else:
+            each = self.dark_e_per_s
         return each * camera.binning**2
 
     def figures(self) -> dict[str, float]:

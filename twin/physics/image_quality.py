@@ -78,7 +78,10 @@ def pixel_reading(
         >>> behind[0].signal > 5 * behind[1].signal, behind[0].noise > behind[1].noise
         (True, True)
     """
-    layers = list(zip(chain.substances, paths_mm, strict=True)) if paths_mm else []
+    if paths_mm:
+        layers = list(zip(chain.substances, paths_mm, strict=True))
+    else:
+        layers = []
     if detail is not None:
         layers.append(detail)
     signal, noise = weights_of(chain, exposure.kV)

@@ -92,7 +92,10 @@ def read_out(
         charge -= np.float32(panel.long_lag_fraction) * expected.mean_e
     blur = panel.blur_px(camera)
     exposed = Exposed(charge, expected.variance_e, averages, panel, camera)
-    spread = [] if rng is None else list(drawn(exposed, rng, spreads=True))
+    if rng is None:
+        spread = []
+    else:
+        spread = list(drawn(exposed, rng, spreads=True))
     charge = blurred(charge, *blur)
     for noise in spread:
         charge = charge + noise

@@ -205,7 +205,10 @@ def scatter_image(
 
     from flexdt.twin.physics import scatter_kernels as kernels
 
-    wanted = ScatterSettings() if settings is None else settings
+    if settings is None:
+        wanted = ScatterSettings()
+    else:
+        wanted = settings
     row = np.asarray(view, dtype=np.float64)
     source = row[0:3]
     centre = row[3:6]
@@ -225,7 +228,10 @@ def scatter_image(
     distance = np.linalg.norm(away, axis=1)
     per_open = distance**3 / (away @ normal)
     occupied = bool(thing.substances) and thing.amounts.any()
-    lit = _lit(thing, row, shape, wanted.collimated) if occupied else (0.0, 0.0, 0.0, 0.0)
+    if occupied:
+        lit = _lit(thing, row, shape, wanted.collimated)
+    else:
+        lit = (0.0, 0.0, 0.0, 0.0)
     left, top, right, bottom = lit
     corner = centre + left * u + top * v
     along_u = (right - left) * u
@@ -458,7 +464,10 @@ class ScanScatter:
         after = min(int(np.searchsorted(known, place)), len(known) - 1)
         before = max(after - 1, 0)
         span = known[after] - known[before]
-        part = 1.0 if span <= 0.0 else min(max((place - known[before]) / span, 0.0), 1.0)
+        if span <= 0.0:
+            part = 1.0
+        else:
+            part = min(max((place - known[before]) / span, 0.0), 1.0)
         return np.asarray(
             (1.0 - part) ** power * values[before] + part**power * values[after]
         )
@@ -513,7 +522,10 @@ def scan_scatter(
         GeometryError: the source is beside or inside the object's box in a view.
         LimitError: no views.
     """
-    wanted = ScatterSettings() if settings is None else settings
+    if settings is None:
+        wanted = ScatterSettings()
+    else:
+        wanted = settings
     rows = np.asarray(views, dtype=np.float64)
     if not len(rows):
         raise LimitError(

@@ -387,7 +387,10 @@ def detect(
                 softer += paths[other] * between(total[other], to_bin)
         solid = share * slant / square * per_open[node]
         a = solid * coherent * math.exp(-depth)
-        b = solid * incoherent * math.exp(-softer) if to_bin >= 0.0 else 0.0
+        if to_bin >= 0.0:
+            b = solid * incoherent * math.exp(-softer)
+        else:
+            b = 0.0
         image[node, channel] += a * same_signal + b * between(response, to_bin)
         image[node, 2] += a * same_spread + b * between(spread, to_bin)
 

@@ -243,9 +243,10 @@ class Tube:
             0.02
         """
         given = TubeModel() if design is None else design
-        layers = (
-            given.filters if self.filters is None else tuple(map(_filter, self.filters))
-        )
+        if self.filters is None:
+            layers = given.filters
+        else:
+            layers = tuple(map(_filter, self.filters))
         if self.spot_mm is None:
             return TubeModel(layers, given.spot_mm_per_W, given.smallest_spot_mm)
         return TubeModel(layers, 0.0, self.spot_mm)

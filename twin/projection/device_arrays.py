@@ -48,7 +48,10 @@ class DeviceArray(NDArrayOperatorsMixin):
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
         """Take images (n, rows, cols) from the host, or share their memory on the device."""
-        there = images if gpu.is_there(images) else gpu.demand(lambda: gpu.upload(images))
+        if gpu.is_there(images):
+            there = images
+        else:
+            there = gpu.demand(lambda: gpu.upload(images))
         return cls(there.reshape(images.size), images.shape)
 
     @classmethod

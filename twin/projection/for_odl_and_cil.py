@@ -85,7 +85,10 @@ def cil_operator(
     def filled(
         function: _Map, x: Any, shape: tuple[int, int, int], geometry: Any, out: Any
     ) -> Any:
-        result = geometry.allocate(None) if out is None else out
+        if out is None:
+            result = geometry.allocate(None)
+        else:
+            result = out
         # CIL leaves out dimensions of one element.
         result.fill(function(x.as_array().reshape(shape)).reshape(result.shape))
         return result

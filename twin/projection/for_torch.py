@@ -75,7 +75,10 @@ class TorchOperator:
         if rows.ndim != 2 or rows.shape[1] != 12:
             raise GeometryError.of_shape("rows", rows.shape, ("n", 12))
         images = (len(rows), *self.detector_shape)
-        wanted = images if self.transposed else self.like.shape
+        if self.transposed:
+            wanted = images
+        else:
+            wanted = self.like.shape
         if tuple(values.shape[-3:]) != wanted:
             raise GeometryError.of_shape("values", values.shape, ("...", *wanted))
         function = _Spread if self.transposed else _Project
@@ -98,10 +101,14 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
         x, rows = ctx.saved_tensors
-        by_x = (
-            _Spread.apply(g, rows, ctx.a).to(x.dtype) if ctx.needs_input_grad[0] else None
-        )
-        by_rows = _ByRows.apply(x, g, rows, ctx.a) if ctx.needs_input_grad[1] else None
+        if ctx.needs_input_grad[0]:
+            by_x = _Spread.apply(g, rows, ctx.a).to(x.dtype)
+        else:
+            by_x = None
+        if ctx.needs_input_grad[1]:
+            by_rows = _ByRows.apply(x, g, rows, ctx.a)
+        else:
+            by_rows = None
         return by_x, by_rows, None
 
 
@@ -120,12 +127,14 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
         y, rows = ctx.saved_tensors
-        by_y = (
-            _Project.apply(g, rows, ctx.a).to(y.dtype)
-            if ctx.needs_input_grad[0]
-            else None
-        )
-        by_rows = _ByRows.apply(g, y, rows, ctx.a) if ctx.needs_input_grad[1] else None
+        if ctx.needs_input_grad[0]:
+            by_y = _Project.apply(g, rows, ctx.a).to(y.dtype)
+        else:
+            by_y = None
+        if ctx.needs_input_grad[1]:
+            by_rows = _ByRows.apply(g, y, rows, ctx.a)
+        else:
+            by_rows = None
         return by_y, by_rows, None
 
 
@@ -159,7 +168,10 @@ def _tensor(values: Any) -> Any:
         values = (
             values if values.flags.writeable else values.copy()
         )  # no tensor is read-only
-    tensor = values if isinstance(values, torch.Tensor) else torch.from_dlpack(values)
+    if isinstance(values, torch.Tensor):
+        tensor = values
+    else:
+        tensor = torch.from_dlpack(values)
     usable = _is_there(tensor) and gpu.availability().present
     gpu.check_host(
         usable or tensor.device.type == "cpu", f"the tensor on {tensor.device}"
@@ -177,7 +189,9 @@ def _cone_vec(rows: Any) -> ConeVec:
 
 def _memory(one: Any) -> Any:
     """View a tensor as numpy's or numba's array, which shares its memory."""
-    return gpu.taken(one.contiguous()) if _is_there(one) else one.numpy()
+    if _is_there(one):
+        return gpu.taken(one.contiguous())
+    return one.numpy()
 
 
 def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
@@ -197,9 +211,9 @@ def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
 
 def _voxels(volume: Volume | DeviceVolume) -> Any:
     """Return the voxels of a result of `back`, in C order if they are numpy's."""
-    return (
-        volume if isinstance(volume, DeviceVolume) else np.array(volume.data, order="C")
-    )
+    if isinstance(volume, DeviceVolume):
+        return volume
+    return np.array(volume.data, order="C")
 
 
 def _each(
@@ -225,5 +239,8 @@ def _each(
         results = [torch.from_numpy(function(member)) for member in members]
     if len(results) == 1:
         return results[0].reshape(*batch, *shape)
-    whole = torch.stack(results) if results else torch.zeros(0, device=device)
+    if results:
+        whole = torch.stack(results)
+    else:
+        whole = torch.zeros(0, device=device)
     return whole.reshape(*batch, *shape)

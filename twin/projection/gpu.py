@@ -206,7 +206,10 @@ def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0
     views = len(images) + (before if voxel_bytes >= WORTH_BYTES else 0)
     if not availability().present or (voxel_bytes and views < VIEWS_A_THREAD * threads):
         return False
-    portion = images[_chunks(images)[0]].nbytes if len(images) else 0
+    if len(images):
+        portion = images[_chunks(images)[0]].nbytes
+    else:
+        portion = 0
     return has_room(voxel_bytes + portion)
 
 
@@ -255,7 +258,10 @@ def taken(x: Any) -> Any:
     """
     from numba import cuda
 
-    array = x if hasattr(x, "copy_to_host") else cuda.as_cuda_array(x)
+    if hasattr(x, "copy_to_host"):
+        array = x
+    else:
+        array = cuda.as_cuda_array(x)
     if array.dtype != np.float32 or not array.is_c_contiguous():
         said = f"an array of {array.dtype} on the device"
         raise GeometryError.instead(said, str(array.dtype), "float32 in C order")
@@ -355,7 +361,10 @@ def spread(
         clean: True if box.flat holds zeros, which are not transferred.
         deterministic: add integers; see `spread_there`.
     """
-    voxels = zeros(box.flat.size) if clean else upload(box.flat)
+    if clean:
+        voxels = zeros(box.flat.size)
+    else:
+        voxels = upload(box.flat)
     spread_there(box, voxels, views, values, deterministic=deterministic)
     voxels.copy_to_host(box.flat)
 
@@ -367,9 +376,12 @@ def whole_factor(box: Box, values: Any) -> float:
     2^62.
     """
     diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
-    values = values.copy_to_host() if is_there(values) else values
+    if is_there(values):
+        values = values.copy_to_host()
     most = float(np.abs(values).max(initial=0.0)) * diagonal * max(1, values.size)
-    return 2.0 ** math.floor(62 - math.log2(most)) if 0.0 < most < math.inf else 1.0
+    if 0.0 < most < math.inf:
+        return 2.0 ** math.floor(62 - math.log2(most))
+    return 1.0
 
 
 def by_slabs(
@@ -479,11 +491,10 @@ def launcher(
     kind = KINDS * turned + slabs + (slabs & upright)
     order = np.argsort(kind, kind="stable")
     table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
-    walks = (
-        (kernels.spread_rays, kernels.spread_slabs, kernels.spread_columns)
-        if transposed
-        else (kernels.project_rays, kernels.project_slabs, kernels.project_columns)
-    )
+    if transposed:
+        walks = (kernels.spread_rays, kernels.spread_slabs, kernels.spread_columns)
+    else:
+        walks = (kernels.project_rays, kernels.project_slabs, kernels.project_columns)
     kinds, counts = np.unique(kind, return_counts=True)
 
     def launch() -> None:

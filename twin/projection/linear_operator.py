@@ -252,7 +252,9 @@ class Operator:
         )
 
     def _volume(self, x: Volume | npt.ArrayLike) -> Volume:
-        return x if isinstance(x, Volume) else self.like.like(np.asarray(x))
+        if isinstance(x, Volume):
+            return x
+        return self.like.like(np.asarray(x))
 
     def linear_operator(self) -> Any:
         """Return the map as a `scipy.sparse.linalg.LinearOperator` on flat vectors (C

@@ -238,7 +238,10 @@ def _on_device(
     views = voxel_rays(geometry, layout, shape)
     box = box_of(layout)
     copy = layout.device_copy
-    to_move = layout.flat.nbytes if copy.there is None else 0
+    if copy.there is None:
+        to_move = layout.flat.nbytes
+    else:
+        to_move = 0
     before = copy.views
     copy.views = copy.views + len(views)
     return gpu.usable(to_move, out, cpu.threads(), before) and gpu.attempt(
@@ -461,11 +464,10 @@ def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
     Raises:
         GeometryError: a row does not; it is named.
     """
-    given = (
-        cone_vec
-        if isinstance(cone_vec, ConeVec)
-        else ConeVec(as_numbers("cone_vec", cone_vec))
-    )
+    if isinstance(cone_vec, ConeVec):
+        given = cone_vec
+    else:
+        given = ConeVec(as_numbers("cone_vec", cone_vec))
     return check_spread(given)
 
 

@@ -250,11 +250,9 @@ class Volume:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """Return the values, (nz, ny, nx)."""
-        return (
-            np.array(self.data, dtype=dtype)
-            if copy
-            else np.asarray(self.data, dtype=dtype)
-        )
+        if copy:
+            return np.array(self.data, dtype=dtype)
+        return np.asarray(self.data, dtype=dtype)
 
     def __dlpack__(self, **options: Any) -> Any:
         """Export the values to another library, such as `torch.from_dlpack(volume)`,
@@ -269,7 +267,10 @@ class Volume:
     def __repr__(self) -> str:
         """Describe the volume in one line."""
         sizes = [f"{size:g}" for size in self.voxel_xyz]
-        voxel = sizes[0] if len(set(sizes)) == 1 else " x ".join(sizes)
+        if len(set(sizes)) == 1:
+            voxel = sizes[0]
+        else:
+            voxel = " x ".join(sizes)
         centre = ", ".join(f"{c:g}" for c in self.center_mm)
         nz, ny, nx = self.shape
         return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
@@ -304,7 +305,10 @@ class Volume:
 
         found = gpu.availability()
         if device != "cuda" or not found.present:
-            why = f": {found.reason}" if device == "cuda" else ""
+            if device == "cuda":
+                why = f": {found.reason}"
+            else:
+                why = ""
             raise NotBuiltError(
                 f"no volumes on device {device!r}{why}; allowed: 'cpu', and 'cuda' where "
                 "there is "
@@ -413,7 +417,11 @@ class Volume:
         access.
         """
         noise: Any = getattr(self, "_noise", None)  # of `volume_errors.with_errors`
-        found: Float32Array | None = None if noise is None else noise.sigma(self)
+        found: Float32Array | None
+        if noise is None:
+            found = None
+        else:
+            found = noise.sigma(self)
         return found
 
     @property
@@ -425,7 +433,11 @@ class Volume:
         access. Where `accuracy.cut_off` it is an estimate.
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
-        found: Float32Array | None = None if bias is None else bias.bound(self)
+        found: Float32Array | None
+        if bias is None:
+            found = None
+        else:
+            found = bias.bound(self)
         return found
 
     @property
@@ -441,7 +453,11 @@ class Volume:
             Accuracy(half=0.006, most=0.021, cause='cone', cut_off=False)
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
-        found: Accuracy | None = None if bias is None else bias.accuracy(self)
+        found: Accuracy | None
+        if bias is None:
+            found = None
+        else:
+            found = bias.accuracy(self)
         return found
 
     @property
@@ -729,7 +745,9 @@ def as_volume(volume: Volume | Grid) -> Volume:
         >>> as_volume(Grid((6, 4, 4), 0.5))
         <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
     """
-    return volume.blank() if isinstance(volume, Grid) else volume
+    if isinstance(volume, Grid):
+        return volume.blank()
+    return volume
 
 
 def aligned_zeros(count: int) -> Float32Array:

@@ -84,7 +84,10 @@ def fdk(
     require_line_integrals(values)
     if values.ndim != 3 or len(values) != len(geometry):
         values = check_projections(values, len(geometry))
-    chunk = max(CHUNK, 4 * PIXELS // max(values[0].size, 1)) if len(values) else CHUNK
+    if len(values):
+        chunk = max(CHUNK, 4 * PIXELS // max(values[0].size, 1))
+    else:
+        chunk = CHUNK
 
     def parts() -> Iterable[Float32Array]:
         for start in range(0, len(values), chunk):

@@ -136,7 +136,10 @@ class CoarseScan:
             all_views: take fewer rows alone.
         """
         count, rows, cols = self.images.shape
-        each = 1 if all_views else max(1, round(count / (COMPARED_VIEWS * cols)))
+        if all_views:
+            each = 1
+        else:
+            each = max(1, round(count / (COMPARED_VIEWS * cols)))
         down = max(1, rows // COMPARED_ROWS)
         rows -= rows % down
         chosen = slice(None, None, each)
@@ -247,7 +250,10 @@ class CoarseScan:
         """Project values on the grid, (nz, ny, nx), and reconstruct them."""
         truncation = self.truncation
         if truncation is not None:
-            truncation = truncation.nothing if rung.flaw and truncation.beyond else None
+            if rung.flaw and truncation.beyond:
+                truncation = truncation.nothing
+            else:
+                truncation = None
         images = self.projected(thing, rung.cone_vec, rung.shape)
         return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
 

@@ -132,15 +132,18 @@ class LinearSystem:
             weights = 1.0 / spread
         system = cls(values, geometry, as_volume(like), weights, hardening)
         box = system.like.boxes[0]
-        given = np.asarray(projections) if on_host else None
+        if on_host:
+            given = np.asarray(projections)
+        else:
+            given = None
         found = examine(Operation.ITERATE, geometry, system.shape, images=given, grid=box)
         warn_of(found, GeometryError, stacklevel=4)
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
             said = "images on a device, with hardening or surroundings"
             raise GeometryError.instead(said, "device", "images of the host")
-        return (
-            system if surroundings is None else RegionSystem.within(system, surroundings)
-        )
+        if surroundings is None:
+            return system
+        return RegionSystem.within(system, surroundings)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -249,7 +252,9 @@ class DeviceProblem(LinearSystem):
 
     def volume(self, x: Any) -> Any:
         """Return the voxels, as a `DeviceVolume` if the images were on the device."""
-        return x.volume.to("cpu") if self.returns else x.volume
+        if self.returns:
+            return x.volume.to("cpu")
+        return x.volume
 
 
 @dataclass(frozen=True, eq=False)

@@ -352,7 +352,10 @@ def scatterer_of(
     Raises:
         As `without_scatter`.
     """
-    wanted = ScatterSettings() if settings is None else settings
+    if settings is None:
+        wanted = ScatterSettings()
+    else:
+        wanted = settings
     stack: Float32Array = check_projections(line_integrals, len(cone_vec))
     require_finite(stack)
     shape = shape_of(stack)
@@ -435,7 +438,10 @@ def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
     values = np.where(volume.data > AIR * knots[1], volume.data, np.float32(0.0))
     occupied = np.argwhere(values)
     size = np.array(values.shape)
-    box = occupied if len(occupied) else np.array([0 * size, size - 1])
+    if len(occupied):
+        box = occupied
+    else:
+        box = np.array([0 * size, size - 1])
     low = box.min(axis=0)
     high = box.max(axis=0) + 1
     values = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]

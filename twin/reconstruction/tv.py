@@ -214,7 +214,10 @@ def _minimised(
         problem.tell(watch, len(costs) - 1, iterations, at.rest)
         costs.append(at.cost)
         advance((len(costs) - 1) / iterations)
-        little = little + 1 if costs[-2] - at.cost <= tolerance * at.cost else 0
+        if costs[-2] - at.cost <= tolerance * at.cost:
+            little = little + 1
+        else:
+            little = 0
         return tolerance > 0 and little >= STALLED_ITERATIONS
 
     count = min(subsets, len(problem.geometry))

@@ -381,11 +381,10 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
             for m in document["markers"]
         ]
         yield table(rows, ("marker", "x, y, z [mm]", "frames", "rms [px]"))
-        free = (
-            "; give the distance of two: --scale A-B=MM"
-            if document["scale"] == "free"
-            else ""
-        )
+        if document["scale"] == "free":
+            free = "; give the distance of two: --scale A-B=MM"
+        else:
+            free = ""
         yield f"scale: {document['scale']}{free}"
     for text in document["weak"]:
         yield f"weak: {text}"

@@ -55,7 +55,10 @@ def check(
 
     data = script.read_bytes()
     scanner = machines.machine(machine)
-    phantom = None if sample is None else as_phantom(sample)
+    if sample is None:
+        phantom = None
+    else:
+        phantom = as_phantom(sample)
     report = check_script(
         data,
         scanner,

@@ -109,10 +109,14 @@ def reconstruct(
     from flexdt.twin.projection.volume import Accuracy
 
     voxels = None if shape is None else _shape(shape)
-    scattering = (
-        None if scatter_correction is None else option_values.names(scatter_correction)
-    )
-    made_of = None if material is None else option_values.names(material)
+    if scatter_correction is None:
+        scattering = None
+    else:
+        scattering = option_values.names(scatter_correction)
+    if material is None:
+        made_of = None
+    else:
+        made_of = option_values.names(material)
     middle = "X,Y,Z, e.g. 0,0,-5.5"
     request = VolumeRequest(
         algorithm=algorithm or DEFAULT,
@@ -144,7 +148,12 @@ def reconstruct(
         )
     workers = _workers(scheduler, slurm)
     direct = ALGORITHMS[request.algorithm].direct
-    unit = "iterations" if not direct else "images" if workers is None else "slabs"
+    if not direct:
+        unit = "iterations"
+    elif workers is None:
+        unit = "images"
+    else:
+        unit = "slabs"
     with ProgressBar(f"{request.algorithm} of {dataset.name}", unit) as bar:
         if preview:
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
@@ -336,7 +345,10 @@ def read_report(path: Path) -> Report:
         document = json_text.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise CommandError(f"{path}: not JSON: {error}") from None
-    content = document.get("correction", document) if isinstance(document, dict) else None
+    if isinstance(document, dict):
+        content = document.get("correction", document)
+    else:
+        content = None
     if not isinstance(content, dict) or not content:
         raise CommandError(
             f"{path}: holds no correction (was the calibration identifiable?)"
@@ -419,11 +431,22 @@ def export(
     from flexdt.library.datasets.exchange import export_dataset
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
-    report = None if correction is None else read_report(correction)
-    parameters = report.parameters if report else None if corrected else NOMINAL
+    if correction is None:
+        report = None
+    else:
+        report = read_report(correction)
+    if report:
+        parameters = report.parameters
+    elif corrected:
+        parameters = None
+    else:
+        parameters = NOMINAL
     data = scan_of(dataset, texts, report)
     warn(data.warnings, dataset)
-    real = None if unknown is None else Offsets.from_edge(read(unknown))
+    if unknown is None:
+        real = None
+    else:
+        real = Offsets.from_edge(read(unknown))
     written = export_dataset(
         data,
         out,
@@ -491,7 +514,10 @@ def import_(
         "notes": list(geometry.notes),
     }
     height, width = geometry.shape or (None, None)
-    size = "unknown size" if width is None else f"{width} x {height} pixels"
+    if width is None:
+        size = "unknown size"
+    else:
+        size = f"{width} x {height} pixels"
     u, v = geometry.pitch_mm
     yield f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm"
 
@@ -521,7 +547,10 @@ def said(
     from flexdt.library.datasets.exchange import Given
     from flexdt.library.reading.folders import load_dataset
 
-    known = Given() if like is None else Given.of(load_dataset(like))
+    if like is None:
+        known = Given()
+    else:
+        known = Given.of(load_dataset(like))
     return Given(
         known.shape if size is None else (int(size[0]), int(size[1])),
         known.pitch_mm if pitch is None else (pitch[0], pitch[-1]),

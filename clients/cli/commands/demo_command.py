@@ -316,7 +316,10 @@ def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
 
 def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
     """Print the verdict, the files and the next commands."""
-    program = PROGRAM if shutil.which(PROGRAM) else sys.argv[0]
+    if shutil.which(PROGRAM):
+        program = PROGRAM
+    else:
+        program = sys.argv[0]
     dataset = shlex.quote(document["dataset"])
     folder = shlex.quote(str(out))
     tell(f"verdict: {document['calibration']['verdict']}")

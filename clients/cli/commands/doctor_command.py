@@ -31,7 +31,10 @@ def doctor() -> Answer:
     findings = []
     for finding in examine(up.data or TwinSettings.data, ports):
         findings.append(finding)
-        advice = f" -> {finding.advice}" if finding.advice else ""
+        if finding.advice:
+            advice = f" -> {finding.advice}"
+        else:
+            advice = ""
         yield f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}"
     sound = all(finding.verdict != "error" for finding in findings)
     yield {"ok": sound, "findings": [vars(finding) for finding in findings]}

@@ -94,11 +94,10 @@ def _seen(found: Forecast | Measured) -> Answer:
         f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "
         f"5 % below {seen.p5:.3g}, half below {seen.median:.3g}"
     )
-    full = (
-        "unknown"
-        if found.saturated is None
-        else f"{100 * found.saturated:.3g} % of the pixels"
-    )
+    if found.saturated is None:
+        full = "unknown"
+    else:
+        full = f"{100 * found.saturated:.3g} % of the pixels"
     yield f"saturated {full}, starved {100 * found.starved:.3g} %"
 
 

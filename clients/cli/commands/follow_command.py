@@ -62,7 +62,10 @@ def follow(
         raise CommandError("give either ADDRESS or --replay FILE", USAGE)
     follower = _follower(machine, profile, script, sample)
     session = FollowSession(follower)
-    session.tell = (lambda alarm: None) if json else partial(_say, session)
+    if json:
+        session.tell = lambda alarm: None
+    else:
+        session.tell = partial(_say, session)
     if replay is not None:
         recording = replay.read_bytes()
         if STAMP.match(recording) is None:
@@ -89,9 +92,10 @@ def follow(
     except ValueError as error:
         raise CommandError(str(error), USAGE) from None
     with ExitStack() as files:
-        session.record = (
-            None if record is None else files.enter_context(record.open("ab"))
-        )
+        if record is None:
+            session.record = None
+        else:
+            session.record = files.enter_context(record.open("ab"))
         note(
             f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it"
         )
@@ -134,7 +138,10 @@ def _follower(
     from flexdt.twin.script import parse_script
 
     chosen = machines.machine(machine)
-    phantom = None if sample is None else as_phantom(sample)
+    if sample is None:
+        phantom = None
+    else:
+        phantom = as_phantom(sample)
     return Follower(
         chosen,
         machines.profile(profile, chosen, machine),
@@ -169,8 +176,14 @@ async def _status(session: FollowSession) -> None:
         await asyncio.sleep(STATUS_S)
         mirror = session.mirror
         age = mirror.age_s(session.clock())
-        link = "connected" if mirror.connected else "NOT CONNECTED"
-        old = "nothing heard yet" if age is None else f"last message {age:.1f} s ago"
+        if mirror.connected:
+            link = "connected"
+        else:
+            link = "NOT CONNECTED"
+        if age is None:
+            old = "nothing heard yet"
+        else:
+            old = f"last message {age:.1f} s ago"
         under_way = ", ".join(mirror.under_way) or "nothing under way"
         note(f"{link}, {old}; {under_way}; {mirror.raised} alarms{_unread(session)}")
 

@@ -109,9 +109,15 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
 
     def show(status: JobStatus) -> None:
         nonlocal shown
-        text = f"{job}: {status.state}" if status.state != "running" else None
+        if status.state != "running":
+            text = f"{job}: {status.state}"
+        else:
+            text = None
         bar.update(status.frames_done, status.frames_total or None, text)
-        reason = str(status.error.get("message", "")) if status.error else ""
+        if status.error:
+            reason = str(status.error.get("message", ""))
+        else:
+            reason = ""
         if status.state == "paused" and reason and reason != shown:
             shown = reason
             if own:
@@ -169,7 +175,10 @@ def forget(
 ) -> Answer:
     """Forget an ended job; its data set stays."""
     with twin() as client:
-        gone = client.forget_job(days=0.0) if job == ALL else client.forget_job(job)
+        if job == ALL:
+            gone = client.forget_job(days=0.0)
+        else:
+            gone = client.forget_job(job)
     yield gone
     yield f"forgotten: {', '.join(gone.jobs) or 'none'}"
 

@@ -82,11 +82,10 @@ def fit(
     from flexdt.twin.script.log_fit import fit_machine, unlike
 
     machine = machines.machine(base)
-    text = (
-        Path(base).read_text("utf-8")
-        if machines.is_file(base)
-        else builtin_machine_text(base)
-    )
+    if machines.is_file(base):
+        text = Path(base).read_text("utf-8")
+    else:
+        text = builtin_machine_text(base)
     commands = [read_log_file(log, machine) for log in logs]
     names = ", ".join(log.name for log in logs).encode("utf-8", "replace").decode()
     source = f"measured: {names} ({sum(map(len, commands))} lines)"

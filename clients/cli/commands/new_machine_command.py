@@ -78,8 +78,14 @@ def new(
         kv,
         f"{like.tube.min_kV:g}:{like.tube.max_kV:g}",
     )
-    volts = None if kv is None else option_values.span(kv, "--kv")
-    pixels = None if size is None else _pair(size, "--detector", whole=True)
+    if kv is None:
+        volts = None
+    else:
+        volts = option_values.span(kv, "--kv")
+    if size is None:
+        pixels = None
+    else:
+        pixels = _pair(size, "--detector", whole=True)
     lines = [word.partition("=") for word in limit or []]
     answers = Answers(
         name=name,

@@ -52,7 +52,12 @@ def state(twin: Twin) -> Answer:
 
 def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
     lower, upper = axis.limits
-    doing = "moving" if axis.moving else "virtual" if axis.virtual else ""
+    if axis.moving:
+        doing = "moving"
+    elif axis.virtual:
+        doing = "virtual"
+    else:
+        doing = ""
     return (
         name,
         f"{axis.position:.4f}",
@@ -96,7 +101,10 @@ def _facts(state: State) -> list[tuple[str, str]]:
     ]
     if state.image is not None:
         i = state.image
-        cut = f", sample cut off at: {', '.join(i.truncated)}" if i.truncated else ""
+        if i.truncated:
+            cut = f", sample cut off at: {', '.join(i.truncated)}"
+        else:
+            cut = ""
         facts.append(
             ("image", f"{i.saturated:.1%} saturated, {i.starved:.1%} starved{cut}")
         )
@@ -218,7 +226,10 @@ def move(
         raise CommandError(
             "the move did not end at its target; see `flexdt state`", REFUSED
         )
-    verb = "moving, arrives in" if no_wait else "arrived after"
+    if no_wait:
+        verb = "moving, arrives in"
+    else:
+        verb = "arrived after"
     yield f"{verb} {duration(done.duration_s)} of the twin's clock"
 
 
@@ -235,7 +246,10 @@ def jog(
         seconds: Stop after so many seconds of the twin's clock.
     """
     speed = option_values.number(velocity, "the velocity")
-    lasting = math.inf if seconds is None else option_values.number(seconds, "--for")
+    if seconds is None:
+        lasting = math.inf
+    else:
+        lasting = option_values.number(seconds, "--for")
     if lasting <= 0:
         raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
     with twin() as client:
@@ -264,7 +278,10 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
     left = seconds
     shown = ""
     while left > 0:
-        pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
+        if now.clock.speed_up == "max":
+            pace = math.inf
+        else:
+            pace = now.clock.speed_up
         lease = min(JOG_LEASE_S * pace, LONGEST_LEASE_S, left)
         jogged = client.jog(axis, speed, lease_s=lease)
         if jogged.duration_s == 0.0:
@@ -321,11 +338,10 @@ def _rest(state: Stopped) -> str:
     ways = [
         f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()
     ]
-    hit = (
-        f"; {' and '.join(stopping.would_hit)} would collide"
-        if stopping.would_hit
-        else ""
-    )
+    if stopping.would_hit:
+        hit = f"; {' and '.join(stopping.would_hit)} would collide"
+    else:
+        hit = ""
     return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
 
 
@@ -336,7 +352,10 @@ def reset(twin: Twin) -> Answer:
             client.state().safety
         )  # the stop to release; an older twin has no number for it
         current = client.reset(seen.stop or None)
-    why = f": {current.safety.message}" if current.safety.message else ""
+    if current.safety.message:
+        why = f": {current.safety.message}"
+    else:
+        why = ""
     yield current
     yield f"safety: {current.safety.state}{why}"
 
@@ -359,7 +378,10 @@ def sample(
     from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
 
     file = None if name is None else Path(name)
-    kind = "" if file is None else file.suffix.lower().lstrip(".")
+    if file is None:
+        kind = ""
+    else:
+        kind = file.suffix.lower().lstrip(".")
     if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
         file = None
     if (file is None or kind not in MESH_FORMATS) and (
@@ -450,7 +472,10 @@ def snap(
         )
     elif taken.flags is not None:
         warn_of_exposure(taken.flags)
-    flags = None if dark or taken.flags is None else taken.flags.model_dump()
+    if dark or taken.flags is None:
+        flags = None
+    else:
+        flags = taken.flags.model_dump()
     yield {
         "file": str(file),
         "dtype": str(image.dtype),

@@ -71,13 +71,22 @@ def batch(
     elif slurm_script:
         raise typer.BadParameter("--slurm-script needs --slurm FILE")
     else:
-        workers = dask_executor(scheduler) if scheduler is not None else processes(jobs)
-    folder = Path(wanted.batch.name) if out is None else out
+        if scheduler is not None:
+            workers = dask_executor(scheduler)
+        else:
+            workers = processes(jobs)
+    if out is None:
+        folder = Path(wanted.batch.name)
+    else:
+        folder = out
     if folder.exists() and not folder.is_dir():
         raise CommandError(f"{folder}: is a file")
     whole = wanted.batch.items * item_bytes(wanted)
     free = free_bytes(folder)
-    more = f"; {size(free)} are free" if whole > free else ""
+    if whole > free:
+        more = f"; {size(free)} are free"
+    else:
+        more = ""
     note(f"{wanted.batch.items} items, {size(whole)} before compression{more}")
     last = 0.0
 
@@ -85,7 +94,10 @@ def batch(
         nonlocal last
         if time.monotonic() - last >= PROGRESS_S or done == items:
             last = time.monotonic()
-            left = (items - done) / rate if rate > 0 else 0.0
+            if rate > 0:
+                left = (items - done) / rate
+            else:
+                left = 0.0
             note(f"{done}/{items} items, {rate:.2f} a second, {left:.0f} s left")
 
     summary = run_batch(wanted, folder, workers, tell=tell)

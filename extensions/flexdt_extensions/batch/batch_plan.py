@@ -75,7 +75,9 @@ class Draw:
 
     def to_plain(self) -> object:
         """Convert to the form that plans have in TOML."""
-        return self.values[0] if self.kind == "fixed" else {self.kind: list(self.values)}
+        if self.kind == "fixed":
+            return self.values[0]
+        return {self.kind: list(self.values)}
 
 
 _SAMPLERS: Final[Mapping[str, Callable[[Any, Generator], Any]]] = {
@@ -155,7 +157,10 @@ def _numbers(value: object) -> Draw:
 def _positive(value: object) -> Draw:
     draw = _numbers(value)
     if draw.lowest <= 0:
-        also = " (a normal distribution has them)" if draw.kind == "normal" else ""
+        if draw.kind == "normal":
+            also = " (a normal distribution has them)"
+        else:
+            also = ""
         raise ValueError(f"values must be above 0{also}, got {draw.to_plain()!r}")
     return draw
 
@@ -355,7 +360,9 @@ class Calibrate(_Table):
     @property
     def stated_priors(self) -> Mapping[str, float]:
         """The priors that take the place of the assumed ones; 0 is exactly known."""
-        return exact(self.free) if self.priors == "none" else self.priors or {}
+        if self.priors == "none":
+            return exact(self.free)
+        return self.priors or {}
 
 
 class Plan(_Table):

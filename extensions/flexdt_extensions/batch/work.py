@@ -187,7 +187,10 @@ def _camera(
         return None, (wanted.shape[0], wanted.shape[1]), wanted.pixel_mm, (0.0, 0.0)
     standard = machine.detector.camera
     sensor = machine.detector.pixels
-    roi = standard.roi if wanted.roi is None else Roi(*wanted.roi)
+    if wanted.roi is None:
+        roi = standard.roi
+    else:
+        roi = Roi(*wanted.roi)
     camera = replace(
         standard,
         mode=wanted.mode or standard.mode,
@@ -327,7 +330,10 @@ def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
         "cone_vec_true": ((frames, 12), "<f8"),
     }
     if plan.batch.kind == "projections":
-        dtype = "<u2" if plan.images.values == "counts" else "<f4"
+        if plan.images.values == "counts":
+            dtype = "<u2"
+        else:
+            dtype = "<f4"
         out["projections"] = ((frames, *detector_shape(plan)), dtype)
         if plan.reconstruct is not None:
             z, y, x = plan.reconstruct.shape
@@ -422,7 +428,10 @@ def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, An
         want = plan.reconstruct
         z, y, x = want.shape
         like = Volume(np.zeros((z, y, x), np.float32), want.voxel_mm)
-        geometry = cone if want.geometry == "true" else item.poses.cone_vec()
+        if want.geometry == "true":
+            geometry = cone
+        else:
+            geometry = item.poses.cone_vec()
         arrays["volumes"] = fdk(
             images, geometry, like, window=want.window, errors=False
         ).data
@@ -476,7 +485,10 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     parts = channels(item.phantom)
     panel = detector_of(item.machine.detector)
     tube = tube_of(item.machine.tube)
-    mono_keV = stated_keV() if plan.images.physics == "mono" else None
+    if plan.images.physics == "mono":
+        mono_keV = stated_keV()
+    else:
+        mono_keV = None
     chain = chain_through(parts, panel, tube, mono_keV)
     paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])
     nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
@@ -568,13 +580,22 @@ def _judged(
         fit, `error`.
     """
     truth = item.truth.to_edge()
-    estimates = {} if fit is None else fit.certificate.estimates
+    if fit is None:
+        estimates = {}
+    else:
+        estimates = fit.certificate.estimates
     values = {}
     errors = {}
     sigmas = {}
     for name in free:
-        found = estimates.get(name) if identifiable else None
-        value = None if found is None else _finite(found.value)
+        if identifiable:
+            found = estimates.get(name)
+        else:
+            found = None
+        if found is None:
+            value = None
+        else:
+            value = _finite(found.value)
         values[name] = value
         errors[name] = None if value is None else value - truth[name]
         sigmas[name] = None if found is None else _finite(found.sigma)

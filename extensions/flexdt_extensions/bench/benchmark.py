@@ -295,7 +295,10 @@ def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
     """Check whether a contestant has run often enough."""
     if rounds < MIN_ROUNDS:
         return False
-    most = MAX_SHORT_ROUNDS if spent_s < SHORT_S else MAX_ROUNDS
+    if spent_s < SHORT_S:
+        most = MAX_SHORT_ROUNDS
+    else:
+        most = MAX_ROUNDS
     return spent_s > budget_s or rounds >= most
 
 
@@ -549,7 +552,9 @@ def machine(missing: Mapping[str, str | None]) -> Document:
 def load() -> float | None:
     """Return the mean number of runnable processes in the last minute, where the
     system has it."""
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    if hasattr(os, "getloadavg"):
+        return os.getloadavg()[0]
+    return None
 
 
 def line_of(entry: Document) -> str:

@@ -121,7 +121,10 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
     ) -> None:
         met = "not measured" if value is None else "missed"
         if value is not None and sign * value <= sign * accepted:
-            met = "wanted" if sign * value <= sign * wanted else "accepted"
+            if sign * value <= sign * wanted:
+                met = "wanted"
+            else:
+                met = "accepted"
         entry = {
             "target": what,
             "accepted": accepted,
@@ -143,9 +146,15 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
         views = COUNTS[which]
         beside = seen[COUNTS[which]]
         astra = beside["astra_ms"]
-        share = None if astra is None else beside["kernel_ms"] / astra
+        if astra is None:
+            share = None
+        else:
+            share = beside["kernel_ms"] / astra
         line(f"{name}: forward kernel / ASTRA, {views} views", share, accepted, wanted)
-        part = None if top["bound_ms"] is None else top["bound_ms"] / top["kernel_ms"]
+        if top["bound_ms"] is None:
+            part = None
+        else:
+            part = top["bound_ms"] / top["kernel_ms"]
         line(
             f"{name}: part of the bound, {most} views", part, *OF_THE_BOUND[name], sign=-1
         )
@@ -361,7 +370,10 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
 
 def row(line: Document) -> str:
     """Format a line of the page's table."""
-    value = "-" if line["measured"] is None else f"{line['measured']:.3g}"
+    if line["measured"] is None:
+        value = "-"
+    else:
+        value = f"{line['measured']:.3g}"
     limits = f"{line['accepted']:.3g} | {line['wanted']:.3g}"
     why = f": {line['why']}" if "why" in line else ""
     return f"| {line['target']} | {limits} | {value} | {line['met']}{why} |"
@@ -436,7 +448,10 @@ class Resident:
         self._volume = astra.data3d.link("-vol", space, _link(astra, self._voxels))
         self._images = astra.data3d.link("-sino", panel, _link(astra, self._views))
         options = astra.astra_dict(algorithm)
-        into = "VolumeDataId" if algorithm == "FP3D_CUDA" else "ReconstructionDataId"
+        if algorithm == "FP3D_CUDA":
+            into = "VolumeDataId"
+        else:
+            into = "ReconstructionDataId"
         options[into] = self._volume
         options["ProjectionDataId"] = self._images
         self._algorithm = astra.algorithm.create(options)

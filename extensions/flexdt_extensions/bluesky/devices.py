@@ -119,7 +119,10 @@ class AxisLogic(MovableLogic[float]):
 
     def _arrived(self, axis: AxisState, target: float, state: State) -> None:
         if abs(axis.position - target) > ARRIVAL_TOLERANCE:
-            why = " by the emergency stop" if state.safety.estop else ""
+            if state.safety.estop:
+                why = " by the emergency stop"
+            else:
+                why = ""
             raise RuntimeError(
                 f"{self.axis} stopped{why} at {axis.position:g} {axis.unit}, "
                 f"on its way to {target:g}"
@@ -273,11 +276,17 @@ class TwinLab(Device, AsyncStageable):
         name: str = "",
         collisions: bool = True,
     ) -> None:
-        scanner = builtin_machine(machine) if isinstance(machine, str) else machine
+        if isinstance(machine, str):
+            scanner = builtin_machine(machine)
+        else:
+            scanner = machine
         self.link = LabConnection(host, port, token, ssl=ssl, transport=transport)
         self.axis_names = (*scanner.axes, *scanner.virtual_axes)
         for axis in self.axis_names:
-            unit = scanner.axes[axis].unit if axis in scanner.axes else "mm"
+            if axis in scanner.axes:
+                unit = scanner.axes[axis].unit
+            else:
+                unit = "mm"
             setattr(self, axis, TwinAxis(self.link, axis, unit, collisions=collisions))
         self.tube = TwinTube(self.link)
         self.camera = TwinCamera(self.link, where)

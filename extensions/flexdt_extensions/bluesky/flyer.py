@@ -188,7 +188,10 @@ class TwinFlyer(
             script = value.script
             if isinstance(script, ScanRequest):
                 script = compose_script(script, machine, profile)
-            text = script.encode("utf-8") if isinstance(script, str) else script
+            if isinstance(script, str):
+                text = script.encode("utf-8")
+            else:
+                text = script
             report = await self._link.client.check_script(text)
             if not report.ok:
                 raise _refused(report)
@@ -307,7 +310,10 @@ class TwinFlyer(
         """Yield angle [deg] and planned start [s of the scan's clock] of each complete
         image."""
         ready = self._ready()
-        done = 0 if self.job is None else self.job.frames_done
+        if self.job is None:
+            done = 0
+        else:
+            done = self.job.frames_done
         yield from list(zip(ready.angles_deg, ready.times_s, strict=True))[:done]
 
     async def get_index(self) -> int:
@@ -321,7 +327,10 @@ class TwinFlyer(
         """Yield the documents of the files up to `index`."""
         if self._images is None:
             return
-        count = await self.get_index() if index is None else index
+        if index is None:
+            count = await self.get_index()
+        else:
+            count = index
         async for document in self._images.make_stream_docs(count, 1):
             yield document
 
@@ -330,7 +339,11 @@ class TwinFlyer(
         source = self.source("script.check")
         keys = dict[str, DataKey]()
         for name, (value, dtype, numpy, units) in self._settings().items():
-            shape: list[int | None] = [len(value)] if isinstance(value, list) else []
+            shape: list[int | None]
+            if isinstance(value, list):
+                shape = [len(value)]
+            else:
+                shape = []
             key = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=numpy)
             keys[f"{self.name}-{name}"] = (
                 key if units is None else {**key, "units": units}
@@ -378,9 +391,10 @@ class TwinFlyer(
 
     def _scanner(self) -> tuple[Machine, Profile]:
         server = self._link.client.server
-        machine = (
-            builtin_machine(server.machine) if self._machine is None else self._machine
-        )
+        if self._machine is None:
+            machine = builtin_machine(server.machine)
+        else:
+            machine = self._machine
         return machine, self._profile or profile_of(machine, server.profile)
 
 
@@ -405,7 +419,10 @@ def _planned(
     plan = plan_script(parse_script(text), machine, profile)
     images = [e for e in plan.exposures if e.kind == "projection"]
     names = [e.file for e in images]
-    numbered = re.fullmatch(r"(.*?)(0+)(\.tiff?)", names[0] or "") if names else None
+    if names:
+        numbered = re.fullmatch(r"(.*?)(0+)(\.tiff?)", names[0] or "")
+    else:
+        numbered = None
     if numbered is None:
         raise TwinError(
             f"a fly scan has images numbered from 0; this one has {names[:2]}"
@@ -431,7 +448,10 @@ def _planned(
 def _refused(report: CheckResult) -> LimitsExceeded:
     errors = [p for p in report.problems if p.severity == "error"]
     lines = [f"line {p.line}: {p.message}" for p in errors[:5]]
-    more = f" (and {len(errors) - 5} more)" if len(errors) > 5 else ""
+    if len(errors) > 5:
+        more = f" (and {len(errors) - 5} more)"
+    else:
+        more = ""
     return LimitsExceeded(
         "the scan was refused: " + "; ".join(lines) + more,
         {

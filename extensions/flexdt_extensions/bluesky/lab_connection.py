@@ -72,7 +72,10 @@ class LabConnection:
         ssl: tls.SSLContext | None = None,
         transport: Transport | None = None,
     ) -> None:
-        self.address = f"{host}:{port}" if transport is None else "in-process"
+        if transport is None:
+            self.address = f"{host}:{port}"
+        else:
+            self.address = "in-process"
         self.client = AsyncTwinClient(
             host, port, token, transport, name="flexdt_extensions.bluesky", ssl=ssl
         )
@@ -236,7 +239,10 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """Get the value at `path`; zero where that is not known."""
         value: Any = state
         for name in self._path.split("."):
-            value = value[name] if isinstance(value, Mapping) else getattr(value, name)
+            if isinstance(value, Mapping):
+                value = value[name]
+            else:
+                value = getattr(value, name)
         return cast(_T, cast(type[Any], self.datatype)() if value is None else value)
 
     def source(self, name: str, read: bool) -> str:
@@ -290,9 +296,10 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """Subscribe a callback to changes."""
         if self._end is not None:
             self._end()
-        self._end = (
-            None if callback is None else self._link.watch(_changes(self._get, callback))
-        )
+        if callback is None:
+            self._end = None
+        else:
+            self._end = self._link.watch(_changes(self._get, callback))
 
 
 def _changes(

@@ -192,7 +192,10 @@ class ScenarioReader:
         if start > stop:
             raise self._error("acquisition.stop_angle", "not below start_angle")
         final = acquisition.get("include_final_angle", True)
-        steps = self._count - 1 if final in (True, None) else self._count
+        if final in (True, None):
+            steps = self._count - 1
+        else:
+            steps = self._count
         angles = start + np.arange(self._count) * (stop - start) / max(1, steps)
         direction = acquisition.get("direction") or "CCW"
         if direction not in ("CW", "CCW"):
@@ -392,7 +395,10 @@ class ScenarioReader:
         return table
 
     def _value(self, value: object, where: str, units: Mapping[Any, float]) -> float:
-        entry = value if isinstance(value, dict) else {"value": value}
+        if isinstance(value, dict):
+            entry = value
+        else:
+            entry = {"value": value}
         number = entry.get("value")
         if not _numeric([number]) or not isinstance(number, int | float):
             raise self._error(where, "a number")
@@ -420,7 +426,10 @@ class ScenarioReader:
     def _at(self, *path: str) -> Mapping[str, Any]:
         found: Any = self._document
         for i, key in enumerate(path):
-            found = found.get(key) if isinstance(found, dict) else None
+            if isinstance(found, dict):
+                found = found.get(key)
+            else:
+                found = None
             if not isinstance(found, dict):
                 raise self._error(".".join(path[: i + 1]), "an object")
         return found  # type: ignore[no-any-return]
@@ -451,9 +460,14 @@ class ScenarioReader:
             if isinstance(found, list) and key.isdigit() and int(key) < len(found):
                 found = found[int(key)]
             else:
-                found = found.get(key) if isinstance(found, dict) else None
+                if isinstance(found, dict):
+                    found = found.get(key)
+                else:
+                    found = None
         text = json.dumps(found)
-        return text if len(text) <= 60 else f"{text[:60]} ..."
+        if len(text) <= 60:
+            return text
+        return f"{text[:60]} ..."
 
 
 def seen_from(pose: Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
@@ -534,7 +548,10 @@ def _interpolated(values: FloatArray, count: int) -> FloatArray:
 
 def drifts_of(value: object) -> list[Any]:
     """List the drifts of a parameter."""
-    found = value.get("drifts") if isinstance(value, dict) else None
+    if isinstance(value, dict):
+        found = value.get("drifts")
+    else:
+        found = None
     if found is None and isinstance(value, dict):
         found = value.get("drift")
     if found is None:

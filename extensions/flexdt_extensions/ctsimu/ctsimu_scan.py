@@ -437,7 +437,9 @@ class _ScanReader(ScenarioReader):
         thick = self._plain(given.get("thickness"), MM, f"{where}.thickness", 0.0)
         if not 0.0 <= thick <= 1e3:
             raise self._error(f"{where}.thickness", "0 to 1000 mm")
-        return None if substance is None or not thick else Filter(substance, thick)
+        if substance is None or not thick:
+            return None
+        return Filter(substance, thick)
 
     # Tube
 
@@ -546,9 +548,10 @@ class _ScanReader(ScenarioReader):
                     f"source.spot: a Gaussian of the same width along {axis}"
                 )
                 x = np.linspace(-size / 2.0, size / 2.0, 1001)
-                weights = (
-                    np.exp(-0.5 * (x / sigma) ** 2) if sigma > 0.0 else np.ones(1001)
-                )
+                if sigma > 0.0:
+                    weights = np.exp(-0.5 * (x / sigma) ** 2)
+                else:
+                    weights = np.ones(1001)
                 sigma = float(np.sqrt((weights * x**2).sum() / weights.sum()))
             found.append(sigma)
         return found[0], found[1]
@@ -644,7 +647,9 @@ class _ScanReader(ScenarioReader):
         )
 
     def _sharp(self) -> str:
-        return "sharpness" if "sharpness" in self._at("detector") else "unsharpness"
+        if "sharpness" in self._at("detector"):
+            return "sharpness"
+        return "unsharpness"
 
     def _reference(self, name: str) -> Reference:
         at = ("acquisition", name)
@@ -695,7 +700,10 @@ class _ScanReader(ScenarioReader):
             raise self._error(".".join(path), "null; such files are not read")
 
     def _text(self, given: object, where: str) -> str | None:
-        value = given.get("value") if isinstance(given, dict) else given
+        if isinstance(given, dict):
+            value = given.get("value")
+        else:
+            value = given
         if drifts_of(given) or not isinstance(value, str | None):
             raise self._error(where, "a text without drifts")
         return value or None
@@ -706,7 +714,10 @@ class _ScanReader(ScenarioReader):
         drifts = drifts_of(given)
         if not drifts:
             return [self._text(given, where)] * self._count
-        last = drifts[-1] if isinstance(drifts[-1], dict) else {}
+        if isinstance(drifts[-1], dict):
+            last = drifts[-1]
+        else:
+            last = {}
         names = last.get("value")
         if isinstance(last.get("file"), str):
             names = (self._beside or str)(last["file"]).split()
@@ -756,7 +767,10 @@ class _ScanReader(ScenarioReader):
         """Read a positive number for each frame."""
         where = ".".join(path)
         given = self._given(*path)
-        value = given.get("value") if isinstance(given, dict) else given
+        if isinstance(given, dict):
+            value = given.get("value")
+        else:
+            value = given
         if value is None and default is not None:
             return np.full(self._count, default)
         found = self._frames(given, where, units).real

@@ -79,9 +79,10 @@ def scenario_of(
         The scenario's JSON object.
     """
     if parameters is None:
-        parameters = (
-            NOMINAL if dataset.correction is None else dataset.correction.parameters
-        )
+        if dataset.correction is None:
+            parameters = NOMINAL
+        else:
+            parameters = dataset.correction.parameters
     doc = dataset.document
     machine = dataset.machine
     geometry_of(dataset, NOMINAL)  # raises for frames of several shapes

@@ -326,7 +326,10 @@ class ScenarioImages:
         """
         scan = self.scan
         lag = self.scan.grey.lag
-        dark = np.mean(self.darks(), axis=0) if scan.dark.correction else 0.0
+        if scan.dark.correction:
+            dark = np.mean(self.darks(), axis=0)
+        else:
+            dark = 0.0
         gain = None
         if scan.flat.correction:
             gain = self.brightest / np.maximum(np.mean(self.flats(), axis=0) - dark, 1e-9)
@@ -336,7 +339,10 @@ class ScenarioImages:
             energy, variance = self._collected(i)
             if lag > 0.0:
                 # Each frame keeps the part `lag` of the previous one.
-                left = np.zeros_like(energy) if before is None else before - energy
+                if before is None:
+                    left = np.zeros_like(energy)
+                else:
+                    left = before - energy
                 n = scan.averages
                 before = energy + left * np.float32(lag**n)
                 energy = energy + left * np.float32(lag * (1 - lag**n) / (1 - lag) / n)
@@ -362,7 +368,8 @@ class ScenarioImages:
         counts = np.stack(list(self.projections()))
         if scan.dark.correction and dark is not None:
             dark = np.zeros_like(dark)
-            flat = None if flat is None else flat - np.mean(darks, axis=0)
+            if flat is not None:
+                flat = flat - np.mean(darks, axis=0)
         if scan.flat.correction:
             flat = np.full(counts.shape[1:], round(self.brightest), np.uint16)
         if flat is not None:
@@ -401,14 +408,16 @@ class ScenarioImages:
         try:
             names = {}
             for kind, images in (("dark", self.darks()), ("flat", self.flats())):
-                pattern = (
-                    f"{stem}_{kind}.tif"
-                    if len(images) == 1
-                    else f"{stem}_{kind}_%04d.tif"
-                )
+                if len(images) == 1:
+                    pattern = f"{stem}_{kind}.tif"
+                else:
+                    pattern = f"{stem}_{kind}_%04d.tif"
                 names[kind] = pattern if images else None
                 for k, image in enumerate(images):
-                    name = pattern % k if "%" in pattern[len(stem) :] else pattern
+                    if "%" in pattern[len(stem) :]:
+                        name = pattern % k
+                    else:
+                        name = pattern
                     (part / name).write_bytes(tiff_bytes(image))
             for i, image in enumerate(self.projections()):
                 (part / f"{stem}_{i:04d}.tif").write_bytes(tiff_bytes(image))

@@ -195,7 +195,10 @@ def needles(files: list[Path]) -> Iterator[Told]:
         )
         document, shapes[scan] = _calibrated(seen, frames, start, "dO_x", "dD_z")
         value, sigma = (document["parameters"]["dD_z"][key] for key in ("value", "sigma"))
-        ours = f"{value:.2f} +- {sigma:.2f} mm" if document["identifiable"] else "refused"
+        if document["identifiable"]:
+            ours = f"{value:.2f} +- {sigma:.2f} mm"
+        else:
+            ours = "refused"
         near = document["identifiable"] and abs(value - SHIFT_MM) <= 2 * sigma
         rms = document["rms_px"]
         yield Figure(f"{scan}: shift of the detector", "about -758 mm", ours, near)

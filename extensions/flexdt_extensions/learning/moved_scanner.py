@@ -42,8 +42,14 @@ def require_positive(*, or_zero: bool = False, **values: float) -> None:
         counted = name in COUNTS
         above = value >= 0.0 if or_zero else value > 0.0
         if not (above and value < math.inf) or (counted and value != int(value)):
-            least = "0 or more" if or_zero else "more than 0"
-            allowed = f"{least}, a whole number" if counted else least
+            if or_zero:
+                least = "0 or more"
+            else:
+                least = "more than 0"
+            if counted:
+                allowed = f"{least}, a whole number"
+            else:
+                allowed = least
             raise LimitError(
                 f"{name} {value:g}; allowed: {allowed}",
                 {"asked": value, "allowed": allowed},

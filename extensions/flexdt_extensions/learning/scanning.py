@@ -115,20 +115,20 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self._sectors = np.zeros(SECTORS, np.float32)
         self._taken = 0
         self._over = True
-        self.action_space = (
-            gymnasium.spaces.Discrete(SECTORS)
-            if action == "discrete"
-            else gymnasium.spaces.Box(
+        if action == "discrete":
+            self.action_space = gymnasium.spaces.Discrete(SECTORS)
+        else:
+            self.action_space = gymnasium.spaces.Box(
                 -1.0, 1.0, (4 if action == "pose" else 1,), np.float32
             )
-        )
-        self.observation_space = (
-            gymnasium.spaces.Box(0, 255, (*self.lab.small_shape, 1), np.uint8)
-            if self._shows
-            else gymnasium.spaces.Box(
+        if self._shows:
+            self.observation_space = gymnasium.spaces.Box(
+                0, 255, (*self.lab.small_shape, 1), np.uint8
+            )
+        else:
+            self.observation_space = gymnasium.spaces.Box(
                 -1.0, 1.0, (7 + self.task.features + SECTORS,), np.float32
             )
-        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

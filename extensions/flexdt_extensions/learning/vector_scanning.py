@@ -57,7 +57,10 @@ class Turntable:
     def way(self, start: float, target: float) -> tuple[Taken, float]:
         """Compute the cost of a turn of rot_obj, and its end [deg]."""
         upper = self.still.range_of("rot_obj")[1]
-        turns = 0.0 if abs(start) > upper - 360.0 else start - start % 360.0
+        if abs(start) > upper - 360.0:
+            turns = 0.0
+        else:
+            turns = start - start % 360.0
         key = start - turns, target % 360.0
         if key not in self._ways:
             lab = self._moved
@@ -100,7 +103,9 @@ class TurnedLab(Lab):
 
     def position(self, axis: str) -> float:
         """Return the position of a motor [mm, deg]."""
-        return self.angle if axis == "rot_obj" else self.table.still.position(axis)
+        if axis == "rot_obj":
+            return self.angle
+        return self.table.still.position(axis)
 
     def take(self, targets: dict[str, float]) -> Taken:
         """Take a frame as `Lab.take`, for a target of rot_obj."""

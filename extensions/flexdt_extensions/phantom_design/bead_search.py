@@ -302,11 +302,10 @@ def design(
             {"asked": count, "allowed": [2, len(places)]},
         )
     some, weight = planned.thinned(DESIGN_FRAMES)
-    slot = (
-        np.zeros(len(places), np.int64)
-        if slots is None
-        else np.asarray(slots, dtype=np.int64)
-    )
+    if slots is None:
+        slot = np.zeros(len(places), np.int64)
+    else:
+        slot = np.asarray(slots, dtype=np.int64)
     most = count if per_slot is None else per_slot
     table = SeatTable.of(places, radius_mm, some, weight)
     rules = _Rules(slot, most, 2.0 * radius_mm + gap_mm, unlike_mm)

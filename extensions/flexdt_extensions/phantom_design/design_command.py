@@ -68,7 +68,10 @@ def design(
             plan.read_bytes().decode("utf-8", "surrogateescape"), scanner, offsets
         )
     else:
-        places = [place(word) for word in position] if position else [(600.0, 0.0)]
+        if position:
+            places = [place(word) for word in position]
+        else:
+            places = [(600.0, 0.0)]
         poses, shape = work.circle_poses(scanner, places, sdd, frames)
     if not (noise > 0 and tolerance >= 0 and radius > 0):
         raise typer.BadParameter(

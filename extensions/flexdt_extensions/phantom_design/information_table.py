@@ -74,7 +74,9 @@ class PlannedScans:
     @property
     def widths(self) -> Mapping[str, float]:
         """The priors, those that are assumed where none are given."""
-        return known(self.free) if self.priors is None else self.priors
+        if self.priors is None:
+            return known(self.free)
+        return self.priors
 
     def sizes(self) -> FloatArray:
         """Return (n, 2) detector (rows, cols) of each frame."""

@@ -439,7 +439,9 @@ def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -
 
 
 def _of(measured: dict[str, float] | None, name: str) -> str:
-    return "-" if measured is None else f"{measured[name]:.3g}"
+    if measured is None:
+        return "-"
+    return f"{measured[name]:.3g}"
 
 
 SCALE_PX_MM = 12.0
@@ -501,7 +503,10 @@ def brick_drawings(
         for k in np.flatnonzero(owner == brick):
             x, y, z = beads[k].tolist()
             _bead(axes, x, y, radius, int(k) + 1)
-            edge = "towards the source" if y < 0 else "away from the source"
+            if y < 0:
+                edge = "towards the source"
+            else:
+                edge = "away from the source"
             side = "left" if x < 0 else "right"
             steps.append(
                 f"bead {k + 1}: centre {wide / 2 - abs(x):.2f} mm from the {side} outer face, "

@@ -187,7 +187,10 @@ def tasks(
             raise UnknownNameError.among(
                 f"no {what} {value!r}; there are", value, allowed
             )
-    n = projection_counts() if counts is None else tuple(counts)
+    if counts is None:
+        n = projection_counts()
+    else:
+        n = tuple(counts)
     scenarios = tuple(thesis()["scenarios"])
 
     def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:

@@ -216,7 +216,10 @@ def exposures(
     margin = math.ceil(4.0 * camera.blur_px)
     rows, cols = shape
     wide = (rows + 2 * margin, cols + 2 * margin)
-    kernel = blur_kernel(camera.blur_px) if camera.blur_px > 0 else None
+    if camera.blur_px > 0:
+        kernel = blur_kernel(camera.blur_px)
+    else:
+        kernel = None
     for start in range(0, len(cone), block):
         part = cone[start : start + block]
         for i, image in enumerate(intensities(scene, model, part, wide, camera.fine)):
@@ -276,7 +279,10 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
             scene=scene,
         )
         note = "; ".join(f.text for f in result.errors)
-        problem = None if result.fit is None or note else result.fit.problem
+        if result.fit is None or note:
+            problem = None
+        else:
+            problem = result.fit.problem
         return run_of(task, n, result.fit, truth, problem, note)
 
     return [attempted(task.setting, task.scenario, n, solve) for n in task.counts]
@@ -296,7 +302,10 @@ def _rendered(
     Returns:
         One scan for each placement.
     """
-    camera = CLEAN if task.fidelity == "clean" else Rendering()
+    if task.fidelity == "clean":
+        camera = CLEAN
+    else:
+        camera = Rendering()
     most = max(task.counts)
     everything, truth = geometry_of(task, most)
     placements = task.experiment == "detector" and task.setting

@@ -175,7 +175,10 @@ def run_of(
     and ours is in `beside`; elsewhere it is the other way round.
     """
     run = fitted_run(task.setting, task.scenario, n, fit, truth, task.limit, note)
-    other = None if problem is None else _algorithm_2(task, n, problem, truth)
+    if problem is None:
+        other = None
+    else:
+        other = _algorithm_2(task, n, problem, truth)
     if other is None:
         return run
     if task.experiment == "damping" and run.identifiable:
@@ -235,7 +238,9 @@ def fitted_run(
 
 
 def _mae(errors: Mapping[str, float]) -> float:
-    return float(np.mean(list(errors.values()))) if errors else math.nan
+    if errors:
+        return float(np.mean(list(errors.values())))
+    return math.nan
 
 
 def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:

@@ -112,7 +112,10 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
         )
         for method in METHODS:
             found, iterations = _solve(method, _Draw(tracks, model, poses, start, rng))
-            values = {} if found is None else found.to_edge()
+            if found is None:
+                values = {}
+            else:
+                values = found.to_edge()
             errors = errors_of({n: v for n, v in values.items() if n in SIX}, truth)
             out.append(
                 Run(
@@ -305,9 +308,10 @@ def _collected(
 
 def run_task(task: WorkUnit) -> list[Run]:
     """Run one task; a plain function, so that it can be sent to another process."""
-    phantom = (
-        load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
-    )
+    if task.variant == "printed":
+        phantom = load_phantom(task.phantom)
+    else:
+        phantom = authors(task.phantom)
     model = bead_model(phantom)
     if task.fidelity in ("points", "noisy"):
         return point_runs(task, model)

@@ -149,7 +149,10 @@ def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] 
     for row in rows:
         sigmas = {n: s for n, s in row["mean_sigma"].items() if s is not None}
         worst = max(sigmas, key=lambda n: sigmas[n], default=None)
-        text = "-" if worst is None else f"{worst} {sigmas[worst]:.3g} {UNITS[worst]}"
+        if worst is None:
+            text = "-"
+        else:
+            text = f"{worst} {sigmas[worst]:.3g} {UNITS[worst]}"
         out.append((f"{row['weak']} of {row['runs']}", text))
     return out
 
@@ -213,7 +216,9 @@ def curve_table(curve: Mapping[str, Any]) -> str:
 
 
 def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")
+    if values:
+        return float(np.mean(values))
+    return float("nan")
 
 
 def report(document: Mapping[str, Any], *charts: str) -> str:

@@ -180,7 +180,10 @@ def import_geometry(
             said = f"{path} says {found} {what}, not {asked}"
             raise ExchangeError(said, {"asked": asked, "allowed": found})
     known.check_pitch(geometry, path)
-    shape = known.shape if geometry.shape is None else geometry.shape
+    if geometry.shape is None:
+        shape = known.shape
+    else:
+        shape = geometry.shape
     return _examined(
         replace(geometry, shape=shape, name=geometry.name or path.stem), path
     )
@@ -194,7 +197,9 @@ def _examined(geometry: ScanGeometry, path: Path) -> ScanGeometry:
     """
     found = examine(Operation.OPEN, geometry.cone_vec, geometry.shape)
     doubts = settled(found, ExchangeError, str(path))
-    return replace(geometry, notes=(*geometry.notes, *doubts)) if doubts else geometry
+    if doubts:
+        return replace(geometry, notes=(*geometry.notes, *doubts))
+    return geometry
 
 
 def _known(format: str, allowed: Iterable[str]) -> Format:

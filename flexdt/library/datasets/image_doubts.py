@@ -107,7 +107,8 @@ def image_doubts(
         top: float | None = scan.full_scale
         if top is None:
             top = float(max(flat.max(), max(int(look(i).max()) for i in wanted)))
-            top = top if np.log2(top + 1.0).is_integer() else np.inf
+            if not np.log2(top + 1.0).is_integer():
+                top = np.inf
         few = dark[alive] + FEW_COUNTS
         opened = np.where(alive, flat - dark, np.nan)
         beam: list[float | None] = []

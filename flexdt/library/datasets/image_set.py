@@ -77,7 +77,10 @@ class Arrays:
         """Select the arrays of some of the images."""
         if self.counts is None:
             return self
-        kept = None if self.integrals is None else self.integrals[chosen]
+        if self.integrals is None:
+            kept = None
+        else:
+            kept = self.integrals[chosen]
         return replace(self, counts=self.counts[chosen], integrals=kept)
 
 
@@ -213,9 +216,10 @@ class ImageSet:
                     {"asked": str(values.dtype), "allowed": "uint16"},
                 )
             values = values.astype(np.uint16)
-        cone = (
-            geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
-        )
+        if isinstance(geometry, ConeVec):
+            cone = geometry
+        else:
+            cone = ConeVec(np.asarray(geometry))
         shape = cone.of_shape((values.shape[1], values.shape[2]))
         if len(cone) != len(values):
             raise DatasetFormatError(
@@ -231,7 +235,11 @@ class ImageSet:
         frames = tuple(
             Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(values))
         )
-        told = () if dark is not None else ("no dark image: zero is taken",)
+        told: tuple[str, ...]
+        if dark is not None:
+            told = ()
+        else:
+            told = ("no dark image: zero is taken",)
         return cls(
             name,
             frames,
@@ -249,9 +257,15 @@ class ImageSet:
 
     def __repr__(self) -> str:
         rows, cols = self.shape
-        state = "complete" if self.complete else "incomplete"
+        if self.complete:
+            state = "complete"
+        else:
+            state = "incomplete"
         many = len(self.warnings)
-        doubts = f", {many} warning{'s' if many > 1 else ''}" if many else ""
+        if many:
+            doubts = f", {many} warning{'s' if many > 1 else ''}"
+        else:
+            doubts = ""
         images = f"{len(self)} projections of {rows} x {cols} (rows x columns)"
         return f"<DataSet {self.name!r}: {images}, {state}{doubts}>"
 
@@ -307,7 +321,9 @@ class ImageSet:
     @property
     def where(self) -> str:
         """The folder, or the name of a data set in memory, for messages."""
-        return self.name if self.folder is None else str(self.folder)
+        if self.folder is None:
+            return self.name
+        return str(self.folder)
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -326,9 +342,9 @@ class ImageSet:
         Raises:
             GeometryError: a panel on its side, so that the stage's angle is unknown.
         """
-        return (
-            Poses.from_cone_vec(self.cone_vec) if self.nominal is None else self.nominal
-        )
+        if self.nominal is None:
+            return Poses.from_cone_vec(self.cone_vec)
+        return self.nominal
 
     @property
     def angles_deg(self) -> FloatArray:
@@ -359,9 +375,10 @@ class ImageSet:
         if parameters is None:
             if self.correction is None and self.nominal is None:
                 return self.cone_vec
-            parameters = (
-                NOMINAL if self.correction is None else self.correction.parameters
-            )
+            if self.correction is None:
+                parameters = NOMINAL
+            else:
+                parameters = self.correction.parameters
         return self.poses.cone_vec(parameters)
 
     def with_correction(self, correction: NamedCorrection | Offsets | None) -> Self:
@@ -384,7 +401,9 @@ class ImageSet:
     def panel(self) -> Panel | None:
         """The panel's distortion and lag that the correction in force undoes in line
         integrals."""
-        return None if self.correction is None else self.correction.panel
+        if self.correction is None:
+            return None
+        return self.correction.panel
 
     def with_motion(self, motion: Motion) -> Self:
         """Return the data set with a motion of scanner or sample in its geometry.
@@ -442,7 +461,9 @@ class ImageSet:
     def dark(self) -> Float32Array:
         """Mean of the dark images, (rows, cols); zero, with a warning, without any."""
         dark = self._mean(self.darks, None if self.arrays is None else self.arrays.darks)
-        return np.zeros(self.shape, dtype=np.float32) if dark is None else dark
+        if dark is None:
+            return np.zeros(self.shape, dtype=np.float32)
+        return dark
 
     @cached_property
     def flat(self) -> Float32Array:
@@ -465,15 +486,17 @@ class ImageSet:
     ) -> Float32Array | None:
         if images is not None:
             return np.asarray(images.mean(axis=0), dtype=np.float32)
-        return mean_image(files, self.shape) if files else None
+        if files:
+            return mean_image(files, self.shape)
+        return None
 
     @cached_property
     def normalisation(self) -> LineIntegrals:
         """How counts become line integrals; `dead` marks the pixels for which they cannot."""
         plain = LineIntegrals.of(self.dark, self.flat)
-        return (
-            plain if self.interpolated is None else plain.interpolating(self.interpolated)
-        )
+        if self.interpolated is None:
+            return plain
+        return plain.interpolating(self.interpolated)
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
         """Compute projections as -log((p - d) / (f - d)), always finite; the panel's
@@ -532,7 +555,10 @@ class ImageSet:
             >>> data.stack([0, 2]).shape
             (2, 4, 5)
         """
-        chosen = self.present if indices is None else tuple(indices)
+        if indices is None:
+            chosen = self.present
+        else:
+            chosen = tuple(indices)
         out = np.empty((len(chosen), *self.shape), dtype=np.float32)
         for k, index in enumerate(chosen):
             out[k] = self.line_integrals(index)
@@ -575,7 +601,10 @@ def _normalised(
     shape = values.shape[1], values.shape[2]
     darks = _several("dark", dark, shape)
     flats = _several("flat", flat, shape)
-    opened = np.zeros(shape) if flats is None else flats.mean(axis=0)
+    if flats is None:
+        opened = np.zeros(shape)
+    else:
+        opened = flats.mean(axis=0)
     return of_intensities(values, 0.0 if darks is None else darks.mean(axis=0), opened)
 
 

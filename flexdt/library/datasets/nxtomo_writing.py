@@ -108,7 +108,9 @@ def _field_of_view(axis_column: float, columns: int) -> str:
     """Return `Full`, or `Half` where the rotation axis is near a side of the panel."""
     left = axis_column + 0.5
     right = columns - 0.5 - axis_column
-    return "Half" if min(left, right) < HALF_SEEN * max(left, right) else "Full"
+    if min(left, right) < HALF_SEEN * max(left, right):
+        return "Half"
+    return "Full"
 
 
 def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any) -> None:
@@ -159,7 +161,10 @@ def _exposure_of(data: ImageSet) -> tuple[float | None, float | None, float | No
     """Return voltage [kV], power [W] and exposure of one image [ms], None where unknown."""
     if data.settings is not None:
         return data.settings.kV, data.settings.power_W, data.settings.exposure_ms
-    exposure = None if data.truth is None else data.truth.exposure
+    if data.truth is None:
+        exposure = None
+    else:
+        exposure = data.truth.exposure
     if exposure is None:
         return None, None, None
     return exposure.kV, exposure.power_W, exposure.exposure_ms

@@ -64,7 +64,10 @@ def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
         for name in (SCAN_SETTINGS, XRE_SETTINGS, SCRIPT):
             if data.folder is not None and (data.folder / name).is_file():
                 out.put(name, (data.folder / name).read_bytes())
-        stated = stated_settings(data) if data.folder is None else None
+        if data.folder is None:
+            stated = stated_settings(data)
+        else:
+            stated = None
         if stated is not None:
             out.put(SCAN_SETTINGS, format_scan_settings(stated).encode())
             out.put(XRE_SETTINGS, format_settings(stated).encode())

@@ -175,7 +175,10 @@ def read_tiffs(
     first = read_values(content.path / chosen[0])
     if isinstance(geometry, str | PathLike):
         geometry = ConeVec.load(geometry, shape=first.shape)
-    cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+    if isinstance(geometry, ConeVec):
+        cone = geometry
+    else:
+        cone = ConeVec(np.asarray(geometry))
     chosen, doubts = in_order(content, chosen, len(cone))
     if first.dtype != np.uint16:
         made = _of_floats(content.path, cone, chosen, darks, flats)
@@ -210,7 +213,10 @@ def _of_floats(
             {"path": bad},
         )
     if flats:
-        dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
+        if darks:
+            dark = np.mean([read_values(folder / n) for n in darks], axis=0)
+        else:
+            dark = 0.0
         flat = np.mean([read_values(folder / n) for n in flats], axis=0)
         images = of_intensities(images, dark, flat)
     return DataSet.from_arrays(images, geometry, name=folder.name)
@@ -231,8 +237,10 @@ def _from_document(
     path = content.path / DOCUMENT
     doc = parse_document(read_text(path), str(path))
     own = machine is None and profile is None
-    machine = doc.machine_of(str(path)) if machine is None else machine
-    profile = doc.profile_of(str(path)) if profile is None else profile
+    if machine is None:
+        machine = doc.machine_of(str(path))
+    if profile is None:
+        profile = doc.profile_of(str(path))
     try:
         found = doc.poses(machine, profile)
         shapes = doc.shapes("projection")
@@ -286,7 +294,9 @@ def _foreign_file(content: Folder) -> Path | None:
         return None
     known = tuple(ending for form in SCAN_FORMATS for ending in form.endings)
     named = [name for name in content.names if name.lower().endswith(known)]
-    return content.path / named[0] if len(named) == 1 else None
+    if len(named) == 1:
+        return content.path / named[0]
+    return None
 
 
 def _other_scan(content: Folder) -> str:
@@ -369,8 +379,14 @@ def _from_texts(
     first = next(iter(content.projections.values()))
     rows, cols = read_image(content.path / first).shape
     shape = (rows, cols)
-    machines = [machine] if machine else [builtin_machine(n) for n in builtin_machines()]
-    profiles = [profile] if profile else [builtin_profile(n) for n in builtin_profiles()]
+    if machine:
+        machines = [machine]
+    else:
+        machines = [builtin_machine(n) for n in builtin_machines()]
+    if profile:
+        profiles = [profile]
+    else:
+        profiles = [builtin_profile(n) for n in builtin_profiles()]
     said_in = str(content.path / SCAN_SETTINGS)
     rebuilt = rebuild(settings, count, shape, machines, profiles, file=said_in)
     names = [content.projection_name(i) for i in range(count)]

@@ -61,7 +61,9 @@ def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> lis
         DatasetFormatError: no scanner has such a geometry.
     """
     found = examine(Operation.OPEN, geometry, shape)
-    return settled(found, DatasetFormatError, str(content.path)) if found else []
+    if found:
+        return settled(found, DatasetFormatError, str(content.path))
+    return []
 
 
 def listed(
@@ -152,9 +154,10 @@ def nothing_in(blank: Sequence[str]) -> str:
     if not blank:
         return ""
     more = f" to {blank[-1]}" if len(blank) > 1 else ""
-    many = (
-        f"{len(blank)} projections, {blank[0]}{more}, are" if more else f"{blank[0]} is"
-    )
+    if more:
+        many = f"{len(blank)} projections, {blank[0]}{more}, are"
+    else:
+        many = f"{blank[0]} is"
     return f"{many} zero everywhere: nothing was recorded"
 
 

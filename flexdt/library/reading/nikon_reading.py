@@ -79,7 +79,10 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     )
     rows = (place @ _axis(*np.deg2rad(tilts)))[None] @ rotation_z(-turn)
     folder = list_folder(path.parent / said.get("InputFolderName", "").replace("\\", "/"))
-    cone = ConeVec(rows.reshape(views, 12)) if geometry is None else geometry
+    if geometry is None:
+        cone = ConeVec(rows.reshape(views, 12))
+    else:
+        cone = geometry
     names, told = _images(folder, len(cone))
     data = listed(folder, cone, names, (), (), said.get("Name", ""))
     if list(data.shape) != size:

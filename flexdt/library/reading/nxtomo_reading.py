@@ -125,7 +125,10 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
 
     file.visititems(look)
     if not found:
-        why = lost[0] if lost else "no group has data and image_key; allowed: NXtomo"
+        if lost:
+            why = lost[0]
+        else:
+            why = "no group has data and image_key; allowed: NXtomo"
         raise DatasetFormatError(f"{path}: {why}", {"path": str(path)})
     entries = list(dict.fromkeys(name.split("/")[0] for name in found))
     told = []
@@ -151,7 +154,10 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
             said, list(data.shape), "(n, rows, cols) and (n,)"
         )
     if len(keys) != len(data):
-        turned = " (sinograms? give them as images)" if len(keys) in data.shape else ""
+        if len(keys) in data.shape:
+            turned = " (sinograms? give them as images)"
+        else:
+            turned = ""
         said = f"{path}: {len(data)} images and {len(keys)} image keys{turned}"
         raise DatasetFormatError.instead(
             said, len(keys), f"one for each of {len(data)} images"
@@ -284,7 +290,9 @@ def _angles(
             if angles is not None and angles.shape == projections.shape:
                 values = np.asarray(angles, dtype=np.float64)[projections]
                 radians = _unit(angles, "deg").startswith("rad")
-                return values if radians else values * (math.pi / 180)
+                if radians:
+                    return values
+                return values * (math.pi / 180)
     return None
 
 
@@ -304,7 +312,9 @@ def _length(file: Any, name: str, *members: str) -> float | None:
 
 def _member(group: Any, name: str) -> Any:
     """Return a member of a group; None if there is no such member or no group."""
-    return group.get(name) if hasattr(group, "get") else None
+    if hasattr(group, "get"):
+        return group.get(name)
+    return None
 
 
 def _stated(
@@ -328,7 +338,10 @@ def _stated(
     near = file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
     for place in (near, *(_member(p, "instrument/detector") for p in places)):
-        size = None if place is None else _member(place, "x_pixel_size")
+        if place is None:
+            size = None
+        else:
+            size = _member(place, "x_pixel_size")
         if size is not None and size.size == 1:
             scale = UNITS_MM.get(_unit(size, "m"))
             if scale is not None:
@@ -339,4 +352,6 @@ def _stated(
 def _unit(dataset: Any, usual: str) -> str:
     """Return the unit that an attribute states, or the usual one."""
     said = dataset.attrs.get("units", usual)
-    return said.decode() if isinstance(said, bytes) else str(said)
+    if isinstance(said, bytes):
+        return said.decode()
+    return str(said)

@@ -94,7 +94,10 @@ class _Streams:
         wanted = count * np.dtype(kind).itemsize
         held = self.ole.get_size(name) if there else 0
         if not wanted <= held <= self.size:
-            said = f"has {held} bytes" if there else "is missing"
+            if there:
+                said = f"has {held} bytes"
+            else:
+                said = "is missing"
             raise DatasetFormatError(
                 f"{name} {said}; allowed: {wanted} to {self.size} bytes{hint}"
             )
@@ -170,7 +173,10 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
     data = DataSet.from_arrays(
         images, cone, dark=dark, flat=flats, name=name, warnings=doubts
     )
-    reason = f"{taken} of {planned} images were taken" if taken < planned else ""
+    if taken < planned:
+        reason = f"{taken} of {planned} images were taken"
+    else:
+        reason = ""
     return replace(data, complete=not reason, reason=reason)
 
 

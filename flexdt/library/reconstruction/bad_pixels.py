@@ -79,4 +79,6 @@ def _bad_pixels(
             yield image
 
     found = bad_pixels(images, axis_column)
-    return BadPixels(found.mask.T) if found is not None and lies else found
+    if found is not None and lies:
+        return BadPixels(found.mask.T)
+    return found

@@ -38,7 +38,9 @@ class MemoryPlan:
     @property
     def disk_bytes(self) -> int:
         """Room on disk for the images."""
-        return 4 * self.kept * self.most_pixels if self.on_disk else 0
+        if self.on_disk:
+            return 4 * self.kept * self.most_pixels
+        return 0
 
 
 def plan_memory(
@@ -75,7 +77,9 @@ def plan_memory(
         )
     left = max(memory - work, layer)
     whole = _plan(grid, again, most_pixels, left)
-    return whole if not whole.prepared else _plan(grid, images, most_pixels, left)
+    if not whole.prepared:
+        return whole
+    return _plan(grid, images, most_pixels, left)
 
 
 def plan_whole(grid: Grid, again: int, most_pixels: int, memory: int) -> MemoryPlan:

@@ -208,7 +208,9 @@ class ScanFrames:
             image = subtracted(image, self.scatter.signal(number))
         if self.rings is not None:
             image = image - self.rings
-        return image if self.harden is None else self.harden(image)
+        if self.harden is None:
+            return image
+        return self.harden(image)
 
     def measured(self, dataset: ImageSet, number: int) -> Float32Array:
         """Read one frame's line integrals, binned, from a data set of the same frames."""
@@ -265,7 +267,10 @@ def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     if request.shape is not None:
         shape = request.shape
         center = (0.0, 0.0, 0.0)
-    chosen = center if request.center_mm is None else request.center_mm
+    if request.center_mm is None:
+        chosen = center
+    else:
+        chosen = request.center_mm
     return Grid(shape, whole.voxel_mm, chosen)
 
 
@@ -302,7 +307,10 @@ class ReconstructionTask:
         panel = self.views.dataset.panel
         if self.request.rings or (panel is not None and panel.lag):
             return count
-        some = 0 if self.request.scatter_correction is None else SCATTER_VIEWS + 1
+        if self.request.scatter_correction is None:
+            some = 0
+        else:
+            some = SCATTER_VIEWS + 1
         if self.direct:
             angles = len(distinct_angles(circle_of(self.views.cone_vec))[0])
             some += (TRUNCATION_VIEWS + BIAS_VIEWS) * -(-count // angles)
@@ -318,7 +326,10 @@ class ReconstructionTask:
         Raises:
             LimitError: too little memory.
         """
-        given = FREE_SHARE * free_memory_bytes() if memory is None else memory
+        if memory is None:
+            given = FREE_SHARE * free_memory_bytes()
+        else:
+            given = memory
         images = len(self.views.indices)
         pixels = math.prod(self.views.shape)
         again = self.again
@@ -382,7 +393,10 @@ def reconstruct_dataset(
     images = {f.file for f in dataset.frames} | {
         p.name for p in (*dataset.darks, *dataset.flats)
     }
-    home = None if dataset.folder is None else dataset.folder.resolve()
+    if dataset.folder is None:
+        home = None
+    else:
+        home = dataset.folder.resolve()
     if out.parent.resolve() == home and out.name in images:
         raise LimitError(f"{out} is an image of the data set itself", {"asked": str(out)})
     begun = time.perf_counter()
@@ -402,17 +416,22 @@ def reconstruct_dataset(
             slices.take(read_volume(out).data)
     accuracy = None
     if task.direct:
-        accuracy = None if bias is None else bias.accuracy(task.grid)
+        if bias is None:
+            accuracy = None
+        else:
+            accuracy = bias.accuracy(task.grid)
         doubts = [*bias_warnings(bias, task.grid), *doubts]
-    pictures = slices.write(out) if task.request.png else []
+    if task.request.png:
+        pictures = slices.write(out)
+    else:
+        pictures = []
     in_force = dataset.correction
-    used = (
-        parameters
-        if parameters is not None
-        else in_force.parameters
-        if in_force
-        else None
-    )
+    if parameters is not None:
+        used = parameters
+    elif in_force:
+        used = in_force.parameters
+    else:
+        used = None
     return {
         "file": str(out),
         "slices": [str(file) for file in pictures],
@@ -534,11 +553,10 @@ def _reading_once(
     views = task.views
     fdk = task.direct
     dataset = task.counts.read_by(views.dataset)
-    work = (
-        Work.of(task.standing, task.grid, plan.slabs, tell)
-        if fdk
-        else Work(1, 1.0, (), _untold)
-    )
+    if fdk:
+        work = Work.of(task.standing, task.grid, plan.slabs, tell)
+    else:
+        work = Work(1, 1.0, (), _untold)
     store = ImagesOnDisk(folder, plan.most_pixels) if plan.on_disk else ImagesInMemory()
     with KeptImages(partial(views.measured, dataset), store, work.read) as kept:
         yield kept, work
@@ -585,7 +603,10 @@ def reconstruct_volume(
             return _iterative(views, grid, task.request, tell)
         bias = _bias(views) if errors else None
         slabs = _fdk_slabs(task, views, kept, plan, work, errors=errors and in_memory)
-        volume = next(slabs) if in_memory else _in_a_file(slabs, grid, folder)
+        if in_memory:
+            volume = next(slabs)
+        else:
+            volume = _in_a_file(slabs, grid, folder)
     doubts = layer_warnings(lost_layers(volume.data), grid.shape[0])
     if errors:
         volume = with_errors(volume, bias=bias)
@@ -617,7 +638,10 @@ def _task(
     Raises:
         TwinError: the request cannot be met.
     """
-    wanted = VolumeRequest() if request is None else request
+    if request is None:
+        wanted = VolumeRequest()
+    else:
+        wanted = request
     name = wanted.algorithm
     if name not in ALGORITHMS:
         raise UnknownNameError.among(
@@ -632,7 +656,10 @@ def _task(
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     counts = CountsOnce(dataset.counts)
     grid = grid_of(views, wanted)
-    operation = Operation.FDK if ALGORITHMS[name].direct else Operation.ITERATE
+    if ALGORITHMS[name].direct:
+        operation = Operation.FDK
+    else:
+        operation = Operation.ITERATE
     half = 0.5 * grid.voxel_mm * np.array(grid.shape[::-1])
     box = np.array([grid.center_mm - half, grid.center_mm + half])
     found = examine(operation, views.cone_vec, views.shape, grid=box)
@@ -708,7 +735,9 @@ def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
 
 
 def _names(given: str | tuple[str, ...] | None) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else given or ()
+    if isinstance(given, str):
+        return (given,)
+    return given or ()
 
 
 def _without_scatter(
@@ -765,7 +794,10 @@ def _source(
 
     if request.tube is not None:
         return request.tube.kV, request.tube.model(), request.tube.mono_keV
-    said = None if dataset.settings is None else dataset.settings.kV
+    if dataset.settings is None:
+        said = None
+    else:
+        said = dataset.settings.kV
     kV = said if request.kV is None else request.kV
     if kV is None:
         raise LimitError(

@@ -75,7 +75,9 @@ def _axis_column(
         tall = shape[1]
     lean_px = tall * np.ptp(columns) / np.ptp(rows)
     middle = float(columns.mean())
-    return middle if np.isfinite(middle) and lean_px <= MOST_LEAN_PX else None
+    if np.isfinite(middle) and lean_px <= MOST_LEAN_PX:
+        return middle
+    return None
 
 
 def _evenly_turned(circle: Circle) -> bool:

@@ -83,8 +83,14 @@ class StandingImages:
             shape = (shape[1], shape[0])
         rises = bool(circle.rise)
         rows, cols = shape
-        wide = round(FINER * cols) if leans(cone_vec) else cols
-        level = cone_vec if is_upright(cone_vec) else upright(cone_vec, wide / cols)
+        if leans(cone_vec):
+            wide = round(FINER * cols)
+        else:
+            wide = cols
+        if is_upright(cone_vec):
+            level = cone_vec
+        else:
+            level = upright(cone_vec, wide / cols)
         if wide != cols and narrow_overlap(circle, level, wide):
             # FDK moves the axis between columns as it stands these up: resampled once, not
             # twice.

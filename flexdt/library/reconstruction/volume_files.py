@@ -48,7 +48,10 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
         OSError: the file cannot be written.
     """
     form = check_name(path)
-    places = VoxelPlaces.of(grid) if isinstance(grid, Grid) else grid
+    if isinstance(grid, Grid):
+        places = VoxelPlaces.of(grid)
+    else:
+        places = grid
     if not (form.oblong or places.cubes):
         allowed = [
             ending for one in VOLUME_FORMATS if one.oblong for ending in one.endings
@@ -97,7 +100,10 @@ def _format(path: Path) -> VolumeFormat:
     by_ending = {ending: form for form in VOLUME_FORMATS for ending in form.endings}
     form = by_ending.get(ending(path))
     if form is None:
-        why = f". {NO_PLACE}" if ending(path) == ".npy" else ""
+        if ending(path) == ".npy":
+            why = f". {NO_PLACE}"
+        else:
+            why = ""
         raise LimitError(
             f"{path}: the ending must be one of {', '.join(by_ending)}{why}",
             {"asked": path.suffix, "allowed": [*by_ending]},

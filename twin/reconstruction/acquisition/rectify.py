@@ -163,7 +163,10 @@ def field_of_view(
     pitch = float(np.linalg.norm(cone_vec.u[0]))
     if voxel_mm is None:
         size = pitch * scale
-        voxel_mm = round(size, 3) if size >= SMALL_MM else float(f"{size:.3g}")
+        if size >= SMALL_MM:
+            voxel_mm = round(size, 3)
+        else:
+            voxel_mm = float(f"{size:.3g}")
     centre = cone_vec.project_points(np.zeros((1, 3)), shape)[:, 0]
     reach = float(
         np.abs(np.concatenate([centre[:, 0] + 0.5, cols - 0.5 - centre[:, 0]])).max()

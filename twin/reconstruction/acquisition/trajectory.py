@@ -138,7 +138,10 @@ def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[n
 
     Neither depends on the order of views, except in which of equal ones is the first.
     """
-    angle = circle.angle.round(9) if circle.rise else _on_circle(circle.angle)
+    if circle.rise:
+        angle = circle.angle.round(9)
+    else:
+        angle = _on_circle(circle.angle)
     _, first, same = np.unique(angle, return_index=True, return_inverse=True)
     return first, same
 
@@ -183,11 +186,9 @@ def _usual(steps: FloatArray) -> float:
     """
     ordered = np.sort(steps)
     covered = np.cumsum(ordered)
-    return (
-        float(ordered[int(np.searchsorted(covered, covered[-1] / 3))])
-        if len(steps)
-        else TURN
-    )
+    if len(steps):
+        return float(ordered[int(np.searchsorted(covered, covered[-1] / 3))])
+    return TURN
 
 
 def _helix(

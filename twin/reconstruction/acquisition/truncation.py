@@ -291,7 +291,10 @@ def truncation_of(
         images = [image.T for image in images]
         shape = (shape[1], shape[0])
         cone_vec = swapped(cone_vec)
-    panels = cone_vec if is_upright(cone_vec) else upright(cone_vec)
+    if is_upright(cone_vec):
+        panels = cone_vec
+    else:
+        panels = upright(cone_vec)
     if panels is not cone_vec:
         images = [
             rectified(image[None], cone_vec[i : i + 1], panels[i : i + 1])[0]
@@ -420,7 +423,9 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
     """
     bend = lines[..., 2:] - 2.0 * lines[..., 1:-1] + lines[..., :-2]
     # Of normal noise, a second difference's median is 1.65 standard deviations.
-    return float(np.median(np.abs(bend))) / 1.65 if bend.size else 0.0
+    if bend.size:
+        return float(np.median(np.abs(bend))) / 1.65
+    return 0.0
 
 
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
