@@ -309,15 +309,7 @@ def simulate(
         made: DataSet = scenario(sample, noise, 3 if rays is None else rays)
         return made
     rays = 1 if rays is None else rays
-    if noise is not None and noise < 0:
-        raise LimitError.instead(f"noise is {noise}", noise, "a seed >= 0, or None")
-    check_rays(rays)
-    allowed = (1, *range(3, MOST_POINTS + 1))
-    if spot_points not in allowed:
-        raise LimitError(
-            f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",
-            {"asked": spot_points, "allowed": [1, 3, MOST_POINTS]},
-        )
+    _check_sampling(noise, rays, spot_points)
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
     scanner = machine_of(machine) if isinstance(machine, str) else machine
@@ -399,6 +391,23 @@ def simulate(
     for doubt in told:
         warnings.warn(doubt, stacklevel=3)
     return replace(made, warnings=(*truth.assumed, *told))
+
+
+def _check_sampling(noise: int | None, rays: int, spot_points: int) -> None:
+    """Check the seed of the noise, the rays per pixel side and the points of the focal spot.
+
+    Raises:
+        LimitError: a value is not allowed.
+    """
+    if noise is not None and noise < 0:
+        raise LimitError.instead(f"noise is {noise}", noise, "a seed >= 0, or None")
+    check_rays(rays)
+    allowed = (1, *range(3, MOST_POINTS + 1))
+    if spot_points not in allowed:
+        raise LimitError(
+            f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",
+            {"asked": spot_points, "allowed": [1, 3, MOST_POINTS]},
+        )
 
 
 def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:

@@ -206,9 +206,7 @@ def scatter_image(
     from flexdt.twin.physics import scatter_kernels as kernels
 
     if settings is None:
-        wanted = ScatterSettings()
-    else:
-        wanted = settings
+        settings = ScatterSettings()
     row = np.asarray(view, dtype=np.float64)
     source = row[0:3]
     centre = row[3:6]
@@ -216,7 +214,7 @@ def scatter_image(
     v = row[9:12]
     rows, cols = shape
     nv, nu = _node_counts(
-        shape, float(np.linalg.norm(v) / np.linalg.norm(u)), wanted.nodes
+        shape, float(np.linalg.norm(v) / np.linalg.norm(u)), settings.nodes
     )
     sections = cross_sections(thing.substances)
     row_of = np.linspace(0, rows - 1, nv)[:, None, None] - (rows - 1) / 2
@@ -229,7 +227,7 @@ def scatter_image(
     per_open = distance**3 / (away @ normal)
     occupied = bool(thing.substances) and thing.amounts.any()
     if occupied:
-        lit = _lit(thing, row, shape, wanted.collimated)
+        lit = _lit(thing, row, shape, settings.collimated)
     else:
         lit = (0.0, 0.0, 0.0, 0.0)
     left, top, right, bottom = lit
@@ -247,7 +245,7 @@ def scatter_image(
     share = beam.signal[bins] / beam.signal.sum()
     chance = _energy_chances(thing, row, sections.total[:, bins], share)
     rng = np.random.Generator(
-        np.random.PCG64(np.random.SeedSequence([wanted.seed, stream]))
+        np.random.PCG64(np.random.SeedSequence([settings.seed, stream]))
     )
     keys = rng.integers(0, 2**64, BATCHES, dtype=np.uint64)
     sequences = [qmc.Sobol(kernels.DIMENSIONS, rng=one) for one in rng.spawn(BATCHES)]
@@ -298,7 +296,7 @@ def scatter_image(
         mean = batches.mean(axis=0)
         error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
         relative = float(error.mean() / max(mean.mean(), 1e-300))
-        if relative <= wanted.error or done >= MAX_HISTORIES:
+        if relative <= settings.error or done >= MAX_HISTORIES:
             break
         each = min(done, MAX_POINTS_PER_STEP)  # Sobol's points are even in powers of two
     whole = images.sum(axis=0) / (done * BATCHES)
