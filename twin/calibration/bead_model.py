@@ -53,6 +53,11 @@ class BeadModel:
     contrast: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        """Check the beads and store them as read-only arrays, one radius a bead.
+
+        Raises:
+            TwinError: `beads` is not (k, 3), finite, k >= 1, or a radius is not positive.
+        """
         beads = np.array(self.beads, dtype=np.float64, ndmin=2, order="C")
         if beads.shape[1:] != (3,) or len(beads) == 0 or not np.isfinite(beads).all():
             shape = np.shape(self.beads)

@@ -37,7 +37,16 @@ def judge_first_sizes(
 
 
 def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
-    """Judge the sizes of the second measurement, or of the first where the second has none."""
+    """Judge in each scan the bead sizes of the second measurement, or of the first where the
+    second has none.
+
+    Args:
+        state: scans, spots, identifications and the second measurements.
+        fit: of the geometry, which predicts the spots' radii.
+
+    Returns:
+        Findings on sizes that do not fit, at most one a scan; empty if all fit.
+    """
     out = []
     for g, scan in enumerate(state.scans):
         radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))

@@ -427,6 +427,20 @@ def _followed(
 def _rounds(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
+    """Refine one hypothesis: assign spots to beads and fit, with ever smaller gates.
+
+    A hypothesis without a finite loss takes its start from a vote. All rounds have the same
+    loss, so that hypotheses can be compared.
+
+    Args:
+        problem: of the fit.
+        shadows: the spots of all frames.
+        h: the hypothesis to refine.
+        gates: largest distances of a spot from its bead, one a round [px].
+
+    Returns:
+        The refined hypothesis; with the parameters of `h` if its loss is not finite.
+    """
     x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
     quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
     # One loss for all rounds, so that hypotheses can be compared: capped at the same distance.
@@ -435,8 +449,15 @@ def _rounds(
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
-    """Compute the mean capped squared distance of the spots to their beads, and the
-    number explained.
+    """Compute the loss of an assignment: mean squared distance of spots to their beads, capped.
+
+    Args:
+        predicted: (n, k, 2) places of the beads [px].
+        shadows: the spots of all frames.
+        cap: distance from which a spot counts as unexplained [px].
+
+    Returns:
+        The loss [px^2] and the number of explained spots.
     """
     index = assign(predicted, shadows.points, shadows.counts, cap)
     frames, beads = np.nonzero(index >= 0)
@@ -511,7 +532,21 @@ def _report(
     start: Offsets,
     how: Search,
 ) -> Identification:
-    """Make the identification of the best hypothesis: tracks, quality and rivals."""
+    """Make the identification of the best hypothesis: tracks, quality and rivals.
+
+    Spots that overlap their neighbours in the prediction get no track.
+
+    Args:
+        problem: of the fit.
+        shadows: the spots of all frames.
+        finals: refined hypotheses, best first.
+        shapes: (n, 2) rows and columns of the frames.
+        start: offsets that the search began with.
+        how: settings of the search.
+
+    Raises:
+        TwinError: there is no hypothesis, or the best one has no finite loss.
+    """
     model, poses = problem.model, problem.poses
     if not finals or not math.isfinite(finals[0].loss):
         raise TwinError(

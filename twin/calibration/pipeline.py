@@ -156,7 +156,18 @@ def _detected(
 
 
 def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
-    """Fit to the detected spots, all six main parameters free if that is identifiable."""
+    """Fit to the detected spots: with all six main parameters free if they are identifiable,
+    else with those asked for.
+
+    Adds the motion of single frames if asked for, and findings on bead sizes.
+
+    Args:
+        state: scans with identified spots.
+        asked: the caller's request.
+
+    Returns:
+        State, the request that was fitted, the fit and its number of iterations.
+    """
     request = with_free(asked, SIX)
     fit = fit_scans(state, request)
     if not fit.identifiable:
@@ -170,7 +181,16 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
 
 
 def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
-    """Measure a second time, fit to that, and judge sizes, body and lag, unless it failed."""
+    """Measure the spots a second time, fit to them, and judge sizes, body and lag.
+
+    Args:
+        fitted: the first fit.
+        solids: bodies of the phantom besides its beads; None if unknown.
+
+    Returns:
+        As `fitted`, with the new fit and findings. If nothing could be measured, only the fit
+        that `measure_again` returned.
+    """
     request = fitted.request
     state, fit, iterations = measure_again(fitted.state, request, fitted.fit, solids)
     if not state.measured:
@@ -185,8 +205,15 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
 
 
 def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
-    """Explain the residuals, check the parameters that were not estimated, and return the
-    outcome.
+    """Explain the residuals, check the parameters that were not estimated, and add both as
+    findings.
+
+    Args:
+        fitted: the last fit.
+        asked: the caller's request, whose fixed parameters are checked.
+
+    Returns:
+        The calibration, its fit relative to the caller's start.
     """
     fit, explained = explain(fitted.state, fitted.request, fitted.fit)
     state = _judged_places(fitted.state, fit, explained)
@@ -204,7 +231,17 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
 def _judged_places(
     state: Calibration, fit: FitResult, explained: Sequence[Finding]
 ) -> Calibration:
-    """Judge the places of the spots, unless the residuals explain them."""
+    """Judge places of spots without a bead, unless another finding explains the residuals.
+
+    Args:
+        state: the calibration.
+        fit: its fit.
+        explained: findings on the residuals.
+
+    Returns:
+        The state with further findings, and without `extra_spots` where a displaced bead
+        explains them.
+    """
     if not any(f.forbids and f.code != "misfit" for f in explained):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.
         state = state.with_findings(*listed(judge_places(fit, state.looks)))

@@ -69,6 +69,13 @@ class CalibrationRequest:
     per_frame: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check names, priors, tolerance and bound; drop repeated names of `per_frame`.
+
+        Raises:
+            TwinError: no parameter is free, one is both free and exactly known, a `per_scan`
+                parameter is not free, or a value is out of its range.
+            UnknownNameError: a name that is no parameter.
+        """
         object.__setattr__(
             self, "per_frame", tuple(dict.fromkeys(require_movable(self.per_frame)))
         )

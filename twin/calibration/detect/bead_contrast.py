@@ -24,8 +24,16 @@ kinds."""
 
 
 def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
-    """Make a detector for the sizes and contrasts the beads' spots can have at a rough
-    geometry."""
+    """Make a spot finder whose limits allow for the beads' sizes and contrasts.
+
+    Args:
+        model: the phantom's beads.
+        poses: rough geometry, which converts radii to pixels.
+
+    Returns:
+        Limits of radius, of likeness (none if the beads are of several kinds) and of the
+        faintest contrast.
+    """
     sizes, contrasts = model.bead_radius_mm, model.contrasts
     dark = contrasts[contrasts > 0]
     faintest = float(dark.min() / dark.max()) if len(dark) else 1.0

@@ -78,7 +78,14 @@ class Detections:
         radii_px: float | FloatArray,
         shape: tuple[int, int],
     ) -> Detections:
-        """Make complete spots at points (k, 2) whose coordinates are known to `noise_px`."""
+        """Make complete spots at known points, all of contrast and likeness 1.
+
+        Args:
+            centers: (k, 2) column and row [px].
+            noise_px: sigma of each coordinate, one or (k,).
+            radii_px: radius of the spots, one or (k,).
+            shape: the image's (rows, cols).
+        """
         k = len(centers)
         one = np.ones(k)
         covariances = np.multiply.outer((noise_px * one) ** 2, np.eye(2))
@@ -267,7 +274,17 @@ def _window(
 
 
 def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArray | None:
-    """Measure a candidate at full resolution; None if it is unlike a ball or too faint."""
+    """Measure a candidate at full resolution, in a larger window if the first one is too small.
+
+    Args:
+        image: (rows, cols) line integrals.
+        spot: rough place and radius [px].
+        how: limits of radius.
+
+    Returns:
+        `spot_kernels.RESULTS` values, places in pixels of the image; None if the spot is unlike
+        a ball, too faint or of another size.
+    """
     x, y, radius = spot
     result = np.zeros(kernels.RESULTS)
     # What is measured may lie beside the spot or be larger; then a larger window is needed.
@@ -299,8 +316,16 @@ def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
 def _largest_group(
     found: list[FloatArray], same: float
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Split spots into the largest group whose contrasts and radii are alike up to a factor,
-    among equals the stronger one, and the others."""
+    """Split spots into the largest group of alike spots and the others; among equal groups the
+    stronger counts.
+
+    Args:
+        found: results of `_measure`.
+        same: largest factor between contrasts, and between radii, of alike spots.
+
+    Returns:
+        The group and the others, each in the order of `found`.
+    """
     peaks = np.array([r[kernels.PEAK] for r in found])
     radii = np.array([r[kernels.RADIUS] for r in found])
     limit = math.log(same)
@@ -385,7 +410,14 @@ def _fitted_cut(
 def _pack(
     whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]
 ) -> Detections:
-    """Sort results, complete spots first and strong ones first, into `Detections`."""
+    """Sort measured spots into `Detections`: complete ones first, among these the strong ones
+    first.
+
+    Args:
+        whole: results of complete spots.
+        cut: results of spots at the image's edge.
+        shape: the image's (rows, cols).
+    """
     rows = np.array([*whole, *cut]).reshape(-1, kernels.RESULTS)
     flags = np.array([True] * len(whole) + [False] * len(cut), dtype=bool)
     order = np.lexsort((-rows[:, kernels.PEAK], ~flags))

@@ -106,7 +106,16 @@ def take(
     fitted: npt.NDArray[np.intp],
     whole: npt.NDArray[np.bool_],
 ) -> npt.NDArray[np.intp]:
-    """Put fits into `results`: all of the partial spots', the good ones of complete spots.
+    """Replace centroids by fits in `results`: for all partial spots, and for complete ones with
+    a good fit.
+
+    Of complete spots only place, covariance and bias are replaced.
+
+    Args:
+        results: (m, `spot_kernels.RESULTS`) centroids, changed in place.
+        fits: (m, `spot_kernels.RESULTS`) fits of the same windows.
+        fitted: indices of the windows that were fitted.
+        whole: (m,) complete spots.
 
     Returns:
         Indices of the used fits, in the order of `fitted`.

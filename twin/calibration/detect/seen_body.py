@@ -184,6 +184,7 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
+    """Return a shape moved by `shift` (x, y, z) [mm]."""
     if isinstance(shape, ConvexPolyhedron):
         offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(
             shift

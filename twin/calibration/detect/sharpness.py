@@ -48,7 +48,13 @@ _Tried = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
-    """Make balls of the beads alone, with the contrast (k,) and the size of their spots."""
+    """Make a scene of the beads alone.
+
+    Args:
+        model: the phantom's beads.
+        contrast: (k,) line integrals through their centres.
+        size: factor on the radii.
+    """
     return Scene(
         tuple(
             Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
@@ -134,10 +140,19 @@ def _as_rendered(
     cone: ConeVec,
     model: BeadModel,
 ) -> tuple[Sharp, float]:
-    """Estimate sharpness from beads that are rendered with a blur, a size and a contrast.
+    """Estimate sharpness from beads that are rendered with a known blur, size and contrast, to
+    check the method.
+
+    Args:
+        true: estimate for the images, with which the beads are rendered.
+        patches: windows of the images.
+        sample: indices of the windows to render.
+        cone: geometry of the frames.
+        model: the phantom's beads.
 
     Returns:
-        The estimate, and the rendered contrast over that of the images.
+        The estimate from the rendered windows (`seen` is False if none could be measured), and
+        the rendered contrast over that of the images.
     """
     k = patches.windows.corner.shape[1]
     frames, beads = np.divmod(sample, k)
@@ -180,7 +195,16 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     masks, blurs = usable(patches, sample), np.array(BLURS)
 
     def tried(veil: float, blurs: FloatArray) -> _Tried:
-        """Blurs from the least on, until one leaves much more than the one before."""
+        """Fit the windows with each blur, from the least on, until one leaves much more than
+        the one before.
+
+        Args:
+            veil: part of the light about a bead that it does not take away.
+            blurs: increasing blurs [px].
+
+        Returns:
+            `blurs`; the median misfits, inf where not tried; and fitted over predicted radii.
+        """
         misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
         for i, trial in enumerate(blurs.tolist()):
             results = fits(patches, sample, (trial, veil), True, masks)

@@ -90,7 +90,8 @@ def raised(value, power):  # type: ignore[no-untyped-def]
 
 @linked
 def median(values, n):  # type: ignore[no-untyped-def]
-    """Compute the median of the first n > 0 values, which are reordered (Hoare's quickselect).
+    """Compute the median of `values[:n]`, n > 0, reordering `values` in place (Hoare's
+    quickselect).
 
     numba's own takes three times as long to compile.
     """

@@ -104,11 +104,21 @@ def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Win
 def shadow_ellipses(
     model: BeadModel, cone: ConeVec, predicted: FloatArray, shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute minor semi-axes (n, k) [px] and (n, k, 3) direction and ratio of the major ones.
+    """Compute the ellipses that the beads cast on the detector.
 
     A ball's spot is the section of its tangent cone (half-angle beta, axis at theta from the
     detector's normal): semi-axes f sin b / sqrt(cos^2 t - sin^2 b) and, towards the foot point,
     cos b / sqrt(cos^2 t - sin^2 b) times that.
+
+    Args:
+        model: k beads.
+        cone: geometry of n frames.
+        predicted: (n, k, 2) centres of the spots [px].
+        shape: (rows, cols) of the detector.
+
+    Returns:
+        Minor semi-axes (n, k) [px]; direction of the major ones and major over minor axis, (n,
+        k, 3).
     """
     ray = model.beads[None] - cone.source[:, None]
     distance = np.linalg.norm(ray, axis=2)
@@ -224,6 +234,9 @@ def without_beads(scene: Scene, model: BeadModel) -> Scene:
 
 
 def _is_bead(solid: Solid, model: BeadModel) -> bool:
+    """Check whether a solid of the scene is one of the phantom's beads: a sphere within half a
+    radius of its place.
+    """
     if not isinstance(solid.shape, Sphere):
         return False
     gap = np.linalg.norm(model.beads - np.asarray(solid.shape.center), axis=1)
@@ -282,7 +295,17 @@ def lattice(fine: int) -> list[tuple[float, float]]:
 def _window_rays(
     scene: Scene, cone: ConeVec, windows: Windows, place: tuple[float, float]
 ) -> Float32Array:
-    """Render line integrals (n, k, side, side) for rays at a place in their pixels."""
+    """Render line integrals of windows, for rays through one place in each pixel.
+
+    Args:
+        scene: to render.
+        cone: geometry of n frames.
+        windows: k windows a frame.
+        place: right and down from the pixel's centre [px].
+
+    Returns:
+        (n, k, side, side) line integrals.
+    """
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
@@ -379,8 +402,17 @@ def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bo
 
 
 def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
-    """Estimate the noise of each window's pixels from neighbours in a few rows at its top
-    and bottom, (m,).
+    """Estimate the noise of each window's pixels from neighbours in six rows at its top and
+    bottom.
+
+    Args:
+        flat: (m, side, side) line integrals, nan outside the image.
+        edge: first used row and column.
+        width: number of used rows and columns.
+
+    Returns:
+        (m,) standard deviations, at least `LEAST_NOISE`; for windows with nan the others'
+        median.
     """
     rows = [
         edge,

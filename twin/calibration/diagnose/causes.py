@@ -150,6 +150,14 @@ class Candidates:
     """The table of a fit: its geometry's columns, and those of every cause."""
 
     def __init__(self, fit: FitResult, known: Known, borders: Sequence[Border]) -> None:
+        """Tabulate the residuals' derivatives with respect to all causes, residuals of bad
+        spots weighted less.
+
+        Args:
+            fit: of the geometry.
+            known: statements on the phantom and the positions.
+            borders: panel borders that are causes, too.
+        """
         problem, x = fit.problem, fit.solution.x
         self.fit, self.known, self.borders = fit, known, tuple(borders)
         self.count = problem.layout.parameter_count
@@ -178,6 +186,9 @@ class Candidates:
         self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
 
     def _moving(self) -> list[str]:
+        """List the free parameters whose motion can be a cause; empty for several scans or few
+        frames.
+        """
         sizes = np.bincount(self.fit.problem.group)
         if len(sizes) != 1 or sizes[0] < MIN_MOVING_FRAMES:
             return []
@@ -199,8 +210,13 @@ class Candidates:
             yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
 
     def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
-        """List the causes of the table: shape, beads, arc, panel, borders, motion and
-        priors.
+        """List the causes of the table: shape, beads, arc, panel, borders, motion and priors.
+
+        Args:
+            everything: problem with a column for each cause.
+
+        Returns:
+            Causes with their columns, the widths to try, and a width that always holds.
         """
         layout, known = everything.layout, self.known
         out = []
@@ -299,6 +315,9 @@ class Candidates:
         return max((self._climbed(start) for start in starts), key=self.evidence)
 
     def _climbed(self, choice: Choice) -> Choice:
+        """Climb from a choice, one cause after the other, until no other width has more
+        evidence.
+        """
         while True:
             before = choice
             for i, cause in enumerate(self.causes):
@@ -319,11 +338,14 @@ class Candidates:
         return out
 
     def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
-        """Compute the covariance of the geometry's columns over all choices about one,
-        and that of the choice itself.
+        """Compute the covariance of the geometry's columns over all judged choices near one,
+        and for that choice alone.
 
-        Choices with wider priors are left out: statements on the scanner are believed
-        where the images do not contradict them.
+        Choices with wider priors are left out: statements on the scanner are believed where the
+        images do not contradict them.
+
+        Returns:
+            Both (columns, columns), the averaged one first.
         """
         at = self.judged(choice)
         assert at is not None
@@ -415,6 +437,10 @@ def explained_by_causes(
         fit: of the geometry, the phantom's strain with its prior.
         known: statements on the phantom and the positions.
         refit: fits again with `strain`, `arc`, `bead_tolerance_mm` and `panel`.
+
+    Returns:
+        The new fit and the causes that were found. `fit` itself if a fit with causes is not
+        identifiable, or if the object moves and the causes explain little.
     """
     first = fit
     borders: tuple[Border, ...] = ()

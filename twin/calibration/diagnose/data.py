@@ -110,7 +110,11 @@ def judge_frames(
 
 
 def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
-    """Make a finding if beads are found once the images are taken for intensities."""
+    """Search for spots as if the images held intensities instead of line integrals.
+
+    Returns:
+        A sentence for the finding, with a leading blank; empty if few frames show spots then.
+    """
     looks = scan.frames.look(replace(sought, intensities=True))
     shown = sum(len(look.detections) > 0 for look in looks)
     if shown < SHOWN_AT_LEAST * len(looks):
@@ -287,6 +291,9 @@ def _plausible(found: Identification) -> bool:
 
 
 def _convincing(found: Identification) -> bool:
+    """Check whether an identification explains and finds most spots, closely enough to be
+    believed.
+    """
     return (
         found.explained >= GOOD_SHARE
         and found.found >= GOOD_SHARE
@@ -296,6 +303,7 @@ def _convincing(found: Identification) -> bool:
 
 
 def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
+    """Mirror the spots of all frames in columns (`axis` 0) or in rows (1)."""
     out = []
     for d in detections:
         centers = d.centers.copy()
@@ -432,6 +440,7 @@ def _in_motion(
     still = replace(NOMINAL, **{name: getattr(found.parameters, name) for name in SIX})
 
     def fitted(motion: MotionFit | None = None) -> FitResult:
+        """Fit all parameters, frames displaced by `motion`; without it at the stated poses."""
         moved = here if motion is None else motion.motions[0].applied(here)
         return estimate_geometry(
             found.tracks,

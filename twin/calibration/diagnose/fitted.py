@@ -196,6 +196,7 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
 
 
 def _other_size(ratio: float) -> Finding:
+    """Make the error on bead sizes; `ratio` is measured over predicted size."""
     return error(
         "bead_size",
         f"the shadows are {100 * abs(ratio - 1):.0f} % "
@@ -297,7 +298,9 @@ def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
-    """List drifts and jumps, strongest of each parameter."""
+    """List warnings: the strongest drift or jump, and errors that beads of a frame or turns of
+    a bead share.
+    """
     certificate, out = fit.certificate, []
     for drift in certificate.drifts[:1]:
         estimate = certificate.estimates.get(drift.column)
@@ -366,7 +369,16 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
 
 
 def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
-    """Judge whether a factor on the angles explains the residuals; None if not."""
+    """Fit a factor on the angles, and judge whether it explains the residuals.
+
+    Args:
+        fit: without the factor.
+        refit: fits again with further parameters, `extra`.
+
+    Returns:
+        An error that names the factor, as an endpoint error if it fits n / (n - 1); None if the
+        factor is estimated already or explains nothing.
+    """
     if "angle_scale" in fit.certificate.estimates:
         return None
     better = refit(extra=("angle_scale",))
@@ -441,7 +453,16 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
 
 
 def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
-    """Return code and words for an object that turns too far in a scan with `angles` [rad]."""
+    """Name the likely cause where an object turns too far: lost frames if by whole steps, else
+    a slip.
+
+    Args:
+        turn_deg: the turn beyond the stated one.
+        angles: stated angles of the frames [rad].
+
+    Returns:
+        Code of the finding, `frame_numbers` or `angle_step`, and its words.
+    """
     step = abs(math.degrees(float(np.median(np.diff(angles)))))
     whole = round(turn_deg / step) if step else 0
     if whole and abs(turn_deg - whole * step) < 0.05 * step:
@@ -456,7 +477,14 @@ def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
 
 
 def _shape(curve: FloatArray) -> tuple[str, int | None]:
-    """Describe how a parameter moves, and return the frame before a jump, or None."""
+    """Describe how a parameter moves over the frames.
+
+    Args:
+        curve: (n,) values of the frames.
+
+    Returns:
+        Words for the finding, and the frame before a jump; None unless it jumps.
+    """
     steps = np.abs(np.diff(curve))
     jump = int(np.argmax(steps))
     sides = [side for side in (curve[: jump + 1], curve[jump + 1 :]) if len(side)]

@@ -107,6 +107,7 @@ class FrameNumbers:
 
 
 def _change(frame: int, steps: int) -> str:
+    """Describe lost frames (`steps` > 0) or repeated ones (< 0) at a frame, for the finding."""
     if steps < 0:
         times = "" if steps == -1 else f" {-steps} times"
         return (

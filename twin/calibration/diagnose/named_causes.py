@@ -77,8 +77,15 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
 
 
 def _strained(found: Found) -> Finding | None:
-    """Make the finding on the phantom's strain other than its scale, which images do not
+    """Make the warning on the phantom's shape, apart from its scale, which images do not
     determine.
+
+    Args:
+        found: the causes, with mean and covariance of the strain.
+
+    Returns:
+        The warning, with the causes that look alike; None if no part of the strain is
+        significant.
     """
     if found.strain is None:
         return None

@@ -307,6 +307,9 @@ class Certificate:
         return self._rms(1)
 
     def _rms(self, axis: int) -> FloatArray:
+        """Compute the rms of the used residuals, over frames (`axis` 0, one a bead) or beads
+        (1) [px].
+        """
         square = np.where(self.used[:, :, None], self.residuals_px, 0.0) ** 2
         count = 2 * self.used.sum(axis=axis)
         with np.errstate(invalid="ignore", divide="ignore"):

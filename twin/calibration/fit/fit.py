@@ -196,6 +196,13 @@ def _levenberg(
     threshold follows the residuals: `how.huber` times their robust spread. Stops when a step is
     predicted to change the residuals' rms by less than the tolerance plus a millionth of it.
 
+    Args:
+        p: the problem.
+        x: (columns,) values to start from.
+        use: (frames, beads) spots that count.
+        how: settings of the solver.
+        prior_noise: noise of the spots, which scales the priors' weight [px].
+
     Returns:
         (values, iterations, Huber threshold, converged).
     """

@@ -69,7 +69,9 @@ def _unit(a):  # type: ignore[no-untyped-def]
 
 @linked
 def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
-    """Turn `vector` about the direction `axis` by `angle` (Rodrigues)."""
+    """Turn `vector` (x, y, z) about the direction `axis` by `angle` [rad] (Rodrigues); a tuple
+    of three.
+    """
     c, s = _wave(angle)
     k = _unit(axis)
     t = (1.0 - c) * _dot(k, vector)

@@ -344,8 +344,14 @@ class _Mixed:
         return out
 
     def _diagonals(self, i: int, pick: tuple[float, float]) -> FloatArray:
-        """Compute the three lower diagonals (3, n) of the prior precision of a
-        parameter's deviations.
+        """Compute the prior precision of a parameter's deviations, a banded matrix.
+
+        Args:
+            i: number of the parameter.
+            pick: width and smoothness of its motion.
+
+        Returns:
+            (3, n) the main diagonal and the two below it, for n frames.
         """
         parts = []
         for size, variance in zip(self.sizes, self.spectrum(i, pick), strict=True):
@@ -359,7 +365,15 @@ class _Mixed:
         return np.concatenate(parts, axis=1)
 
     def _factor(self, moving: Sequence[int], choice: _Choice) -> FloatArray:
-        """Factorise the deviations' normal equations, frame by frame (banded Cholesky)."""
+        """Factorise the deviations' normal equations, frame by frame (banded Cholesky).
+
+        Args:
+            moving: numbers of the p moving parameters.
+            choice: width and smoothness of each parameter.
+
+        Returns:
+            (2 p + 1, n p) lower Cholesky factor as `scipy.linalg.cho_solve_banded` takes it.
+        """
         n, p = len(self.pull), len(moving)
         band = np.zeros((2 * p + 1, n, p))
         for a, i in enumerate(moving):
@@ -375,7 +389,15 @@ class _Mixed:
         )
 
     def _eliminated(self, choice: _Choice) -> _Eliminated:
-        """Eliminate the deviations of a choice from the normal equations."""
+        """Eliminate the deviations of a choice from the normal equations (Schur complement).
+
+        Args:
+            choice: width and smoothness of each parameter; None for one that does not move.
+
+        Returns:
+            The reduced equations, and the factors with which deviations follow from their
+            solution.
+        """
         moving = [i for i, pick in enumerate(choice) if pick is not None]
         if not moving:
             empty = np.zeros((0, len(self.scale)))
@@ -512,13 +534,18 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
     known: dict[_Choice, float] = {}
 
     def likelihood(i: int, pick: tuple[float, float] | None) -> float:
+        """Compute the log likelihood with parameter `i` at `pick` and the others as chosen;
+        cached.
+        """
         whole = (*choice[:i], pick, *choice[i + 1 :])
         if whole not in known:
             known[whole] = model.likelihood(whole)
         return known[whole]
 
     def climbed(i: int, at: tuple[int, int]) -> tuple[int, int]:
-        """Find the best place of the grid that is reached uphill."""
+        """Find the best place (width, smoothness) of the grid for parameter `i` that is reached
+        uphill from `at`.
+        """
         while True:
             around = [
                 (w, t)

@@ -151,6 +151,16 @@ def identifiability(
     def predict(
         beads: BeadModel, plan: Poses, sizes: FloatArray
     ) -> tuple[Forecast, npt.NDArray[np.bool_]]:
+        """Predict what a fit to a planned scan would determine.
+
+        Args:
+            beads: the phantom's k beads.
+            plan: poses of n frames.
+            sizes: (n, 2) rows and columns of the frames.
+
+        Returns:
+            The forecast, and the visible beads (n, k).
+        """
         visible = visible_beads(beads, plan, sizes, at)
         pixels = plan.cone_vec(at).project_points(beads.beads, (1, 1))
         origin = (sizes[:, ::-1] - 1) / 2

@@ -422,6 +422,15 @@ class FitProblem:
     def _evaluate(
         self, x: FloatArray, use: npt.NDArray[np.bool_], want: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Evaluate the problem at `x`, `use` telling the spots that count; see `evaluate` for
+        `want`.
+
+        Returns:
+            Predictions, norms of the whitened residuals, and the Jacobian.
+
+        Raises:
+            TwinError: a bead is at or behind the source.
+        """
         cost, predicted, norms, jac, _, _ = self.evaluate(x, use, want)
         if not np.isfinite(cost):
             raise TwinError("a bead lies at or behind the source in this geometry")
@@ -513,7 +522,28 @@ def build_problem(
     strain: Strain = UNSTRAINED,
     arc: bool = False,
 ) -> FitProblem:
-    """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
+    """Check the arguments of a fit and put them into arrays.
+
+    Args:
+        tracks: (n, k, 2) measured column and row of each bead [px], nan where not seen.
+        model: k beads [mm].
+        geometry: n stated poses.
+        free: names of the parameters to estimate.
+        shape: (rows, cols), of all frames or of each.
+        covariances: (n, k, 2, 2) of the tracks [px^2]; `noise_px` without.
+        noise_px: sigma of the tracks.
+        groups: (n,) labels of the scans; frames of a label share their parameters.
+        per_group: names of free parameters with a value in each scan.
+        free_beads: the beads' positions are estimated, too.
+        start: offsets to start from, of all scans or of each.
+        reading: definition of the offsets of the axis.
+        centre: correction of the spots' centres, or (n, k, 2) [px].
+        bead_tolerance_mm: sigma of the stated bead positions.
+        priors: sigma of each offset; see `fit_geometry`.
+        prior_centre: means of the priors; `start` without.
+        panel: distortion of the panel to estimate.
+        strain: distortion of the phantom to estimate, with its prior.
+        arc: the arc that the object turns during an exposure is estimated, too.
 
     Raises:
         TwinError: shapes do not fit together, or no position was measured.

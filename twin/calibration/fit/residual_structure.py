@@ -93,7 +93,11 @@ class Residuals:
 def drifts(left: Residuals) -> tuple[Drift, ...]:
     """Find drifts and jumps of single parameters in the residuals, strongest first.
 
-    If none is certain, the possible ones are returned.
+    Args:
+        left: residuals with their derivatives, covariance and noise.
+
+    Returns:
+        The certain ones; if none is certain, the possible ones.
     """
     problem, jacobian, residual, frame = (
         left.problem,
@@ -364,6 +368,9 @@ def correlation_length(
     power /= count
 
     def rho(lag: int) -> tuple[float, int]:
+        """Compute the correlation of residuals `lag` frames apart in the same scan, and the
+        number of values it is from.
+        """
         together = use[:-lag] & use[lag:] & (group[:-lag] == group[lag:])[:, None]
         pairs = 2 * int(together.sum())
         if pairs == 0:

@@ -53,6 +53,9 @@ def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
 
     @wraps(find)
     def found(*args: P.args, **options: P.kwargs) -> Alignment:
+        """Call `find`; where it raises NotIdentifiableError, return an alignment that refuses
+        every parameter for that reason.
+        """
         try:
             return find(*args, **options)
         except NotIdentifiableError as error:
@@ -130,8 +133,14 @@ def align_turn(
 def _plane_parameters(
     plane: SymmetryPlane,
 ) -> tuple[dict[str, AlignEstimate], dict[str, str]]:
-    """Return the parameters that the plane of symmetry determines, and name -> reason for
-    the others.
+    """Split the parameters into those that the plane of symmetry determines and the others.
+
+    Args:
+        plane: of symmetry, found in the images.
+
+    Returns:
+        Estimates by name: `axis_column_px` always, roll and yaw [deg] where the images
+        determine them; and name -> reason for the others.
     """
     column = plane.scan.column(plane.values)
     parameters = {"axis_column_px": AlignEstimate(column, plane.column_sigma_px, "px")}
@@ -174,12 +183,15 @@ def _motion(
 
 
 def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]:
-    """List doubts about the scan.
+    """List doubts about the scan: gap of the panel, repeated and missing frames, a jump.
 
     Args:
         plane: of symmetry.
         turn: its frames.
         missing: number of missing frames.
+
+    Returns:
+        Sentences; empty without doubts.
     """
     out = []
     if plane.opposite is not None and plane.opposite.warning is not None:

@@ -192,7 +192,14 @@ class Profile:
         return values, np.asarray(inverse, dtype=np.float64), rest
 
     def _steps(self, sigma: FloatArray) -> tuple[list[Step], FloatArray]:
-        """Return the steps at all radii, and their residuals in sigmas, (r, m)."""
+        """Estimate the step at each radius.
+
+        Args:
+            sigma: (m,) standard deviations of the values; inf for one that does not count.
+
+        Returns:
+            The steps (r of them), and the fits' residuals in sigmas, (r, m).
+        """
         values, inverse, rest = self._fit(sigma)
         count, dropped = len(sigma), int(np.isinf(sigma).sum())
         chances = 2.0 * count * math.comb(count, dropped)
@@ -282,6 +289,14 @@ class ConjugateRays:
     def __init__(
         self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float
     ) -> None:
+        """Smooth the images along their rows and prepare them for interpolation.
+
+        Args:
+            scan: a full turn.
+            band: (views, groups, cols) means of groups of rows.
+            rows: (groups,) the groups' middle rows [px].
+            step: angle between views [rad].
+        """
         self.scan, self.band, self.rows, self.step = scan, band, rows, step
         self.views, self.cols = len(band), band.shape[2]
         self.smoothing = max(
@@ -412,12 +427,15 @@ class ConjugateRays:
     def _both(
         self, group: int, values: FloatArray, columns: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Read rays to columns of a group of rows from both ends in all views, (n, k) each.
+        """Read rays to columns of a group of rows from both ends in all n views.
 
         Args:
-            group: of rows.
+            group: number of the group of rows.
             values: parameters in the order of `circular_scan.FREE`.
             columns: (k,) [px].
+
+        Returns:
+            Values read forwards and from the opposite side, (n, k) each.
         """
         view = self.scan.view(values)
         middle = (np.array(self.scan.shape[::-1]) - 1) / 2

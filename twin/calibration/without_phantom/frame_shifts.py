@@ -82,6 +82,13 @@ class _System:
     """Equations for changes of shifts, at given ones."""
 
     def __init__(self, pairs: PlanePairs, at: FloatArray, shifts: FloatArray) -> None:
+        """Set up the normal equations of shifts of all frames.
+
+        Args:
+            pairs: of views.
+            at: parameters of the geometry.
+            shifts: (frames, 2) right and down, about which the equations are linear [px].
+        """
         self.pairs, self.at = pairs, at
         self.views = pairs.rows(at).copy()
         u, v = self.views[:, 6:9], self.views[:, 9:12]

@@ -122,7 +122,17 @@ def _closed(
 
 
 def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
-    """Correct the width of a gap by the step that is left when it is closed."""
+    """Correct the width of a gap by the step that is left when it is closed, in `ROUNDS`
+    rounds.
+
+    Args:
+        rays: seen from both ends.
+        values: parameters of the geometry.
+        gap: first estimate.
+
+    Returns:
+        The gap with width and sigma [px] of the last round that could be read.
+    """
     for _ in range(ROUNDS):
         closed, again = _closed(rays, values, gap.column, gap.width)
         beside = gap.column - 0.5 - rays.scan.column(again, rays.row)

@@ -110,8 +110,15 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
 
 
 def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
-    """Find the least cost, and the ratio to it of the next dip that is `apart`; 0 for a
-    minimum at an end.
+    """Find the least cost, and how much higher the next minimum is.
+
+    Args:
+        cost: (n,) costs of equally spaced trials.
+        apart: least distance between two minima, in trials.
+
+    Returns:
+        Index of the least cost, and the next minimum's cost over it: inf without another, 0 if
+        the least cost is at an end.
     """
     best, inner = int(cost.argmin()), cost[1:-1]
     dips = (
@@ -175,6 +182,18 @@ class _Level:
         border: int | None,
         held_px: float | None,
     ) -> None:
+        """Smooth the mean image by `sigma` and choose the places that are compared.
+
+        Args:
+            turn: mean image with its doubts and noise.
+            view: of parameters.
+            scales: (p,) steps of the parameters.
+            mean: (p,) means of the priors.
+            priors: (p,) standard deviations.
+            sigma: smoothing [px].
+            border: column of a gap in the panel; None without.
+            held_px: width of that gap if it is fixed.
+        """
         self.view, self.scales, self.sigma, self.border = view, scales, sigma, border
         self.held_px = held_px
         self.start, self.priors = mean, priors
@@ -291,6 +310,13 @@ class _MirrorPairs:
     """Pixels and their mirror images, with slopes and weights taken at `here`."""
 
     def __init__(self, level: _Level, here: FloatArray, at: FloatArray) -> None:
+        """Mirror places and read both ends, their weights and slopes.
+
+        Args:
+            level: smoothed images.
+            here: (p,) parameters of the geometry.
+            at: (2, m) column and row of the places [px].
+        """
         self.level, self.here, self.at = level, here, at
         image = self.image = level._mirrored(here, at)
         variance = sum(
@@ -457,8 +483,15 @@ def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
 
 
 def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
-    """Measure edges along the rows at a quarter of the sampling's frequency, (rows,
-    cols), and the ratio of half of it to that.
+    """Measure edges along the rows at a quarter of the sampling's frequency.
+
+    Args:
+        mean: (rows, cols) mean image.
+        noise: its variance; weaker edges count as 0.
+
+    Returns:
+        Edges (rows, cols), and the strength at half the sampling's frequency over that at a
+        quarter, at most 1.
     """
     change = np.diff(mean, axis=0, append=mean[-1:])
 

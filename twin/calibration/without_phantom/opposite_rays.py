@@ -82,6 +82,21 @@ class OppositeRays:
         priors: FloatArray,
         random: np.random.Generator,
     ) -> None:
+        """List the pairs of views that see a line from both ends.
+
+        Args:
+            frames: (n, rows, cols) line integrals of a band of rows.
+            top: first row of the band.
+            shape: (rows, cols) of the whole images.
+            views: cone_vec rows (n, 12) of parameters.
+            start: (p,) parameters to start from.
+            scales: (p,) their steps.
+            priors: (p,) their standard deviations.
+            random: for images of noise.
+
+        Raises:
+            NotIdentifiableError: too few pairs; the message says which turn would do.
+        """
         self.frames, self.top, self.shape, self.views = frames, top, shape, views
         self.start, self.scales, self.known = (
             start,
@@ -177,7 +192,16 @@ class _Level:
     def read(
         self, image: FloatArray, places: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> FloatArray:
-        """Read the values of both views of pairs, (2, q, lifts)."""
+        """Read the values of both views of pairs.
+
+        Args:
+            image: spline coefficients of all views, one above the other.
+            places: (2, q, 2) column and row in each view [px].
+            pairs: (q, 2) numbers of the views.
+
+        Returns:
+            (2, q, lifts) line integrals, `lifts` rows higher or lower.
+        """
         rows = self.rays.frames.shape[1]
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
         row = (

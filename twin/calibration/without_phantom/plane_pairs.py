@@ -72,6 +72,19 @@ class PlanePairs:
         views: Views,
         start: FloatArray,
     ) -> None:
+        """List pairs of views whose sources' connection is clear of the object, and the planes
+        through it.
+
+        Args:
+            frames: (n, rows, cols) line integrals, binned.
+            mean: image over the turn, not binned.
+            factor: of the binning.
+            views: geometry of parameters.
+            start: (p,) parameters to start from.
+
+        Raises:
+            NotIdentifiableError: the object reaches so far that too few pairs are clear of it.
+        """
         self.shape, self.factor, self.views, self.start = mean.shape, factor, views, start
         n, rows, cols = frames.shape
         self.sums = np.zeros((n, cols, rows + 1), dtype=np.float32)
@@ -269,10 +282,18 @@ def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Arra
 
 
 def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray:
-    """Estimate standard deviations of sums over pairs (q, 2) of n frames of parts (..., q).
+    """Estimate standard deviations of sums over pairs of frames.
 
     Pairs that share a frame, or one of a sector, are not independent: of squares of the sums
     over all that do, those that count pairs twice are taken away. The largest of three counts.
+
+    Args:
+        parts: (..., q) terms of the sums.
+        pairs: (q, 2) frames of each term.
+        n: number of frames.
+
+    Returns:
+        (...) standard deviations.
     """
     own = parts - parts.mean(axis=-1, keepdims=True)
     worst = np.square(own).sum(axis=-1)
@@ -301,8 +322,15 @@ def without(
 
 
 def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]:
-    """Return the first column of each view that the object can reach and the one after
-    the last, (n, 2).
+    """Determine the columns that the object can reach in each view.
+
+    Args:
+        here: (n, 12) cone_vec rows.
+        cols: number of columns.
+        radius: of the object about the axis [mm].
+
+    Returns:
+        (n, 2) first column, and the one after the last.
     """
     i = np.arange(cols) - (cols - 1) / 2
     x, y = (

@@ -171,7 +171,18 @@ def _first(
 
 
 def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
-    """Evaluate slope, curvature and sigma of all levels' costs about a height."""
+    """Evaluate slope, curvature and sigma of all levels' costs about a height.
+
+    Args:
+        pairs: of views.
+        at: height [px].
+        h: step of the differences [px].
+        up: (p,) the parameters' change by a pixel of height.
+
+    Returns:
+        The heights of least cost and their sigmas [px], inf where a level has no minimum, and
+        the curvatures.
+    """
     low, mid, high = (pairs.costs(pairs.start + (at + s * h) * up) for s in (-1, 0, 1))
     scale = pairs.scales(mid)
     slopes, bends = (high - low) * scale / (2 * h), (high + low - 2 * mid) * scale / h**2

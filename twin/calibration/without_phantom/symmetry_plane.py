@@ -191,7 +191,11 @@ def find_plane(
 
 
 def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColumn:
-    """Search for the axis in the mean over a full turn, or else in opposite rays."""
+    """Search for the axis in the mean over a full turn, or else in opposite rays.
+
+    Raises:
+        NotIdentifiableError: neither determines it; the message has both reasons.
+    """
     try:
         angle = scan.base.angle_scale * scan.poses.angle
         turn = read_turn(scan.image, angle, scan.present, source_row=scan.source_row())
@@ -206,6 +210,7 @@ def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColum
 
 
 def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
+    """Search for the axis' column in the mean image of a turn, and set the start to it."""
     nominal = scan.column(scan.start)
     values, scales = scan.start[:OF_TURN], scan.scales[:OF_TURN]
     column, ratio = first_column(turn.mean, nominal)
@@ -217,7 +222,13 @@ def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
 def _first_in_rays(
     scan: CircularScan, no_turn: str, random: np.random.Generator
 ) -> FirstColumn:
-    """Search for the axis in opposite rays; `no_turn` begins the messages of errors."""
+    """Search for the axis in opposite rays.
+
+    Args:
+        scan: to align.
+        no_turn: why there is no turn; the messages of errors begin with it.
+        random: for images of noise.
+    """
     scales, given = scan.scales, scan.priors
     scales[1] = 2 / scan.shape[1]
     priors = np.array(
@@ -294,7 +305,13 @@ def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
 
 
 def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
-    """Fit all parameters of the plane."""
+    """Fit all parameters of the plane, in the mean over the turn or else in opposite rays.
+
+    Args:
+        scan: to align.
+        first: first estimate of the axis.
+        gap: of the panel, closed in the fit; None without.
+    """
     if first.turn is None:
         assert first.rays is not None
         return first.rays.find(first.values)

@@ -178,8 +178,16 @@ def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
 
 
 def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
-    """Check that angles cover a turn; return the gaps after each sorted angle, and the
-    usual one [rad].
+    """Check that angles cover a full turn.
+
+    Args:
+        angle: (n,) of the frames [rad].
+
+    Returns:
+        The gaps after each sorted angle (n,), and the usual one [rad].
+
+    Raises:
+        NotIdentifiableError: too few directions, or a wide gap.
     """
     around = angle % (2 * np.pi)
     gaps = np.diff(around, append=around[:1] + 2 * np.pi)

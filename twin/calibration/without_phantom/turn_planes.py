@@ -59,6 +59,17 @@ class TurnPlanes:
         covariance: FloatArray,
         priors: Mapping[str, float],
     ) -> None:
+        """Sort the frames of a turn by angle; images are read later.
+
+        Args:
+            image: reads the line integrals of a frame.
+            poses: of all frames.
+            turn: the used frames and their mean.
+            offsets: of parameters.
+            values: (p,) parameters found in the plane of symmetry.
+            covariance: (p, p) of them.
+            priors: standard deviation of each offset.
+        """
         self.image, self.poses, self.turn, self.offsets = image, poses, turn, offsets
         self.values, self.priors = values, priors
         self.doubts = np.linalg.cholesky(covariance)
@@ -83,7 +94,10 @@ class TurnPlanes:
         )
 
     def _pairs(self, stride: int, coarser: int = 1) -> PlanePairs:
-        """Make pairs of every frame, or of every second, third and so on."""
+        """Make pairs of every `stride`-th frame, binned by a further factor `coarser`.
+
+        The stack of images is read when the frames change, and kept.
+        """
         frames = self.sorted[::stride]
         if self.stack is None or len(self.stack) != len(frames):
             images = [binned_mean(self.image(i), self.factor) for i in frames.tolist()]
@@ -146,6 +160,9 @@ class TurnPlanes:
         return self._as_motion(find_shifts(self._pairs(1), at, angle, random))
 
     def _as_motion(self, shifts: Shifts) -> Motion:
+        """Convert shifts on the detector into motions of the object, `dO_x` and `dO_y` [mm], of
+        all frames.
+        """
         pose = self.poses[self.sorted[:1]]
         scale = self.factor * float(pose.sod[0] / pose.sdd[0])
         values, sigmas = np.zeros((2, len(self.poses), 2))
