@@ -254,6 +254,12 @@ class TriangleMesh:
     faces: IntArray
 
     def __post_init__(self) -> None:
+        """Check the mesh and store its vertices and faces as read-only arrays.
+
+        Raises:
+            GeometryError: wrong shapes, a face with an unknown vertex, or a mesh that is not
+                closed.
+        """
         vertices = np.array(self.vertices, dtype=np.float64)
         faces = np.array(self.faces, dtype=np.int64)
         if (
@@ -337,7 +343,15 @@ def project_mesh(
 
 
 def _check_closed(faces: IntArray, vertices: int) -> None:
-    """Check that every edge is passed as often in one direction as in the other."""
+    """Check that every edge is passed as often in one direction as in the other.
+
+    Args:
+        faces: (m, 3) numbers of vertices.
+        vertices: number of vertices.
+
+    Raises:
+        GeometryError: an edge has no partner; the message names one.
+    """
     start = faces.ravel()
     end = faces[:, [1, 2, 0]].ravel()
     there = start * vertices + end

@@ -119,7 +119,12 @@ class Convex:
 
 
 def as_convex(shape: Shape) -> Convex:
-    """Convert one shape to its quadric and slabs."""
+    """Convert one shape to its quadric and slabs, with its corners or semi-axes [mm].
+
+    Raises:
+        GeometryError: a size is not positive, axes are not orthonormal, or a polyhedron is not
+            bounded.
+    """
     none = np.zeros((0, 5))
     match shape:
         case Sphere(center, radius):
@@ -309,6 +314,11 @@ def _positive(shape: Shape, *sizes: float) -> None:
 
 
 def _unit(shape: Shape, direction: Vector) -> FloatArray:
+    """Check that a direction of a shape is a unit vector, and return it normalised, (3,).
+
+    Raises:
+        GeometryError: it is not.
+    """
     k = np.array(direction, dtype=np.float64)
     if k.shape != (3,) or abs(np.linalg.norm(k) - 1) > UNIT_TOLERANCE:
         raise GeometryError(f"{shape!r}: direction {direction!r} is not a unit vector")
@@ -316,6 +326,11 @@ def _unit(shape: Shape, direction: Vector) -> FloatArray:
 
 
 def _orthonormal(shape: Shape, axes: Matrix) -> FloatArray:
+    """Check that the axes of a shape are orthonormal rows, and return them as an array (3, 3).
+
+    Raises:
+        GeometryError: they are not.
+    """
     a = np.array(axes, dtype=np.float64)
     if a.shape != (3, 3) or np.abs(a @ a.T - np.eye(3)).max() > UNIT_TOLERANCE:
         raise GeometryError(f"{shape!r}: axes are not orthonormal rows")

@@ -145,6 +145,16 @@ def spread(
 def _spread(
     box: Box, views: FloatArray, values: Float32Array, clean: bool, fans: bool
 ) -> None:
+    """Add the transpose of the projection of `values` to the box's voxels: fans first, then
+    single rays.
+
+    Args:
+        box: the layout's voxels, changed in place.
+        views: (n, 12) rays in voxels.
+        values: (n, rows, cols) images.
+        clean: the voxels hold zeros; otherwise each is cleared before its first use.
+        fans: views are planned as fans; False: all rays on their own.
+    """
     from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])

@@ -88,6 +88,7 @@ class DeviceArray(NDArrayOperatorsMixin):
             return self
 
         def gather() -> DeviceArray:
+            """Copy the chosen views into a new array on the device."""
             from numba import cuda
 
             there = self.images
@@ -167,6 +168,7 @@ def _combined(
         )
 
     def launch() -> DeviceArray:
+        """Launch the kernel into `out`, or into a new array like `a`, and return it."""
         from numba import cuda
 
         from flexdt.twin.projection.kernels import gpu_kernels as kernels
@@ -189,9 +191,19 @@ def _combined(
 
 
 def _folded(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
-    """Reduce one or two arrays on the device to partial results in double precision."""
+    """Reduce one or two arrays on the device to partial results.
+
+    Args:
+        name: of the kernel's kind: DOT, SUM or LARGEST.
+        a: first array.
+        b: second array, of the same size; only DOT reads it.
+
+    Returns:
+        The parts on the host, in double precision, in an order that is always the same.
+    """
 
     def launch() -> FloatArray:
+        """Launch the kernel and copy its parts to the host."""
         from numba import cuda
 
         from flexdt.twin.projection.kernels import gpu_kernels as kernels

@@ -145,7 +145,12 @@ def plan_fans(
 
 
 def _level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
-    """Plan views with detector columns parallel to z: each column is a fan, in all views."""
+    """Plan views with detector columns parallel to z: each column is a fan, in all views.
+
+    Args:
+        chosen: (n,) numbers of these views.
+        shape: the detector's (rows, cols).
+    """
     rows, cols = shape
     edges = np.arange(cols + 1) - 0.5
     starts = np.arange(0, cols, FANS)
@@ -237,7 +242,17 @@ def _counted(counts: IntArray) -> tuple[IntArray, IntArray]:
 def _step(
     source: FloatArray, u: FloatArray, rays: FloatArray, counts: tuple[int, int, int]
 ) -> FloatArray:
-    """Compute the columns a fan may span so that its rays stay within SPREAD voxels."""
+    """Compute the columns a fan may span so that its rays stay within SPREAD voxels.
+
+    Args:
+        source: (n, 3) [voxels].
+        u: (n, 3) step of a column.
+        rays: (n, k, 3) directions of k rays of each view.
+        counts: the box's voxels along x, y and z.
+
+    Returns:
+        (n,) columns, at most `WIDEST`.
+    """
     ends = np.array(
         [[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64
     )
@@ -344,7 +359,17 @@ def _cuts(width: FloatArray) -> list[int]:
 def _image_widths(
     plan: FanPlan, views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute each job's width where the box is nearest to the source [voxels], (k,)."""
+    """Compute each job's width where the box is nearest to the source.
+
+    Args:
+        plan: k jobs.
+        views: (n, 12) rays in voxels.
+        counts: the box's voxels along x, y and z.
+        shape: the detector's (rows, cols).
+
+    Returns:
+        (k,) [voxels]; 0 with a source inside the box.
+    """
     view, first, last = plan.jobs.T
     r = (shape[0] - 1) / 2
     of = views[view]

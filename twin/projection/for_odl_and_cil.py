@@ -85,6 +85,9 @@ def cil_operator(
     def filled(
         function: _Map, x: Any, shape: tuple[int, int, int], geometry: Any, out: Any
     ) -> Any:
+        """Apply a function to the array of a CIL container, and put the result into `out`, or
+        into a new container of `geometry`.
+        """
         if out is None:
             result = geometry.allocate(None)
         else:

@@ -90,6 +90,9 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Any, rows: Any, a: TorchOperator) -> Any:
+        """Project a batch of volumes (..., nz, ny, nx) to images (..., n, rows, cols); keep
+        what `backward` needs.
+        """
         ctx.save_for_backward(x, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)
@@ -100,6 +103,9 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
+        """Compute gradients with respect to the volumes and to the rows of cone_vec; None where
+        none is needed.
+        """
         x, rows = ctx.saved_tensors
         if ctx.needs_input_grad[0]:
             by_x = _Spread.apply(g, rows, ctx.a).to(x.dtype)
@@ -117,6 +123,9 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
+        """Apply the transpose of the projection to images (..., n, rows, cols); keep what
+        `backward` needs.
+        """
         ctx.save_for_backward(y, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)
@@ -126,6 +135,9 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
+        """Compute gradients with respect to the images and to the rows of cone_vec; None where
+        none is needed.
+        """
         y, rows = ctx.saved_tensors
         if ctx.needs_input_grad[0]:
             by_y = _Project.apply(g, rows, ctx.a).to(y.dtype)
@@ -144,6 +156,9 @@ class _ByRows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
+        """Compute the gradient of the images' inner product with `y` with respect to cone_vec,
+        (n, 12), summed over the batch.
+        """
         cone_vec = _cone_vec(rows)
         total = np.zeros((len(rows), 12))
         images = y.detach().cpu().reshape(-1, len(rows), *a.detector_shape)
@@ -157,6 +172,11 @@ class _ByRows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
+        """Refuse second derivatives with respect to the geometry.
+
+        Raises:
+            NotBuiltError: always.
+        """
         raise NotBuiltError(
             "second derivatives with respect to the geometry are not built; allowed: the first",
             {"asked": 2, "allowed": 1},
@@ -164,6 +184,12 @@ class _ByRows(torch.autograd.Function):
 
 
 def _tensor(values: Any) -> Any:
+    """Convert an array of any library to a tensor that shares its memory; a read-only array is
+    copied.
+
+    Raises:
+        NotBuiltError: it is on a device that the kernels cannot use.
+    """
     if isinstance(values, np.ndarray):
         values = (
             values if values.flags.writeable else values.copy()
@@ -195,8 +221,12 @@ def _memory(one: Any) -> Any:
 
 
 def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
-    """Wrap voxels (nz, ny, nx); on a device they share the tensor's memory if z is
-    contiguous.
+    """Wrap voxels as a volume with the place and voxel size of `like`.
+
+    Args:
+        one: tensor (nz, ny, nx). On a device its memory is shared if z is contiguous, and
+            copied if not.
+        like: place and size.
     """
     if not _is_there(one):
         return like.like(one.numpy())
@@ -219,11 +249,18 @@ def _voxels(volume: Volume | DeviceVolume) -> Any:
 def _each(
     function: Callable[[Any], Any], values: Any, shape: tuple[int, int, int]
 ) -> Any:
-    """Apply a function of a three-dimensional tensor to each member of a batch, on its
-    device.
+    """Apply a function to each member of a batch, on its device.
 
-    Before and after, it waits for PyTorch's streams and for the kernels' own, which do
-    not know each other.
+    Before and after, it waits for PyTorch's streams and for the kernels' own, which do not know
+    each other.
+
+    Args:
+        function: of a three-dimensional float32 tensor; returns an array.
+        values: tensor (..., a, b, c).
+        shape: of the function's results.
+
+    Returns:
+        A tensor (..., *shape) on the device of `values`.
     """
     batch = values.shape[:-3]
     device = values.device

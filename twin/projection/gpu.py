@@ -81,7 +81,12 @@ def availability() -> Availability:
 
 @cache
 def _probed() -> Availability:
-    """Look for the driver, import numba's CUDA and project one ray on the device."""
+    """Look for the driver, import numba's CUDA and project one ray on the device.
+
+    Returns:
+        Whether a device can be used, with its name or the reason; nothing is raised. A failed
+        first ray is logged.
+    """
     from numba import config
 
     if not config.ENABLE_CUDASIM:
@@ -421,6 +426,11 @@ def clear_of(
 
     Boxes too long for the slab walk have no such views.
 
+    Args:
+        box: the layout's voxels.
+        views: (n, 12) rays in voxels.
+        shape: the detector's (rows, cols).
+
     Returns:
         (n,) bool.
     """
@@ -469,12 +479,23 @@ def launcher(
     transposed: bool,
     factor: float = 1.0,
 ) -> Callable[[], None]:
-    """Prepare the kernels for these views; return a function that launches them.
+    """Prepare the kernels for these views, and copy the views to the device.
 
-    images: flat, on the device. One array goes there: views by kernel, each with the
-        number of its
-    image. Views of a detector on its side take its columns for rows, so that lanes are
-    neighbours along z there, too.
+    One array goes there: views by kernel, each with the number of its image. Views of a
+    detector on its side take its columns for rows, so that lanes are neighbours along z there,
+    too.
+
+    Args:
+        box: the layout's voxels.
+        voxels: of the layout, on the device.
+        views: (n, 12) rays in voxels.
+        images: flat, on the device.
+        shape: the detector's (rows, cols).
+        transposed: voxels are written and images read; otherwise the other way round.
+        factor: of the written values.
+
+    Returns:
+        A function that launches the kernels and does not wait for them.
     """
     from numba import cuda
 
@@ -498,6 +519,7 @@ def launcher(
     kinds, counts = np.unique(kind, return_counts=True)
 
     def launch() -> None:
+        """Launch one kernel for each kind of view."""
         first = 0
         for which, count in zip(kinds, counts, strict=True):
             lying_down, walk = divmod(int(which), KINDS)

@@ -57,6 +57,12 @@ def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[A
     """
 
     def wrapped(x: Any) -> Any:
+        """Call the function with a NumPy array of `x`, and return its result in the library
+        that `x` is from.
+
+        Raises:
+            NotBuiltError: `x` is on a device.
+        """
         if isinstance(x, np.ndarray) or not hasattr(x, "__dlpack__"):
             return function(np.asarray(x))
         gpu.check_host(x.__dlpack_device__()[0] == HOST, type(x).__name__)
@@ -111,6 +117,7 @@ class Operator:
         like: Volume | Grid,
         shape: Shape2 | None = None,
     ) -> None:
+        """Take the geometry, the volume's grid and the detector's shape; see the class."""
         scan = as_cone_vec(geometry)
         object.__setattr__(self, "geometry", scan)
         object.__setattr__(self, "like", as_volume(like))
@@ -162,6 +169,11 @@ class Operator:
         return forward(self.like.like(x), self.geometry, self.detector_shape)
 
     def _back(self, y: npt.NDArray[Any]) -> Float32Array:
+        """Apply the transpose to images of `image_shape`; returns voxels (nz, ny, nx).
+
+        Raises:
+            GeometryError: another shape.
+        """
         _check(y.shape, self.image_shape, "projections")
         room = room_like(self.like)
         back(y, self.geometry, self.like, room)
@@ -322,6 +334,11 @@ class Operator:
 
 
 def _require(package: str, how: str) -> None:
+    """Check that a package can be imported.
+
+    Raises:
+        TwinError: it is not installed; `how` ends the message.
+    """
     try:
         import_module(package)
     except ImportError as error:
@@ -363,6 +380,11 @@ def _is_tensor(x: object) -> bool:
 
 
 def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> None:
+    """Check a shape of `what`, as the message calls it.
+
+    Raises:
+        GeometryError: `got` is not `wanted`.
+    """
     if got != wanted:
         raise GeometryError.of_shape(
             what, got, wanted, " (flat vectors: linear_operator())"
@@ -370,6 +392,7 @@ def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> Non
 
 
 def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:
+    """Check whether two volumes have the same voxels at the same place, up to rounding."""
     return (
         a.shape == b.shape
         and np.allclose(a.voxel_xyz, b.voxel_xyz, rtol=1e-9)

@@ -231,7 +231,21 @@ def forward(
 def _on_device(
     volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Array
 ) -> bool:
-    """Try to fill `out` on a CUDA device and return whether that succeeded."""
+    """Try to fill `out` with line integrals on a CUDA device.
+
+    Counts the views projected from this volume, which decides whether copying it is worth
+    while.
+
+    Args:
+        volume: to project.
+        geometry: n views.
+        shape: the detector's (rows, cols).
+        out: (n, rows, cols) filled.
+
+    Returns:
+        Whether it is filled; False without a device, where the processor is faster, or if the
+        device failed.
+    """
     if not gpu.availability().present or len(geometry) == 0 or volume.layout.empty:
         return False
     layout = volume.layout
@@ -336,10 +350,16 @@ def back(
 def _spread(
     like: Volume, layout: Layout, geometry: ConeVec, values: Float32Array, *, clean: bool
 ) -> None:
-    """Apply `back` on the processor, into a layout that holds zeros (clean) or anything.
+    """Apply `back` on the processor, adding to a layout.
 
-    Views with levels along x or y are summed in a volume of that order, which is added
-    last.
+    Views with levels along x or y are summed in a volume of that order, which is added last.
+
+    Args:
+        like: place and size of the voxels.
+        layout: of `like`, changed in place.
+        geometry: n views.
+        values: (n, rows, cols) images.
+        clean: the layout holds zeros; otherwise anything, and is cleared first.
     """
     from flexdt.twin.projection.kernels import layout_kernels
 
@@ -398,11 +418,14 @@ def layout_data(layout: Layout) -> Float32Array:
 
 
 def check_projections(projections: npt.ArrayLike, n: int) -> Any:
-    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay
-    there.
+    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay there.
+
+    Args:
+        projections: an array of any library.
+        n: number of views.
 
     Raises:
-        GeometryError: they are no `n` images.
+        GeometryError: they are not `n` images, or on a device not float32 in C order.
     """
     if gpu.is_there(projections):
         values = gpu.taken(projections)

@@ -73,6 +73,7 @@ class Accuracy:
     cut_off: bool = False
 
     def __str__(self) -> str:
+        """Return the accuracy sentence, as docs/glossary.md explains it."""
         if self.cut_off:
             return f"{NOT_BOUNDED}; {GRANTED}"
         half, most = (
@@ -230,6 +231,12 @@ class Volume:
     center_mm: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check data, voxel sizes and centre, and store them: data as a read-only view, sizes
+        as (x, y, z).
+
+        Raises:
+            GeometryError: data is not three-dimensional, or a size is not positive.
+        """
         data = as_numbers("volume data", self.data, np.float32)
         if data.ndim != 3 or 0 in data.shape:
             wanted = ("nz", "ny", "nx")
@@ -276,6 +283,7 @@ class Volume:
         return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
 
     def _repr_html_(self) -> str:
+        """Return a table of size and values for a notebook."""
         size = " x ".join(f"{side:g}" for side in self.size_mm)
         least = float(self.data.min())
         most = float(self.data.max())
@@ -649,7 +657,7 @@ class DeviceVolume:
         return {**memory, "shape": self.shape, "strides": self.strides}
 
     def to(self, device: str) -> Any:
-        """Return this volume for "cuda", or download it to a `Volume` for "cpu".
+        """Return this volume for "cuda", or a `Volume` downloaded from the device for "cpu".
 
         Raises:
             NotBuiltError: another device.
@@ -688,6 +696,11 @@ class Grid:
     center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check that the grid has voxels of a positive size.
+
+        Raises:
+            GeometryError: it has not.
+        """
         if min(self.shape) < 1 or not (
             math.isfinite(self.voxel_mm) and self.voxel_mm > 0
         ):
@@ -767,7 +780,15 @@ def bring_over(
     *,
     adding: bool = False,
 ) -> None:
-    """Copy or add data[z, y, x] to flat[y * stride_y + x * stride_x + z]."""
+    """Copy or add data to a layout's memory, in portions of the kernel.
+
+    Args:
+        data: (nz, ny, nx), in any order of its axes.
+        flat: changed in place: flat[y * stride_y + x * stride_x + z].
+        stride_x: elements from x to x + 1.
+        stride_y: elements from y to y + 1.
+        adding: data is added to what flat holds.
+    """
     from flexdt.twin.projection.kernels import layout_kernels
 
     data = data.view()
@@ -786,6 +807,7 @@ class _Memory:
     """Memory of an array as numpy's array interface shows it; keeps the array alive."""
 
     def __init__(self, owner: Float32Array, count: int) -> None:
+        """Expose the memory of `owner` as `count` elements, and keep it alive."""
         self.owner = owner
         self.__array_interface__ = {
             "shape": (count,),
@@ -812,6 +834,11 @@ def edges_xyz(voxel_mm: float | Vector3) -> Vector3:
 
 
 def _vector(value: object, name: str) -> Vector3:
+    """Convert three finite numbers to floats (x, y, z).
+
+    Raises:
+        GeometryError: they are not; the message begins with `name`.
+    """
     numbers = np.asarray(value, dtype=np.float64)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         wanted = "three finite numbers (x, y, z) in mm"

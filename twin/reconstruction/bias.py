@@ -106,8 +106,12 @@ class Bias:
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
         """Compute the accuracy of the object's uniform regions in a grid.
 
-        None if the grid holds no such region, or if images and geometry do not belong
-        together.
+        Args:
+            grid: place and size.
+
+        Returns:
+            Bounds for half and for nine of ten regions, with the largest cause; None if the
+            grid holds no such region, or if images and geometry do not belong together.
         """
         if self.contradiction is not None or self.too_coarse(grid):
             return None
@@ -166,7 +170,14 @@ def bias_of(
 
 
 def _bias_of(scan: CoarseScan) -> Bias:
-    """Reconstruct a coarse scan and bound its errors, cause by cause."""
+    """Reconstruct a coarse scan and bound its errors, cause by cause.
+
+    Args:
+        scan: few views and pixels of the whole scan.
+
+    Returns:
+        The bound; without causes where images and geometry contradict each other.
+    """
     from scipy.ndimage import gaussian_filter
 
     data = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
@@ -250,7 +261,12 @@ def _evenness(values: Float32Array, most: float) -> FloatArray:
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
-    """Compute the root mean square about each node; differences have zeros in places."""
+    """Compute the weighted root mean square about each node; differences have zeros in places.
+
+    Args:
+        values: (nz, ny, nx).
+        weights: (nz, ny, nx).
+    """
     from scipy.ndimage import gaussian_filter
 
     def mean(what: FloatArray) -> FloatArray:

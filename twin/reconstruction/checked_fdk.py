@@ -90,6 +90,7 @@ def fdk(
         chunk = CHUNK
 
     def parts() -> Iterable[Float32Array]:
+        """Yield the images as float32 in chunks, checked for values that are not finite."""
         for start in range(0, len(values), chunk):
             part = np.asarray(values[start : start + chunk], dtype=np.float32)
             require_finite(part)
@@ -128,7 +129,8 @@ def checked_fdk(
     *,
     errors: bool = True,
 ) -> tuple[Volume, list[str]]:
-    """Reconstruct a volume by FDK and list warnings for the user.
+    """Reconstruct a volume by FDK, with its accuracy and noise if `errors`, and list warnings
+    for the user.
 
     Args and raises as `fdk`, except for these:
 
@@ -139,7 +141,8 @@ def checked_fdk(
         shape: (rows, cols).
 
     Returns:
-        the volume and the texts of warnings.
+        The volume and the texts of warnings: lost layers, and with `errors` what limits the
+        accuracy.
     """
     truncation = truncation_of(image, cone_vec, shape)
     volume = fdk_parts(

@@ -94,7 +94,15 @@ class CoarseScan:
         shape: tuple[int, int],
         truncation: Truncation | None,
     ) -> CoarseScan:
-        """Reduce a scan to few views and pixels; arguments as for `bias.bias_of`."""
+        """Reduce a scan to few views and pixels, by choosing views and averaging pixels; images
+        of repeated angles are averaged.
+
+        Args:
+            image: gives an image by its number, (rows, cols).
+            cone_vec: of all views.
+            shape: (rows, cols).
+            truncation: of the scan; None if the object is not cut off.
+        """
         circle = circle_of(cone_vec)
         flip = on_its_side(cone_vec)
         if flip:
@@ -233,7 +241,16 @@ class CoarseScan:
         cone_vec: ConeVec,
         truncation: Truncation | None = None,
     ) -> Float32Array:
-        """Reconstruct the grid from some images, NaN where no data cover it."""
+        """Reconstruct the grid by FDK.
+
+        Args:
+            images: (n, rows, cols) line integrals.
+            cone_vec: n views.
+            truncation: continues the images beyond the panel.
+
+        Returns:
+            (nz, ny, nx) [1/mm], NaN where no data cover it.
+        """
         shape = (images.shape[1], images.shape[2])
         volume = fdk_parts(
             lambda: [images.copy()],

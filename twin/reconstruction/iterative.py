@@ -184,7 +184,19 @@ def _subset_steps(
     watch: Watch | None,
     advance: Advance,
 ) -> Volume:
-    """Take SIRT's step on the views of each part in turn, for each iteration."""
+    """Take SIRT's step on the views of each part in turn, for each iteration.
+
+    Args:
+        problem: images, geometry and grid.
+        parts: views of each part.
+        relaxation: factor on the steps.
+        iterations: at most as many; fewer with weights, once the residuals are as large as the
+            noise.
+        start: first volume; zeros without.
+        nonnegative: negative values become 0 after each step.
+        watch: called with each iteration's residual.
+        advance: called with the share that is done.
+    """
     sums = [problem.scales(part) for part in parts]
     weighted = problem.weights is not None
     x = problem.first(start)
@@ -250,7 +262,15 @@ def _cgls(
     watch: Watch | None,
     advance: Advance,
 ) -> Volume:
-    """Take steps along conjugate directions."""
+    """Take steps along conjugate directions (CGLS).
+
+    Args:
+        problem: images, geometry and grid.
+        iterations: at most as many; fewer if the gradient vanishes.
+        start: first volume; zeros without.
+        watch: called with each iteration's residual.
+        advance: called with the share that is done.
+    """
     x = problem.first(start)
     rest = problem.measured - problem.project(x)
     gradient = problem.spread(rest)
@@ -309,7 +329,15 @@ def _em(
     watch: Watch | None,
     advance: Advance,
 ) -> Volume:
-    """Multiply by the back-projected ratios of measured and projected line integrals."""
+    """Multiply by the back-projected ratios of measured and projected line integrals (MLEM).
+
+    Args:
+        problem: images, geometry and grid; negative line integrals count as 0.
+        iterations: how many.
+        start: first volume; without, one value in all voxels that a ray meets.
+        watch: called with each iteration's residual.
+        advance: called with the share that is done.
+    """
     measured = np.maximum(problem.measured, np.float32(0))
     whole = problem.spread(ones(measured)).copy(order="K")
     x = problem.first(start)

@@ -101,9 +101,18 @@ class LinearSystem:
     ) -> LinearSystem:
         """Check the arguments and make the system from them.
 
+        Args:
+            projections: (n, rows, cols) line integrals, also on a device.
+            cone_vec: n views.
+            like: place and size of the volume.
+            iterations: only checked.
+            variances: (n, rows, cols) of the line integrals; weights are their inverses.
+            hardening: expected line integrals of a polychromatic beam.
+            surroundings: volume or grid around the region, whose line integrals are taken off.
+
         Raises:
-            GeometryError: no views, shapes that do not fit, variances that are not above
-                0, surroundings within the region, or either with images on a device.
+            GeometryError: no views, shapes that do not fit, variances that are not above 0,
+                surroundings within the region, or either with images on a device.
             LimitError: no iterations.
         """
         if iterations < 1:
@@ -171,8 +180,15 @@ class LinearSystem:
         return back(y, self.geometry[views], self.like, self.room).data
 
     def misfit(self, x: Any, views: Some) -> tuple[Any, Any]:
-        """Measured less expected line integrals of some views, and how many times as much a
-        step must add to straight ones: straight over expected, 1 without `hardening`.
+        """Compute measured less expected line integrals of some views.
+
+        Args:
+            x: voxels (nz, ny, nx).
+            views: which ones.
+
+        Returns:
+            The differences, and how many times as much a step must add to straight line
+            integrals: straight over expected, 1 without `hardening`.
         """
         measured = self.measured[views]
         if self.hardening is None:

@@ -156,7 +156,14 @@ class Polychromatic:
         panel: Detector | None = None,
         tube: TubeModel | None = None,
     ) -> Polychromatic:
-        """Compute the model from tube and detector; arguments as for `hardening`.
+        """Compute the model of a beam from tube and detector.
+
+        Args:
+            materials: of the object.
+            kV: tube voltage.
+            energy_keV: at which the volume's attenuations hold.
+            panel: detector; the default one without.
+            tube: the default one without.
 
         Raises:
             LimitError: no material, two that attenuate alike, no spectrum for `kV`, or an
@@ -432,7 +439,20 @@ def attenuations(
 
 
 def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
-    """Convert the occupied box of a volume to amounts of the materials."""
+    """Convert the occupied box of a volume to amounts of the materials.
+
+    A value between two materials is a mixture of both, one above the densest is more of it, and
+    one close to 0 is air.
+
+    Args:
+        volume: attenuations [1/mm].
+        chain: its substances are the k materials.
+        mu: (k,) their attenuations [1/mm].
+
+    Returns:
+        Amounts (nz, ny, nx, k) of the smallest box that holds the object; of the whole volume
+        if it is empty.
+    """
     order = np.argsort(mu)
     knots = np.concatenate([[0.0], mu[order]])
     values = np.where(volume.data > AIR * knots[1], volume.data, np.float32(0.0))

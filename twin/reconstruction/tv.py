@@ -149,6 +149,9 @@ def minimise_tv(
     with long_work.during("minimising total variation", progress) as advance:
 
         def minimised(problem: LinearSystem) -> Minimised:
+            """Minimise for a problem on the processor or on a device, with the regulariser
+            where the problem is.
+            """
             there = isinstance(problem, DeviceProblem)
             kept = DeviceRegular.of_host(regular, problem.like) if there else regular
             return _minimised(
@@ -194,7 +197,23 @@ def _minimised(
     watch: Watch | None,
     advance: Advance,
 ) -> Minimised:
-    """Minimise by passes through subsets, then by accelerated steps."""
+    """Minimise by passes through subsets of views, then by accelerated steps over all.
+
+    Args:
+        problem: images, geometry and grid.
+        regular: total variation and bounds of the values.
+        iterations: at most as many.
+        weight: of total variation, relative to the largest back-projected value.
+        tolerance: relative decrease of the cost below which iterations count as stalled; 0:
+            never stop early.
+        subsets: number of parts in the first passes; 1 for none.
+        start: first volume; zeros without.
+        watch: called with each iteration's residual.
+        advance: called with the share that is done.
+
+    Returns:
+        The volume, the costs, and whether the stopping rule ended it.
+    """
     scale = problem.spread(problem.measured)
     strength = weight * max(float(scale.max()), 0.0)
     objective = _Objective(problem, strength, regular)
@@ -315,7 +334,16 @@ class Regular:
 
     @classmethod
     def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> Regular:
-        """Create the regulariser of a grid, with all dual variables zero."""
+        """Create the regulariser of a grid, with all dual variables zero.
+
+        Args:
+            like: the grid.
+            nonnegative: values are not below 0.
+            mask: (nz, ny, nx), 0 where values must be 0; None allows all.
+
+        Raises:
+            GeometryError: the mask has another shape than the grid.
+        """
         if mask is None:
             allowed = np.ones(like.shape, np.uint8)
         else:
@@ -348,7 +376,16 @@ class Regular:
         return float(layers.sum())
 
     def proximal(self, z: Any, theta: float) -> Any:
-        """Find the allowed x of least 1/2 sum((x - z)^2) + theta TV(x), approximately."""
+        """Find the allowed x of least 1/2 sum((x - z)^2) + theta TV(x), approximately, from the
+        last call's dual variables on.
+
+        Args:
+            z: voxels (nz, ny, nx).
+            theta: weight of total variation; 0 only enforces the bounds.
+
+        Returns:
+            x; the dual variables are kept for the next call.
+        """
         if theta == 0.0:
             return self.allow(z)
         if isinstance(z, np.ndarray):
@@ -427,6 +464,12 @@ class DeviceRegular(Regular):
         return self.allowed.shape, stride, tuple(self.scale)
 
     def _run(self, name: str, *arguments: Any) -> None:
+        """Launch a kernel with a thread for each voxel.
+
+        Raises:
+            gpu.DeviceError: the device fails.
+        """
+
         def launch() -> None:
             from flexdt.twin.reconstruction.kernels import (
                 gpu_reconstruction_kernels as kernels,

@@ -81,6 +81,13 @@ def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
 
 
 def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
+    """Find the known places next to others: lower and upper index, and the share of the upper
+    one for linear interpolation.
+
+    Args:
+        places: (n,).
+        known: (m,) increasing.
+    """
     at = np.interp(places, known, np.arange(len(known)))
     lower = np.minimum(at.astype(np.int64), max(len(known) - 2, 0))
     upper = np.minimum(lower + 1, len(known) - 1)

@@ -28,7 +28,18 @@ BAND = 16
 
 @kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
-    """Cut [t0, t1] down to low <= at + t (rate + column * step) <= high."""
+    """Cut the pieces [t0, t1] of the rays to a run of columns down to a slab, in place.
+
+    Args:
+        t0: (k,) beginnings, in lengths of the rays.
+        t1: (k,) ends.
+        at: the source's height above the slab's plane.
+        low: lower limit, low <= at + t (rate + column * step).
+        high: upper limit.
+        rate: height of the ray to column 0.
+        step: change of it by a column.
+        first: the first ray's column.
+    """
     # A ray along the slab gets TINY: both quotients are huge, of one sign where it runs outside
     # (no chord is left) and of two where it runs inside (nothing is cut). No branch, so it
     # vectorises.
@@ -45,7 +56,17 @@ def cut_by_slab(t0, t1, at, low, high, rate, step, first):
 
 @kernel
 def cut_by_quadric(t0, t1, q, d, e, first):
-    """Cut [t0, t1] down to |q + t (d + column * e)| <= 1, all three already mapped by M."""
+    """Cut the pieces [t0, t1] of the rays to a run of columns down to |q + t (d + column * e)|
+    <= 1, in place.
+
+    Args:
+        t0: (k,) beginnings, in lengths of the rays.
+        t1: (k,) ends.
+        q: (3,) the source, mapped by the quadric's matrix M, as are d and e.
+        d: (3,) direction of the ray to column 0.
+        e: (3,) change of it by a column.
+        first: the first ray's column.
+    """
     qq = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
     for i in range(t0.size):
         c = first + i
@@ -99,10 +120,21 @@ def mapped(m, p, out):
 def project_convex(
     quadric, slabs, slab_range, shadow, rays, weight, channel, out, first_job, last_job
 ):
-    """Fill out (channels, n, rows, cols) with weighted chord lengths.
+    """Fill `out` with weighted chord lengths of convex solids, job by job: BAND rows of a view
+    each.
 
-    rays (n, 12) [mm]: source, first pixel centre minus source, u, v; shadow (n, k, 4) from
-    `analytic_solids.shadows`; weight, channel (k,) of each solid. A job: BAND rows of a view.
+    Args:
+        quadric: (k, 13) whether a solid is curved, its matrix and centre.
+        slabs: slabs of all solids, one after the other.
+        slab_range: (k, 2) first slab of each solid and the one after its last.
+        shadow: (n, k, 4) rows and columns that a solid can reach, from
+            `analytic_solids.shadows`.
+        rays: (n, 12) [mm]: source, first pixel centre minus source, u, v.
+        weight: (k,) factors on the chord lengths.
+        channel: (k,) the solid's channel in `out`.
+        out: (channels, n, rows, cols).
+        first_job: number of the first job.
+        last_job: number of the job after the last.
     """
     channels, _, rows, cols = out.shape
     bands = (rows + BAND - 1) // BAND
@@ -179,7 +211,17 @@ def edge_form(p, i, j, g, form):
 
 @kernel
 def draw_row(line, forms, flips, plane, r, c0, c1):
-    """Add the signed distances of one triangle to a row of pixels, in lengths of their rays."""
+    """Add the signed distances of one triangle to a row of pixels, in lengths of their rays.
+
+    Args:
+        line: (cols,) sums of the row, changed in place.
+        forms: (3, 3) the edges' forms, from `edge_form`.
+        flips: (3,) edges that the triangle runs through from the higher vertex number.
+        plane: (4,) the triangle's plane: form of the pixel, and the source's distance.
+        r: row.
+        c0: first column.
+        c1: column after the last.
+    """
     a0, b0 = forms[0, 0] + forms[0, 2] * r, forms[0, 1]
     a1, b1 = forms[1, 0] + forms[1, 2] * r, forms[1, 1]
     a2, b2 = forms[2, 0] + forms[2, 2] * r, forms[2, 1]
@@ -204,8 +246,20 @@ def draw_row(line, forms, flips, plane, r, c0, c1):
 
 @kernel
 def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plane):
-    """Draw one triangle onto rows row0 to row1 - 1. pixels (k, 3): column, row and
-    whether the vertex is in front of the source.
+    """Draw one triangle onto rows row0 to row1 - 1: add its signed distances to `sums`.
+
+    Args:
+        sums: (row1 - row0, cols) changed in place.
+        p: (k, 3) vertices seen from the source.
+        pixels: (k, 3) their column, row, and 1 in front of the source, 0 behind it.
+        face: (3,) numbers of its vertices.
+        g: (12,) source, first pixel minus source, u, v [mm].
+        row0: first row of `sums`.
+        row1: row after the last.
+        cols: the detector's columns.
+        forms: (3, 3) room.
+        flips: (3,) room.
+        plane: (4,) room.
     """
     i, j, k = face[0], face[1], face[2]
     front = pixels[i, 2] + pixels[j, 2] + pixels[k, 2]
@@ -249,8 +303,15 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
 
 @kernel
 def locate(vertices, g, inverse, p, pixels):
-    """Transform vertices to positions seen from the source and compute their pixel
-    coordinates.
+    """Transform vertices to positions seen from the source and compute their pixel coordinates.
+
+    Args:
+        vertices: (k, 3) [mm].
+        g: (12,) source, first pixel minus source, u, v [mm].
+        inverse: (3, 3) of the matrix with columns u, v, first pixel minus source.
+        p: (k, 3) filled with positions minus source.
+        pixels: (k, 3) filled with column, row and 1; 0 as the third for a vertex behind the
+            source.
     """
     for i in range(len(vertices)):
         x = vertices[i, 0] - g[0]
@@ -285,10 +346,18 @@ def make_band(vertices, cols):
 
 @parallel
 def project_triangles(vertices, faces, rays, inverses, workers, out, first_job, last_job):
-    """Fill out (n, rows, cols) with path lengths [mm].
+    """Fill `out` with path lengths through a closed mesh, job by job: MESH_BAND rows of a view
+    each.
 
-    rays (n, 12) [mm]: source, first pixel minus source, u, v; inverses (n, 3, 3): of the matrix
-    with columns u, v, first pixel minus source. A job: MESH_BAND rows of a view.
+    Args:
+        vertices: (k, 3) [mm].
+        faces: (m, 3) numbers of vertices.
+        rays: (n, 12) [mm]: source, first pixel minus source, u, v.
+        inverses: (n, 3, 3) of the matrix with columns u, v, first pixel minus source.
+        workers: number of threads.
+        out: (n, rows, cols) [mm].
+        first_job: number of the first job.
+        last_job: number of the job after the last.
     """
     rows, cols = out.shape[1:]
     bands = (rows + MESH_BAND - 1) // MESH_BAND

@@ -56,7 +56,11 @@ binding.add_symbol(ALONE, ctypes.addressof(kernel_threads.ALONE))
 
 
 def _choose(module: ir.Module) -> None:
-    """Have a module's parallel loops call the threading layer only where `ALONE` is 0."""
+    """Change a module so that its parallel loops call the threading layer only where `ALONE` is
+    0; otherwise they run in the calling thread.
+
+    A module without parallel loops stays as it is.
+    """
     layer = module.globals.get(LAYER)
     if layer is None:
         return
@@ -109,6 +113,9 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int | None:
+        """Return the address of a function that raises TypeError, whatever the name: only
+        Python would call it.
+        """
         # Only Python would call this; it raises TypeError, as arguments are no attribute's
         # name.
         self._ensure_finalized()
@@ -147,6 +154,9 @@ class _EntryPoint(_Linked):
     silent = False
 
     def _compile_core(self) -> Any:
+        """Compile the function into a cacheable library of its own, with a progress line; the
+        first time, log that it takes long.
+        """
         name = self.state.func_id.func_name
         if not _EntryPoint.silent:
             LOG.warning(SLOW, name)
@@ -217,6 +227,7 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
     """Fetch array[index]'s cache line for reading; any index is safe."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        """Emit LLVM's prefetch of the element's cache line, for reading, into all caches."""
         address = _address(context, builder, signature.args[0], *args)
         byte = builder.bitcast(address, ir.IntType(8).as_pointer())
         word = ir.IntType(32)

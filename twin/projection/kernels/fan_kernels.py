@@ -48,9 +48,19 @@ SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
 
 @inline
 def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
-    """Sum the integrals of a fan of n collected rays into the job's buffer.
+    """Sum the integrals of a fan of collected rays into the job's buffer; transposed, add the
+    buffer's values to the voxels.
 
-    Transposed, it adds the buffer's values to the voxels.
+    Args:
+        box: voxels; transposed, changed in place.
+        g: (12,) source, first pixel minus source, u, v [voxels].
+        grid: the box as seen along the fan, from `oriented`.
+        found: n collected rays.
+        rays: room for them, sorted.
+        work: room for the walk.
+        n: number of rays.
+        buffer: values of the job's pixels; changed in place unless transposed.
+        transposed: see above.
     """
     fan = describe(grid, found, n)
     if not fan.together:
@@ -81,7 +91,17 @@ def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
 
 @kernel
 def put(image, buffer, starts, ends, width, top, bottom):
-    """Copy a job's buffer into its columns of an image (rows, cols); zeros outside its rows."""
+    """Copy a job's buffer into its columns of an image; zeros outside its rows.
+
+    Args:
+        image: (rows, cols) changed in place.
+        buffer: rows top to bottom - 1, `width` values each.
+        starts: (rows,) first column of the job in each row.
+        ends: (rows,) column after the last.
+        width: columns of the buffer.
+        top: first row that the box can reach.
+        bottom: row after the last.
+    """
     for r in range(starts.size):
         row = image[r, starts[r] : ends[r]]
         if top <= r < bottom:
@@ -120,7 +140,25 @@ def work_on(
     buffer,
     transposed,
 ):
-    """Do one job: fill the columns of an image between two lines; transposed, read them."""
+    """Do one job: fill the columns of an image between two lines; transposed, add them to the
+    voxels.
+
+    Args:
+        box: voxels; transposed, changed in place.
+        g: (12,) source, first pixel minus source, u, v [voxels].
+        lines: (m, 2) column of each line in row 0, and its slope.
+        first: number of the first line.
+        last: number of the last line.
+        shadow: (4,) rows and columns that the box can reach.
+        image: (rows, cols); changed in place unless transposed.
+        starts: (rows,) room.
+        ends: (rows,) room.
+        found: room for collected rays.
+        rays: room for sorted rays.
+        work: room for the walk.
+        buffer: room for the job's pixels.
+        transposed: see above.
+    """
     rows, cols = image.shape
     # The job's pixels lie between two slanted lines: each row has a start and an end of its
     # own, and the buffer holds the rows one behind the other, all `width` long.
@@ -141,6 +179,10 @@ def work_on(
 
 
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
+    """Compile `project_fans` and `spread_fans` for one key, which is part of their machine
+    code's name; return both.
+    """
+
     @parallel
     def project_fans(box, fans, shadows, workers, out):
         """Fill out (n, rows, cols), but for views without a job; shadows (n, 4): rows and

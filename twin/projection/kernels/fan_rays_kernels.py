@@ -26,8 +26,15 @@ bound."""
 
 @kernel
 def oriented(box, g, lines, line, rows):
-    """Compute the box as seen along the central ray of the fan between `line` and the
-    next.
+    """Compute the box as seen along the central ray of the fan between `line` and the next: a
+    `Grid`.
+
+    Args:
+        box: voxels.
+        g: (12,) source, first pixel minus source, u, v [voxels].
+        lines: (m, 2) column of each line in row 0, and its slope.
+        line: number of the first one.
+        rows: the detector's rows.
     """
     r = 0.5 * (rows - 1)
     c = 0.5 * (
@@ -137,7 +144,9 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
 
 @kernel
 def describe(grid, found, n):
-    """Compute the `Fan` of n collected rays."""
+    """Compute the `Fan` of n collected rays: its reference line, slabs, and whether its rays
+    can be walked together.
+    """
     slope, rise, span = found.slope[:n], found.rise[:n], found.span[:n]
     m_low, m_high, rise_low, rise_high = slope[0], slope[0], rise[0], rise[0]
     nearest = span[0]
@@ -170,7 +179,17 @@ def describe(grid, found, n):
 
 @kernel
 def sort_by_slope(grid, fan, found, rays, bins, n):
-    """Sort the rays that meet the box by slope (in bins); returns their number."""
+    """Sort the rays that meet the box by slope (in bins) into `rays`, and fill `bins`; returns
+    their number.
+
+    Args:
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        found: n collected rays; their bins are filled in.
+        rays: filled with slope, rise and slot in the new order.
+        bins: (BINS + 1,) filled with the first place of each bin.
+        n: number of collected rays.
+    """
     slope, rise, slot, part = found.slope, found.rise, found.slot, found.bin
     reach0, reach1 = fan.begin - grid.st, fan.j1 - grid.st
     # A counting sort: count the rays of each bin, turn counts into first places, deal out.
@@ -205,7 +224,15 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
 
 @kernel
 def start(grid, fan, rays, work, n):
-    """Initialise n sorted rays for their walk, and list their first z crossings by slab."""
+    """Initialise n sorted rays for their walk, and list their first z crossings by slab.
+
+    Args:
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        rays: slopes and rises are read, all else is filled in.
+        work: lists of crossings are filled in, sums set to zero.
+        n: number of rays.
+    """
     slope, rise = rays.slope[:n], rays.rise[:n]
     weight, tilt, ratio, length = (
         rays.weight[:n],

@@ -149,7 +149,9 @@ def levels_between(grid, fan, t0, t1):
 
 @inline
 def difference(flat, grid, j, i, a, b):
-    """Compute level a minus level b in voxel column (l = i, t = j); 0 outside."""
+    """Compute level a minus level b in voxel column (l = i, t = j); 0 outside. Level k + 1 is
+    voxel z = k.
+    """
     if i < 0 or i >= grid.nl:
         return ZERO
     inside = np.uint32(grid.nz)
@@ -164,13 +166,24 @@ def difference(flat, grid, j, i, a, b):
 
 @inline
 def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
-    """Process all z crossings in slab j from the list head[j] and list each ray's next
-    one.
+    """Process all z crossings in slab j from the list head[j]: add their integrals to the rays,
+    and list each ray's next crossing.
 
-    The integral inside the slab is counted from the reference line's column r0 to the
-    ray's own. Rays that share the line change columns where it does: (x - r1) / m would
-    be the same, but rays within a voxel plane have slopes of rounding errors, by which
-    nothing can be divided.
+    The integral inside the slab is counted from the reference line's column r0 to the ray's
+    own. Rays that share the line change columns where it does: (x - r1) / m would be the same,
+    but rays within a voxel plane have slopes of rounding errors, by which nothing can be
+    divided.
+
+    Args:
+        flat: voxels.
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        rays: sorted rays; crossings, levels and sums are changed.
+        work: lists of crossings and the reference line's sums; the lists are changed.
+        j: number of the slab.
+        r0: column of the reference line at the slab's beginning.
+        r1: at its end.
+        share: of the slab, that the line is in r0.
     """
     cross, pace, slope, weight, ratio = (
         rays.cross,
@@ -273,7 +286,9 @@ def add_pair(flat, grid, j, i, a, b, value):
 
 @inline
 def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
-    """Apply the transpose of `cross_levels`: total and moment receive each level's share."""
+    """Apply the transpose of `cross_levels`, with the same arguments: total and moment of
+    `work`, and voxels beside the line, receive each level's share.
+    """
     cross, pace, slope, weight, ratio = (
         rays.cross,
         rays.pace,
@@ -334,7 +349,19 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
 @inline
 def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
     """Correct the rays that pass a grid vertex of plane t = j on the other side than the
-    reference line, which is at l = x there.
+    reference line.
+
+    Args:
+        flat: voxels; transposed, changed in place.
+        spans: occupied levels of each voxel column.
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        rays: sorted rays; their sums are changed unless transposed.
+        work: bins, and room for the jump.
+        n: number of rays.
+        j: number of the plane.
+        x: place of the reference line there, l = x.
+        transposed: voxels receive the rays' values.
     """
     bins, jump, zeros = work.bins, work.jump, work.zeros
     w0, w1 = levels_between(grid, fan, j, j)
@@ -410,6 +437,18 @@ def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
 
     The line is in column r0 for `share` of the slab, for the rest in r1. Q takes the jump
     between them at its distance from the source (arm).
+
+    Args:
+        flat: voxels; transposed, changed in place.
+        spans: occupied levels of each voxel column.
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        work: its total is S, its moment Q; changed unless transposed.
+        j: number of the slab.
+        r0: column of the reference line at the slab's beginning.
+        r1: at its end.
+        share: of the slab, that the line is in r0.
+        transposed: see above.
     """
     total, moment = work.total, work.moment
     w0, w1 = levels_between(grid, fan, j, j + 1)
@@ -526,9 +565,19 @@ def share_out(rays, work, n):
 
 @kernel
 def walk(flat, spans, grid, fan, rays, work, n, transposed):
-    """Carry a sorted fan of n rays through its slabs.
+    """Carry a sorted fan of n rays through its slabs: fill the rays' sums, or (transposed) add
+    them to the voxels.
 
-    Transposed, spans mark the voxel columns that are open: see `siddon_kernels.open_column`.
+    Args:
+        flat: voxels; transposed, changed in place.
+        spans: occupied levels of each voxel column; transposed, marks of those that are open,
+            see `siddon_kernels.open_column`.
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        rays: sorted rays, initialised by `start`.
+        work: room.
+        n: number of rays.
+        transposed: see above.
     """
     x = grid.sl + fan.m0 * (fan.j0 - grid.st)
     r0 = math.floor(x)

@@ -252,6 +252,14 @@ def slab_kernel(transposed):
         step_c,
         factor,
     ):
+        """Walk the ray to a thread's pixel slab by slab: write its line integral, or
+        (transposed) add the pixel's value to the voxels.
+
+        Voxel (x, y, z) is flat[base + x hop_x + y hop_y + z] for nx, ny, nz voxels of size_x,
+        size_y, size_z [mm]. Rows start to start + n - 1 of `views` are walked: a ray each in
+        voxels, and the number of its image. Pixel (r, c) of image k is images[k rows cols + r
+        step_r + c step_c]; written values are multiplied by factor.
+        """
         # Views are fastest in the grid: blocks at work together read the same part of the
         # volume.
         view = start + cuda.blockIdx.x % n
@@ -431,6 +439,9 @@ def column_kernel(transposed):
         step_c,
         factor,
     ):
+        """Walk the rays of a warp together where they share voxel columns; arguments as those
+        of `slab_kernel`'s walk.
+        """
         view = start + cuda.blockIdx.x % n
         lane, warp = cuda.threadIdx.x, cuda.threadIdx.y
         r = cuda.blockIdx.y * BLOCK[0] + lane
@@ -642,6 +653,9 @@ def ray_kernel(transposed):
         step_c,
         factor,
     ):
+        """Walk the ray to a thread's pixel voxel by voxel, in any direction; arguments as those
+        of `slab_kernel`'s walk.
+        """
         view = start + cuda.blockIdx.x % n
         r = cuda.blockIdx.y * BLOCK[0] + cuda.threadIdx.x
         c = cuda.blockIdx.x // n * BLOCK[1] + cuda.threadIdx.y
@@ -747,8 +761,15 @@ which consumer cards are 64 times slower."""
 
 @cuda.jit
 def combine(kind, a, b, number, alone, out):
-    """Compute out = a (kind) b, or a (kind) number if alone; a RATIO is 0 where b <=
-    `number`.
+    """Compute out = a (kind) b, or a (kind) number if alone, one element a thread.
+
+    Args:
+        kind: ADD, SUBTRACT, MULTIPLY, MAXIMUM or RATIO.
+        a: (k,) float32.
+        b: (k,) float32.
+        number: second operand if alone; otherwise a RATIO is 0 where b <= number.
+        alone: b is not read.
+        out: (k,) filled; may be a.
     """
     i = cuda.grid(1)
     if i >= out.size:

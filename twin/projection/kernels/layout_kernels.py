@@ -16,10 +16,17 @@ BLOCK = 32
 
 @parallel
 def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
-    """Copy data to flat[y * stride_y + x * stride_x + z] (adding: add), first_y <= y <
-    last_y.
+    """Copy data to flat[y * stride_y + x * stride_x + z] for first_y <= y < last_y, in blocks
+    that fit the first cache.
 
-    Works in blocks that fit the first cache.
+    Args:
+        data: (nz, ny, nx) float32.
+        flat: changed in place.
+        stride_x: elements from x to x + 1.
+        stride_y: elements from y to y + 1.
+        adding: data is added to what flat holds.
+        first_y: first y.
+        last_y: y after the last.
     """
     nz, _, nx = data.shape
     for y in prange(first_y, last_y):
@@ -38,8 +45,18 @@ def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
 
 @parallel
 def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
-    """Fill first, last (ny, nx) for first_y <= y < last_y: the range of z outside which a voxel
+    """Fill `first` and `last` for first_y <= y < last_y: the range of z outside which a voxel
     column is zero.
+
+    Args:
+        flat: voxels, flat[y * stride_y + x * stride_x + z].
+        stride_x: elements from x to x + 1.
+        stride_y: elements from y to y + 1.
+        nz: voxels along z.
+        first: (ny, nx) filled with the first z that is not zero, nz in an empty column.
+        last: (ny, nx) filled with the z after the last.
+        first_y: first y.
+        last_y: y after the last.
     """
     nx = first.shape[1]
     for y in prange(first_y, last_y):

@@ -102,8 +102,17 @@ def ray_of(box, g, r, c):
 def walk_ray(box, g, r, c, value, transposed):
     """Compute the line integral of the ray to pixel (r, c), voxel by voxel.
 
-    Transposed, it adds value times the ray's length in each voxel to that voxel, and
-    box.spans are the marks of `open_column`, two for each voxel column.
+    Args:
+        box: voxels; transposed, changed in place, and its spans are the marks of `open_column`,
+            two for each voxel column.
+        g: (12,) source, first pixel minus source, u, v [voxels].
+        r: row.
+        c: column.
+        value: of the pixel, for the transpose.
+        transposed: add value times the ray's length in each voxel to that voxel.
+
+    Returns:
+        The integral, float32; meaningless if transposed.
     """
     dx, dy, dz, length = ray_of(box, g, r, c)
     nx, ny, nz = box.nx, box.ny, box.nz
@@ -173,12 +182,19 @@ def project_rays(box, views, chosen, out, tile, first_job, last_job):
 
 @parallel
 def spread_rays(box, views, chosen, values, slices, marks, first_column, last_column):
-    """Apply the transpose of `project_rays` to columns of the chosen views: add to
-    box.flat.
+    """Apply the transpose of `project_rays` to columns of the chosen views: add to box.flat.
 
-    Each job owns a range of z, slices (s, 2), and meets every ray, so that no two jobs
-    write the same voxel; marks (s, 2 nx ny): see `open_column`. Columns are counted
-    through all chosen views.
+    Each job owns a range of z and meets every ray, so that no two jobs write the same voxel.
+
+    Args:
+        box: voxels, changed in place.
+        views: (n, 12) rays in voxels.
+        chosen: (k,) numbers of views.
+        values: (n, rows, cols) images.
+        slices: (s, 2) ranges of z.
+        marks: (s, 2 nx ny): see `open_column`.
+        first_column: first column, counted through all chosen views.
+        last_column: column after the last.
     """
     rows, cols = values.shape[1:]
     for job in prange(len(slices)):
@@ -220,10 +236,24 @@ def faces(s, d, n):
 def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
     """Walk a ray like `walk_ray` and sum up the terms of its derivatives.
 
+    Args:
+        flat: voxels, flat[base + x step_x + y step_y + z].
+        base: index of voxel (0, 0, 0).
+        step_x: elements from x to x + 1.
+        step_y: elements from y to y + 1.
+        nx: voxels along x.
+        ny: voxels along y.
+        nz: voxels along z.
+        sx: the source's x [voxels].
+        sy: its y.
+        sz: its z.
+        dx: the ray's length along x, from source to pixel [voxels].
+        dy: along y.
+        dz: along z.
+
     Returns:
-        sum of values times ray parameter; then sum of J and sum of J t over the planes
-            across x,
-        y and z.
+        sum of values times ray parameter; then sum of J and sum of J t over the planes across
+        x, y and z.
     """
     jx = jy = jz = mx = my = mz = total = 0.0
     enter, leave = clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz)
@@ -317,9 +347,17 @@ def ends(total, length, d, jumps, moments):
 
 @kernel
 def ray_derivatives(box, g, r, c):
-    """Compute derivatives [1/mm] of the integral of the ray to pixel (r, c).
+    """Compute derivatives of the integral of the ray to pixel (r, c).
 
-    They are with respect to the source (x, y, z) and to the pixel's centre (x, y, z).
+    Args:
+        box: voxels.
+        g: (12,) source, first pixel minus source, u, v [voxels].
+        r: row.
+        c: column.
+
+    Returns:
+        Six derivatives [1/mm]: with respect to the source's x, y, z and the pixel centre's x,
+        y, z.
     """
     dx, dy, dz, length = ray_of(box, g, r, c)
     total, jx, mx, jy, my, jz, mz = walk_jumps(
@@ -402,11 +440,17 @@ def gather(box, views, weights, tile, parts, first_job, last_job):
 
 @parallel
 def follow(box, views, change, tile, out, first_job, last_job):
-    """Apply the transpose of `gather`: the effect of a view change (n, 12) [mm] on each
+    """Apply the transpose of `gather`: compute the effect of a change of the views on each
     pixel.
 
-    Fills out (n, rows, cols); each job, `tile` columns of one view, has pixels of its
-    own.
+    Args:
+        box: voxels.
+        views: (n, 12) rays in voxels.
+        change: (n, 12) change of the cone_vec rows [mm].
+        tile: columns of a job; each job, columns of one view, has pixels of its own.
+        out: (n, rows, cols) filled.
+        first_job: number of the first job.
+        last_job: number of the job after the last.
     """
     _, rows, cols = out.shape
     tiles = (cols + tile - 1) // tile

@@ -145,7 +145,14 @@ class Sharing:
     def of(
         cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume
     ) -> Sharing:
-        """Compute the shares of upright panels of `shape` (rows, cols) for a grid.
+        """Compute the shares of upright panels for a grid, and check that every voxel is seen
+        from every side.
+
+        Args:
+            circle: the sources' helix.
+            cone_vec: n upright views.
+            shape: the panel's (rows, cols).
+            like: place and size of the grid.
 
         Raises:
             GeometryError: a voxel is not seen from every side.
@@ -185,7 +192,15 @@ class Sharing:
         return np.column_stack([first, (DEPTHS - 1) / (last - first)])
 
     def table(self, views: slice, rows: tuple[int, int]) -> Float32Array:
-        """Compute shares of rows first <= r < last at each depth, (n, DEPTHS, rows)."""
+        """Compute the shares of rows at each depth.
+
+        Args:
+            views: a slice of the views, n of them.
+            rows: first row, and the one after the last; rows off the panel repeat its edge.
+
+        Returns:
+            (n, DEPTHS, rows), between 0 and 1.
+        """
         first, last = self.depth[views].T[..., None]
         depth = first + (last - first) * np.linspace(0.0, 1.0, DEPTHS)
         turn = (

@@ -117,6 +117,9 @@ def homography(
     """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
+        """Return the matrix that takes a pixel (column, row, 1) to its ray: columns u, v, first
+        pixel minus source.
+        """
         first = (
             row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
         )

@@ -97,7 +97,14 @@ def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
 
 
 def circle_of(cone_vec: ConeVec) -> Circle:
-    """Find the circle or helix of a scan's sources.
+    """Fit the circle or helix of a scan's sources.
+
+    Args:
+        cone_vec: n views.
+
+    Returns:
+        Centre, radius, and each view's angle and step of angle; for a circle its gaps, for a
+        helix its rise.
 
     Raises:
         GeometryError: fewer than three views, or neither about an axis along z.
@@ -162,7 +169,16 @@ def mean_image(
 
 
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
-    """Make a circle with its sources at angles from 0 to 2 pi."""
+    """Make a circle from its sources' angles, with steps and gaps.
+
+    Args:
+        azimuth: (n,) from 0 to 2 pi [rad].
+        centre: (2,) [mm].
+        radius: [mm].
+
+    Returns:
+        The circle; views at one angle share its step, and gaps belong to no view.
+    """
     at, same = np.unique(_on_circle(azimuth), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
@@ -194,7 +210,17 @@ def _usual(steps: FloatArray) -> float:
 def _helix(
     azimuth: FloatArray, height: FloatArray, centre: FloatArray, radius: float
 ) -> Circle | None:
-    """Fit a helix that rises steadily for a turn or more without a gap; else None."""
+    """Fit a helix that rises steadily for a turn or more without a gap.
+
+    Args:
+        azimuth: (n,) of the sources [rad].
+        height: (n,) [mm].
+        centre: (2,) [mm].
+        radius: [mm].
+
+    Returns:
+        The helix; None if the sources are on none.
+    """
     order = np.argsort(height, kind="stable")
     run = np.empty(len(order))
     run[order] = np.unwrap(azimuth[order])
@@ -226,13 +252,21 @@ def _helix(
 def redundancy(
     circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = False
 ) -> FloatArray:
-    """Compute weights (n, cols) of rays so that a line and its opposite together count
-    once.
+    """Compute weights of rays so that a line and its opposite together count once.
 
-    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol.
-    47 (2002) 2525), which falls smoothly to nothing towards a gap of the angles, and
-    towards the near edge of a panel moved to one side; with gaps that is where an object
-    reaches `beyond` the near edge. In a full turn of a centred panel each counts 1/2.
+    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol. 47
+    (2002) 2525), which falls smoothly to nothing towards a gap of the angles, and towards the
+    near edge of a panel moved to one side; with gaps that is where an object reaches `beyond`
+    the near edge. In a full turn of a centred panel each counts 1/2.
+
+    Args:
+        circle: of the sources.
+        cone_vec: n upright views.
+        cols: columns of the panel.
+        beyond: the object reaches beyond the panel's near edge.
+
+    Returns:
+        (n, cols) between 0 and 1.
 
     Raises:
         GeometryError: some lines are not seen from either side.
@@ -342,10 +376,19 @@ def reach(fan: FloatArray) -> tuple[float, float]:
 
 
 def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
-    """Count the columns before the first and after the last to continue a shifted panel.
+    """Count the columns before the first and after the last by which a shifted panel is
+    continued.
 
-    The filter's response to the panel's signal continues beyond its near edge. Voxels
-    whose shadow falls there need it, as far out as the panel ends on the other side.
+    The filter's response to the panel's signal continues beyond its near edge. Voxels whose
+    shadow falls there need it, as far out as the panel ends on the other side.
+
+    Args:
+        circle: of the sources.
+        cone_vec: n upright views.
+        cols: columns of the panel.
+
+    Returns:
+        (before, after), each 0 for a centred panel.
     """
     widest = max(reach(fan_angles(circle, cone_vec, cols)))
     source = cone_vec.source[:, :2]
@@ -371,6 +414,11 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
     """Compute the horizontal angle of each column's ray from the line source to axis.
+
+    Args:
+        circle: of the sources.
+        cone_vec: n upright views.
+        cols: columns of the panel.
 
     Returns:
         (n, cols) [rad], positive counter-clockwise seen from above.

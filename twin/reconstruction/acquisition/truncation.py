@@ -174,6 +174,13 @@ class Truncation:
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
         """Count the columns before the first and after the last that the object's shadow
         reaches.
+
+        Args:
+            cone_vec: upright views.
+            cols: columns of the panel.
+
+        Returns:
+            (before, after), at most twice the panel's columns.
         """
         most = 2.0 * cols
         before = 0.5 * cols
@@ -251,7 +258,13 @@ class Continuation:
 
     @classmethod
     def empty(cls, views: int, rows: int, wide: int) -> Continuation:
-        """Make a continuation with nothing beyond the edges."""
+        """Make a continuation with nothing beyond the edges.
+
+        Args:
+            views: number of views.
+            rows: of the images.
+            wide: columns with those beyond the edges.
+        """
         none = np.zeros(rows)
         return cls(
             0,
@@ -319,7 +332,12 @@ def truncation_of(
 
 
 def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
-    """Return whether some columns (n, cols) of the views show more than noise."""
+    """Check whether some columns of the views show more than noise.
+
+    Args:
+        images: n views (rows, cols).
+        there: (n, cols) the columns to check.
+    """
     from scipy.ndimage import uniform_filter
 
     rows, cols = images[0].shape
@@ -429,12 +447,18 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
 
 
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
-    """Find the edges (2,) beyond which the object continues, in some neighbouring views
-    or all.
+    """Find the edges beyond which the object continues, in some neighbouring views or all.
 
-    The middle one of three views counts, and the mean of all, in which less noise hides
-    it. Noise is that of every other bin near the edge: detectors blur it over some
-    columns.
+    The middle one of three views counts, and the mean of all, in which less noise hides it.
+    Noise is that of every other bin near the edge: detectors blur it over some columns.
+
+    Args:
+        band: (n, bins) line integrals of a band of rows.
+        least: line integral below which an edge never counts.
+        usual: line integral that is typical of the object.
+
+    Returns:
+        (2,) bool: left, right.
     """
     from scipy.ndimage import median_filter
 

@@ -136,6 +136,9 @@ class _Trial:
     """Explanations compared with the stated geometry of the scan."""
 
     def __init__(self, scan: CoarseScan) -> None:
+        """Reconstruct the scan as stated and project it again, and compare the residuals with
+        those expected.
+        """
         self.scan = scan
         self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
         own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation)
@@ -149,7 +152,13 @@ class _Trial:
         self.even = bool(enough and step.max() <= MAX_ARC_RATIO * np.median(step))
 
     def verdict(self) -> Contradiction | None:
-        """Find the error of the scan's geometry; None if there is none."""
+        """Judge the scan's geometry by trying other ones: reversed, shifted sideways and those
+        of `suspects`.
+
+        Returns:
+            The contradiction, with the kinds of error that explain it (none if the images fit
+            no trial); None if the images fit.
+        """
         if not self.telling.any() or self.excess < MIN_DOUBTFUL_MISFIT:
             return None
         unfit = self.whole and self.even and self.excess > MAX_MISFIT
@@ -196,6 +205,9 @@ class _Trial:
         )
 
     def _tried(self, suspect: Suspect) -> _Tried:
+        """Score a suspected geometry: its residuals over those of the stated one, the geometric
+        mean; inf if it has no volume.
+        """
         # The explanation of a scan also explains why it seemed cut off.
         shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
         if shown is None:
@@ -219,6 +231,7 @@ class _Trial:
         tried: dict[float, _Tried] = {}
 
         def score(columns: float) -> float:
+            """Score a shift of the panel by some columns; each is tried once."""
             if columns not in known:
                 tried[columns] = self._offset(columns)
                 known[columns] = tried[columns].score

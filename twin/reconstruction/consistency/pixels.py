@@ -109,7 +109,18 @@ def bad_pixels(
 def _outliers(
     views: Iterable[Float32Array], axis_column: float
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-    """Find pixels far beyond their neighbours, and the excess of all, (rows, cols)."""
+    """Find pixels far beyond their neighbours in the mean over the views.
+
+    Near the axis the neighbours above and below count, too, as rings of the object end there.
+
+    Args:
+        views: line integrals (rows, cols).
+        axis_column: column of the rotation axis.
+
+    Returns:
+        The outliers, and the excess of all pixels over their neighbours, (rows, cols) each; one
+        pixel without views or of too small ones.
+    """
     along, down, near = _Usual(), _Usual(), slice(0, 0)
     for view in views:
         if min(view.shape) <= 2 * NEIGHBOURS:

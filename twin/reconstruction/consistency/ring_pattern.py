@@ -81,7 +81,20 @@ def ring_errors(
 
 
 def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Array]:
-    """Compute medians of pixels' excess over neighbours in groups of views, (rows, cols)."""
+    """Compute medians of pixels' excess over neighbours in groups of views.
+
+    Groups are joined in pairs when there are `MAX_GROUPS`, so that memory is bounded.
+
+    Args:
+        views: line integrals (rows, cols).
+        width: columns of the neighbourhood.
+
+    Returns:
+        Medians (rows, cols), at least one.
+
+    Raises:
+        LimitError: there are no views.
+    """
     size = 2 * max(1, width // 2) + 1
     medians: list[Float32Array] = []
     group: list[Float32Array] = []

@@ -85,7 +85,12 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
 
 
 def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
-    """Rotate the views about the axis, each by its own angle (n,) [rad]."""
+    """Rotate the views about the axis, each by its own angle.
+
+    Args:
+        scan: n views.
+        turn: (n,) [rad].
+    """
     cos, sin, centre = np.cos(turn), np.sin(turn), np.append(scan.circle.centre, 0.0)
 
     def about(vectors: FloatArray) -> FloatArray:

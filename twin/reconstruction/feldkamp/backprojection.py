@@ -57,6 +57,7 @@ class OnProcessor:
     """
 
     def __init__(self, like: Volume) -> None:
+        """Allocate a volume of zeros with the place and size of `like`."""
         nz, ny, nx = like.shape
         self._first, self._size = first_and_steps(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
@@ -64,7 +65,9 @@ class OnProcessor:
         self.meter: NoiseMeter | None = None
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume."""
+        """Weigh and filter views, and add them to the volume and to the noise meter, if there
+        is one.
+        """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         n, wide, cols, rows = views.sizes
@@ -130,6 +133,11 @@ class OnDevice:
     """
 
     def __init__(self, like: Volume) -> None:
+        """Allocate a volume of zeros on the device, with the place and size of `like`.
+
+        Raises:
+            gpu.DeviceError: the device fails.
+        """
         nz, ny, nx = like.shape
         self._shape = (ny, nx, nz)
         self._halves: list[tuple[Any, Any]] = []
@@ -188,7 +196,17 @@ class OnDevice:
                     )
 
     def _transformed(self, views: Views, order: npt.NDArray[np.intp], length: int) -> Any:
-        """Weigh and filter columns of the images by a transform, (n, cols, rows)."""
+        """Weigh and filter columns of the images by a Fourier transform on the device.
+
+        Args:
+            views: n views with their weights and response.
+            order: (n,) order in which the images are uploaded.
+            length: of the transform, a power of 2.
+
+        Returns:
+            The filtered images (n, cols, rows) on the device, ready when its stream comes to
+            them.
+        """
         from flexdt.twin.reconstruction.kernels import (
             gpu_reconstruction_kernels as kernels,
         )
@@ -221,8 +239,14 @@ class OnDevice:
         return ready
 
     def _filter_tables(self, views: Views, length: int) -> tuple[Any, ...]:
-        """Return the tables that all chunks share: continuation, response, transform's
-        factors.
+        """Upload the tables that all chunks share: continuation, response, transform's factors.
+
+        Args:
+            views: with their response.
+            length: of the transform, a power of 2.
+
+        Returns:
+            `band` to `sines` of `kernels.filter_rows`, on the device.
         """
         from numba import cuda
 
@@ -287,7 +311,16 @@ class OnDevice:
         flat: Any,
         shape: tuple[int, ...],
     ) -> None:
-        """Add filtered columns of images of `size` (cols, rows) to a volume (ny, nx, nz)."""
+        """Add filtered images to a volume on the device.
+
+        Args:
+            ready: filtered images (n, cols, rows) on the device.
+            size: (cols, rows).
+            table: (n, 11) of `view_table`.
+            grid: centre of the first voxel and steps, on the device.
+            flat: the volume's voxels, changed in place.
+            shape: (ny, nx, nz).
+        """
         from numba import cuda
 
         from flexdt.twin.reconstruction.kernels import (
@@ -323,6 +356,9 @@ class OnDevice:
         layout_kernels.touch(out.reshape(-1))  # while the device is still at work
 
         def fetch() -> None:
+            """Wait for the device and copy the volume into `out`, and the difference of both
+            half volumes into the noise meter.
+            """
             self._stream.synchronize()
             self._flat.copy_to_host(out.reshape(-1))
             if self.meter is not None:

@@ -66,7 +66,15 @@ class Task:
     def onto(
         self, target: Backprojector, like: Volume, progress: Progress | None
     ) -> tuple[Float32Array, Noise | None]:
-        """Reconstruct into one grid: values (nz, ny, nx) and their noise.
+        """Reconstruct into one grid.
+
+        Args:
+            target: adds the views to a volume.
+            like: place and size of the grid.
+            progress: called with the share of the views that is done.
+
+        Returns:
+            Values (nz, ny, nx), and their noise; None without `errors` or in a helix.
 
         Raises:
             GeometryError: see `plan_fdk`; or images that do not fit.
@@ -128,7 +136,17 @@ def fdk_parts(
 def _on_device(
     task: Task, like: Volume, slabs: list[tuple[int, int]], progress: Progress | None
 ) -> Volume:
-    """Reconstruct on a device, slab by slab."""
+    """Reconstruct on a device, slab by slab.
+
+    Args:
+        task: images, geometry and settings.
+        like: place and size of the grid.
+        slabs: first layer of each, and the one after its last.
+        progress: called with the share that is done.
+
+    Returns:
+        The volume, with noise where it was measured in every slab.
+    """
     if len(slabs) == 1:
         data, noise = task.onto(OnDevice(like), like, progress)
         return with_errors(replace(like, data=data), noise)
@@ -152,6 +170,12 @@ def _add_all(
     progress: Progress | None,
 ) -> None:
     """Add the images of all views to a volume.
+
+    Args:
+        plan: views, weights and filter.
+        parts: the images in order, (k, rows, cols) each.
+        target: the volume.
+        progress: called with the share of the views that is done.
 
     Raises:
         GeometryError: images of another shape, or another number of them.

@@ -269,6 +269,15 @@ def plan_fdk(
 def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels:
     """Make the panels upright, with the axis on a column or between two if needed.
 
+    Args:
+        circle: of the sources.
+        cone_vec: n views as stated.
+        shape: (rows, cols).
+
+    Returns:
+        The views as stated and upright with their shapes, and whether rows and columns were
+        exchanged.
+
     Raises:
         GeometryError: rows of one pixel, a horizontal panel, or one that moves sideways.
     """
@@ -324,11 +333,20 @@ def weighing(
     views: slice,
     weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute the weights that FDK applies before the filter: factors, across and up of
-    `Views`.
+    """Compute the weights that FDK applies before the filter.
 
     The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion
     for a panel at any angle to that line then needs the distance along the panel's normal only.
+
+    Args:
+        shape: (rows, cols).
+        cone_vec: the chosen views, n of them.
+        circle: of all sources.
+        views: which of all views these are.
+        weights: (n, cols) of `redundancy`.
+
+    Returns:
+        Factors (n, cols), across (n, cols) and up (n, rows) of `Views`.
     """
     rows, cols = shape
     source, u, v = cone_vec.source, cone_vec.u, cone_vec.v

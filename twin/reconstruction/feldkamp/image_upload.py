@@ -25,6 +25,7 @@ class ImageUpload:
     """
 
     def __init__(self, stream: Any) -> None:
+        """Begin uploads for kernels that run in `stream`."""
         from numba import cuda
 
         self._reader, self._writer = stream, cuda.stream()
@@ -101,7 +102,15 @@ class ImageUpload:
         return pair[self._chunk][:count]
 
     def _portion(self, count: int) -> Any:
-        """Return page-locked memory, (count,), once the device has fetched its content."""
+        """Return page-locked memory once the device has fetched its content; two portions take
+        turns.
+
+        Args:
+            count: float32 numbers needed.
+
+        Returns:
+            (count,) float32.
+        """
         from numba import cuda
 
         self._turn = 1 - self._turn

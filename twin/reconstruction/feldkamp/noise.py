@@ -100,6 +100,13 @@ class NoiseMeter:
     """
 
     def __init__(self, like: Volume, circle: Circle, table: FloatArray) -> None:
+        """Make a coarse grid in which views are added with alternating signs.
+
+        Args:
+            like: the volume's grid.
+            circle: of the sources.
+            table: (n, 11) of `view_table`.
+        """
         self._circle, self._table = circle, table
         rows_per_mm = float(table[:, 9].mean()) / circle.radius
         size = np.array(like.voxel_xyz)
@@ -153,8 +160,10 @@ class NoiseMeter:
         )
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
-        """Place points on a spiral about the centre: radii (POINTS,) and (POINTS, 2)
-        [mm].
+        """Place points on a spiral about the centre.
+
+        Returns:
+            Radii (POINTS,) and places (POINTS, 2) [mm].
         """
         x, y, _ = self.grid.centers()
         farthest = float(np.hypot(*(np.abs([x[[0, -1]], y[[0, -1]]]).max(axis=1))))
@@ -167,8 +176,14 @@ class NoiseMeter:
         return radii, radii[:, None] * around + self._circle.centre
 
     def _seen_at(self, views: Views) -> tuple[FloatArray, FloatArray]:
-        """Compute the column, before the filter, at which views see the points, and its
-        weight.
+        """Compute the column, before the filter, at which views see the points, and the weight
+        there.
+
+        Args:
+            views: n views.
+
+        Returns:
+            (n, POINTS) each; both 0 for a point beside the panel.
         """
         points = self._points()[1]
         g = views.table[:, :, None]

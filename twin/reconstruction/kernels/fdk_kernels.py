@@ -65,9 +65,20 @@ def _spread(builder: Any, value: Any) -> Any:
 
 
 def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
-    """Select samples of two registers, one after the other, by their index."""
+    """Emit the selection of samples by index from two registers, one after the other.
+
+    Args:
+        builder: of LLVM's instructions.
+        low: the first register.
+        high: the second.
+        index: register of LANES indices, 0 <= index < 2 LANES.
+
+    Returns:
+        The register of the selected samples.
+    """
 
     def permute(name: str, *args: Any) -> Any:
+        """Emit a call of an intrinsic that permutes registers; returns its result."""
         kind = ir.FunctionType(_FLOATS, [arg.type for arg in args])
         return builder.call(
             cgutils.get_or_insert_function(builder.module, kind, name), args
@@ -111,6 +122,7 @@ def mix_lanes(
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
+        """Emit the weighted sum of LANES elements of two arrays, stored in a third."""
         left = _load(b, _at(context, b, signature, args, 2, args[4]))
         right = _load(b, _at(context, b, signature, args, 3, args[4]))
         mixed = _fma(b, left, _spread(b, args[5]), b.fmul(right, _spread(b, args[6])))
@@ -131,6 +143,7 @@ def resample_lanes(
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
+        """Emit the linear look-up of LANES places, added to LANES elements."""
         target = _at(context, b, signature, args, 0, args[1])
         # line[at : at + 2 LANES] in two registers, between whose samples the permutation picks.
         second = b.add(args[3], ir.IntType(64)(LANES))
@@ -246,7 +259,20 @@ def _column(g, cols, x, y):
 
 @kernel
 def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
-    """Add one view to the voxels above one another at (x, y); see `backproject`."""
+    """Add one view to the voxels above one another at (x, y); see `backproject`.
+
+    Args:
+        acc: (nz,) voxels, changed in place.
+        image: (cols, rows) filtered.
+        rows: of the image.
+        shares: (depths, rows) of a helix; unused otherwise.
+        g: (11,) or (13,) row of the views' table.
+        x: [mm].
+        y: [mm].
+        z0: lowest voxel's centre [mm].
+        dz: step along z [mm].
+        line: room for a column of the image.
+    """
     depth, c = _column(g, len(image), x, y)
     if depth == 0.0:
         return
@@ -388,7 +414,11 @@ def _add_tile(
     parts,
     volume,
 ):
-    """Add all views to one tile of voxel columns."""
+    """Add all views to one tile of voxel columns.
+
+    Args as for `backproject`; besides first_x, first_y: the tile's first voxel column; line,
+    at, parts: room.
+    """
     ny, nx = volume.shape[:2]
     few = images.shape[2] == rows
     last_x = min(nx, first_x + (WIDE if few else TILE))
@@ -420,6 +450,10 @@ def _add_tile(
 
 
 def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
+    """Compile `backproject` for a number of `lanes`, which is part of the disk cache's key;
+    return it.
+    """
+
     @parallel
     def backproject(images, rows, shares, views, x0, y0, z0, dx, dy, dz, volume, workers):
         """Add views to a volume.
@@ -642,8 +676,13 @@ BLOCK = 32
 
 @parallel
 def stand_up(rows_first, start, out):
-    """Transpose out[n, c, r] = rows_first[n, r, start + c], in blocks that stay in the
-    cache.
+    """Transpose images into columns, in blocks that stay in the cache: out[n, c, r] =
+    rows_first[n, r, start + c].
+
+    Args:
+        rows_first: float32 (n, rows, columns before the cut).
+        start: first column that is kept.
+        out: float32 (n, cols, rows or more), filled.
     """
     n, cols = out.shape[:2]
     rows = rows_first.shape[1]
@@ -673,11 +712,16 @@ def lanczos() -> Float32Array:
 
 @parallel
 def warp(images, maps, weights, out):
-    """Sample out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges repeat their last
-    pixel.
+    """Sample out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges repeat their last pixel.
 
-    `weights` are those of `lanczos`: with three lobes sharp details in a tilted image
-    stay sharper than by cubic interpolation, which took contrast from the finest ones.
+    `weights` are those of `lanczos`: with three lobes sharp details in a tilted image stay
+    sharper than by cubic interpolation, which took contrast from the finest ones.
+
+    Args:
+        images: float32 (n, rows of the panel, cols).
+        maps: float64 (n, 3, 3) homographies.
+        weights: float32 (PARTS + 1, TAPS).
+        out: float32 (n, rows, wide), filled.
     """
     n, rows, wide = out.shape
     cols = images.shape[2]

@@ -427,8 +427,19 @@ def lengths(x, counts, stride, scale, out):
 
 @cuda.jit
 def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
-    """Compute x, the allowed values next to z - theta D' dual, D' the transposed
-    differences.
+    """Compute x, the allowed values next to z - theta D' dual, D' the transposed differences; a
+    thread a voxel.
+
+    Args:
+        z: flat voxels.
+        dual: three arrays of that size, one after the other: along z, y, x.
+        theta: length of the step.
+        counts: voxels along z, y, x.
+        stride: places from one voxel column to the next.
+        scale: (3,) factors on the differences.
+        lowest: values are not less.
+        allowed: 0 where x must be 0.
+        x: flat voxels, filled.
     """
     i = cuda.grid(1)
     if i >= z.size:
@@ -452,10 +463,18 @@ def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
 
 @cuda.jit
 def dual_step(x, ahead, dual, rate, momentum, counts, stride, scale):
-    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate
-    ahead.
+    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate: ahead =
+    dual + momentum times the change of dual.
 
-    ahead = dual + momentum times the change of dual.
+    Args:
+        x: flat voxels.
+        ahead: three arrays of that size, one after the other; changed in place.
+        dual: likewise; changed in place.
+        rate: length of the step.
+        momentum: of the extrapolation.
+        counts: voxels along z, y, x.
+        stride: places from one voxel column to the next.
+        scale: (3,) factors on the differences.
     """
     i = cuda.grid(1)
     if i >= x.size or i % stride >= counts[0]:

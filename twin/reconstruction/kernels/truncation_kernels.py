@@ -145,6 +145,14 @@ def continue_rows(
 def _cost(x, source, rays, length, seen, scale):
     """Compute half the sum of Cauchy's losses of a prism's deviations, over their squared
     scale.
+
+    Args:
+        x: (6,) of `Prism.of`.
+        source: (n, 2) in the plane, over the radius of the field of view.
+        rays: (n, k, 2) likewise.
+        length: (n, k) of these rays [mm].
+        seen: (n, k) line integrals in the plane.
+        scale: deviation from which on rays count less.
     """
     e, f = math.exp(x[2]), math.exp(x[3])
     attenuation = math.exp(x[5])
@@ -167,8 +175,18 @@ def _cost(x, source, rays, length, seen, scale):
 
 @kernel
 def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient):
-    """Compute curvature (6, 6) and gradient (6,) of `_cost`; slope: memory for six
-    numbers.
+    """Compute curvature and gradient of `_cost`, whose arguments come first.
+
+    Args:
+        x: (6,) of `Prism.of`.
+        source: see `_cost`.
+        rays: see `_cost`.
+        length: see `_cost`.
+        seen: see `_cost`.
+        scale: see `_cost`.
+        slope: room for six numbers.
+        matrix: (6, 6) lower triangle filled.
+        gradient: (6,) filled.
     """
     e, f = math.exp(x[2]), math.exp(x[3])
     attenuation = math.exp(x[5])
@@ -211,7 +229,19 @@ def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradi
 
 @kernel
 def _solved(matrix, gradient, free, damping, factor, step):
-    """Compute the damped step of the free parameters by Cholesky; False if there is none."""
+    """Compute the damped step of the free parameters by Cholesky.
+
+    Args:
+        matrix: (6, 6) curvature, lower triangle.
+        gradient: (6,).
+        free: (6,) bool.
+        damping: share of the diagonal that is added to it.
+        factor: (6, 6) room.
+        step: (6,) filled; 0 for parameters that are not free.
+
+    Returns:
+        Whether there is a step; False if the matrix is not positive definite.
+    """
     for a in range(PARAMETERS):
         step[a] = -gradient[a] if free[a] else 0.0
         for b in range(a + 1):

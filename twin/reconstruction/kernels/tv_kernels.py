@@ -46,10 +46,19 @@ def variation(x, scale, layers, first, last):
 
 @parallel
 def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
-    """Compute x, the allowed values next to z - theta D' dual, D' the transposed
-    differences.
+    """Compute x, the allowed values next to z - theta D' dual, D' the transposed differences,
+    in layers first <= k < last.
 
-    lowest: values are not less; allowed: uint8 (nz, ny, nx), 0 where x must be 0.
+    Args:
+        z: (nz, ny, nx).
+        dual: (3, nz, ny, nx) along z, y, x.
+        theta: length of the step.
+        scale: (3,) factors on the differences.
+        lowest: values are not less.
+        allowed: uint8 (nz, ny, nx), 0 where x must be 0.
+        x: (nz, ny, nx) filled.
+        first: first layer.
+        last: layer after the last.
     """
     ny, nx = x.shape[1:]
     for k in prange(first, last):
@@ -74,10 +83,18 @@ def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
 
 @parallel
 def dual_step(x, ahead, dual, rate, momentum, scale, first, last):
-    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate
-    ahead.
+    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate: ahead =
+    dual + momentum times the change of dual; in layers first <= k < last.
 
-    ahead = dual + momentum times the change of dual.
+    Args:
+        x: (nz, ny, nx).
+        ahead: (3, nz, ny, nx) changed in place.
+        dual: (3, nz, ny, nx) changed in place.
+        rate: length of the step.
+        momentum: of the extrapolation.
+        scale: (3,) factors on the differences.
+        first: first layer.
+        last: layer after the last.
     """
     ny, nx = x.shape[1:]
     one = np.float32(1)
