@@ -190,7 +190,7 @@ def prepared(root: Path | None) -> Iterator[Place]:
 def main() -> int:
     """Build, start, check, stop."""
     options = argparse.ArgumentParser(
-        description=__doc__.split("\n")[0] if __doc__ else None
+        description=__doc__.partition("\n\n")[0] if __doc__ else None
     )
     options.add_argument("images", nargs="*", default=[])
     options.add_argument(

@@ -453,7 +453,7 @@ def study_scripts() -> dict[str, object]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study; exit code 1 if a contact was missed, a stop false, a clearance wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--sweeps", type=int, default=2000)
     parser.add_argument("--moves", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)

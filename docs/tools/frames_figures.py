@@ -243,7 +243,7 @@ FIGURES = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images")
     out = parser.parse_args().out
     for name, draw in FIGURES.items():

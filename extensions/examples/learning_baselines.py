@@ -77,7 +77,7 @@ def draw(found: dict[str, dict[str, dict[str, Any]]], out: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--episodes", type=int, default=8)
     parser.add_argument("--frames", type=int, default=16)

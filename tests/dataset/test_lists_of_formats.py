@@ -121,7 +121,7 @@ def volume_page() -> object:
 
 
 def volume_docstring() -> object:
-    said = (inspect.getdoc(fx.Volume.save) or "").splitlines()[0]
+    said = (inspect.getdoc(fx.Volume.save) or "").partition("\n\n")[0]
     return difference(
         endings(said), {f.endings[0] for f in volume_formats.VOLUME_FORMATS}
     )

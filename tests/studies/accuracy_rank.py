@@ -91,7 +91,7 @@ def judged(seed: int, number: int) -> Stated | None:
 
 def main() -> int:
     """Draw, compare and rank."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the first draw")
     parser.add_argument("--seed", type=int, default=63)

@@ -631,7 +631,7 @@ def right(rng: np.random.Generator, scan: Scan, folder: Path) -> tuple[str, Told
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--count", type=int, default=1000, help="contradictions")
     parser.add_argument("--right", type=int, default=1000, help="right scans")
     parser.add_argument("--seed", type=int, default=1)

@@ -156,7 +156,7 @@ WALKS: dict[str, Callable[[Walk], None]] = {
 
 def main() -> None:
     """Walk and print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument(
         "--json", type=Path, help="write the counts, and the files of each walk"
     )

@@ -313,7 +313,7 @@ def run(check: Check, sizes: Sizes) -> None:
 
 def main() -> int:
     """Run all parts that the time allows."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument(
         "--out", type=Path, required=True, help="folder of device_check.json"
     )

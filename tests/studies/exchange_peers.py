@@ -231,7 +231,7 @@ def leap(folder: Path) -> Callable[[fx.ConeVec], float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0] if __doc__ else None
+        description=__doc__.partition("\n\n")[0] if __doc__ else None
     )
     peers = {"cil": cil, "tigre": tigre, "leap": leap}
     for name in peers:

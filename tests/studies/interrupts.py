@@ -149,7 +149,7 @@ def campaign(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--longest", type=float, default=6.0)
     parser.add_argument("--seed", type=int, default=1)

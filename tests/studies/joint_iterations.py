@@ -168,7 +168,7 @@ def region(o: argparse.Namespace) -> int:
 
 def main() -> int:
     """One of the two."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("what", choices=("materials", "region"))
     parser.add_argument("--views", type=int, default=120)
     parser.add_argument("--iterations", type=int, default=30)

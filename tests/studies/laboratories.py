@@ -99,7 +99,7 @@ def laboratories(count: int, seed: int) -> Iterator[Outcome]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--laboratories", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

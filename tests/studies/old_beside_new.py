@@ -90,7 +90,7 @@ class Code:
 
 def main() -> int:
     """Measure in turns and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("commit")
     parser.add_argument("--only", default="C1,C2,C3,C1-tilt,C1x36,C2x10,adjoint-C1,FDK")
     parser.add_argument("--rounds", type=int, default=3)

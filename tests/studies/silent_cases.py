@@ -267,7 +267,7 @@ def told(case: Case, layer: FloatArray | None, word: str) -> str:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument(
         "commit", nargs="?", help="an older state, to stand beside today's"
     )

@@ -239,7 +239,7 @@ def off(found: float, least: float, most: float) -> float:
 
 def main() -> int:
     """Draw, judge and count."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", type=int, help="this draw alone")

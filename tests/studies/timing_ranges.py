@@ -314,7 +314,7 @@ def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--machines", type=int, default=50)
     parser.add_argument("--seed", type=int, default=17)
     parser.add_argument(

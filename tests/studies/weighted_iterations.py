@@ -58,7 +58,7 @@ def projected(volume: np.ndarray, scan: fx.ConeVec) -> np.ndarray:
 
 def main() -> int:
     """Reconstruct, and compare at equal sharpness."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--photons", type=float, default=300.0, help="of an open pixel")
     parser.add_argument("--seed", type=int, default=1)
     o = parser.parse_args()

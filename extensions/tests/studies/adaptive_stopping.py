@@ -79,7 +79,7 @@ def submit(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--scans", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--speed-up", type=float, default=3.0)

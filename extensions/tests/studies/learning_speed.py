@@ -53,7 +53,7 @@ def many(name: str, count: int, seconds: float) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--envs", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=10.0)
     given = parser.parse_args()
