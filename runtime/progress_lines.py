@@ -4,8 +4,7 @@ elsewhere.
 `told` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends
 within `SILENT_S` shows nothing. Work within other work of the same thread lends it its name
 only: there is one bar. Where a program handles the records of the logger `flexdt`, it gets
-    lines, not a bar; a
-level above WARNING of the logger `flexdt.progress` silences both.
+lines, not a bar; a level above WARNING of the logger `flexdt.progress` silences both.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ lego`.
 
 Three figures, best and median of several runs with kernels compiled and files in the page
 cache: the fit alone (bead positions in, parameters out), everything from counts in memory, and
-    everything
-from the files. CPU seconds are given beside wall seconds, so that a busy machine shows.
+everything from the files. CPU seconds are given beside wall seconds, so that a busy machine
+shows.
 """
 
 from __future__ import annotations

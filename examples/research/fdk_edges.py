@@ -14,9 +14,8 @@ table.
 
 `--rtk` does the same with itk-rtk's FDK (`pip install itk-rtk`) and writes its figures behind
 ours: its weights for displaced detectors; for wide objects its filter's truncation correction
-    of 0.5. The
-first table has RTK for level panels only, the third none. `--only tilted` (or `aside`, `wider`,
-`told`) makes one table.
+of 0.5. The first table has RTK for level panels only, the third none. `--only tilted` (or
+`aside`, `wider`, `told`) makes one table.
 """
 
 from __future__ import annotations

@@ -375,8 +375,8 @@ def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
     least: bytes that any method reads once; asked: those that ours asks for, of caches or
         memory.
     bound_ms: `least` at the speed at which all threads read. cached_ms: with every voxel column
-        in
-    one place, where it stays in the cache. cpu_ms: of all threads, as loads disturb it less.
+    in one place, where it stays in the cache. cpu_ms: of all threads, as loads disturb it
+    less.
     serial_ms: what one thread does beside the kernels, by its own clock.
     """
     rate = bandwidth()["all_threads_GB_s"]

@@ -1,7 +1,6 @@
 """The studies behind docs/evidence/physics.json and reconstruction.json, with what they must
 show: physics_figures, detector_figures, reference_scan, and, where the peers are installed,
-    compare_fdk
-and compare_gvxr; and silent_errors of tests/studies.
+compare_fdk and compare_gvxr; and silent_errors of tests/studies.
 """
 
 from __future__ import annotations

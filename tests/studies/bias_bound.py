@@ -4,11 +4,11 @@
 
 Solids of known attenuation are projected along rays of this file's own, through drawn
 geometries: whole turns, parts of turns, gaps, wedges, views at random or twice; panels in the
-    middle, aside,
-far aside, tilted; sources near and far; objects taller and wider than the panel; noise, and a
-flat that drifts. Means of small even balls, all over the object, are compared with the truth.
-Prints the part within the bound (and three times the noise), the bound over the error, and how
-many volumes had a warning. Exits with 1 where more than one region of fifty is outside.
+middle, aside, far aside, tilted; sources near and far; objects taller and wider than the
+panel; noise, and a flat that drifts. Means of small even balls, all over the object, are
+compared with the truth. Prints the part within the bound (and three times the noise), the
+bound over the error, and how many volumes had a warning. Exits with 1 where more than one
+region of fifty is outside.
 """
 
 from __future__ import annotations

@@ -7,9 +7,8 @@ Each simulated machine has limits, rates and times of its own and runs one to fo
 logs are fitted, and then another one, whose lines and total are compared with their ranges.
 Where its axes stand before that scan is known. Its times follow a family that the fit does not
 know: lognormal, bimodal (some commands of a kind take much longer) or drifting (everything
-    becomes slower
-from line to line). Not among the 50 unless asked for are `daily`: all times of a scan share a
-factor; and those of `COMPARED` and `UNSEEN`.
+becomes slower from line to line). Not among the 50 unless asked for are `daily`: all times
+of a scan share a factor; and those of `COMPARED` and `UNSEEN`.
 
 The logs are written here, byte by byte, with kinematics and times of this file; of flexdt only
 the reader, the fit and the comparison are used.

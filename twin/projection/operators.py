@@ -290,8 +290,7 @@ def back(
 
     Returns:
         Volume (of images on a device: `DeviceVolume`) on the grid of `like`; values in
-            the unit of
-        projections times mm.
+        the unit of projections times mm.
 
     Raises:
         GeometryError: the number of projections is not that of the views, out does not

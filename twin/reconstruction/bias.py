@@ -1,13 +1,12 @@
 """A bound of the bias in a volume of FDK, from the geometry and some of the images.
 
 A coarse volume of the object is projected and reconstructed on a ladder of scans: from
-    one without
-a flaw (parallel rays from everywhere, a panel that sees all) to the one at hand, one flaw a
-rung. The difference of two rungs is the effect of that flaw on such an object. Two flaws show
-in the images alone, and get a reconstruction each: what lies beyond the panel's edges,
-    continued in
-another way, and the drift of the flat, which is seen beside the object. A voxel's bound is what
-all of them come to about it.
+one without a flaw (parallel rays from everywhere, a panel that sees all) to the one at
+hand, one flaw a rung. The difference of two rungs is the effect of that flaw on such an
+object. Two flaws show in the images alone, and get a reconstruction each: what lies beyond
+the panel's edges,
+continued in another way, and the drift of the flat, which is seen beside the object. A
+voxel's bound is what all of them come to about it.
 """
 
 from __future__ import annotations

@@ -448,9 +448,8 @@ def run_bench(
         {machine, cases: [{name, views, ms_per_view, median_ms_per_view, mean_error,
         worst_error,
         peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth: {}};
-            errors are
-        shares of the maximum against double-precision exact lengths, ratios are peer /
-        flexdt.
+        errors are shares of the maximum against double-precision exact lengths, ratios are
+        peer / flexdt.
     """
     warm_up()
     found = peers() if with_peers else []

@@ -45,8 +45,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     """Choose algorithm, strength and constraint for a scan of a random object.
 
     Actions: (algorithm, strength, nonnegative): FDK with one of five windows, SIRT with 5 to 80
-        or
-    CGLS with 2 to 13 iterations; then clipped at zero or not.
+    or CGLS with 2 to 13 iterations; then clipped at zero or not.
 
     Observations, (13,) in [0, 1]: views, photons, attempts left, whether there was one, its
     algorithm, strength and constraint, its residual, its roughness, whether it was the best so

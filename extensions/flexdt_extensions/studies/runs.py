@@ -289,8 +289,7 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
 
     Returns:
         Rows: counts of runs, successes and failures, means and maxima of MAE, iterations
-            and cost
-        reduction, errors and sigmas by parameter, `beside` of the other method,
+        and cost reduction, errors and sigmas by parameter, `beside` of the other method,
         `thesis_*`.
     """
     out: list[dict[str, object]] = []

@@ -179,8 +179,7 @@ def fixed_line(start, slope, n):
 
     Returns:
         position and slope in fixed point, slope and its inverse in single precision, and
-            the slabs
-        between which the line is within [0, n).
+        the slabs between which the line is within [0, n).
     """
     start = min(max(start, -REACH), REACH)
     position = np.int64(math.floor(start * FIXED))
@@ -207,8 +206,7 @@ def crossing(t, slope, distance, steps):
 
     Returns:
         the bits that number the voxel, and the share of the slab before that is behind
-            the last
-        plane crossed.
+        the last plane crossed.
     """
     y = fused(t, slope, distance)
     floor, bits = floor_bits(y)
@@ -604,8 +602,7 @@ def first_crossing(s, d, n, enter, unit):
 
     Returns:
         voxel at entry, distance of the first crossing after it, distance between
-            crossings, and
-        crossings until the box ends.
+        crossings, and crossings until the box ends.
     """
     at = plus(s, times(enter, d))
     # On the device, floor gives a float.

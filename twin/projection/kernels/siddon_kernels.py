@@ -60,8 +60,7 @@ def first_step(s, d, n, enter, hop):
 
     Returns:
         voxel at entry, steps left until the box ends, t of the next crossing, t between
-            crossings,
-        and the memory step signed by direction.
+        crossings, and the memory step signed by direction.
     """
     # Rounding at the entry may give the voxel before the box or behind it.
     i = min(max(math.floor(s + enter * d), 0), n - 1)
@@ -167,8 +166,8 @@ def project_rays(box, views, chosen, out, tile, first_job, last_job):
     """Fill the chosen views of out (n, rows, cols) with line integrals.
 
     views (n, 12): source, first pixel centre minus source, u, v in voxel units of the box;
-        chosen:
-    indices of views; tile: columns a job; of each chosen view one job after the other.
+    chosen: indices of views; tile: columns a job; of each chosen view one job after the
+    other.
     """
     rows, cols = out.shape[1:]
     tiles = (cols + tile - 1) // tile

@@ -2,8 +2,7 @@
 
 Rows are continued on all cores, in one pass over the pixels, for the processor and for a device
 alike: of 360 views into 512^3 a device takes milliseconds a view, this a fraction of one, and
-    what
-it writes is what has to be copied there anyway.
+what it writes is what has to be copied there anyway.
 
 The fit is Levenberg and Marquardt's, of six numbers, with normal equations of six rows that are
 solved here: BLAS would start a thread on each core for each step. Arguments are not checked.
