@@ -38,11 +38,10 @@ ADVISED: Final = (
     "drift_across", "drift_along", "screw", "jump_across", "spot_drift", "runout", "wobble",
     "vibration", "angle_factor", "endpoint", "slip", "sdd_far_off", "panel_far_rolled",
     "axis_far_aslant", "tau_held", "height_held", "across_held", "strain_x", "strain_z", "grows",
-    "source_jumps",
+    "source_jumps", "other_pitch",
 )  # fmt: skip
-"""Kinds of faults whose findings advise arguments. Not among them: `other_pitch`, whose
-sentence names the pixels beside dD_z (freed, dD_z is 56 sigma off), and `four_tiles`, whose
-tiles may have no name."""
+"""Kinds of faults whose findings advise arguments. Not among them: `four_tiles`, whose tiles
+may have no name."""
 
 
 @dataclass(frozen=True)

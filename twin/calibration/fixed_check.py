@@ -22,9 +22,10 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
     narrow_priors,
 )
+from flexdt.twin.calibration.diagnose.pixel_pitch import with_rival_pitch
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver
-from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED
+from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, known
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     from_printed_reading,
@@ -143,7 +144,10 @@ def check_fixed(
         alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
         return refit_scans(state, alone, fit)
 
-    return doubtful(fit, verdict, without), [*explained, *found]
+    fit, pitch = with_rival_pitch(
+        doubtful(fit, verdict, without), known((), None, (s.priors for s in state.scans))
+    )
+    return fit, [*explained, *found, *listed(pitch)]
 
 
 def _centre(asked: CalibrationRequest) -> dict[str, float]:

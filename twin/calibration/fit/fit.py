@@ -300,6 +300,27 @@ def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> f
     return float(0.5 * np.sum(norms[use] ** 2))
 
 
+@dataclass(frozen=True)
+class RivalPitch:
+    """A pixel pitch that explains a fit as well as its distance of the panel.
+
+    Attributes:
+        growth: true pitch over the stated one, less 1.
+        change: parameter -> its change where that is the cause, edge units.
+        share: probability that it is the cause.
+    """
+
+    growth: float
+    change: Mapping[str, float]
+    share: float
+
+    @property
+    def open_change(self) -> dict[str, float]:
+        """Parameter -> standard deviation, with its sign, that the pitch adds to it."""
+        part = math.sqrt(self.share)
+        return {name: part * change for name, change in self.change.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class FitResult:
     """A fitted geometry.
@@ -318,6 +339,7 @@ class FitResult:
         solution: column values.
         bead_prior_mm: standard deviation of the prior on bead positions; 0 if they were fixed.
         strain_prior: that of the phantom's stretches and shears; 0 if it has its stated shape.
+        rival_pitch: pixel pitch that is in the covariance; None: no such pitch.
     """
 
     parameters: Offsets
@@ -333,6 +355,7 @@ class FitResult:
     solution: Solution
     bead_prior_mm: float = 0.0
     strain_prior: Strain = UNSTRAINED
+    rival_pitch: RivalPitch | None = None
 
     @property
     def panel(self) -> Panel | None:
@@ -599,9 +622,10 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     out = []
     for group in range(len(fit.group_parameters)):
         here, rows = image_slopes(fit.problem, fit.solution.x, group)
-        sigma = np.sqrt(
-            np.maximum(np.einsum("qi,ij,qj->q", rows, fit.covariance, rows), 0.0)
-        )
+        variance = np.einsum("qi,ij,qj->q", rows, fit.covariance, rows)
+        if fit.rival_pitch is not None:
+            variance += _pitch_variance(fit, fit.rival_pitch, group, here[0], rows)
+        sigma = np.sqrt(np.maximum(variance, 0.0))
         out.append(
             {
                 name: Estimate(v, s, v - t * s, v + t * s, unit)
@@ -611,6 +635,29 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
             }
         )
     return tuple(out)
+
+
+def _pitch_variance(
+    fit: FitResult, pitch: RivalPitch, group: int, column: float, rows: FloatArray
+) -> FloatArray:
+    """Compute what another pixel pitch adds to the variances (3,) of the quantities of
+    IN_IMAGES beyond its part of the covariance.
+
+    A column in pixels is nearer to the panel's centre where pixels are wider.
+
+    Args:
+        fit: with the pitch in its covariance.
+        pitch: the pitch.
+        group: of frames.
+        column: of the axis [px].
+        rows: (3, p) derivatives of the quantities by the parameters, edge units.
+    """
+    change = np.array([pitch.change.get(n, 0.0) for n in fit.values])
+    alone = rows @ change
+    frame = int(np.flatnonzero(fit.problem.group == group)[0])
+    beside = alone.copy()
+    beside[0] -= pitch.growth * (column - fit.problem.origin[frame, 0])
+    return np.asarray(pitch.share * (beside**2 - alone**2))
 
 
 def image_slopes(
