@@ -26,9 +26,11 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
 
-MEASURED = Solver(floor_px=0.3)
+MEASURED = Solver(floor_px=0.3, spread_px=1.0)
 """Positions of a second measurement are never taken to be better than a third of their
 sigma: in images without noise, positions off by a thousandth of a pixel are no outliers."""
+FOUND = Solver(spread_px=0.02)
+"""Positions of a first measurement have no sigma of their own: .005 to .09 px, assumed."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
 
@@ -104,7 +106,7 @@ def fit_scans(
         start=_start(state, request) if start is None else start,
         reading=request.reading,
         sampling_px=max((m.sampling_px for m in state.measured), default=0.0),
-        solver=MEASURED if weighed else None,
+        solver=MEASURED if weighed else FOUND,
         priors=priors_of(state.scans, request),
         prior_centre=request.start,
         bound=request.bound,

@@ -44,6 +44,9 @@ RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
 MAX_ROUNDING = 1e-9
 """Residuals of exact positions [whitened] below which structure is rounding."""
+SPREAD_FREEDOM = 3.0
+"""Degrees of freedom that a spread expected of the residuals counts for; assumed. Two
+positions to spare may agree by chance 20 times better than they are known."""
 LEAST_FREEDOM = 1e-3
 """Degrees of freedom from which the residuals have a spread."""
 ROUNDING_OF_COLUMNS = 1e-13
@@ -513,7 +516,7 @@ def spread_of_residuals(
     A column costs the part of a degree of freedom that the images, not its prior,
     determine (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a full one.
     Where priors are moved by more than that to fit the images, their shifts count as
-    residuals.
+    residuals. A spread that the problem expects counts as SPREAD_FREEDOM residuals.
 
     Args:
         problem: the data.
@@ -524,14 +527,17 @@ def spread_of_residuals(
     Returns:
         The standard deviation, nan without degrees of freedom, and their number.
     """
-    _, _, norms, _, upper, _ = problem.evaluate(x, use, 1)
-    told = upper + np.triu(upper, 1).T
+    _, _, norms, _, told, _ = problem.evaluate(x, use, 1)
     weight = problem.prior_weight(prior_noise)
     count = 2.0 * int(use.sum())
     dof = count - _determined(told, weight)
     if not dof > LEAST_FREEDOM:
         return math.nan, 0.0
     square = float(np.sum(norms[use] ** 2))
+    if problem.expected_spread > 0.0:
+        dof += SPREAD_FREEDOM
+        count += SPREAD_FREEDOM
+        square += SPREAD_FREEDOM * problem.expected_spread**2
     moved = float(np.sum(weight * (x - problem.prior_mean) ** 2))
     with_priors = max(count - float((weight == 0.0).sum()), LEAST_FREEDOM)
     return math.sqrt(max(square / dof, (square + moved) / with_priors)), dof

@@ -29,6 +29,7 @@ from scipy.special import stdtrit
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
 from flexdt.twin.calibration.fit.certificate import (
+    SPREAD_FREEDOM,
     Certificate,
     Estimate,
     certify,
@@ -64,6 +65,14 @@ LEAST_PIVOT = 1e-15
 LEAST_NOISE = 1e-4
 """Least spread of whitened residuals, assumed for exact data: priors then still fix
 directions that the data leave open, and count when the rank is judged."""
+FEW_VALUES: Final = 4
+"""Measured coordinates per column up to which two spreads of the residuals are tried."""
+QUIET_SHARES: Final = (0.1, 0.01)
+"""Parts of the spread that was found from which smaller ones are sought."""
+QUIET_LOG_ODDS: Final = math.log(10.0)
+"""Logarithm of the odds from which a smaller spread is believed."""
+TRIMMED_SPREADS: Final = 10.0
+"""Range of positions that are left out, in the larger of their noise and sigma; assumed."""
 IN_IMAGES: Final[Mapping[str, str]] = {
     "axis_column": "px",
     "axis_angle": "deg",
@@ -91,6 +100,8 @@ class Solver:
             data have no outliers.
         max_iterations: of each Levenberg-Marquardt run.
         tolerance: stop when the residuals' rms would change by less [whitened units].
+        spread_px: spread of the residuals that is expected before they are seen [whitened
+            units], see `certificate.spread_of_residuals`; 0: nothing is expected.
     """
 
     huber: float = 3.0
@@ -98,6 +109,7 @@ class Solver:
     floor_px: float = 1e-3
     max_iterations: int = 60
     tolerance: float = 1e-9
+    spread_px: float = 0.0
 
 
 LEAST_SQUARES = Solver(huber=math.inf, trim=math.inf)
@@ -272,7 +284,7 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
     """Solve the column-scaled, damped normal equations.
 
     Args:
-        hess: (c, c), upper triangle.
+        hess: (c, c).
         grad: (c,).
         damping: added to the scaled diagonal.
 
@@ -498,6 +510,7 @@ def estimate_geometry(
         panel=panel,
         strain=strain,
         arc=arc,
+        expected_spread=0.0 if solver is None else solver.spread_px,
     )
     if not problem.seen.any():
         raise TwinError(
@@ -592,11 +605,38 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
     """Solve a problem, and weight its priors by the spread of the residuals.
 
+    Few positions may be explained in two ways: by priors that hold and noise, or by
+    priors that are off and hardly any noise. The more likely one is returned.
+
     Returns:
         The solution, and the spread of the whitened residuals by which its priors were
         weighted, from the previous pass.
     """
-    noise, x = 1.0, problem.start
+    found = _weighted(problem, solver, problem.start, 1.0)
+    weighed = bool(np.isfinite(problem.prior_sigma).any())
+    if not weighed or 2 * problem.seen.sum() > FEW_VALUES * len(problem.layout.names):
+        return found
+    solution, noise = found
+    best, likelihood = found, _log_likelihood(problem, *found) + QUIET_LOG_ODDS
+    for share in QUIET_SHARES:
+        quiet = _weighted(problem, solver, solution.x, max(share * noise, LEAST_NOISE))
+        gained = _log_likelihood(problem, *quiet)
+        if gained > likelihood:
+            best, likelihood = quiet, gained
+    return best
+
+
+def _weighted(
+    problem: FitProblem, solver: Solver | None, x: FloatArray, noise: float
+) -> tuple[Solution, float]:
+    """Solve a problem from a spread of the residuals on, until that spread repeats itself.
+
+    Args:
+        problem: the data and columns.
+        solver: settings.
+        x: start of the columns.
+        noise: start of the spread of the whitened residuals.
+    """
     for _ in range(4):
         solution = solve(problem, solver, x=x, prior_noise=noise)
         if np.isinf(problem.prior_sigma).all():
@@ -607,6 +647,39 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
             break
         noise = fresh
     return solution, noise
+
+
+def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> float:
+    """Compute the logarithm of the likelihood of the positions used, all columns integrated
+    out (Laplace), but for a constant.
+
+    Args:
+        problem: the data and columns.
+        solution: about which is integrated; positions that it leaves out are outliers of
+            TRIMMED_SPREADS times the noise.
+        noise: spread of the whitened residuals.
+    """
+    use, x = solution.use, solution.x
+    told = problem.evaluate(x, use, 1)[4]
+    precision = 1.0 / problem.prior_sigma**2
+    with_prior = precision > 0.0
+    whole = told / noise**2 + np.diag(precision)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    volume = (
+        np.linalg.slogdet(whole * np.outer(scale, scale))[1] - 2.0 * np.log(scale).sum()
+    )
+    moved = float(precision @ np.square(x - problem.prior_mean))
+    left_out = 2.0 * float(problem.seen.sum() - use.sum())
+    outliers = left_out * math.log(TRIMMED_SPREADS * max(noise, 1.0))
+    expected = SPREAD_FREEDOM if problem.expected_spread > 0.0 else 0.0
+    square = 2.0 * solution.cost + expected * problem.expected_spread**2
+    count = 2.0 * float(use.sum()) + expected
+    spread = count * math.log(noise) + 0.5 * square / noise**2
+    return (
+        -spread
+        - outliers
+        - 0.5 * (moved + float(volume) - float(np.log(precision[with_prior]).sum()))
+    )
 
 
 def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:

@@ -271,6 +271,8 @@ class FitProblem:
         panel: terms of the panel's distortion; None: no distortion.
         curvature: (n, k, 2, 1) shifts of the positions by an exposure of a full step, or
             (n, k, 2, 0): each exposure is an instant.
+        expected_spread: of the whitened residuals, expected before they are seen; 0: nothing is
+            expected.
     """
 
     poses: Poses
@@ -288,6 +290,7 @@ class FitProblem:
     prior_sigma: FloatArray
     panel: PanelModel | None = None
     curvature: FloatArray | None = None
+    expected_spread: float = 0.0
 
     @property
     def start(self) -> FloatArray:
@@ -450,7 +453,7 @@ class FitProblem:
             use, want, huber: as of the kernel.
 
         Returns:
-            Cost, predicted, norms, jac, hess and grad.
+            Cost, predicted, norms, jac, hess (symmetric) and grad.
         """
         x = np.asarray(x, dtype=np.float64)
         params, beads = self.spread(x)
@@ -467,10 +470,12 @@ class FitProblem:
         cost = kernels.evaluate(
             self.data, params, beads, shifts, use, huber, want, *written
         )
-        if table is None or want == 0:
+        if want == 0:
             return float(cost), *written
         predicted, norms, jac, hess, grad = written
         whole = hess + np.triu(hess, 1).T
+        if table is None:
+            return float(cost), predicted, norms, jac, whole, grad
         return (
             float(cost),
             predicted,
@@ -521,6 +526,7 @@ def build_problem(
     panel: PanelModel | None = None,
     strain: Strain = UNSTRAINED,
     arc: bool = False,
+    expected_spread: float = 0.0,
 ) -> FitProblem:
     """Check the arguments of a fit and put them into arrays.
 
@@ -609,6 +615,7 @@ def build_problem(
         ),
         panel=panel,
         curvature=curvature(poses, model, base, group, reading) if arc else None,
+        expected_spread=expected_spread,
     )
 
 
