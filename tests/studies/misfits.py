@@ -9,8 +9,9 @@ turned the other way, interlaced, in alphabetical order, a panel on the wrong si
 some pixels, motion. With `--right` they are made difficult instead: beam hardening, scatter,
 noise, few views, wires, foam, bodies that are almost symmetric. A contradiction counts as
 answered where its kind is named, where no accuracy is claimed, or where means of small balls
-are right within 10 %. Exits with 1 where less than 98 % are answered, or more than 1 % of right
-scans are told anything.
+are right within 10 %. "Not decided" are scans whose images fit another geometry as well: it is
+true of right and of wrong ones, and nothing is claimed. Exits with 1 where less than 98 % are
+answered, or more than 1 % of right scans are told of a contradiction.
 """
 
 from __future__ import annotations
@@ -277,6 +278,8 @@ def main() -> int:
 def judged(case: Case, bias: Bias | None) -> tuple[str, bool]:
     """What is told of a case, and whether that is as it should be."""
     found = None if bias is None else bias.contradiction
+    if found is not None and found.change is not None:
+        return "not decided", True
     if case.kind in RIGHT:
         return ("told something" if found else "nothing told"), found is None
     if found is not None:

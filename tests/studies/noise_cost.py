@@ -20,7 +20,7 @@ import flexdt as fx
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.reconstruction.checked_fdk import checked_fdk
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
-from flexdt.twin.reconstruction.consistency.agreement import contradiction_of
+from flexdt.twin.reconstruction.consistency.agreement import compared
 
 CASES = (
     (360, (128, 128), 1.17, fx.Grid((96, 96, 96), 0.6)),
@@ -62,7 +62,7 @@ def comparison_times(
         times = []
         for _ in range(3):
             begun = time.process_time()
-            contradiction_of(coarse)
+            compared(coarse)
             times.append(time.process_time() - begun)
         found.append(f"{min(times):.3f}")
     return found[0], found[1]

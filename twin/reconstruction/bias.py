@@ -12,7 +12,7 @@ voxel's bound is what all of them come to about it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Final
@@ -29,8 +29,9 @@ from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import (
     Contradiction,
-    contradiction_of,
+    compared,
 )
+from flexdt.twin.reconstruction.uniform_nodes import MIN_EVENNESS, UniformNodes
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 SAFETY_FACTOR: Final = 3.0
@@ -53,12 +54,6 @@ that reach their bound in narrow places have small ones
 (`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
 USUAL_FLOOR: Final = 0.001
 """Usual error of FDK without flaws, relative to the attenuation."""
-SMOOTHING_NODES: Final = 1.5
-"""Standard deviation of the smoothing of the coarse volume [nodes]: steps between its
-voxels would show as flaws of their own."""
-EDGE_CHANGE_SHARE: Final = 0.05
-"""Change between nodes at an edge, relative to the object's attenuation; blur hides
-flaws there."""
 MAX_VOXEL_NODES: Final = 4.0
 """Largest edge of a voxel for which a grid can hold uniform regions [nodes]."""
 
@@ -123,8 +118,8 @@ class Bias:
         ]
         inside = near[2][:, None, None] & near[1][:, None] & near[0] & self.inside
         value = np.abs(self.found.data)
-        if (inside & (self.even > 0.5)).any():
-            inside &= self.even > 0.5
+        if (inside & (self.even > MIN_EVENNESS)).any():
+            inside &= self.even > MIN_EVENNESS
         if not inside.any():
             return None
         off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
@@ -169,41 +164,26 @@ def bias_of(
 
 
 def _bias_of(scan: CoarseScan) -> Bias:
-    """Reconstruct a coarse scan and bound its errors, cause by cause.
-
-    Args:
-        scan: few views and pixels of the whole scan.
-
-    Returns:
-        The bound; without causes where images and geometry contradict each other.
-    """
-    from scipy.ndimage import gaussian_filter
-
-    data = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-    unseen = np.isnan(data) | scan.rim
-    data = np.nan_to_num(data)
-    sharp = np.where(scan.rim, np.float32(0.0), data)
-    smooth = (min(SMOOTHING_NODES, (len(data) - 1) / 4), SMOOTHING_NODES, SMOOTHING_NODES)
-    found = gaussian_filter(sharp, smooth, mode="nearest")
-    typical = _typical(sharp)
-    even = (
-        np.where(unseen, 0.0, _evenness(found, EDGE_CHANGE_SHARE * typical)) + 1e-3
-    )  # a mean needs weight
-    # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
-    inside = (sharp > 0.5 * found) & (np.minimum(sharp, found) > 0.25 * typical) & ~unseen
+    """Reconstruct a coarse scan and bound its errors, cause by cause."""
+    values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
+    data = np.nan_to_num(values)
+    nodes = UniformNodes.of(values, scan.rim)
+    found = nodes.found
     causes: dict[str, FloatArray] = {}
-    contradiction = contradiction_of(scan)
-    if contradiction is not None:
-        return Bias(scan.grid.like(found), even, inside, causes, contradiction)
+    bias = Bias(scan.grid.like(found), nodes.even, nodes.inside, causes)
+    comparison = compared(scan)
+    if comparison is not None and (seen := comparison.contradiction()) is not None:
+        return replace(bias, contradiction=seen)
 
     def add(cause: str, share: float, change: Float32Array) -> None:
-        causes[cause] = causes.get(cause, 0.0) + share * _about(change, even)
+        causes[cause] = causes.get(cause, 0.0) + share * _about(change, nodes.even)
 
     if scan.sparse:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
         best, ours = (
-            scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles)
+            scan.seen(nodes.sharp, scan.parallel("", wide, t))
+            for t in (None, scan.angles)
         )
         add("angles", SAFETY_FACTOR, np.abs(ours - best))
     rungs = [(rung.flaw, scan.seen(found, rung)) for rung in scan.ladder()]
@@ -224,7 +204,10 @@ def _bias_of(scan: CoarseScan) -> Bias:
             add("beyond", share, other - data)
     else:
         add("drift", 1.0, np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec)))
-    return Bias(scan.grid.like(found), even, inside, causes)
+    accuracy = bias.accuracy(bias.found)
+    if comparison is None or accuracy is None or accuracy.cut_off:
+        return bias
+    return replace(bias, contradiction=comparison.undecided(accuracy.most))
 
 
 def _drift(images: Float32Array) -> Float32Array:
@@ -236,27 +219,6 @@ def _drift(images: Float32Array) -> Float32Array:
     ends = images[:, :, [0, -1]].mean(axis=1)
     beside = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)
     return np.ascontiguousarray(np.broadcast_to(beside[:, :, None], images.shape))
-
-
-def _typical(values: Float32Array) -> float:
-    """Compute the attenuation below which half of the attenuation is: of a body, not of a
-    pin in it.
-    """
-    ordered = np.sort(values[values > 0.0], axis=None)
-    if not ordered.size:
-        return 0.0
-    below = np.cumsum(ordered, dtype=np.float64)
-    return float(ordered[np.searchsorted(below, 0.5 * below[-1])])
-
-
-def _evenness(values: Float32Array, most: float) -> FloatArray:
-    """Compute weights of nodes, small where values change by more than `most`."""
-    from scipy.ndimage import gaussian_gradient_magnitude
-
-    steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")
-    return np.asarray(
-        np.exp(-np.square(steep / max(most, float(np.finfo(np.float32).tiny))))
-    )
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:

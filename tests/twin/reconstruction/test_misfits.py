@@ -6,6 +6,8 @@ projectors.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bias_bound
 import misfits
 import numpy as np
@@ -100,6 +102,64 @@ def test_right_images_are_not_told_anything(kind: str, aside: float) -> None:
 def test_motion_is_no_offset() -> None:
     found = looked_at("moving").contradiction
     assert found is None or not found.kinds
+
+
+def drum(rod_mm: float) -> bias_bound.Scan:
+    """A cylinder with a rod and a hole in one half, in a beam of 9 degrees: reversed images are
+    nearly those of the mirrored body."""
+    scan = ConeVec.circular(sod=300.0, sdd=600.0, angles=TURN, shape=SHAPE, pixel=1.6)
+    solids = [
+        bias_bound.Solid("cylinder", np.zeros(3), np.array([17.0, 17.0, 8.0]), 0.0, 0.02),
+        bias_bound.Solid(
+            "cylinder",
+            np.array([9.0, 3.0, 0.0]),
+            np.array([rod_mm, rod_mm, 6.0]),
+            0.0,
+            0.02,
+        ),
+        bias_bound.Solid(
+            "box", np.array([-2.0, 8.0, 0.0]), np.array([rod_mm, 3.0, 6.0]), 0.4, -0.02
+        ),
+    ]
+    return bias_bound.Scan("", scan, SHAPE, solids, 0.0, 0.0, 0)
+
+
+@pytest.mark.parametrize("rod_mm", [2.0, 4.0])
+@pytest.mark.parametrize("reversed_", [False, True])
+def test_accuracy_is_claimed_only_where_the_sense_of_rotation_is_told(
+    rod_mm: float, reversed_: bool
+) -> None:
+    scan = drum(rod_mm)
+    images = scan.images()
+    if reversed_:
+        images = images[np.r_[0, np.arange(len(images) - 1, 0, -1)]]
+    case = misfits.Case("", images, scan.geometry, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    accuracy = bias.accuracy(Grid((16, 30, 30), 1.0))
+    assert (accuracy is None) == reversed_
+    if reversed_:
+        assert bias.contradiction is not None
+        assert "direction" in bias.contradiction.kinds
+
+
+def test_a_mirrored_body_in_a_parallel_beam_is_not_decided() -> None:
+    """No image tells the sense of rotation of parallel rays."""
+    far = ConeVec.circular(sod=3e5, sdd=3.3e5, angles=TURN, shape=SHAPE, pixel=0.88)
+    scan = replace(drum(4.0), geometry=far)
+    case = misfits.Case("", scan.images(), far, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert bias.contradiction is not None
+    assert "they fit as well if the rotation runs the other way" in str(
+        bias.contradiction
+    )
+    turned = replace(scan, solids=scan.solids[:2])  # mirror images of themselves
+    case = misfits.Case("", turned.images(), far, turned, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert bias.contradiction is None
+    assert bias.accuracy(Grid((16, 30, 30), 1.0)) is not None
 
 
 def test_volumes_of_voxels_that_hold_no_region_claim_nothing() -> None:

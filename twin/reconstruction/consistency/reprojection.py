@@ -15,6 +15,8 @@ from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
 MEDIAN_OF_SQUARES = 0.4549
 """Median of the squares of standard normal deviates."""
+ARCS = 12
+"""Arcs of a scan's views in which residuals are compared: at least one view each."""
 NOISE_VARIANCE_RATIO = 1.5
 """Variance of noise relative to the estimate by its median: few photons deviate more."""
 NOISE_OF_CHANGES = np.array([1.0, 0.25])
@@ -30,10 +32,12 @@ class Reprojection:
 
     Attributes:
         images: (n, rows, cols) line integrals.
-        again: of the volume, (n, rows, cols).
+        values: of the volume, (nz, ny, nx), NaN where no data cover it [1/mm].
+        again: line integrals through the volume, (n, rows, cols).
     """
 
     images: Float32Array
+    values: Float32Array
     again: Float32Array
 
     @classmethod
@@ -56,11 +60,12 @@ class Reprojection:
             None where FDK cannot use the geometry.
         """
         try:
-            values = np.nan_to_num(scan.fdk(images, cone_vec, truncation))
+            values = scan.fdk(images, cone_vec, truncation)
         except GeometryError:
             return None
         shape = (images.shape[1], images.shape[2])
-        return cls(images, scan.projected(values, cone_vec, shape, fine=False))
+        again = scan.projected(np.nan_to_num(values), cone_vec, shape, fine=False)
+        return cls(images, values, again)
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
         """Compute the root mean square of the residual over that of the images, without
@@ -75,6 +80,18 @@ class Reprojection:
         residual, signal, noise = self._powers
         beside = np.maximum(residual - noise, least * residual)
         return np.asarray(np.sqrt(beside / np.maximum(signal, np.finfo(np.float32).tiny)))
+
+    @cached_property
+    def arcs(self) -> FloatArray:
+        """Mean squares of the residual in arcs of views: of its values, and of their
+        changes along rows, (2, arcs)."""
+        rest = self.again - self.images
+        least = np.finfo(np.float32).tiny
+        parts = [
+            [max(_mean_square(arc), least) for arc in np.array_split(what, ARCS)]
+            for what in (rest, _changes(rest))
+        ]
+        return np.array(parts)
 
     @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:

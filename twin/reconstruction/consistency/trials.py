@@ -1,0 +1,240 @@
+"""Explanations of a scan's images, tried beside its stated geometry.
+
+Images are reconstructed as of each geometry, and the volume is projected again. Which geometry
+fits better is told by likelihood: the logarithm of the residuals' ratio, in arcs of views, whose
+scatter gives the standard error of its mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.reprojection import Reprojection
+from flexdt.twin.reconstruction.consistency.suspects import (
+    Suspect,
+    moved,
+    reversed_turn,
+    suspects,
+)
+from flexdt.twin.reconstruction.uniform_nodes import UniformNodes, smoothed
+
+MAX_RELIABLE_RESIDUAL: Final = 0.3
+"""Residual of the second reconstruction, over the images, below which it is reliable:
+one of few views or few columns beyond the axis has larger ones."""
+MIN_VIEWS_A_COLUMN: Final = 1.6
+"""Least views for a coarse column; with fewer, streaks hide contradictions."""
+MAX_ARC_RATIO: Final = 2.0
+"""Widest over usual angle of a view, above which views are random and weights are
+rough."""
+MIN_SIGNAL_SHARE: Final = 0.01
+"""Share of a residual that is never attributed to noise."""
+PROBE_COLUMNS: Final = 0.35
+"""Movement of the panel to find the side on which it fits better [coarse columns]."""
+FAR_PROBE_COLUMNS: Final = 3.0
+"""The same if images do not fit at all [coarse columns]."""
+MIN_EVIDENCE_SIGMAS: Final = 2.0
+"""Least distance of two likelihoods, in standard errors, at which one geometry fits
+better than another."""
+MAX_PROBE_STEPS: Final = 7
+"""Number of further movements of the panel, each twice as far."""
+UPSIDE_DOWN: Final = frozenset({"rows", "turned"})
+"""Explanations whose volume is upside down."""
+TURNED: Final = frozenset({"direction", "columns", "turned"})
+"""Explanations whose volume is turned about the axis."""
+TURN_STEPS: Final = 180
+"""Angles of a turn in which a mirrored object is compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """One explanation beside the stated geometry.
+
+    Attributes:
+        suspect: the explanation.
+        shown: its images, and its volume's; None where FDK cannot use its geometry.
+        score: its misfit over that of the stated geometry.
+        evidence: by how many standard errors the stated geometry fits better.
+        change: what nine of ten uniform nodes of the volume change by at most, relative
+            to their values.
+    """
+
+    suspect: Suspect
+    shown: Reprojection | None
+    score: float = np.inf
+    evidence: float = np.inf
+    change: float = 0.0
+
+
+class Trial:
+    """The stated geometry of a scan, beside which explanations are tried.
+
+    Args:
+        scan: coarse; all of its views and rows are compared.
+    """
+
+    def __init__(self, scan: CoarseScan) -> None:
+        self.scan = scan
+        self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
+        own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation)
+        assert own is not None  # as a scan has a volume
+        self.own = own
+        self.expected = self._expected(own, scan.cone_vec)
+        self.telling = self.expected < MAX_RELIABLE_RESIDUAL
+        self.excess = self._excess(own, self.expected)
+        step = scan.circle.step
+        enough = len(step) >= MIN_VIEWS_A_COLUMN * scan.images.shape[2]
+        self.even = bool(enough and step.max() <= MAX_ARC_RATIO * np.median(step))
+
+    @cached_property
+    def _nodes(self) -> UniformNodes:
+        """The stated geometry's volume."""
+        return UniformNodes.of(self.own.values, self.scan.rim)
+
+    def opposite(self) -> Tried:
+        """Try the rotation the other way."""
+        return self._tried(reversed_turn(self.scan))
+
+    def others(self, *, far: bool) -> list[Tried]:
+        """Try all explanations but the opposite rotation.
+
+        Args:
+            far: panels far aside, too, as for images that do not fit.
+        """
+        listed = suspects(self.scan, whole=self.whole and self.even)
+        return [*self._beside(far), *map(self._tried, listed)]
+
+    def excess_of(self, one: Tried) -> float:
+        """Compute an explanation's misfit over that of its volume's second
+        reconstruction.
+        """
+        if one.shown is None:
+            return np.inf
+        return self._excess(one.shown, self._expected(one.shown, one.suspect.cone_vec))
+
+    def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
+        """Compute the misfit of a volume's second reconstruction, infinite without one,
+        (2,).
+        """
+        again = Reprojection.of(self.scan, shown.again, cone_vec, None)
+        return np.full(2, np.inf) if again is None else again.misfit()
+
+    def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
+        """Compute the misfit relative to the expected one: by edges, if the coarse volume
+        has some.
+        """
+        ratios = shown.misfit(MIN_SIGNAL_SHARE) / expected
+        return float(ratios[1 if self.telling[1] else 0])
+
+    def _tried(self, suspect: Suspect) -> Tried:
+        # The explanation of a scan also explains why it seemed cut off.
+        shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
+        if shown is None or not self.telling.any():
+            return Tried(suspect, None)
+        misfits = (shown.misfit() / self.own.misfit())[self.telling]
+        score = float(np.exp(np.log(misfits).mean()))
+        residuals = (shown.arcs / self.own.arcs)[self.telling]
+        each = 0.5 * np.log(residuals).mean(axis=0)
+        spread = max(float(each.std(ddof=1)), np.finfo(np.float32).tiny)
+        evidence = float(each.mean()) * np.sqrt(len(each)) / spread
+        return Tried(suspect, shown, score, evidence, self._change(suspect, shown))
+
+    def _change(self, suspect: Suspect, shown: Reprojection) -> float:
+        """Compute the largest relative change of nine of ten uniform nodes.
+
+        An object that is turned about the axis is none: the zero of an opposite rotation
+        is unknown, and so is which end of an object is up.
+        """
+        nodes = self._nodes
+        values = np.where(self.scan.rim, np.float32(0.0), np.nan_to_num(shown.values))
+        other = smoothed(values)
+        if suspect.kind in UPSIDE_DOWN:
+            other = other[::-1]
+        change = nodes.change(other)
+        if suspect.kind not in TURNED:
+            return change
+        return min(change, nodes.change(_turned_onto(other, nodes.found)))
+
+    def _offset(self, columns: float) -> Tried:
+        """Try the panel moved along its rows [coarse columns]."""
+        said = f"by {columns * self.scan.binned[1]:+.1f} px along its rows"
+        moved_panel = moved(self.scan.cone_vec, columns)
+        return self._tried(Suspect("offset", self.scan.images, moved_panel, said))
+
+    def _beside(self, far: bool) -> list[Tried]:
+        """Try panels moved along their rows towards the side where images fit better, and on
+        either side until they fit worse."""
+        known = {0.0: 1.0}
+        tried: dict[float, Tried] = {}
+
+        def score(columns: float) -> float:
+            if columns not in known:
+                tried[columns] = self._offset(columns)
+                known[columns] = tried[columns].score
+            return known[columns]
+
+        side = min((-PROBE_COLUMNS, PROBE_COLUMNS), key=score)
+        if far and score(side) >= 1.0:
+            side = min((-FAR_PROBE_COLUMNS, FAR_PROBE_COLUMNS), key=score)
+        at = side
+        for _ in range(MAX_PROBE_STEPS):
+            if score(at) >= min(value for place, value in known.items() if place != at):
+                break
+            at *= 2.0
+        if len(known) > 3 or score(side) < 1.0:
+            for _ in range(2):
+                score(_lowest(known))
+        for at in (-PROBE_COLUMNS, PROBE_COLUMNS):
+            for _ in range(MAX_PROBE_STEPS):
+                score(at)
+                if at in tried and tried[at].evidence >= MIN_EVIDENCE_SIGMAS:
+                    break
+                at *= 2.0
+        return list(tried.values())
+
+
+def _lowest(known: dict[float, float]) -> float:
+    """Find the vertex of a parabola through the squares of the three lowest scores."""
+    places = sorted(known, key=known.__getitem__)[:3]
+    squares = np.square([known[place] for place in places])
+    if not np.isfinite(squares).all():
+        return places[0]
+    bend, slope, _ = np.polyfit(places, squares, 2)
+    if bend <= 0.0:
+        return places[0]
+    return float(np.clip(-slope / (2.0 * bend), min(places), max(places)))
+
+
+def _turned_onto(values: Float32Array, other: Float32Array) -> Float32Array:
+    """Turn a volume about its middle axis so that it is most like another.
+
+    Args:
+        values, other: (nz, ny, nx) of one grid.
+    """
+    from scipy.ndimage import rotate
+
+    moving, fixed = (np.fft.rfft(_around(one), axis=1) for one in (values, other))
+    likeness = np.fft.irfft((fixed * np.conj(moving)).sum(axis=0), TURN_STEPS)
+    turn_deg = 360.0 / TURN_STEPS * int(np.argmax(likeness))
+    turned = rotate(values, -turn_deg, axes=(1, 2), reshape=False, order=1)
+    return np.asarray(turned, np.float32)
+
+
+def _around(values: Float32Array) -> FloatArray:
+    """Sample the mean layer on circles about its middle, (radii, angles), weighted by
+    their lengths.
+    """
+    from scipy.ndimage import map_coordinates
+
+    layer = values.mean(axis=0, dtype=np.float64)
+    middle = 0.5 * (len(layer) - 1)
+    radii = np.arange(1.0, middle)[:, None]
+    angles = 2.0 * np.pi / TURN_STEPS * np.arange(TURN_STEPS)
+    places = middle + radii * np.sin(angles), middle + radii * np.cos(angles)
+    return np.asarray(np.sqrt(radii) * map_coordinates(layer, places, order=1))
