@@ -243,6 +243,8 @@ INVALID = 1
 FAILED = 1
 USAGE = 2
 REFUSED = 4
+INTERRUPTED = 130
+INTERRUPTED_LINE = b"flexdt: interrupted\n"
 SUPERVISED = "FLEXDT_SUPERVISED"
 """Environment variable of a supervisor's processes."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -253,12 +255,32 @@ T = TypeVar("T")
 
 def stop_signal() -> asyncio.Event:
     """Make an event that SIGTERM or SIGINT sets; a second signal does not
-    interrupt the stopping."""
+    interrupt the stopping.
+
+    A console script that watches for signals learns from it that an orderly end has begun,
+    which it ends where that gets stuck.
+    """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
+    watch = signal.set_wakeup_fd(-1)
+
+    def begin_to_stop() -> None:
+        stop.set()
+        if watch != -1:
+            with contextlib.suppress(OSError):
+                os.write(watch, b"\0")
+
     for number in SIGNALS:
-        loop.add_signal_handler(number, stop.set)
+        loop.add_signal_handler(number, begin_to_stop)
     return stop
+
+
+def leave(*_: object) -> None:
+    """End the process now, as a signal's handler; printed lines stay."""
+    try:
+        os.write(2, INTERRUPTED_LINE)
+    finally:
+        os._exit(INTERRUPTED)
 
 
 async def first_of(*events: asyncio.Event) -> None:
@@ -293,14 +315,21 @@ def announce_bound(server: str, host: str, port: int) -> None:
 def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:
     """Run the work to its end; print an error on standard error.
 
+    SIGINT ends the process at once until the work calls `stop_signal`: nobody has been
+    promised anything yet, and an exception within asyncio's loop can lose the turn of a
+    task, which then never ends. An ignored SIGINT stays ignored.
+
     Args:
         settings: of the process; `host` and `port` are where it listens.
-        run: the work; returns its own exit code.
+        run: the work; returns its own exit code, and calls `stop_signal` before it
+            announces that it is ready.
 
     Returns:
         Exit code.
     """
     _allow_descriptors()
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, leave)
     try:
         with asyncio.Runner(loop_factory=ServerLoop) as runner:
             return runner.run(run(settings))

@@ -7,13 +7,15 @@ first.
 From the start of `main` on SIGINT ends the process with exit code 130 and one line:
 
 - while a module is imported, at once: libraries do not expect an exception there, and
-some swallow
-  it;
+  some swallow it;
 - where the main thread runs Python, as KeyboardInterrupt, which commands clean up after;
-at once
-  where no code would get it, as in a finaliser;
+  at once where no code would get it, as in a finaliser;
 - where the main thread has been in compiled code for `STUCK_S` (a kernel, the compiler),
-at once.
+  at once;
+- after `SILENCE_S` in which the process, its descendants and their disks have had nothing
+  to do: an exception that a library swallowed, a lock that is never released, an orderly
+  end that waits for something that does not come. Servers, whose event loop hears of
+  signals itself, report the beginning of their end by `runtime.process.stop_signal`.
 """
 
 from __future__ import annotations
@@ -31,6 +33,14 @@ INTERRUPTED = 130
 LINE = b"flexdt: interrupted\n"
 STUCK_S = 0.4
 """Time from the signal to the end of a process whose main thread has not reacted [s]."""
+SILENCE_S = 20.0
+"""Time without work after which an end that has begun is taken for stuck [s]; supervised
+processes have 15 s to stop."""
+CHECK_S = 1.0
+"""Interval at which the work of an ending process is measured [s]."""
+MIN_WORKING_SHARE = 0.5
+"""Least share of the time for which a process that works has a processor or waits for one;
+what only ticks has less."""
 IMPORT_FILE = "<frozen importlib._bootstrap>"
 
 _heard = 0
@@ -69,14 +79,102 @@ def _watch() -> None:
 
 
 def _end_if_stuck(arrivals: int) -> None:
+    """End the process where the main thread does not react, or where nothing works after
+    it has.
+
+    Args:
+        arrivals: descriptor that gives the number of each signal, 0 for the beginning of
+            an orderly end.
+    """
+    import threading
     import time
 
+    watched = False
     while True:
         before = _heard
-        if signal.SIGINT in os.read(arrivals, 1):
+        number = os.read(arrivals, 1)[0]
+        if number == signal.SIGINT:
             time.sleep(STUCK_S)
             if _heard == before:
                 leave()
+        if not watched and number in (signal.SIGINT, 0):
+            watched = True
+            threading.Thread(target=_end_if_silent, name="silence", daemon=True).start()
+
+
+def _end_if_silent() -> None:
+    """End the process after `SILENCE_S` without work."""
+    import time
+
+    last_s = _wanted_s()
+    since = seen = time.monotonic()
+    while seen - since < SILENCE_S:
+        time.sleep(CHECK_S)
+        now_s = _wanted_s()
+        now = time.monotonic()
+        if now_s - last_s >= MIN_WORKING_SHARE * (now - seen):
+            since = now
+        last_s = now_s
+        seen = now
+    if "FLEXDT_TRACEBACK" in os.environ:
+        import faulthandler
+
+        faulthandler.dump_traceback()
+    leave()
+
+
+def _wanted_s() -> float:
+    """Sum up for how long the threads of this process and its descendants have had a
+    processor, or have waited for one or for a disk [s]; without /proc only those of this
+    process, and only while they had one.
+
+    Waiting counts as work: a busy machine gives a process less, and never ends it.
+    """
+    import time
+
+    try:
+        tasks = [task for pid in _family() for task in _entries(f"/proc/{pid}/task")]
+        times = [_text(f"{task}/schedstat").split()[:2] for task in tasks]
+        states = [_text(f"{task}/stat").rpartition(")")[2].split()[:1] for task in tasks]
+    except OSError:  # no /proc
+        times = []
+    if not any(times):
+        return time.process_time()
+    at_disk = time.monotonic() if ["D"] in states else 0.0
+    return at_disk + sum(int(each) for pair in times for each in pair) / 1e9
+
+
+def _family() -> list[str]:
+    """List the process ids of this process and its descendants."""
+    parents = {}
+    for entry in _entries("/proc"):
+        pid = entry.rpartition("/")[2]
+        if pid.isdigit():
+            words = _text(f"{entry}/stat").rpartition(")")[2].split()
+            parents[pid] = words[1] if words else ""
+    family = [str(os.getpid())]
+    for pid in family:
+        family += [child for child, parent in parents.items() if parent == pid]
+    return family
+
+
+def _entries(folder: str) -> list[str]:
+    """List the paths in a folder; none of a process that has ended."""
+    try:
+        return [f"{folder}/{name}" for name in os.listdir(folder)]
+    except FileNotFoundError:
+        if folder == "/proc":
+            raise
+        return []
+
+
+def _text(file: str) -> str:
+    """Read a small file; nothing of a process that has ended."""
+    try:
+        with open(file, encoding="ascii", errors="replace") as opened:
+            return opened.read()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
 
 
 def _not_lost(unraisable: object) -> None:

@@ -74,7 +74,6 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     viewer = Viewer(
         twin_address, ANSWERS, machine, profile, token, options.data, limits, looks
     )
-    stop = stop_signal()
     context = server_tls(options.tls_cert, options.tls_key)
     try:
         await viewer.start(options.host, options.port, context)
@@ -82,6 +81,7 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
         at = Address(options.host, viewer.front.port)
         url = f"{'http' if context is None else 'https'}://{at}/"
         async with served_pages(viewer_pages(viewer), options) as pages:
+            stop = stop_signal()
             announce(
                 "viewer",
                 {

@@ -12,6 +12,8 @@ import pytest
 from interrupts import COMMANDS, campaign
 
 SILENCE_S = 60.0
+STUCK_END_S = 1.5
+"""After so long without work an end counts as stuck here [s]."""
 MOST_USED_S = 1.5
 """Processor time from the signal to the end; servers stop their children in order."""
 
@@ -28,7 +30,52 @@ one = Waits()
 del one
 while True: pass
 """,
+    "an exception that a library swallows": """
+import time
+try:
+    time.sleep(30)
+except BaseException:
+    pass
+time.sleep(30)
+""",
+    "a server's end that never comes": """
+import asyncio
+from flexdt.runtime.process import stop_signal
+async def serve():
+    stop = stop_signal()
+    print("ready", flush=True)
+    await stop.wait()
+    while True:
+        await asyncio.sleep(0.1)
+asyncio.run(serve())
+""",
+    "a server's start": """
+import asyncio
+from types import SimpleNamespace
+from flexdt.runtime.process import run_process
+def work():
+    sum(range(10**8))
+    print("went on", flush=True)
+async def serve(settings):
+    print("ready", flush=True)
+    await asyncio.to_thread(work)
+run_process(SimpleNamespace(command="twin", host="", port=0), serve)
+""",
 }
+WORKING = """
+import asyncio, time
+from flexdt.runtime.process import stop_signal
+def work(until):
+    while time.monotonic() < until:
+        sum(range(1000))
+async def serve():
+    stop = stop_signal()
+    print("ready", flush=True)
+    await stop.wait()
+    await asyncio.to_thread(work, time.monotonic() + {work_s})
+    print("written", flush=True)
+asyncio.run(serve())
+"""
 SWALLOWING = """
 import time
 print("begins", flush=True)
@@ -43,10 +90,12 @@ import sys
 from flexdt.clients.cli import console_script
 
 def command():
-    if "swallowing" not in {code!r}:
+    if "swallowing" not in {code!r} and "ready" not in {code!r}:
         print("begins", flush=True)
-    exec({code!r})
+    exec({code!r}, {{}})
 
+console_script.SILENCE_S = {stuck_s}
+console_script.CHECK_S = 0.2
 console_script._command = command
 console_script.main()
 """
@@ -57,20 +106,36 @@ def test_the_main_thread_is_interrupted_wherever_it_is(
     where: str, tmp_path: Path
 ) -> None:
     (tmp_path / "swallowing.py").write_text(SWALLOWING)
-    program = PROGRAM.format(code=STUCK[where])
+    assert interrupted_end(STUCK[where], tmp_path) == (130, "", "flexdt: interrupted\n")
+
+
+def test_an_end_that_works_is_waited_for(tmp_path: Path) -> None:
+    code = WORKING.format(work_s=2 * STUCK_END_S)
+    assert interrupted_end(code, tmp_path) == (0, "written\n", "")
+
+
+def interrupted_end(code: str, folder: Path) -> tuple[int, str, str]:
+    """Interrupt a command after its first line, and return its exit code, further output
+    and errors.
+
+    Args:
+        code: of the command; it prints `ready`, or `begins` is printed before it.
+        folder: where it runs.
+    """
+    program = PROGRAM.format(code=code, stuck_s=STUCK_END_S)
     with subprocess.Popen(
-        [sys.executable, "-c", program], cwd=tmp_path, stdout=subprocess.PIPE,
+        [sys.executable, "-c", program], cwd=folder, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stdout is not None
-        assert process.stdout.readline() == "begins\n"
+        assert process.stdout.readline() in ("begins\n", "ready\n")
         process.send_signal(signal.SIGINT)
         try:
-            _, said = process.communicate(timeout=SILENCE_S)
+            further, said = process.communicate(timeout=SILENCE_S)
         except subprocess.TimeoutExpired:
             process.kill()
             raise
-    assert (process.returncode, said) == (130, "flexdt: interrupted\n")
+    return process.returncode, further, said
 
 
 @pytest.mark.slow
