@@ -34,8 +34,14 @@ SOURCE = "".join(
 )
 WORDS = set(re.findall(r"\w+", SOURCE))
 COLUMNS = 120
+"""Most columns of a line of styles."""
+SCRIPT_COLUMNS = 100
+"""Most columns of a line of TypeScript."""
+UPLOT = WEB / "node_modules" / "uplot"
+VENDORED = {"uplot.js", "uplot.css"}
+"""Files of the page that the build takes from npm's packages as they are."""
 HELD = "\0"
-SHORT = 80
+SHORT = 60
 HEAD = """\
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
 // viewer's own methods: the methods that the page calls, and the types and fields that it names.
@@ -131,7 +137,7 @@ def typed(schema: Mapping[str, Any], asked: bool) -> str:
         # field.
         held = "; ".join(field.replace(" ", HELD) for field in fields)
         lines = textwrap.wrap(
-            held, COLUMNS - 2, break_long_words=False, break_on_hyphens=False
+            held, SCRIPT_COLUMNS - 2, break_long_words=False, break_on_hyphens=False
         )
         if len(held) < SHORT:
             return f"{{ {lines[0].replace(HELD, ' ')} }}"
@@ -170,11 +176,27 @@ def tool(entry: str, *words: str) -> None:
 
 
 def build(target: Path) -> None:
+    """Write the page's JavaScript and what it takes from npm's packages."""
     tool("typescript/bin/tsc", "--project", str(WEB), "--outDir", str(target))
+    for name, content in vendored().items():
+        (target / name).write_text(content, "utf-8")
+
+
+def vendored() -> dict[str, str]:
+    """Read the files of npm's packages that browsers get: uPlot, as a module, under its
+    licence."""
+    licence = (UPLOT / "LICENSE").read_text("utf-8").strip()
+    program = (UPLOT / "dist" / "uPlot.iife.min.js").read_text("utf-8").strip()
+    return {
+        "uplot.js": f"/*\n{licence}\n*/\n{program}\nexport default uPlot;\n",
+        "uplot.css": (UPLOT / "dist" / "uPlot.min.css").read_text("utf-8"),
+    }
 
 
 def lint() -> None:
+    """Check the page's source: types and style by eslint, format by prettier."""
     tool("eslint/bin/eslint.js", "--max-warnings", "0", str(WEB))
+    tool("prettier/bin/prettier.cjs", "--log-level", "warn", "--check", "*.ts")
 
 
 @pytest.fixture
@@ -194,14 +216,16 @@ def test_the_types_of_the_wire_are_current() -> None:
 
 def test_every_module_has_a_source() -> None:
     sources = {path.stem for path in WEB.glob("*.ts") if not path.name.endswith(".d.ts")}
-    assert {path.stem for path in BUILT.glob("*.js")} == sources
+    built = {path.name for path in BUILT.glob("*.js")} - VENDORED
+    assert {name.removesuffix(".js") for name in built} == sources
 
 
 @pytest.mark.usefixtures("tools")
 @pytest.mark.slow
 def test_what_browsers_get_is_what_the_source_says(tmp_path: Path) -> None:
     build(tmp_path)
-    built = {path.name: path.read_text("utf-8") for path in BUILT.glob("*.js")}
+    paths = [*BUILT.glob("*.js"), *(BUILT / name for name in VENDORED)]
+    built = {path.name: path.read_text("utf-8") for path in paths}
     assert {path.name: path.read_text("utf-8") for path in tmp_path.iterdir()} == built, (
         "run `make web`"
     )
@@ -209,7 +233,7 @@ def test_what_browsers_get_is_what_the_source_says(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("tools")
-def test_eslint_finds_nothing() -> None:
+def test_eslint_and_prettier_find_nothing() -> None:
     lint()
 
 
@@ -217,9 +241,20 @@ def test_styles_have_no_long_lines() -> None:
     lines = [
         line
         for path in BUILT.glob("*.css")
+        if path.name not in VENDORED
         for line in path.read_text("utf-8").split("\n")
     ]
     assert [line for line in lines if len(line) > COLUMNS] == []
+
+
+def test_typescript_has_no_long_lines() -> None:
+    long = [
+        f"{path.name}:{number}"
+        for path in WEB.glob("*.ts")
+        for number, line in enumerate(path.read_text("utf-8").split("\n"), 1)
+        if len(line) > SCRIPT_COLUMNS
+    ]
+    assert long == []
 
 
 if __name__ == "__main__":

@@ -137,7 +137,7 @@ def test_the_loupe_enlarges_what_is_under_the_pointer(page: Any, wait: Wait) -> 
 
 
 def test_the_windows_end_is_pulled_on_the_histogram(page: Any, wait: Wait) -> None:
-    box = page.locator("#histogram").bounding_box()
+    box = page.locator("#histogram .u-over").bounding_box()
     high = float(page.input_value("#high")) / 1000
     page.mouse.move(box["x"] + high * box["width"], box["y"] + 20)
     page.mouse.down()

@@ -196,6 +196,28 @@ def test_saturation_is_said(page: Any, twin: TwinClient, wait: Wait) -> None:
     wait(lambda: "saturated" not in page.inner_text("#warnings"), "the warning goes")
 
 
+BINS = 128
+BARS_DRAWN = """
+bins => {
+  const canvas = document.querySelector('#histogram canvas');
+  const box = canvas.getBoundingClientRect();
+  const area = document.querySelector('#histogram .u-over').getBoundingClientRect();
+  const unit = canvas.width / box.width, image = flexdt.store.image;
+  const rows = Math.round(area.height * unit), top = Math.round((area.top - box.top) * unit);
+  const blue = column => {
+    const d = canvas.getContext('2d').getImageData(column, top, 1, rows).data;
+    return d.filter((v, k) => k % 4 == 2 && v > d[k - 2] + 60 && d[k + 1] > 60).length;
+  };
+  const column = k => Math.round((area.left - box.left + area.width * (k + .5) / bins) * unit);
+  const ends = [Math.min(0, image.low), Math.max(image.low + image.scale * 65535, .1)];
+  const [low, high] = ['#low', '#high'].map(
+    id => ends[0] + (ends[1] - ends[0]) * document.querySelector(id).valueAsNumber / 1000);
+  return [[...Array(bins).keys()].map(k => blue(column(k))), ends, [low, high]];
+}
+"""
+"""Height in pixels of each bar of the histogram, its ends and those of the window."""
+
+
 def test_the_histogram_counts_what_the_image_holds(
     page: Any, twin: TwinClient, wait: Wait
 ) -> None:
@@ -215,13 +237,14 @@ def test_the_histogram_counts_what_the_image_holds(
 
     wait(lambda: page.evaluate("flexdt.store.image?.code === 'deflate'"))
     wait(counts_it, "the image's histogram")
-    drawn = page.evaluate(
-        "(() => { const c = document.querySelector('#histogram'), d = c.getContext('2d')"
-        ".getImageData(0, 0, c.width, c.height).data; return d.filter((v, k) => k % 4 == "
-        "3 && v)"
-        ".length; })()"
-    )
-    assert drawn > 100
+    heights, ends, window = page.evaluate(BARS_DRAWN, BINS)
+    shares, edges = np.histogram(values, BINS, ends)
+    percent = 100.0 * shares / shares.sum()
+    middles = (edges[1:] + edges[:-1]) / 2
+    free = np.abs(np.subtract.outer(middles, window)).min(axis=1) > 2 * np.diff(edges)[0]
+    rising = np.log1p(percent[free] / 0.01)
+    assert np.corrcoef(rising, np.array(heights)[free])[0, 1] > 0.99
+    assert free.sum() > BINS / 2
     flags = twin.state().image
     assert flags is not None
     seen(page, twin)

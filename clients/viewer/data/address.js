@@ -1,7 +1,9 @@
 // What a reload brings back: tab, view, data set and frame in the address, the script after its
 // #.
 import { base64 } from "./dom.js";
-const MOST = 6000, DUE_MS = 300, KEY = "flexdt-script"; // a longer script stays in this browser's tab
+const MOST = 6000;
+const DUE_MS = 300;
+const KEY = "flexdt-script"; // a longer script stays in this browser's tab
 export const asked = (name) => new URLSearchParams(location.search).get(name);
 // Values of null are taken out; with `step` the browser's Back comes back to what was before.
 export function remember(values, step = false) {

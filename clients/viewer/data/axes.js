@@ -1,7 +1,10 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
 import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
-const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
+const LEASE_S = 0.5;
+const MOST_S = 10;
+const RENEW_MS = 180;
+const SETTLE_MS = 400;
 const GROUPS = [
     ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
     [
@@ -13,7 +16,9 @@ const GROUPS = [
 ];
 const TURN = { rot_obj: "turn of sample" }; // with what is set most
 const JOG_FALLBACK = { mm: 50, deg: 45 };
-const sod = (s) => s.geometry.SOD_mm, sdd = (s) => s.geometry.SDD_mm, high = () => store.framing?.sample_height_mm ?? NaN;
+const sod = (s) => s.geometry.SOD_mm;
+const sdd = (s) => s.geometry.SDD_mm;
+const high = () => store.framing?.sample_height_mm ?? NaN;
 const MAINS = [
     {
         words: "Source to sample",
@@ -71,11 +76,13 @@ export function jogStart(axis, direction, token) {
     if (held.has(token))
         return;
     const renew = () => {
-        const all = store.state, state = all?.axes[axis];
+        const all = store.state;
+        const state = all?.axes[axis];
         if (!all || !state)
             return;
         // The lease runs on the twin's clock, the renewals on ours.
-        const pace = all.clock.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
+        const pace = all.clock.speed_up;
+        const lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
         const top = state.speed ?? JOG_FALLBACK[state.unit];
         const velocity = direction * top * Number($select("#jog-speed").value);
         void command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
@@ -127,7 +134,9 @@ function mainRow(main, state) {
         return [];
     const input = field({ "aria-label": words }, enter, () => input.blur());
     function enter() {
-        const text = input.value, value = parsed(text), s = store.state;
+        const text = input.value;
+        const value = parsed(text);
+        const s = store.state;
         input.blur();
         if (!s || !(value > 0 || (axes.length > 1 && Number.isFinite(value)))) {
             emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`);
@@ -237,7 +246,8 @@ function axisRow(name, axis, what) {
         waiting: 0,
     };
     function enter() {
-        const text = number.value, value = parsed(text);
+        const text = number.value;
+        const value = parsed(text);
         number.blur();
         if (Number.isFinite(value))
             void move(name, value);
@@ -296,7 +306,8 @@ function refresh(state) {
     drawMains(state);
 }
 // Motors are one level below; this browser remembers whether they are open.
-const motors = $("#motors"), MOTORS = "flexdt-motors";
+const motors = $("#motors");
+const MOTORS = "flexdt-motors";
 motors.open = localStorage.getItem(MOTORS) === "open";
 motors.addEventListener("toggle", () => keep(MOTORS, motors.open ? "open" : "closed"));
 // A slider over many turns is of no use: it goes over the present one.

@@ -3,7 +3,10 @@
 import { $, $input, el, fixed, setText } from "./dom.js";
 import { emit, on, store } from "./link.js";
 import * as marks from "./marks.js";
-const AMBER = "#ffb454", GREEN = "#36e28f", BLUE = "#7cc4ff", REACH = 8;
+const AMBER = "#ffb454";
+const GREEN = "#36e28f";
+const BLUE = "#7cc4ff";
+const REACH = 8;
 // Folder -> where a fit of this page found its beads, and put them before and after.
 const tracks = new Map();
 const again = () => emit("image", store.image);
@@ -68,7 +71,8 @@ export function allow(why) {
 let made = null;
 const column = (i) => mode.value === "curtain" ? Math.round((i.shape[1] * Number(curtain.value)) / 1000) : 0;
 export function beside(i, virtual) {
-    const cols = i.shape[1], from = column(i);
+    const cols = i.shape[1];
+    const from = column(i);
     if (made?.of === i && made.from === from)
         return made;
     const pixels = i.pixels.slice();
@@ -84,7 +88,8 @@ export function words(i) {
 // Dragging the curtain in the picture; `pixel` is a CSS pixel in its coordinates.
 let held = false;
 export function press(place, pixel) {
-    const i = store.image, [c] = place;
+    const i = store.image;
+    const [c] = place;
     return (marks.press(place, REACH * pixel) ||
         (held =
             i?.virtual !== undefined &&
@@ -115,7 +120,8 @@ function rms(measured, predicted) {
     return off.length ? Math.sqrt(off.reduce((sum, d) => sum + d * d, 0) / off.length) : null;
 }
 function tell() {
-    const scan = scanned(), f = shown(store.image);
+    const scan = scanned();
+    const f = shown(store.image);
     beads.hidden = !scan;
     if (!scan)
         return;
@@ -142,7 +148,10 @@ export function draw(x, i, unit) {
         x.stroke();
     }
     marks.draw(x, unit);
-    const f = shown(i), k = Number(times.value), r = 9 * unit, arm = 5 * unit;
+    const f = shown(i);
+    const k = Number(times.value);
+    const r = 9 * unit;
+    const arm = 5 * unit;
     if (!f)
         return;
     x.lineWidth = 1.5 * unit;
@@ -156,7 +165,8 @@ export function draw(x, i, unit) {
         f[name]?.forEach((p, n) => {
             if (!p)
                 return;
-            const m = f.measured[n], [c, q] = m
+            const m = f.measured[n];
+            const [c, q] = m
                 ? [m[0] + k * (p[0] - m[0]) + 0.5, m[1] + k * (p[1] - m[1]) + 0.5]
                 : [p[0] + 0.5, p[1] + 0.5];
             x.globalAlpha = m ? 1 : 0.4; // faint where no bead was seen

@@ -8,14 +8,25 @@ import { draw as drawTimeline } from "./timeline.js";
 import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
-const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60, LEAST_PX = 76;
+const SEARCH_MS = 250;
+const AGAIN_MS = 500;
+const PLAYED = 300;
+const LEAST_MS = 60;
+const LEAST_PX = 76;
 const WORDS = {
     complete: "complete",
     incomplete: "incomplete",
     running: "running",
     unknown: "cannot be read in full",
 };
-let listed = [], told = null, plan = null, index = 0, next = null, asking = false, playing = false, number = 0;
+let listed = [];
+let told = null;
+let plan = null;
+let index = 0;
+let next = null;
+let asking = false;
+let playing = false;
+let number = 0;
 const search = $input("#data-search");
 clicks({ "data-more": () => list(listed.length) });
 const slider = el("input", {
@@ -116,7 +127,8 @@ async function list(start = 0) {
     drawn = key;
     $button("#data-more").hidden = listed.length >= answer.total;
     const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
-    const none = search.value ? "none is found" : "none yet: run a scan", all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
+    const none = search.value ? "none is found" : "none yet: run a scan";
+    const all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
     setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all);
     if (answer.unread && !$("#tab-data").hidden)
         setTimeout(() => {
@@ -124,7 +136,8 @@ async function list(start = 0) {
                 void list();
         }, AGAIN_MS);
 }
-let typing, drawn = "";
+let typing;
+let drawn = "";
 function listSoon() {
     clearTimeout(typing);
     typing = window.setTimeout(list, SEARCH_MS);
@@ -188,7 +201,8 @@ export async function open(name, at = null, step = false) {
     emit("recorded", name);
     if (name === null || !told)
         return;
-    const i = told.info, bare = !told.times_s;
+    const i = told.info;
+    const bare = !told.times_s;
     setText($("#record-name"), i.name);
     setText($("#record-state"), [
         [WORDS[i.state], i.problem || i.reason].filter(Boolean).join(": "),
@@ -252,9 +266,13 @@ function note() {
 function lanes() {
     if (!told)
         return;
-    const { kinds } = told, times = told.times_s ?? told.indices, curves = {}, units = {};
+    const { kinds } = told;
+    const times = told.times_s ?? told.indices;
+    const curves = {};
+    const units = {};
     for (const [name, values] of Object.entries(told.positions)) {
-        const known = values.filter((v) => v !== null), moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
+        const known = values.filter((v) => v !== null);
+        const moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
         if (moves) {
             curves[name] = values;
             units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm";
@@ -278,11 +296,13 @@ function lanes() {
     };
     redraw();
 }
-let moment = null, kept;
+let moment = null;
+let kept;
 function redraw() {
     if (!plan || panel.hidden)
         return;
-    const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2, room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
+    const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2;
+    const room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
     drawTimeline(canvas, plan, moment, null, room);
     $("#stage").style.setProperty("--record", `${rest + Math.min(canvas.offsetHeight, room)}px`);
 }
@@ -300,12 +320,15 @@ async function show(wanted) {
     asking = true;
     const name = told.info.name;
     while (next !== null && still(name)) {
-        const at = next, kinds = told.whole ?? told, k = kinds.indices.indexOf(at);
+        const at = next;
+        const kinds = told.whole ?? told;
+        const k = kinds.indices.indexOf(at);
         next = null;
         // Dark and flat images have no line integrals; of an image between those told the answer says
         // what it is.
         const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
-        let about = null, why = "";
+        let about = null;
+        let why = "";
         try {
             about = await call("viewer.recorded_image", {
                 index: at,
@@ -403,7 +426,8 @@ slid(canvas, (part) => {
     void play(false);
     if (!plan || !told)
         return;
-    const { times, duration_s } = plan, t = part * duration_s;
+    const { times, duration_s } = plan;
+    const t = part * duration_s;
     const k = times.reduce((best, v, i) => (Math.abs(v - t) < Math.abs(times[best] - t) ? i : best), 0);
     void show(told.indices[k]);
 });
@@ -427,7 +451,9 @@ window.addEventListener("keydown", (e) => {
 // A viewer that was started again knows nothing of it; a page that was loaded again asks for what
 // its address names: once the viewer has seen the twin, and this page has its own connection to
 // it.
-let lost = false, first = true, seen = false;
+let lost = false;
+let first = true;
+let seen = false;
 function ready() {
     if (!seen || !store.session)
         return;
@@ -450,7 +476,8 @@ on("layers", () => {
 });
 on("session", ready);
 export function restore() {
-    const name = asked("data"), at = asked("frame") === null ? null : Number(asked("frame")) || 0;
+    const name = asked("data");
+    const at = asked("frame") === null ? null : Number(asked("frame")) || 0;
     if (name !== (told?.info.name ?? null))
         void open(name, at);
     else if (told && at !== null)

@@ -63,7 +63,8 @@ export function field(attributes, apply, back) {
 export function numeric(input, apply, back) {
     input.addEventListener("input", () => input.classList.add("typed"));
     input.addEventListener("keydown", (e) => {
-        const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0, value = parsed(input.value);
+        const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0;
+        const value = parsed(input.value);
         if (e.key === "Enter" && !e.repeat)
             apply();
         if (e.key === "Escape")
@@ -111,7 +112,9 @@ export function context2d(canvas) {
 export function putGrey(canvas, [rows, cols], grey) {
     canvas.width = cols;
     canvas.height = rows;
-    const x = context2d(canvas), out = x.createImageData(cols, rows), d = new Uint32Array(out.data.buffer);
+    const x = context2d(canvas);
+    const out = x.createImageData(cols, rows);
+    const d = new Uint32Array(out.data.buffer);
     for (let k = 0; k < d.length; k++)
         d[k] = 0xff000000 | (grey(k) * 0x010101);
     x.putImageData(out, 0, 0);
@@ -121,33 +124,6 @@ export function putImage(canvas, { shape, data }) {
     const raw = atob(data);
     putGrey(canvas, shape, (k) => raw.charCodeAt(k));
     return canvas;
-}
-// A canvas with as many pixels as it takes on the screen, empty: what draws in it, width, height.
-export function cleared(canvas) {
-    canvas.width = canvas.clientWidth * devicePixelRatio;
-    canvas.height = canvas.clientHeight * devicePixelRatio;
-    return [context2d(canvas), canvas.width, canvas.height];
-}
-// Values along a line as a curve; what is no number has no point.
-export function curve(canvas, values, low, high) {
-    const [x, w, h] = cleared(canvas);
-    x.strokeStyle = getComputedStyle(canvas).getPropertyValue("--accent");
-    x.lineWidth = 1.5 * devicePixelRatio;
-    x.beginPath();
-    values.forEach((v, k) => {
-        if (Number.isFinite(v))
-            x.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1));
-    });
-    x.stroke();
-}
-// How often each value occurs, as its logarithm, so that what is rare shows beside much air.
-export function bars([x, w, h], counts, style) {
-    const n = counts.length, most = Math.log1p(Math.max(...Array.from(counts)));
-    for (let k = 0; k < n; k++) {
-        const high = (h * Math.log1p(counts[k])) / most;
-        style(k);
-        x.fillRect((w * k) / n, h - high, Math.max(1, w / n - 1), high);
-    }
 }
 // Pressed or dragged: which part of its width the pointer is at.
 export function slid(canvas, to) {

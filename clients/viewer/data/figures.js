@@ -10,7 +10,8 @@ export function seconds(s) {
     if (!isNumber(s))
         return "–";
     s = Math.round(s);
-    const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
+    const h = Math.floor(s / 3600);
+    const m = Math.floor((s % 3600) / 60);
     return h
         ? `${h} h ${String(m).padStart(2, "0")} min`
         : m

@@ -1,56 +1,96 @@
-// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it, and its
-// difference from a frame that was kept.
-import { below } from "./plot_axes.js";
-import { $, $button, $canvas, $input, $select, bars, cleared, context2d, fixed, setText, slid } from "./dom.js";
+// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn
+// over it, and its difference from a frame that was kept.
+import { histogram as plotted } from "./plots.js";
+import { $, $button, $canvas, $input, $select, context2d, fixed, setText, slid, } from "./dom.js";
 import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 import { signed } from "./slices.js";
-const canvas = $canvas("#film-canvas"), context = context2d(canvas), film = $("#film");
-const buffer = document.createElement("canvas"), pixels2d = context2d(buffer);
+const canvas = $canvas("#film-canvas");
+const context = context2d(canvas);
+const film = $("#film");
+const buffer = document.createElement("canvas");
+const pixels2d = context2d(buffer);
 // Zoom is relative to the whole image fitted in; x, y is the middle in pixels of the image.
 const view = { zoom: 1, x: 0, y: 0 };
-const SLIMMEST = 0.75, FLATTEST = 3; // of the film; a narrower image gets black edges
+const SLIMMEST = 0.75;
+const FLATTEST = 3; // of the film; a narrower image gets black edges
 const CLICK = 4; // pixels of the screen that a click may move
-const SATURATED = 0xff3040ff, STARVED = 0xff30b0ff; // drawn in red and orange
-let range = [0, 1], windowed = [0, 1], due = false, stamps = [], quiet, pointer = null;
+const SATURATED = 0xff3040ff;
+const STARVED = 0xff30b0ff; // drawn in red and orange
+let range = [0, 1];
+let windowed = [0, 1];
+let due = false;
+let stamps = [];
+let quiet;
+let pointer = null;
 export const shown = { count: 0, at: 0 };
 let reference = null;
-// What is shown: the newest image, its virtual one, or by how much it differs from that or from the reference, as
-// an image of its own.
+// What is shown: the newest image, its virtual one, or by how much it differs from that or from
+// the reference, as an image of its own.
 function frame() {
     const i = store.image;
     if (!i)
         return null;
-    const { virtual } = i, way = virtual ? compare.how() : "";
+    const { virtual } = i;
+    const way = virtual ? compare.how() : "";
     if (virtual && (way === "virtual" || way === "curtain"))
         return compare.beside(i, virtual);
-    const r = virtual && way === "difference" ? { ...i, pixels: virtual } : $input("#difference").checked ? reference : null;
+    const r = virtual && way === "difference"
+        ? { ...i, pixels: virtual }
+        : $input("#difference").checked
+            ? reference
+            : null;
     if (!r || r.kind !== i.kind || r.full.join() !== i.full.join())
         return i;
     if (apart?.of === i && apart.from === r.pixels)
         return apart;
-    const [rows, cols] = i.shape, f = r.shape[1] / cols, values = new Float32Array(rows * cols);
+    const [rows, cols] = i.shape;
+    const f = r.shape[1] / cols;
+    const values = new Float32Array(rows * cols);
     for (let k = 0; k < values.length; k++) {
-        const row = Math.min(r.shape[0] - 1, Math.floor((Math.floor(k / cols) + 0.5) * f)), col = Math.min(r.shape[1] - 1, Math.floor(((k % cols) + 0.5) * f));
-        values[k] = i.low + i.scale * i.pixels[k] - (r.low + r.scale * r.pixels[row * r.shape[1] + col]);
+        const row = Math.min(r.shape[0] - 1, Math.floor((Math.floor(k / cols) + 0.5) * f));
+        const col = Math.min(r.shape[1] - 1, Math.floor(((k % cols) + 0.5) * f));
+        values[k] =
+            i.low + i.scale * i.pixels[k] - (r.low + r.scale * r.pixels[row * r.shape[1] + col]);
     }
-    const sizes = values.filter((_, k) => k % EVERY === 0).map(Math.abs).sort(), span = Math.max(1e-6, 1.2 * sizes[Math.floor(0.995 * sizes.length)]);
+    const sizes = values
+        .filter((_, k) => k % EVERY === 0)
+        .map(Math.abs)
+        .sort();
+    const span = Math.max(1e-6, 1.2 * sizes[Math.floor(0.995 * sizes.length)]);
     const scale = Math.max(span, values.reduce((a, v) => Math.max(a, Math.abs(v)), 0)) / 32767;
-    return (apart = { ...i, of: i, from: r.pixels, signed: true, low: -32768 * scale, scale, pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768), window: [-span, span] });
+    return (apart = {
+        ...i,
+        of: i,
+        from: r.pixels,
+        signed: true,
+        low: -32768 * scale,
+        scale,
+        pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768),
+        window: [-span, span],
+    });
 }
 let apart = null;
 export function value(column, row) {
     const i = frame();
     if (!i)
         return NaN;
-    const f = i.full[1] / i.shape[1], c = Math.floor((column + 0.5) / f), r = Math.floor((row + 0.5) / f);
-    return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0] ? NaN : i.low + i.scale * i.pixels[r * i.shape[1] + c];
+    const f = i.full[1] / i.shape[1];
+    const c = Math.floor((column + 0.5) / f);
+    const r = Math.floor((row + 0.5) / f);
+    return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0]
+        ? NaN
+        : i.low + i.scale * i.pixels[r * i.shape[1] + c];
 }
-// Values between which a pixel is neither starved nor saturated: the twin says so with each image. Counts of a
-// recorded one are judged by the same camera, its line integrals by nothing that is known.
-function good(i) { const f = i.flags ?? store.state?.image; return (i.kind === "counts" ? f?.good_counts : i.flags?.good_lines) ?? [NaN, NaN]; }
+// Values between which a pixel is neither starved nor saturated: the twin says so with each
+// image. Counts of a recorded one are judged by the same camera, its line integrals by nothing
+// that is known.
+function good(i) {
+    const f = i.flags ?? store.state?.image;
+    return (i.kind === "counts" ? f?.good_counts : i.flags?.good_lines) ?? [NaN, NaN];
+}
 function limits(i) {
     if (i.signed)
         return i.window;
@@ -58,7 +98,8 @@ function limits(i) {
         return [0, Math.max(good(i)[1] || 0, i.window[1])];
     return [Math.min(0, i.low), Math.max(i.low + i.scale * 65535, 0.1)];
 }
-const lowEnd = () => $input("#low").valueAsNumber, highEnd = () => $input("#high").valueAsNumber;
+const lowEnd = () => $input("#low").valueAsNumber;
+const highEnd = () => $input("#high").valueAsNumber;
 function chooseWindow(i) {
     range = limits(i);
     const span = range[1] - range[0];
@@ -76,12 +117,20 @@ function develop(i) {
         buffer.width = cols;
         buffer.height = rows;
     }
-    const out = pixels2d.createImageData(cols, rows), data = new Uint32Array(out.data.buffer);
-    const low = windowed[0], high = windowed[1] > low ? windowed[1] : low + 1e-6;
-    const a = (255 * i.scale) / (high - low), b = (255 * (i.low - low)) / (high - low), flip = $input("#invert").checked;
-    const gamma = i.signed ? 1 : $input("#gamma").valueAsNumber, tone = Uint8Array.from({ length: 256 }, (_, g) => Math.round(255 * (g / 255) ** (1 / gamma)));
-    const counts = i.kind === "counts", flags = $input("#show-flags").checked && !i.signed && !(counts && unlit(i)), p = i.pixels;
-    const [least, most] = good(i).map((v) => (v - i.low) / i.scale), top = most - (i.code === "jpeg" ? 128.5 : 0.5); // half a step of the code
+    const out = pixels2d.createImageData(cols, rows);
+    const data = new Uint32Array(out.data.buffer);
+    const low = windowed[0];
+    const high = windowed[1] > low ? windowed[1] : low + 1e-6;
+    const a = (255 * i.scale) / (high - low);
+    const b = (255 * (i.low - low)) / (high - low);
+    const flip = $input("#invert").checked;
+    const gamma = i.signed ? 1 : $input("#gamma").valueAsNumber;
+    const tone = Uint8Array.from({ length: 256 }, (_, g) => Math.round(255 * (g / 255) ** (1 / gamma)));
+    const counts = i.kind === "counts";
+    const flags = $input("#show-flags").checked && !i.signed && !(counts && unlit(i));
+    const p = i.pixels;
+    const [least, most] = good(i).map((v) => (v - i.low) / i.scale);
+    const top = most - (i.code === "jpeg" ? 128.5 : 0.5); // half a step of the code
     for (let k = 0; k < data.length; k++) {
         let g = a * p[k] + b;
         g = tone[g < 0 ? 0 : g > 255 ? 255 : g | 0];
@@ -100,21 +149,31 @@ function develop(i) {
 // An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
 const unlit = (i) => i !== null && !i.recorded && i.origin?.lit === false;
 function beam(i) {
-    const tube = store.state?.tube, off = unlit(i);
+    const tube = store.state?.tube;
+    const off = unlit(i);
     $("#film-beam").hidden = !off;
     if (off)
-        setText($("#film-beam"), tube?.on && !tube.ready ? "X-rays warming up" : i?.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
+        setText($("#film-beam"), tube?.on && !tube.ready
+            ? "X-rays warming up"
+            : i?.kind === "counts"
+                ? "X-rays off: dark image"
+                : "X-rays off: drawn as though on");
 }
-// The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
+// The part of the beam that comes through: from the thickest place (all but one in a hundred
+// let more through) on.
 function transmission(i) {
     if (i.kind !== "line_integral" || i.signed)
-        return i.signed ? `difference from the ${i.from === reference?.pixels ? "reference" : "virtual image"}` : "transmission: choose line integral";
+        return i.signed
+            ? `difference from the ${i.from === reference?.pixels ? "reference" : "virtual image"}`
+            : "transmission: choose line integral";
     const through = [];
     for (let k = 0; k < i.pixels.length; k += EVERY)
         through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
     through.sort((a, b) => a - b);
-    const dark = through[Math.floor(0.01 * through.length)], mean = through.reduce((a, v) => a + v, 0) / through.length;
-    return `transmission ${(100 * dark).toFixed(1)} % or less in 1 % of the pixels · ${(100 * mean).toFixed(1)} % in the mean`;
+    const dark = through[Math.floor(0.01 * through.length)];
+    const mean = through.reduce((a, v) => a + v, 0) / through.length;
+    const darkest = `${(100 * dark).toFixed(1)} % or less in 1 % of the pixels`;
+    return `transmission ${darkest} · ${(100 * mean).toFixed(1)} % in the mean`;
 }
 export function draw() {
     due = false;
@@ -134,7 +193,9 @@ export function draw() {
     chooseWindow(i);
     develop(i);
     film.style.aspectRatio = String(Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0])));
-    const dpr = Math.min(devicePixelRatio, 2), w = Math.round(film.clientWidth * dpr), h = Math.round(film.clientHeight * dpr);
+    const dpr = Math.min(devicePixelRatio, 2);
+    const w = Math.round(film.clientWidth * dpr);
+    const h = Math.round(film.clientHeight * dpr);
     if (canvas.width !== w || canvas.height !== h) {
         canvas.width = w;
         canvas.height = h;
@@ -164,15 +225,21 @@ export function draw() {
     clearTimeout(quiet);
     quiet = window.setTimeout(() => setText($("#film-rate"), ""), 2000);
     tell();
-    const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2)), zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
-    const alone = reference && $input("#difference").checked && !i.signed ? "  ·  no difference: the reference is of another kind or size" : "";
+    const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2));
+    const zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
+    const alone = reference && $input("#difference").checked && !i.signed
+        ? "  ·  no difference: the reference is of another kind or size"
+        : "";
     setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`);
 }
 // What the window leaves out is pale.
-const BINS = 128, EVERY = 7;
-const chart = $canvas("#histogram");
+const BINS = 128;
+const EVERY = 7;
+const host = $("#histogram");
+const chart = plotted(host);
 export function histogram(i, [low, high]) {
-    const counts = new Float64Array(BINS), step = BINS / (high - low);
+    const counts = new Float64Array(BINS);
+    const step = BINS / (high - low);
     for (let k = 0; k < i.pixels.length; k += EVERY) {
         const bin = Math.floor((i.low + i.scale * i.pixels[k] - low) * step);
         counts[Math.min(BINS - 1, Math.max(0, bin))]++;
@@ -180,37 +247,35 @@ export function histogram(i, [low, high]) {
     return counts;
 }
 function drawHistogram(i) {
-    const [chart2d, w, h] = cleared(chart), step = (range[1] - range[0]) / BINS, at = (v) => (w * (v - range[0])) / (range[1] - range[0]);
-    const style = getComputedStyle(chart);
-    chart2d.fillStyle = style.getPropertyValue("--accent");
-    bars([chart2d, w, h], histogram(i, range), (k) => {
-        const middle = range[0] + (k + 0.5) * step;
-        chart2d.globalAlpha = middle < windowed[0] || middle > windowed[1] ? 0.3 : 1;
+    const text = getComputedStyle(host).getPropertyValue("--text");
+    chart.draw({
+        counts: histogram(i, range),
+        range,
+        unit: i.kind === "counts" ? "counts" : "−log T",
+        window: windowed,
+        marks: windowed.map((at) => ({ at, colour: text, handle: true })),
     });
-    chart2d.globalAlpha = 1;
-    chart2d.fillStyle = style.getPropertyValue("--text");
-    const wide = 6 * devicePixelRatio;
-    for (const v of windowed) {
-        const x = Math.min(w - 1, Math.max(1, at(v)));
-        chart2d.fillRect(x - 1, 0, 2, h);
-        chart2d.fillRect(x - wide / 2, 0, wide, wide);
-        chart2d.fillRect(x - wide / 2, h - wide, wide, wide);
-    }
-    below(chart, range[0], range[1], i.kind === "counts" ? "counts" : "−log T");
 }
 // The nearer end of the window follows the pointer.
 let pulled = null;
-slid(chart, (part) => {
+slid(chart.area, (part) => {
     const to = 1000 * part;
-    pulled ??= Math.abs(to - lowEnd()) <= Math.abs(to - highEnd()) ? $input("#low") : $input("#high");
+    pulled ??=
+        Math.abs(to - lowEnd()) <= Math.abs(to - highEnd()) ? $input("#low") : $input("#high");
     pulled.value = String(to);
     pulled.dispatchEvent(new Event("input"));
 });
 for (const end of ["pointerup", "pointercancel"])
-    chart.addEventListener(end, () => { pulled?.dispatchEvent(new Event("change")); pulled = null; });
+    chart.area.addEventListener(end, () => {
+        pulled?.dispatchEvent(new Event("change"));
+        pulled = null;
+    });
+const percent = (part) => `${(100 * part).toFixed(part && part < 0.1 ? 1 : 0)} %`;
 on("state", (s) => {
     for (const what of ["saturated", "starved"])
-        setText($(`#${what}`), store.recorded ? `${what}: not judged in a recorded image` : `${what} ${s.image ? `${(100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0)} %` : "–"}`);
+        setText($(`#${what}`), store.recorded
+            ? `${what}: not judged in a recorded image`
+            : `${what} ${s.image ? percent(s.image[what]) : "–"}`);
     if ($("#film-beam").hidden === unlit(store.image))
         ask(); // a dark image has no flags
     beam(store.image);
@@ -228,7 +293,8 @@ function overlay(i, s, dpr) {
     compare.draw(context, i, dpr / s);
     const g = store.state?.geometry;
     if (g && !i.recorded) {
-        const [c, r] = g.piercing_point_px, d = (7 * dpr) / s;
+        const [c, r] = g.piercing_point_px;
+        const d = (7 * dpr) / s;
         context.strokeStyle = "#5ab0ff";
         context.beginPath();
         context.moveTo(c + 0.5 - d, r + 0.5);
@@ -238,22 +304,34 @@ function overlay(i, s, dpr) {
         context.stroke();
     }
 }
-function ask() { if (!due) {
-    due = true;
-    requestAnimationFrame(draw);
-} }
+function ask() {
+    if (!due) {
+        due = true;
+        requestAnimationFrame(draw);
+    }
+}
 // CSS pixels a pixel of the image: fitted in, and zoomed.
-function fitted() { const i = store.image; return i ? Math.min(film.clientWidth / i.full[1], film.clientHeight / i.full[0]) : 1; }
-function scale() { return fitted() * view.zoom; }
+function fitted() {
+    const i = store.image;
+    return i ? Math.min(film.clientWidth / i.full[1], film.clientHeight / i.full[0]) : 1;
+}
+function scale() {
+    return fitted() * view.zoom;
+}
 function at([x, y]) {
-    const box = canvas.getBoundingClientRect(), s = scale();
-    return [(x - box.left - box.width / 2) / s + view.x, (y - box.top - box.height / 2) / s + view.y];
+    const box = canvas.getBoundingClientRect();
+    const s = scale();
+    return [
+        (x - box.left - box.width / 2) / s + view.x,
+        (y - box.top - box.height / 2) / s + view.y,
+    ];
 }
 function clampView() {
-    const i = store.image, s = scale();
+    const i = store.image;
+    const s = scale();
     if (!i)
         return;
-    const inside = (middle, size, room) => (size <= room ? size / 2 : Math.min(Math.max(middle, room / 2), size - room / 2));
+    const inside = (middle, size, room) => size <= room ? size / 2 : Math.min(Math.max(middle, room / 2), size - room / 2);
     view.x = inside(view.x, i.full[1], film.clientWidth / s);
     view.y = inside(view.y, i.full[0], film.clientHeight / s);
 }
@@ -264,12 +342,19 @@ function tell() {
         setText($("#pixel"), "point at the image");
         return;
     }
-    const [c, r] = at(pointer).map(Math.floor), v = value(c, r);
-    const plain = i.kind === "counts" ? `${fixed(v, 0)} counts` : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`;
-    const words = i.signed ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than ${i.virtual ? "the virtual image" : "the reference"}` : plain;
+    const [c, r] = at(pointer).map(Math.floor);
+    const v = value(c, r);
+    const plain = i.kind === "counts"
+        ? `${fixed(v, 0)} counts`
+        : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`;
+    const other = i.virtual ? "the virtual image" : "the reference";
+    const words = i.signed
+        ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than ${other}`
+        : plain;
     setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${words}` : "–");
 }
-// The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are on): a PNG.
+// The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are
+// on): a PNG.
 export function picture() {
     const i = frame();
     if (!i)
@@ -283,7 +368,8 @@ export function picture() {
     return whole.toDataURL("image/png");
 }
 function zoomTo(zoom, place = null) {
-    const before = scale(), [x, y] = place ? at(place) : [view.x, view.y];
+    const before = scale();
+    const [x, y] = place ? at(place) : [view.x, view.y];
     view.zoom = zoom;
     view.x = x - ((x - view.x) * before) / scale();
     view.y = y - ((y - view.y) * before) / scale();
@@ -292,26 +378,38 @@ function zoomTo(zoom, place = null) {
 canvas.addEventListener("wheel", (e) => {
     e.preventDefault();
     if (store.image)
-        zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [e.clientX, e.clientY]);
+        zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [
+            e.clientX,
+            e.clientY,
+        ]);
 }, { passive: false });
-let drag = null, down = [0, 0];
+let drag = null;
+let down = [0, 0];
 function place(e, { full: [rows, cols] }) {
-    const [c, r] = at([e.clientX, e.clientY]), inside = (v, n) => Math.min(n - 1, Math.max(0, Math.floor(v)));
+    const [c, r] = at([e.clientX, e.clientY]);
+    const inside = (v, n) => Math.min(n - 1, Math.max(0, Math.floor(v)));
     return [inside(c, cols), inside(r, rows)];
 }
 canvas.addEventListener("pointerdown", (e) => {
     canvas.setPointerCapture(e.pointerId);
     down = [e.clientX, e.clientY];
     const i = store.image;
-    if (i && (measure.press(place(e, i)) || compare.press(at([e.clientX, e.clientY]), 1 / scale())))
+    if (i &&
+        (measure.press(place(e, i)) || compare.press(at([e.clientX, e.clientY]), 1 / scale())))
         ask();
     else
         drag = [e.clientX, e.clientY, view.x, view.y];
 });
-canvas.addEventListener("pointerup", (e) => { if (Math.hypot(e.clientX - down[0], e.clientY - down[1]) < CLICK)
-    marks.click(at(down)); });
+canvas.addEventListener("pointerup", (e) => {
+    if (Math.hypot(e.clientX - down[0], e.clientY - down[1]) < CLICK)
+        marks.click(at(down));
+});
 for (const end of ["pointerup", "pointercancel"])
-    canvas.addEventListener(end, () => { drag = null; measure.release(); compare.release(); });
+    canvas.addEventListener(end, () => {
+        drag = null;
+        measure.release();
+        compare.release();
+    });
 canvas.addEventListener("pointermove", (e) => {
     pointer = [e.clientX, e.clientY];
     const i = store.image;
@@ -325,13 +423,27 @@ canvas.addEventListener("pointermove", (e) => {
     }
     tell();
 });
-canvas.addEventListener("pointerleave", () => { pointer = null; tell(); if (measure.follows())
-    ask(); });
-const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+canvas.addEventListener("pointerleave", () => {
+    pointer = null;
+    tell();
+    if (measure.follows())
+        ask();
+});
+const STEPS = {
+    ArrowLeft: [-1, 0],
+    ArrowRight: [1, 0],
+    ArrowUp: [0, -1],
+    ArrowDown: [0, 1],
+};
 const TIMES = { "+": 1.25, "=": 1.25, "-": 0.8 };
 canvas.addEventListener("keydown", (e) => {
-    const step = STEPS[e.key], times = TIMES[e.key];
-    if (!store.image || e.ctrlKey || e.metaKey || e.altKey || (!step && !times && !["0", "Enter"].includes(e.key)))
+    const step = STEPS[e.key];
+    const times = TIMES[e.key];
+    if (!store.image ||
+        e.ctrlKey ||
+        e.metaKey ||
+        e.altKey ||
+        (!step && !times && !["0", "Enter"].includes(e.key)))
         return;
     e.preventDefault();
     e.stopPropagation();
@@ -350,30 +462,51 @@ canvas.addEventListener("keydown", (e) => {
 measure.start(ask);
 $button("#keep-reference").addEventListener("click", () => {
     reference = store.image;
-    emit("note", reference ? "good" : "warning-note", "Reference", reference ? "this image is kept; tick “difference” to see what changes" : "no image has come yet");
+    emit("note", reference ? "good" : "warning-note", "Reference", reference
+        ? "this image is kept; tick “difference” to see what changes"
+        : "no image has come yet");
     ask();
 });
-$input("#difference").addEventListener("change", () => { $input("#auto-window").checked = true; });
+$input("#difference").addEventListener("change", () => {
+    $input("#auto-window").checked = true;
+});
 const reset = () => zoomTo(1);
 canvas.addEventListener("dblclick", reset);
 $button("#film-reset").addEventListener("click", reset);
 $button("#film-actual").addEventListener("click", () => zoomTo(1 / (fitted() * Math.min(devicePixelRatio, 2))));
 // Neither end of the window goes past the other.
-$input("#low").addEventListener("input", () => { $input("#low").value = String(Math.min(lowEnd(), highEnd() - 1)); });
-$input("#high").addEventListener("input", () => { $input("#high").value = String(Math.max(highEnd(), lowEnd() + 1)); });
+$input("#low").addEventListener("input", () => {
+    $input("#low").value = String(Math.min(lowEnd(), highEnd() - 1));
+});
+$input("#high").addEventListener("input", () => {
+    $input("#high").value = String(Math.max(highEnd(), lowEnd() + 1));
+});
 for (const id of ["#low", "#high"])
-    $(id).addEventListener("input", () => { $input("#auto-window").checked = false; ask(); });
+    $(id).addEventListener("input", () => {
+        $input("#auto-window").checked = false;
+        ask();
+    });
 for (const id of ["#low", "#high", "#auto-window"])
     $(id).addEventListener("change", () => {
-        const own = !$input("#auto-window").checked && store.image?.kind === "line_integral" && !frame()?.signed;
+        const own = !$input("#auto-window").checked &&
+            store.image?.kind === "line_integral" &&
+            !frame()?.signed;
         call("viewer.window", own ? { low: windowed[0], high: windowed[1] } : {}).catch(() => { });
         ask();
     });
 for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window", "#difference"])
     $(id).addEventListener("change", ask);
-$input("#gamma").addEventListener("input", () => { setText($("#gamma-is"), fixed($input("#gamma").valueAsNumber)); ask(); });
-$select("#kind").addEventListener("change", () => { $input("#auto-window").checked = true; call("viewer.feed", { kind: $select("#kind").value }).catch(() => { }); });
+$input("#gamma").addEventListener("input", () => {
+    setText($("#gamma-is"), fixed($input("#gamma").valueAsNumber));
+    ask();
+});
+$select("#kind").addEventListener("change", () => {
+    $input("#auto-window").checked = true;
+    call("viewer.feed", { kind: $select("#kind").value }).catch(() => { });
+});
 on("image", ask);
-on("open", () => { if ($select("#kind").value !== "line_integral")
-    call("viewer.feed", { kind: $select("#kind").value }).catch(() => { }); });
+on("open", () => {
+    if ($select("#kind").value !== "line_integral")
+        call("viewer.feed", { kind: $select("#kind").value }).catch(() => { });
+});
 new ResizeObserver(ask).observe(film);

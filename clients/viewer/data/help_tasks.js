@@ -19,5 +19,10 @@ const TASKS = [
     ["Show it to others", "pictures, scenes and replays as files", tab("share")],
 ];
 export function tasks(close) {
-    return el("div", { class: "help-tasks" }, ...TASKS.map(([wish, how, act]) => el("button", { onclick: () => { close(); act(); } }, el("b", {}, wish), el("span", { class: "muted small-text" }, how))));
+    return el("div", { class: "help-tasks" }, ...TASKS.map(([wish, how, act]) => el("button", {
+        onclick: () => {
+            close();
+            act();
+        },
+    }, el("b", {}, wish), el("span", { class: "muted small-text" }, how))));
 }

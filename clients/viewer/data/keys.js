@@ -1,4 +1,5 @@
-// Keys: hold to move an axis, where the Move tab says so. W A S D Q E and the arrows stay with the scene's camera.
+// Keys: hold to move an axis, where the Move tab says so. W A S D Q E and the arrows stay with
+// the scene's camera.
 import { $dialog, $input, el, keep, within } from "./dom.js";
 import { jogStart, jogStop, jogStopAll } from "./axes.js";
 import { command, on, store } from "./link.js";
@@ -7,26 +8,45 @@ import { tasks } from "./help_tasks.js";
 import { layout, nearSample } from "./views.js";
 // Key -> axis, direction, what it does.
 export const JOGS = {
-    KeyI: ["ver_tube", 1, "source up"], KeyK: ["ver_tube", -1, "source down"],
-    KeyJ: ["tra_tube", -1, "source left"], KeyL: ["tra_tube", 1, "source right"],
-    KeyT: ["mag_obj", 1, "sample away from source"], KeyG: ["mag_obj", -1, "sample towards source"],
-    KeyF: ["tra_obj", -1, "sample left"], KeyH: ["tra_obj", 1, "sample right"],
-    KeyR: ["rot_obj", -1, "turn anticlockwise"], KeyY: ["rot_obj", 1, "turn clockwise"],
-    KeyU: ["ver_obj", -1, "source and detector up"], KeyO: ["ver_obj", 1, "source and detector down"],
-    Digit8: ["ver_det", 1, "detector up"], Digit2: ["ver_det", -1, "detector down"],
-    Digit4: ["tra_det", 1, "detector left"], Digit6: ["tra_det", -1, "detector right"],
-    Digit9: ["mag_det", 1, "detector away"], Digit7: ["mag_det", -1, "detector towards source"],
+    KeyI: ["ver_tube", 1, "source up"],
+    KeyK: ["ver_tube", -1, "source down"],
+    KeyJ: ["tra_tube", -1, "source left"],
+    KeyL: ["tra_tube", 1, "source right"],
+    KeyT: ["mag_obj", 1, "sample away from source"],
+    KeyG: ["mag_obj", -1, "sample towards source"],
+    KeyF: ["tra_obj", -1, "sample left"],
+    KeyH: ["tra_obj", 1, "sample right"],
+    KeyR: ["rot_obj", -1, "turn anticlockwise"],
+    KeyY: ["rot_obj", 1, "turn clockwise"],
+    KeyU: ["ver_obj", -1, "source and detector up"],
+    KeyO: ["ver_obj", 1, "source and detector down"],
+    Digit8: ["ver_det", 1, "detector up"],
+    Digit2: ["ver_det", -1, "detector down"],
+    Digit4: ["tra_det", 1, "detector left"],
+    Digit6: ["tra_det", -1, "detector right"],
+    Digit9: ["mag_det", 1, "detector away"],
+    Digit7: ["mag_det", -1, "detector towards source"],
 };
-const HELP = "With “keys move axes” ticked in the Move tab, an axis moves while its key is held. Space stops wherever the focus is, except in text, lists and checkboxes;"
-    + " Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; W A S D Q E and the arrows fly the"
-    + " camera. In the radiograph: wheel to zoom, drag to pan, double click to reset.";
-const byKey = $input("#key-jog"), KEY = "flexdt-keys";
+const HELP = "With “keys move axes” ticked in the Move tab, an axis moves while its key is held. " +
+    "Space stops wherever the focus is, except in text, lists and checkboxes; " +
+    "Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; " +
+    "W A S D Q E and the arrows fly the camera. " +
+    "In the radiograph: wheel to zoom, drag to pan, double click to reset.";
+const byKey = $input("#key-jog");
+const KEY = "flexdt-keys";
 byKey.checked = localStorage.getItem(KEY) === "on";
 byKey.addEventListener("change", () => keep(KEY, byKey.checked ? "on" : "off"));
-const LAYOUTS = { Digit1: "four", Digit2: "iso", Digit3: "beam", Digit4: "side", Digit5: "free" };
+const LAYOUTS = {
+    Digit1: "four",
+    Digit2: "iso",
+    Digit3: "beam",
+    Digit4: "side",
+    Digit5: "free",
+};
 const name = (code) => code.replace(/^Key|^Digit/, "");
 // Where Space has a meaning of its own. Numbers need none, and buttons are for Enter.
-const spaced = (e) => within(e.target, "textarea, select, [contenteditable], input:not([type=range], [type=file], [type=number], .num)");
+const spaced = (e) => within(e.target, "textarea, select, [contenteditable], " +
+    "input:not([type=range], [type=file], [type=number], .num)");
 const typing = (e) => within(e.target, "input:not([type=range]):not([type=checkbox]), textarea, select, [contenteditable]");
 function down(e) {
     if (e.code === "Space" && e.shiftKey) {
@@ -43,7 +63,9 @@ function down(e) {
         }
         return;
     }
-    if (e.key === "Enter" && e.repeat && e.target?.tagName === "BUTTON") {
+    if (e.key === "Enter" &&
+        e.repeat &&
+        e.target?.tagName === "BUTTON") {
         e.preventDefault();
         return;
     } // held, it would press what comes next, too
@@ -77,8 +99,9 @@ function down(e) {
     }
 }
 function up(e) {
+    // some browsers click here
     if (e.code === "Space" && (e.shiftKey || !spaced(e)))
-        e.preventDefault(); // some browsers click here
+        e.preventDefault();
     jogStop(`key:${e.code}`);
 }
 export function listen(target) {
@@ -97,7 +120,14 @@ export function toggleHelp() {
     if (!dialog.childElementCount) {
         const grid = el("div", { class: "keys" });
         const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
-        for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["Alt+0", "the sample, near"], ["F1", "this help"]])
+        for (const [key, what] of [
+            ...jogs,
+            ["Space", "stop all axes"],
+            ["Shift+Space", "emergency stop"],
+            ["Alt+1…5", "views"],
+            ["Alt+0", "the sample, near"],
+            ["F1", "this help"],
+        ])
             grid.append(el("kbd", {}, key), el("span", {}, what));
         dialog.append(el("h2", {}, "What would you like to do?"), tasks(() => dialog.close()), el("h2", {}, "Keys"), grid, el("p", { class: "muted" }, HELP), el("div", { class: "row between" }, el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"), el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
     }

@@ -1,8 +1,11 @@
 // How much of the page the radiograph has: a splitter between it and the scene, and all of it.
 import { $, $button, $dialog, keep } from "./dom.js";
 import { on } from "./link.js";
-const KEY = "flexdt-right", LEAST = 280, STEP = 32;
-const page = $("main"), splitter = $("#splitter");
+const KEY = "flexdt-right";
+const LEAST = 280;
+const STEP = 32;
+const page = $("main");
+const splitter = $("#splitter");
 let wide = null;
 function set(width) {
     const most = Math.max(LEAST, page.clientWidth - $("#left").offsetWidth - 160);

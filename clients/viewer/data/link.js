@@ -33,7 +33,11 @@ export const store = {
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
 // more.
 export const OLD_S = 1;
-const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, STOOD_MS = 1000, REST_MS = 500, TRY_AGAIN = 1013;
+const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5);
+const LOOK_MS = 200;
+const STOOD_MS = 1000;
+const REST_MS = 500;
+const TRY_AGAIN = 1013;
 const listeners = {};
 const waiting = new Map();
 // Why a request was refused; code 0: nobody answered it.
@@ -46,7 +50,9 @@ export class Failure extends Error {
         this.data = data;
     }
 }
-let socket = null, nextId = 1, pause = 200;
+let socket = null;
+let nextId = 1;
+let pause = 200;
 export function on(what, f) {
     (listeners[what] ??= []).push(f);
 }
@@ -191,7 +197,8 @@ function text(content) {
 // long the twin has told the viewer nothing. Of the two clocks' difference the least one seen
 // stands for no delay; it may grow by the error of clocks.
 const DRIFT = 1e-4;
-let heard = null, least = null;
+let heard = null;
+let least = null;
 function late(sent) {
     const now = performance.now() / 1000;
     least =
@@ -223,10 +230,12 @@ function look() {
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come
 // meanwhile, before it says that the viewer is silent.
-let looked = performance.now(), woken = -Infinity;
+let looked = performance.now();
+let woken = -Infinity;
 const rested = () => performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
 setInterval(() => {
-    const now = performance.now(), awake = now - looked < STOOD_MS;
+    const now = performance.now();
+    const awake = now - looked < STOOD_MS;
     if (!awake)
         woken = now;
     looked = now;
@@ -263,11 +272,13 @@ function part(buffer) {
 const decoders = {
     async jpeg(body, [rows, cols]) {
         const picture = await createImageBitmap(new Blob([body], { type: "image/jpeg" }));
-        const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d", { willReadFrequently: true });
+        const canvas = new OffscreenCanvas(cols, rows);
+        const context = canvas.getContext("2d", { willReadFrequently: true });
         if (!context)
             throw new Error("this browser draws nothing");
         context.drawImage(picture, 0, 0);
-        const { data } = context.getImageData(0, 0, cols, rows), pixels = new Uint16Array(rows * cols);
+        const { data } = context.getImageData(0, 0, cols, rows);
+        const pixels = new Uint16Array(rows * cols);
         for (let k = 0; k < pixels.length; k++)
             pixels[k] = 257 * data[4 * k];
         return pixels;
@@ -283,11 +294,15 @@ const decoders = {
         return pixels;
     },
 };
-let unpacked = 0, arrived = 0;
+let unpacked = 0;
+let arrived = 0;
 async function image(whole) {
-    const number = ++arrived, size = new DataView(whole.buffer).getUint32(4, true);
-    const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size))), at_ms = performance.now();
-    const all = await decoders[head.code](whole.subarray(8 + size), head.shape), n = all.length / 2;
+    const number = ++arrived;
+    const size = new DataView(whole.buffer).getUint32(4, true);
+    const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size)));
+    const at_ms = performance.now();
+    const all = await decoders[head.code](whole.subarray(8 + size), head.shape);
+    const n = all.length / 2;
     const got = head.pair
         ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) }
         : { ...head, at_ms, pixels: all };

@@ -3,7 +3,10 @@
 import { $input, el, fixed, setText } from "./dom.js";
 import { emit, on, store } from "./link.js";
 const COLOUR = "#ff3ca0";
-let marks = [], last = null, held = false, of = null;
+let marks = [];
+let last = null;
+let held = false;
+let of = null;
 const projection = () => store.image?.recorded?.projection ?? null;
 const here = () => marks.filter((m) => m.frame === projection());
 const tools = el("span", { class: "row", style: "flex-wrap:wrap", hidden: true });
@@ -18,7 +21,8 @@ const toggle = el("button", {
         choose(Boolean(tools.hidden));
     },
 }, "Mark beads");
-const said = el("span", { class: "muted small-text", "aria-live": "polite" }), list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
+const said = el("span", { class: "muted small-text", "aria-live": "polite" });
+const list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
 function choose(wanted) {
     tools.hidden = !wanted;
     toggle.setAttribute("aria-pressed", String(wanted));
@@ -71,7 +75,10 @@ on("recorded", (name) => {
 on("image", tell);
 // Places are in the picture's coordinates: the middle of its first pixel is (0.5, 0.5) there.
 export function click([column, line]) {
-    const frame = projection(), bead = $input("#mark-bead"), number = Math.max(0, Math.round(bead.valueAsNumber || 0)), marker = String(number);
+    const frame = projection();
+    const bead = $input("#mark-bead");
+    const number = Math.max(0, Math.round(bead.valueAsNumber || 0));
+    const marker = String(number);
     if (tools.hidden || frame === null)
         return;
     last = { frame, marker, column: column - 0.5, row: line - 0.5 };
@@ -93,7 +100,8 @@ export function press([column, line], reach) {
     }
     return held;
 }
-let start = [0, 0], slack = 0;
+let start = [0, 0];
+let slack = 0;
 export function drag([column, line]) {
     if (held && last && Math.hypot(column - start[0], line - start[1]) >= slack) {
         slack = 0;
@@ -124,7 +132,8 @@ export function draw(x, unit) {
     x.font = `${13 * unit}px sans-serif`;
     x.beginPath();
     for (const m of here()) {
-        const c = m.column + 0.5, r = m.row + 0.5;
+        const c = m.column + 0.5;
+        const r = m.row + 0.5;
         x.moveTo(c - arm, r);
         x.lineTo(c + arm, r);
         x.moveTo(c, r - arm);

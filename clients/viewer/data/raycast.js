@@ -1,59 +1,101 @@
 import { bar, codeOf, drawBar, extent } from "./slices.js";
-const BRICK = 8, SLOW_MS = 90, ROOM = 1.75; // rays see so many times the box's longest side
+const BRICK = 8;
+const SLOW_MS = 90;
+const ROOM = 1.75; // rays see so many times the box's longest side
 const VERTEX = "#version 300 es\nin vec2 a; out vec2 at; void main() { at = a; gl_Position = vec4(a, 0., 1.); }";
-// Bricks whose greatest value is too low are left out: those are most of the rays' way. `near` is where a ray enters the box, on a cut
-// face as grey values. Steps are of a voxel; a surface is found between two of them.
+// Bricks whose greatest value is too low are left out: those are most of the rays' way. `near`
+// is where a ray enters the box, on a cut face as grey values. Steps are of a voxel; a surface
+// is found between two of them.
 const FRAGMENT = `#version 300 es
 precision highp float; precision highp sampler3D;
-uniform sampler3D whole, bricks, other, otherBricks; uniform float split; uniform vec3 side, count, grid, low, high, right, up, ahead; uniform vec2 room, grey; uniform float level; uniform int cut, most;
-in vec2 at; out vec4 color;
+uniform sampler3D whole, bricks, other, otherBricks;
+uniform float split, level;
+uniform vec3 side, count, grid, low, high, right, up, ahead;
+uniform vec2 room, grey;
+uniform int cut, most;
+in vec2 at;
+out vec4 color;
 bool beside() { return at.x > split; }
 float value(vec3 p) { return beside() ? texture(other, p).r : texture(whole, p).r; }
 float most_of(vec3 p) {
   ivec3 q = min(ivec3(p * grid), textureSize(bricks, 0) - 1);
   return beside() ? texelFetch(otherBricks, q, 0).r : texelFetch(bricks, q, 0).r;
 }
+float between(vec3 p, vec3 h) { return value(p + h) - value(p - h); }
 void main() {
-  vec3 from = (right * at.x * room.x + up * at.y * room.y - 2. * ahead) / side + .5, way = ahead / side;
-  vec3 one = 1. / (way + vec3(equal(way, vec3(0.))) * 1e-9), a = (low - from) * one, b = (high - from) * one, first = min(a, b), last = max(a, b);
-  float near = max(max(first.x, first.y), first.z), far = min(min(last.x, last.y), last.z), d = near + 1e-5, found = 0., before = 0., step = .8 / max(max(count.x * abs(way.x), count.y * abs(way.y)), count.z * abs(way.z));
+  vec3 from = (right * at.x * room.x + up * at.y * room.y - 2. * ahead) / side + .5;
+  vec3 way = ahead / side;
+  vec3 one = 1. / (way + vec3(equal(way, vec3(0.))) * 1e-9);
+  vec3 a = (low - from) * one, b = (high - from) * one;
+  vec3 first = min(a, b), last = max(a, b), each = count * abs(way);
+  float near = max(max(first.x, first.y), first.z);
+  float far = min(min(last.x, last.y), last.z);
+  float step = .8 / max(max(each.x, each.y), each.z);
+  float d = near + 1e-5, found = 0., before = 0.;
   color = vec4(0.);
   if (near >= far) return;
   bool face = cut >= 0 && first[cut] >= near - 1e-6;
-  if (face) { float v = value(from + way * d); if (v >= level && most == 0) { color = vec4(vec3(clamp((v - grey.x) * grey.y, .06, 1.)) * vec3(1., .96, .9), 1.); return; } }
+  if (face) {
+    float v = value(from + way * d);
+    if (v >= level && most == 0) {
+      float shade = clamp((v - grey.x) * grey.y, .06, 1.);
+      color = vec4(shade * vec3(1., .96, .9), 1.);
+      return;
+    }
+  }
   for (int i = 0; i < 1500 && d < far; i++) {
     vec3 p = from + way * d;
     if (most_of(p) < (most == 1 ? max(found, 1e-3) : level)) {
       vec3 e = ((floor(p * grid) + vec3(greaterThan(way, vec3(0.)))) / grid - p) * one;
-      d += max(min(min(e.x, e.y), e.z), 0.) + step * .2; before = 0.; continue;
+      d += max(min(min(e.x, e.y), e.z), 0.) + step * .2;
+      before = 0.;
+      continue;
     }
     float v = value(p);
     if (most == 1) found = max(found, v);
     else if (v >= level) {
       if (before > 0. && v > before) p -= way * step * (v - level) / (v - before);
-      vec3 h = 1.2 / count, n = vec3(value(p + vec3(h.x, 0., 0.)) - value(p - vec3(h.x, 0., 0.)), value(p + vec3(0., h.y, 0.)) - value(p - vec3(0., h.y, 0.)), value(p + vec3(0., 0., h.z)) - value(p - vec3(0., 0., h.z)));
+      vec3 h = 1.2 / count, x = vec3(h.x, 0., 0.), y = vec3(0., h.y, 0.), z = vec3(0., 0., h.z);
+      vec3 n = vec3(between(p, x), between(p, y), between(p, z));
       n = -n / (length(n) + 1e-6);
       float light = max(dot(n, normalize(-ahead + .5 * up - .3 * right)), 0.);
-      color = vec4((beside() ? vec3(.62, .78, .9) : vec3(.9, .86, .78)) * (.22 + .78 * light) + .25 * pow(light, 24.), 1.); return;
+      vec3 paint = beside() ? vec3(.62, .78, .9) : vec3(.9, .86, .78);
+      color = vec4(paint * (.22 + .78 * light) + .25 * pow(light, 24.), 1.);
+      return;
     }
-    before = v; d += step;
+    before = v;
+    d += step;
   }
   if (most == 1) color = vec4(vec3(clamp((found - grey.x) * grey.y, 0., 1.)), 1.);
 }`;
-const NO_WEBGL = "This browser has no WebGL 2, so the volume is not drawn in three dimensions. Slices, "
-    + "histogram, profile and sharing work as usual.";
-const NO_PROGRAM = "This browser's graphics refused to draw the volume in three dimensions, twice. Slices, "
-    + "histogram, profile and sharing work as usual; reloading the page tries again.";
-const LOST = ["The browser's graphics stopped;", "the volume comes back with them.", "Slices work as usual."];
-const REFUSED = ["The browser's graphics refuse", "to draw the volume; reload the page.", "Slices work as usual."];
+const NO_WEBGL = "This browser has no WebGL 2, so the volume is not drawn in three dimensions. Slices, " +
+    "histogram, profile and sharing work as usual.";
+const NO_PROGRAM = "This browser's graphics refused to draw the volume in three dimensions, twice. Slices, " +
+    "histogram, profile and sharing work as usual; reloading the page tries again.";
+const LOST = [
+    "The browser's graphics stopped;",
+    "the volume comes back with them.",
+    "Slices work as usual.",
+];
+const REFUSED = [
+    "The browser's graphics refuse",
+    "to draw the volume; reload the page.",
+    "Slices work as usual.",
+];
 const GLASS = {
-    antialias: false, alpha: true, premultipliedAlpha: false, preserveDrawingBuffer: true,
+    antialias: false,
+    alpha: true,
+    premultipliedAlpha: false,
+    preserveDrawingBuffer: true,
 };
 const TRIES = 2;
 // The program in use, with the triangle that it draws; null where the graphics refuse it.
 function programmed(gl) {
     const program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    for (const [kind, source] of [
+        [gl.VERTEX_SHADER, VERTEX],
+        [gl.FRAGMENT_SHADER, FRAGMENT],
+    ]) {
         const shader = gl.createShader(kind);
         if (!shader)
             return null;
@@ -80,7 +122,8 @@ function programmed(gl) {
 // is tried again on a fresh canvas; a lost context comes back by itself.
 function glassThatDraws() {
     for (let left = TRIES; left > 0; left--) {
-        const glass = document.createElement("canvas"), gl = glass.getContext("webgl2", GLASS);
+        const glass = document.createElement("canvas");
+        const gl = glass.getContext("webgl2", GLASS);
         if (!gl)
             return NO_WEBGL;
         const program = programmed(gl);
@@ -95,7 +138,8 @@ export function raycast(canvas, side = 0) {
         return found;
     const { glass, gl } = found;
     let { program } = found;
-    const info = gl.getExtension("WEBGL_debug_renderer_info"), software = /swiftshader|llvmpipe|software/i.test(String(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""));
+    const info = gl.getExtension("WEBGL_debug_renderer_info");
+    const software = /swiftshader|llvmpipe|software/i.test(String(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""));
     const largest = side || (software ? 128 : 256);
     const place = (name) => (program ? gl.getUniformLocation(program, name) : null);
     function texture(unit, [nx, ny, nz], data, filter) {
@@ -108,11 +152,28 @@ export function raycast(canvas, side = 0) {
             gl.texParameteri(gl.TEXTURE_3D, name, filter);
         gl.texImage3D(gl.TEXTURE_3D, 0, gl.R8, nx, ny, nz, 0, gl.RED, gl.UNSIGNED_BYTE, data);
     }
-    const one = new Uint8Array(4), held = [null, null, null, null];
-    let block = null, twin = null, due = false, seen = [0, 1], spot = [0, 0, 0], scale = 1, resting, held_down = false;
+    const one = new Uint8Array(4);
+    const held = [null, null, null, null];
+    let block = null;
+    let twin = null;
+    let due = false;
+    let seen = [0, 1];
+    let spot = [0, 0, 0];
+    let scale = 1;
+    let resting;
+    let held_down = false;
     const me = {
-        yaw: 0.5, pitch: 0.4, zoom: 1, level: 0.5, most: false, cut: -1, ms: 0, software, split: 1,
-        // 8 bits between the ends of the block's window, and half as much again beyond; the rest of the work is the shader's.
+        yaw: 0.5,
+        pitch: 0.4,
+        zoom: 1,
+        level: 0.5,
+        most: false,
+        cut: -1,
+        ms: 0,
+        software,
+        split: 1,
+        // 8 bits between the ends of the block's window, and half as much again beyond; the rest of
+        // the work is the shader's.
         show(b) {
             block = b;
             if (!b)
@@ -122,27 +183,51 @@ export function raycast(canvas, side = 0) {
                 fill(b, ends(b), 2);
             me.draw();
         },
-        beside(b) { twin = b; if (b && block)
-            fill(b, ends(block), 2); me.draw(); },
-        window(window) { seen = window; me.draw(); },
-        cross(at) { spot = at; if (me.cut >= 0)
-            me.draw(); },
-        draw() { if (!due) {
-            due = true;
-            requestAnimationFrame(() => { due = false; paint(); });
-        } },
+        beside(b) {
+            twin = b;
+            if (b && block)
+                fill(b, ends(block), 2);
+            me.draw();
+        },
+        window(window) {
+            seen = window;
+            me.draw();
+        },
+        cross(at) {
+            spot = at;
+            if (me.cut >= 0)
+                me.draw();
+        },
+        draw() {
+            if (!due) {
+                due = true;
+                requestAnimationFrame(() => {
+                    due = false;
+                    paint();
+                });
+            }
+        },
     };
     function fill(b, range, unit) {
         if (!program || gl.isContextLost())
             return;
-        const size = extent(b), f = Math.max(1, Math.ceil(Math.max(...size) / largest)), n = size.map((v) => Math.max(1, Math.floor(v / f)));
-        const [lo, hi] = range.map((v) => codeOf(b, v)), data = new Uint8Array(n[0] * n[1] * n[2]), grid = n.map((v) => Math.ceil(v / BRICK)), bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
-        const put = (x, y, z, v) => { const k = (z * grid[1] + y) * grid[0] + x; if (v > bricks[k])
-            bricks[k] = v; };
+        const size = extent(b);
+        const f = Math.max(1, Math.ceil(Math.max(...size) / largest));
+        const n = size.map((v) => Math.max(1, Math.floor(v / f)));
+        const [lo, hi] = range.map((v) => codeOf(b, v));
+        const data = new Uint8Array(n[0] * n[1] * n[2]);
+        const grid = n.map((v) => Math.ceil(v / BRICK));
+        const bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
+        const put = (x, y, z, v) => {
+            const k = (z * grid[1] + y) * grid[0] + x;
+            if (v > bricks[k])
+                bricks[k] = v;
+        };
         for (let z = 0, o = 0; z < n[2]; z++)
             for (let y = 0; y < n[1]; y++)
                 for (let x = 0; x < n[0]; x++, o++) {
-                    let sum = 0, known = 0;
+                    let sum = 0;
+                    let known = 0;
                     for (let c = 0; c < f; c++)
                         for (let r = 0; r < f; r++)
                             for (let k = 0, at = ((z * f + c) * size[1] + y * f + r) * size[0] + x * f; k < f; k++, at++)
@@ -150,13 +235,20 @@ export function raycast(canvas, side = 0) {
                                     sum += b.codes[at];
                                     known++;
                                 }
-                    const v = known ? 1 + Math.min(254, Math.max(0, (254 * (sum / known - lo)) / (hi - lo))) : 0;
+                    const v = known
+                        ? 1 + Math.min(254, Math.max(0, (254 * (sum / known - lo)) / (hi - lo)))
+                        : 0;
                     data[o] = v;
                     // What lies at the edge of a brick is seen from the next one, too.
                     const [i, j, l] = [x, y, z].map((q) => Math.floor(q / BRICK));
                     put(i, j, l, v);
-                    for (const [at, step] of [[x, 0], [y, 1], [z, 2]]) {
-                        const edge = at % BRICK === 0 ? -1 : at % BRICK === BRICK - 1 ? 1 : 0, to = [i, j, l];
+                    for (const [at, step] of [
+                        [x, 0],
+                        [y, 1],
+                        [z, 2],
+                    ]) {
+                        const edge = at % BRICK === 0 ? -1 : at % BRICK === BRICK - 1 ? 1 : 0;
+                        const to = [i, j, l];
                         to[step] += edge;
                         if (edge && to[step] >= 0 && to[step] < grid[step])
                             put(to[0], to[1], to[2], v);
@@ -167,10 +259,22 @@ export function raycast(canvas, side = 0) {
         gl.uniform3fv(place("count"), n);
         gl.uniform3fv(place("grid"), n.map((v) => v / BRICK));
     }
-    const ends = (b) => [b.window[0], b.window[1] + 0.5 * (b.window[1] - b.window[0])];
+    const ends = (b) => [
+        b.window[0],
+        b.window[1] + 0.5 * (b.window[1] - b.window[0]),
+    ];
     const axes = () => {
-        const [c, s, p, q] = [Math.cos(me.yaw), Math.sin(me.yaw), Math.cos(me.pitch), Math.sin(me.pitch)];
-        return [[c, s, 0], [-s * q, c * q, p], [-s * p, c * p, -q]]; // right, up, ahead
+        const [c, s, p, q] = [
+            Math.cos(me.yaw),
+            Math.sin(me.yaw),
+            Math.cos(me.pitch),
+            Math.sin(me.pitch),
+        ];
+        return [
+            [c, s, 0],
+            [-s * q, c * q, p],
+            [-s * p, c * p, -q],
+        ]; // right, up, ahead
     };
     function lost(x, w, h, unit) {
         x.fillStyle = "#0b0e13";
@@ -179,7 +283,9 @@ export function raycast(canvas, side = 0) {
         x.font = `${13 * unit}px system-ui, sans-serif`;
         x.textAlign = "center";
         const says = gl.isContextLost() ? LOST : REFUSED;
-        says.forEach((line, k) => { x.fillText(line, w / 2, h / 2 + 20 * unit * (k - 1), 0.95 * w); });
+        says.forEach((line, k) => {
+            x.fillText(line, w / 2, h / 2 + 20 * unit * (k - 1), 0.95 * w);
+        });
         canvas.title = says.join(" ");
     }
     function restored() {
@@ -189,13 +295,19 @@ export function raycast(canvas, side = 0) {
         me.beside(twin);
         me.show(block);
     }
-    glass.addEventListener("webglcontextlost", (e) => { e.preventDefault(); me.draw(); });
+    glass.addEventListener("webglcontextlost", (e) => {
+        e.preventDefault();
+        me.draw();
+    });
     glass.addEventListener("webglcontextrestored", restored);
     function paint() {
-        const b = block, x = canvas.getContext("2d");
+        const b = block;
+        const x = canvas.getContext("2d");
         if (!b || !x || !canvas.clientWidth)
             return;
-        const unit = Math.min(devicePixelRatio, 2), w = Math.round(canvas.clientWidth * unit), h = Math.round(canvas.clientHeight * unit);
+        const unit = Math.min(devicePixelRatio, 2);
+        const w = Math.round(canvas.clientWidth * unit);
+        const h = Math.round(canvas.clientHeight * unit);
         if (canvas.width !== w || canvas.height !== h) {
             canvas.width = w;
             canvas.height = h;
@@ -204,11 +316,20 @@ export function raycast(canvas, side = 0) {
             lost(x, w, h, unit);
             return;
         }
-        const begun = performance.now(), size = extent(b), most = Math.max(...size), box = size.map((v) => v / most), [right, up, ahead] = axes();
+        const begun = performance.now();
+        const size = extent(b);
+        const most = Math.max(...size);
+        const box = size.map((v) => v / most);
+        const [right, up, ahead] = axes();
         glass.width = Math.max(1, Math.round(w * scale));
         glass.height = Math.max(1, Math.round(h * scale));
         gl.viewport(0, 0, glass.width, glass.height);
-        const reach = ROOM / 2 / me.zoom, room = w > h ? [(reach * w) / h, reach] : [reach, (reach * h) / w], span = 254 / 255, [lo, hi] = ends(b), low = [0, 0, 0], high = [1, 1, 1];
+        const reach = ROOM / 2 / me.zoom;
+        const room = w > h ? [(reach * w) / h, reach] : [reach, (reach * h) / w];
+        const span = 254 / 255;
+        const [lo, hi] = ends(b);
+        const low = [0, 0, 0];
+        const high = [1, 1, 1];
         const tone = (v) => 1 / 255 + (span * (v - lo)) / (hi - lo);
         if (me.cut >= 0)
             (ahead[me.cut] > 0 ? low : high)[me.cut] = (spot[me.cut] + 0.5) / size[me.cut];
@@ -221,8 +342,9 @@ export function raycast(canvas, side = 0) {
         gl.uniform1i(place("cut"), me.cut);
         gl.uniform1i(place("most"), me.most ? 1 : 0);
         gl.drawArrays(gl.TRIANGLES, 0, 3);
+        // waits, so that what it takes is known
         if (software)
-            gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, one); // waits, so that what it takes is known
+            gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, one);
         x.fillStyle = "#0b0e13";
         x.fillRect(0, 0, w, h);
         x.imageSmoothingEnabled = true;
@@ -232,14 +354,20 @@ export function raycast(canvas, side = 0) {
             x.fillRect(me.split * w - unit / 2, 0, unit, h);
         }
         // The box, its axes' names, the scale.
-        const at = (v) => { const p = v.map((q, k) => (q - 0.5) * box[k]), dot = (a) => p[0] * a[0] + p[1] * a[1] + p[2] * a[2]; return [(w / 2) * (1 + dot(right) / room[0]), (h / 2) * (1 - dot(up) / room[1])]; };
+        const at = (v) => {
+            const p = v.map((q, k) => (q - 0.5) * box[k]);
+            const dot = (a) => p[0] * a[0] + p[1] * a[1] + p[2] * a[2];
+            return [(w / 2) * (1 + dot(right) / room[0]), (h / 2) * (1 - dot(up) / room[1])];
+        };
         x.lineWidth = unit;
         x.font = `${12 * unit}px system-ui, sans-serif`;
         x.textAlign = "center";
         x.textBaseline = "middle";
         for (const k of [0, 1, 2])
             for (const corner of [0, 1, 2, 3]) {
-                const from = [0, 0, 0], to = [0, 0, 0], [i, j] = [(k + 1) % 3, (k + 2) % 3];
+                const from = [0, 0, 0];
+                const to = [0, 0, 0];
+                const [i, j] = [(k + 1) % 3, (k + 2) % 3];
                 from[i] = to[i] = corner & 1;
                 from[j] = to[j] = corner >> 1;
                 to[k] = 1;
@@ -254,7 +382,8 @@ export function raycast(canvas, side = 0) {
                     x.fillText("xyz"[k], q[0] + 8 * unit * Math.sign(q[0] - p[0] || 1), q[1] + 8 * unit * Math.sign(q[1] - p[1]));
                 }
             }
-        const px = w / (2 * room[0] * most * b.voxel_mm), mm = bar(w / px);
+        const px = w / (2 * room[0] * most * b.voxel_mm);
+        const mm = bar(w / px);
         drawBar(x, mm, mm * px, unit);
         me.ms = performance.now() - begun;
         // Coarser while it is turned on a slow machine, whole again at rest.
@@ -262,22 +391,47 @@ export function raycast(canvas, side = 0) {
             scale *= 0.7;
         clearTimeout(resting);
         if (scale < 1)
-            resting = window.setTimeout(() => { if (!held_down) {
-                scale = 1;
-                me.draw();
-            } }, 250);
+            resting = window.setTimeout(() => {
+                if (!held_down) {
+                    scale = 1;
+                    me.draw();
+                }
+            }, 250);
     }
-    const turn = (yaw, pitch) => { me.yaw += yaw; me.pitch = Math.min(1.55, Math.max(-1.55, me.pitch + pitch)); me.draw(); };
-    canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); held_down = true; });
-    canvas.addEventListener("pointermove", (e) => { if (canvas.hasPointerCapture(e.pointerId))
-        turn(-e.movementX / 120, e.movementY / 120); });
+    const turn = (yaw, pitch) => {
+        me.yaw += yaw;
+        me.pitch = Math.min(1.55, Math.max(-1.55, me.pitch + pitch));
+        me.draw();
+    };
+    canvas.addEventListener("pointerdown", (e) => {
+        canvas.setPointerCapture(e.pointerId);
+        held_down = true;
+    });
+    canvas.addEventListener("pointermove", (e) => {
+        if (canvas.hasPointerCapture(e.pointerId))
+            turn(-e.movementX / 120, e.movementY / 120);
+    });
     for (const end of ["pointerup", "pointercancel"])
-        canvas.addEventListener(end, () => { held_down = false; me.draw(); });
-    canvas.addEventListener("wheel", (e) => { if (e.ctrlKey)
-        return; e.preventDefault(); me.zoom = Math.min(8, Math.max(0.5, me.zoom * Math.exp(-e.deltaY / 500))); me.draw(); }, { passive: false });
-    const STEPS = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+        canvas.addEventListener(end, () => {
+            held_down = false;
+            me.draw();
+        });
+    canvas.addEventListener("wheel", (e) => {
+        if (e.ctrlKey)
+            return;
+        e.preventDefault();
+        me.zoom = Math.min(8, Math.max(0.5, me.zoom * Math.exp(-e.deltaY / 500)));
+        me.draw();
+    }, { passive: false });
+    const STEPS = {
+        ArrowLeft: [0.1, 0],
+        ArrowRight: [-0.1, 0],
+        ArrowUp: [0, 0.1],
+        ArrowDown: [0, -0.1],
+    };
     canvas.addEventListener("keydown", (e) => {
-        const step = STEPS[e.key], times = { "+": 1.25, "=": 1.25, "-": 0.8 }[e.key];
+        const step = STEPS[e.key];
+        const times = { "+": 1.25, "=": 1.25, "-": 0.8 }[e.key];
         if (e.ctrlKey || e.altKey || (!step && !times))
             return;
         e.preventDefault();

@@ -8,8 +8,17 @@ import { draw as drawTimeline } from "./timeline.js";
 import * as designer from "./designer.js";
 import { isOver } from "./job_words.js";
 import { wished } from "./scan_wish.js";
-const text = $("#script"), gutter = $("#gutter"), ink = $("#paint div"), LINE_PX = 16;
-let written = [""], worst = new Map(), problems = [], plan = null, planned = "", lost = false, sent = "";
+const text = $("#script");
+const gutter = $("#gutter");
+const ink = $("#paint div");
+const LINE_PX = 16;
+let written = [""];
+let worst = new Map();
+let problems = [];
+let plan = null;
+let planned = "";
+let lost = false;
+let sent = "";
 designer.place($("#tab-scan .card"));
 clicks({
     "script-open": () => $input("#script-file").click(),
@@ -43,7 +52,8 @@ const said = (line) => problems
 // The lines in sight, under the text itself, which is transparent: component, command, values,
 // comments.
 function paint() {
-    const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1), count = Math.ceil(text.clientHeight / LINE_PX) + 2;
+    const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1);
+    const count = Math.ceil(text.clientHeight / LINE_PX) + 2;
     ink.replaceChildren(...written
         .slice(first, first + count)
         .map((line, i) => el("div", { class: worst.get(first + i + 1) ?? "" }, ...inked(line))));
@@ -121,7 +131,8 @@ export function setScript(value) {
 export function goTo(line) {
     if (!line)
         return;
-    const lines = text.value.split("\n"), start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
+    const lines = text.value.split("\n");
+    const start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
     text.focus();
     text.setSelectionRange(start, start + (lines[line - 1]?.length ?? 0));
     text.scrollTop = Math.max(0, (line - 5) * 16);
@@ -153,7 +164,8 @@ on("design", () => {
 });
 // What stands elsewhere than a scan's script would put it may be meant so.
 function offer(moved, kept) {
-    const axes = Object.entries(moved), unit = (axis) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
+    const axes = Object.entries(moved);
+    const unit = (axis) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
     if (kept.length)
         $("#report").prepend(el("div", { id: "kept" }, `kept where it stands: ${kept.join(", ")}`));
     if (!axes.length)
@@ -360,7 +372,9 @@ function bring(script) {
     setScript(script);
 }
 on("script", bring);
-let asking = false, next = null, at = null;
+let asking = false;
+let next = null;
+let at = null;
 export async function scrub(time) {
     at = time;
     next = [time];
@@ -379,7 +393,8 @@ function redraw() {
     if (!plan)
         return;
     drawTimeline($canvas("#timeline"), plan, at, store.job && !isOver(store.job) ? store.job.elapsed_s : null);
-    const now = at, step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
+    const now = at;
+    const step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
     $("#scrub-at").textContent =
         at === null
             ? `${seconds(plan.duration_s)} in all`

@@ -22,7 +22,7 @@ let mine = null;
 // From the press of the button until the volume stands beside its truth.
 let busy = false;
 // Size of what turns, across and upright, in mm; null where nobody has said it.
-function turning({ sample: { size_mm: size } }) {
+function turning({ sample: { size_mm: size }, }) {
     return size ? [Math.hypot(size[0], size[1]), size[2]] : null;
 }
 // The voxel size [um] at which the sample fills the image.

@@ -1,14 +1,25 @@
 "use strict";
-// Runs in each viser frame before viser. It tells the page when something has been drawn: an empty scene takes fewer
-// calls than ENOUGH a picture, or all is hidden. Without a graphics processor (`gap` > 0, the page's choice)
-// a picture is drawn at most every `gap` ms and without smoothed edges, so that the rest stays quick; where nothing
-// has changed it is drawn anew every REST_MS and not, as viser does, every HEARTBEAT_MS: that took half a core.
+// Runs in each viser frame before viser. It tells the page when something has been drawn: an
+// empty scene takes fewer calls than ENOUGH a picture, or all is hidden. Without a graphics
+// processor (`gap` > 0, the page's choice) a picture is drawn at most every `gap` ms and
+// without smoothed edges, so that the rest stays quick; where nothing has changed it is drawn
+// anew every REST_MS and not, as viser does, every HEARTBEAT_MS: that took half a core.
 (() => {
-    const ENOUGH = 3, LATE_MS = 5000, HEARTBEAT_MS = 1000, REST_MS = 8000, ask = window.requestAnimationFrame.bind(window), gl = WebGL2RenderingContext.prototype;
-    // eslint-disable-next-line @typescript-eslint/unbound-method -- it is called with its context below
+    const ENOUGH = 3;
+    const LATE_MS = 5000;
+    const HEARTBEAT_MS = 1000;
+    const REST_MS = 8000;
+    const ask = window.requestAnimationFrame.bind(window);
+    const gl = WebGL2RenderingContext.prototype;
+    // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
     const draw = gl.drawElements;
-    let calls = 0, first = Infinity;
-    gl.drawElements = function (...all) { calls++; first = Math.min(first, performance.now()); draw.apply(this, all); };
+    let calls = 0;
+    let first = Infinity;
+    gl.drawElements = function (...all) {
+        calls++;
+        first = Math.min(first, performance.now());
+        draw.apply(this, all);
+    };
     const look = () => {
         if (calls >= ENOUGH || performance.now() > first + LATE_MS) {
             gl.drawElements = draw;
@@ -22,14 +33,20 @@
     const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
     if (!(gap > 0))
         return;
-    // eslint-disable-next-line @typescript-eslint/unbound-method -- it is called with its canvas below
+    // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its canvas
     const context = HTMLCanvasElement.prototype.getContext;
     HTMLCanvasElement.prototype.getContext = function (kind, options) {
         return context.call(this, kind, /^webgl/.test(kind) ? { ...options, antialias: false } : options);
     };
-    const every = window.setInterval.bind(window), beats = (f, ms) => ms === HEARTBEAT_MS && !String(f).includes("retry");
-    window.setInterval = ((f, ms, ...more) => every(f, beats(f, ms) ? REST_MS : ms, ...more)); // a lost connection is still tried once a second
-    let queue = new Map(), next = 1, last = -Infinity, due = false;
+    const every = window.setInterval.bind(window);
+    const beats = (f, ms) => ms === HEARTBEAT_MS && !String(f).includes("retry");
+    window.setInterval = ((f, ms, ...more) => 
+    // a lost connection is still tried once a second
+    every(f, beats(f, ms) ? REST_MS : ms, ...more));
+    let queue = new Map();
+    let next = 1;
+    let last = -Infinity;
+    let due = false;
     const run = (time) => {
         const now = queue;
         queue = new Map();
@@ -46,5 +63,7 @@
         }
         return next++;
     };
-    window.cancelAnimationFrame = (id) => { queue.delete(id); };
+    window.cancelAnimationFrame = (id) => {
+        queue.delete(id);
+    };
 })();

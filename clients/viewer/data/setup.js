@@ -1,8 +1,10 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, cleared, clicks, el, fixed, keep, numeric, parsed, setText, words, } from "./dom.js";
+import { $, $$, $button, $input, $select, clicks, el, fixed, keep, numeric, parsed, setText, words, } from "./dom.js";
 import { differences, listed, only } from "./fingerprint.js";
 import { call, command, emit, on, store } from "./link.js";
-const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
+import { curve } from "./plots.js";
+const ROI = ["l", "t", "r", "b"];
+const SIX = ["x", "y", "z", "rx", "ry", "rz"];
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
 for (const input of $$("#tab-setup .num")) {
     numeric(input, () => input.closest(".card")?.querySelector("[data-apply]")?.click(), () => takeBack(input.id));
@@ -30,7 +32,8 @@ clicks({
 const of = (id) => $(`#${id}`);
 const typed = (id) => $(`#${id}`).classList.contains("typed");
 function put(id, value, digits = 0) {
-    const input = of(id), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : (value ?? "");
+    const input = of(id);
+    const text = typeof value === "number" ? String(Number(value.toFixed(digits))) : (value ?? "");
     input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
     if (typed(id) || input.value === text)
         return;
@@ -46,9 +49,11 @@ function takeBack(...ids) {
 }
 // The numbers of some fields; null, and they show the state again, if one is none.
 function numbers(...ids) {
-    const values = ids.map((id) => parsed(of(id).value)), wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
+    const values = ids.map((id) => parsed(of(id).value));
+    const wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
     for (const id of wrong) {
-        const input = of(id), name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
+        const input = of(id);
+        const name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
         emit("note", "error", "Not applied", `${name}: “${input.value}” is not a number`);
     }
     takeBack(...wrong);
@@ -63,19 +68,22 @@ function untouched(ids) {
 // Sends what was typed into `fields` (parameter -> field or fields) as one command; after an
 // error the fields show the state again.
 async function apply(method, fields, title) {
-    const params = {}, ids = Object.values(fields).flat();
+    const params = {};
+    const ids = Object.values(fields).flat();
     for (const [name, its] of Object.entries(fields)) {
         const some = [its].flat();
         if (!some.some(typed))
             continue;
-        const list = of(some[0]), values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
+        const list = of(some[0]);
+        const values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
         if (!values)
             return;
         params[name] = Array.isArray(its) ? values : values[0];
     }
     if (!Object.keys(params).length)
         return;
-    const same = untouched(ids), taken = await command(method, params, title);
+    const same = untouched(ids);
+    const taken = await command(method, params, title);
     if (taken)
         for (const id of same())
             $(`#${id}`).classList.remove("typed"); // the state comes by itself
@@ -94,11 +102,13 @@ function setCamera() {
     }, "The camera refuses");
 }
 async function setSample() {
-    const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
+    const ids = SIX.map((k) => `off-${k}`);
+    const values = numbers(...ids);
     if (!values)
         return;
     const offset = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
-    const same = untouched(["sample", ...ids]), answer = await command("sample.set", { name: $select("#sample").value, offset }, "The sample stays");
+    const same = untouched(["sample", ...ids]);
+    const answer = await command("sample.set", { name: $select("#sample").value, offset }, "The sample stays");
     if (answer)
         for (const id of same())
             $(`#${id}`).classList.remove("typed");
@@ -125,7 +135,8 @@ export async function list() {
     const answer = await call("sample.list").catch(() => null);
     if (!answer)
         return;
-    const select = $select("#sample"), chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");
+    const select = $select("#sample");
+    const chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");
     select.textContent = "";
     for (const s of answer.samples)
         select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
@@ -183,6 +194,7 @@ function outdatePrediction() {
     predicted = null;
     setText($("#predicted"), `made for another ${listed(differ)}: predict again`);
 }
+const beam = curve($("#spectrum"), true);
 let spectrumOf = null;
 async function spectrum(kV) {
     if (spectrumOf === kV || $("#tab-setup").hidden)
@@ -195,7 +207,6 @@ async function spectrum(kV) {
     const s = await call("viewer.spectrum", { kV }).catch(words);
     if (spectrumOf !== kV)
         return;
-    const canvas = $canvas("#spectrum"), [x, w, h] = cleared(canvas);
     if (typeof s === "string") {
         $("#filters").textContent = "–";
         $("#spectrum-note").textContent = s;
@@ -208,13 +219,9 @@ async function spectrum(kV) {
     const used = kind === "ideal" ? " · not used by this physics" : "";
     $("#spectrum-note").textContent =
         `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
-    const most = Math.max(...s.photons), last = Math.max(kV, 1);
-    x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent");
-    x.beginPath();
-    x.moveTo(0, h);
-    s.photons.forEach((n, k) => x.lineTo((w * s.energy_keV[k]) / last, h - ((h - 2) * n) / most));
-    x.lineTo(w, h);
-    x.fill();
+    const places = s.energy_keV.filter((keV) => keV <= Math.max(kV, 1));
+    const values = s.photons.slice(0, places.length);
+    beam.draw({ places, values, unit: "keV", of: "photons" });
 }
 on("tab", () => {
     if (store.state)
@@ -232,7 +239,8 @@ function show(state) {
     void spectrum(state.tube.kV);
     put("kV", state.tube.kV, 2);
     put("power", state.tube.power_W, 2);
-    const xrays = $button("#beam"), { on, ready } = state.tube;
+    const xrays = $button("#beam");
+    const { on, ready } = state.tube;
     xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "Switch X-rays on";
     xrays.classList.toggle("beam-on", on);
     xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";

@@ -1,13 +1,24 @@
 export const SIDES = ["top", "front", "side"];
 // Of each picture, which of x, y and z goes right, which up, and which is gone through.
 const AXES = { top: [0, 1, 2], front: [0, 2, 1], side: [1, 2, 0] };
-const NAMES = "xyz", TOP = 65534, UNKNOWN = 0xff6e5a50, BAR = "#ffd54a", CROSS = "#5ab0ffb0", LINE = "#36e28f", BINS = 160, SAMPLES = 300_000;
+const NAMES = "xyz";
+const TOP = 65534;
+const UNKNOWN = 0xff6e5a50;
+const BAR = "#ffd54a";
+const CROSS = "#5ab0ffb0";
+const LINE = "#36e28f";
+const BINS = 160;
+const SAMPLES = 300_000;
 export const extent = ({ shape }) => [shape[2], shape[1], shape[0]];
 export const index = ({ shape: [, ny, nx] }, [x, y, z]) => (z * ny + y) * nx + x;
-export const valueOf = ({ low, high }, code) => (code ? low + ((code - 1) * (high - low)) / TOP : NaN);
+export const valueOf = ({ low, high }, code) => code ? low + ((code - 1) * (high - low)) / TOP : NaN;
 export const codeOf = ({ low, high }, value) => 1 + ((value - low) * TOP) / (high - low);
 // A round length [mm] of about a quarter of so much.
-export function bar(mm) { const e = 10 ** Math.floor(Math.log10(mm / 4)), m = mm / 4 / e; return e * (m < 2 ? 1 : m < 5 ? 2 : 5); }
+export function bar(mm) {
+    const e = 10 ** Math.floor(Math.log10(mm / 4));
+    const m = mm / 4 / e;
+    return e * (m < 2 ? 1 : m < 5 ? 2 : 5);
+}
 export function drawBar(x, mm, px, unit) {
     const h = x.canvas.height - 7 * unit;
     x.fillStyle = BAR;
@@ -18,15 +29,29 @@ export function drawBar(x, mm, px, unit) {
     x.fillText(`${mm} mm`, 8 * unit, h - 2 * unit);
 }
 // Less than the truth is blue, more is orange.
-export function signed(g) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
+export function signed(g) {
+    const d = (2 * Math.abs(g - 127.5)) | 0;
+    return g < 127.5
+        ? 0xff000000 | (d << 16) | ((d >> 1) << 8)
+        : 0xff000000 | ((d >> 1) << 8) | d;
+}
 // `pointed` hears of the voxel under the pointer, `moved` of a cross or a profile that was moved.
 export function slices(canvases, pointed, moved) {
-    const table = new Uint32Array(TOP + 2), other = new Uint32Array(TOP + 2), buffers = {};
-    let due = false, line = null;
+    const table = new Uint32Array(TOP + 2);
+    const other = new Uint32Array(TOP + 2);
+    const buffers = {};
+    let due = false;
+    let line = null;
     const me = {
-        block: null, window: [0, 1], cross: [0, 0, 0], profiling: false, beside: null, split: 1,
+        block: null,
+        window: [0, 1],
+        cross: [0, 0, 0],
+        profiling: false,
+        beside: null,
+        split: 1,
         show(block, window) {
-            const before = me.block, size = block && extent(block);
+            const before = me.block;
+            const size = block && extent(block);
             if (size && before?.shape.join() !== block.shape.join()) {
                 me.cross = size.map((n) => n >> 1);
                 line = null;
@@ -51,15 +76,24 @@ export function slices(canvases, pointed, moved) {
             me.draw();
             moved();
         },
-        draw() { if (!due) {
-            due = true;
-            requestAnimationFrame(() => { due = false; for (const side of SIDES)
-                paint(side); });
-        } },
+        draw() {
+            if (!due) {
+                due = true;
+                requestAnimationFrame(() => {
+                    due = false;
+                    for (const side of SIDES)
+                        paint(side);
+                });
+            }
+        },
         // Of every n-th voxel.
         histogram([low, high]) {
-            const counts = new Float64Array(BINS), b = me.block, codes = b?.codes ?? new Uint16Array(), step = Math.max(1, Math.floor(codes.length / SAMPLES)) | 1;
-            const from = b ? codeOf(b, low) : 0, per = BINS / (b ? codeOf(b, high) - from : 1);
+            const counts = new Float64Array(BINS);
+            const b = me.block;
+            const codes = b?.codes ?? new Uint16Array();
+            const step = Math.max(1, Math.floor(codes.length / SAMPLES)) | 1;
+            const from = b ? codeOf(b, low) : 0;
+            const per = BINS / (b ? codeOf(b, high) - from : 1);
             for (let k = 0; k < codes.length; k += step) {
                 const bin = Math.floor((codes[k] - from) * per);
                 if (codes[k] && bin >= 0 && bin < BINS)
@@ -68,17 +102,21 @@ export function slices(canvases, pointed, moved) {
             return counts;
         },
         profile() {
-            const b = me.block, l = line;
+            const b = me.block;
+            const l = line;
             if (!b || !l)
                 return null;
-            const [dx, dy] = [l.to[0] - l.from[0], l.to[1] - l.from[1]], length = Math.hypot(dx, dy), n = Math.max(2, Math.ceil(2 * length));
+            const [dx, dy] = [l.to[0] - l.from[0], l.to[1] - l.from[1]];
+            const length = Math.hypot(dx, dy);
+            const n = Math.max(2, Math.ceil(2 * length));
             const values = Array.from({ length: n }, (_, k) => valueOf(b, b.codes[index(b, place(l.side, [l.from[0] + (dx * k) / (n - 1), l.from[1] + (dy * k) / (n - 1)]))]));
             return { values, mm: length * b.voxel_mm };
         },
     };
     // Colours of a block's codes.
     function fill(colors, b, window) {
-        const from = codeOf(b, window[0]), step = 255 / Math.max(1e-9, codeOf(b, window[1]) - from);
+        const from = codeOf(b, window[0]);
+        const step = 255 / Math.max(1e-9, codeOf(b, window[1]) - from);
         for (let k = 1; k < colors.length; k++) {
             const g = Math.min(255, Math.max(0, (k - from) * step)) | 0;
             colors[k] = b.signed ? signed(g) : 0xff000000 | (g * 0x010101);
@@ -87,26 +125,37 @@ export function slices(canvases, pointed, moved) {
     }
     // The voxel of a place in a picture (voxels to the right, and up).
     function place(side, [right, up]) {
-        const [i, j] = AXES[side], at = [...me.cross], size = me.block ? extent(me.block) : [1, 1, 1];
+        const [i, j] = AXES[side];
+        const at = [...me.cross];
+        const size = me.block ? extent(me.block) : [1, 1, 1];
         at[i] = Math.min(size[i] - 1, Math.max(0, Math.round(right)));
         at[j] = Math.min(size[j] - 1, Math.max(0, Math.round(up)));
         return at;
     }
     function paint(side) {
-        const canvas = canvases[side], b = me.block, x = canvas.getContext("2d");
+        const canvas = canvases[side];
+        const b = me.block;
+        const x = canvas.getContext("2d");
         if (!b || !x || !canvas.clientWidth)
             return;
-        const [i, j, k] = AXES[side], size = extent(b), [w, h] = [size[i], size[j]], buffer = (buffers[side] ??= document.createElement("canvas"));
+        const [i, j, k] = AXES[side];
+        const size = extent(b);
+        const [w, h] = [size[i], size[j]];
+        const buffer = (buffers[side] ??= document.createElement("canvas"));
         if (buffer.width !== w || buffer.height !== h) {
             buffer.width = w;
             buffer.height = h;
             canvas.style.aspectRatio = `${w} / ${h}`;
         }
-        const inside = buffer.getContext("2d"), strides = [1, size[0], size[0] * size[1]], out = inside?.createImageData(w, h);
+        const inside = buffer.getContext("2d");
+        const strides = [1, size[0], size[0] * size[1]];
+        const out = inside?.createImageData(w, h);
         if (!inside || !out)
             return;
-        const data = new Uint32Array(out.data.buffer), start = me.cross[k] * strides[k];
-        const far = !b.own && me.beside?.shape.join() === b.shape.join() ? me.beside : null, cut = far ? Math.round(me.split * w) : w;
+        const data = new Uint32Array(out.data.buffer);
+        const start = me.cross[k] * strides[k];
+        const far = !b.own && me.beside?.shape.join() === b.shape.join() ? me.beside : null;
+        const cut = far ? Math.round(me.split * w) : w;
         for (let r = 0, o = 0; r < h; r++) {
             let at = start + (h - 1 - r) * strides[j];
             for (let c = 0; c < w; c++, o++, at += strides[i]) {
@@ -114,7 +163,10 @@ export function slices(canvases, pointed, moved) {
             }
         }
         inside.putImageData(out, 0, 0);
-        const unit = Math.min(devicePixelRatio, 2), wide = Math.round(canvas.clientWidth * unit), high = Math.round((wide * h) / w), s = wide / w;
+        const unit = Math.min(devicePixelRatio, 2);
+        const wide = Math.round(canvas.clientWidth * unit);
+        const high = Math.round((wide * h) / w);
+        const s = wide / w;
         if (canvas.width !== wide || canvas.height !== high) {
             canvas.width = wide;
             canvas.height = high;
@@ -145,24 +197,52 @@ export function slices(canvases, pointed, moved) {
         const mm = bar(w * b.voxel_mm);
         drawBar(x, mm, (mm / b.voxel_mm) * s, unit);
         x.textAlign = "right";
-        x.fillText(`${NAMES[i]} →  ${NAMES[j]} ↑  ${NAMES[k]} ${((me.cross[k] + 0.5 - size[k] / 2) * b.voxel_mm).toFixed(2)} mm`, wide - 6 * unit, high - 4 * unit);
+        const depth_mm = (me.cross[k] + 0.5 - size[k] / 2) * b.voxel_mm;
+        const place = `${NAMES[i]} →  ${NAMES[j]} ↑  ${NAMES[k]} ${depth_mm.toFixed(2)} mm`;
+        x.fillText(place, wide - 6 * unit, high - 4 * unit);
         canvas.dataset.index = String(me.cross[k]);
     }
     const under = (canvas, side, e) => {
-        const box = canvas.getBoundingClientRect(), size = me.block ? extent(me.block) : [1, 1, 1], [i, j] = AXES[side];
-        return [((e.clientX - box.left) / box.width) * size[i] - 0.5, (1 - (e.clientY - box.top) / box.height) * size[j] - 0.5];
+        const box = canvas.getBoundingClientRect();
+        const size = me.block ? extent(me.block) : [1, 1, 1];
+        const [i, j] = AXES[side];
+        return [
+            ((e.clientX - box.left) / box.width) * size[i] - 0.5,
+            (1 - (e.clientY - box.top) / box.height) * size[j] - 0.5,
+        ];
     };
-    const STEPS = { ArrowUp: 1, ArrowRight: 1, ArrowDown: -1, ArrowLeft: -1, PageUp: 10, PageDown: -10, Home: -1e6, End: 1e6 };
+    const STEPS = {
+        ArrowUp: 1,
+        ArrowRight: 1,
+        ArrowDown: -1,
+        ArrowLeft: -1,
+        PageUp: 10,
+        PageDown: -10,
+        Home: -1e6,
+        End: 1e6,
+    };
     for (const side of SIDES) {
-        const canvas = canvases[side], k = AXES[side][2];
-        const through = (step) => { const to = [...me.cross]; to[k] += step; me.go(to); };
-        canvas.addEventListener("wheel", (e) => { if (!me.block || e.ctrlKey)
-            return; e.preventDefault(); through(-Math.sign(e.deltaY)); }, { passive: false });
-        canvas.addEventListener("keydown", (e) => { const step = STEPS[e.key]; if (me.block && step && !e.ctrlKey && !e.altKey) {
+        const canvas = canvases[side];
+        const k = AXES[side][2];
+        const through = (step) => {
+            const to = [...me.cross];
+            to[k] += step;
+            me.go(to);
+        };
+        canvas.addEventListener("wheel", (e) => {
+            if (!me.block || e.ctrlKey)
+                return;
             e.preventDefault();
-            e.stopPropagation();
-            through(step);
-        } });
+            through(-Math.sign(e.deltaY));
+        }, { passive: false });
+        canvas.addEventListener("keydown", (e) => {
+            const step = STEPS[e.key];
+            if (me.block && step && !e.ctrlKey && !e.altKey) {
+                e.preventDefault();
+                e.stopPropagation();
+                through(step);
+            }
+        });
         canvas.addEventListener("pointerdown", (e) => {
             if (!me.block)
                 return;

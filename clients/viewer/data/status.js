@@ -45,7 +45,9 @@ on("state", (s) => {
     holder();
 });
 function holder() {
-    const pill = $("#holder"), who = store.state?.controller ?? null, mine = who !== null && who === store.session;
+    const pill = $("#holder");
+    const who = store.state?.controller ?? null;
+    const mine = who !== null && who === store.session;
     // Without the twin nobody knows who may; with it the next state says.
     pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
     setText(pill, !store.twin
@@ -59,7 +61,8 @@ function holder() {
     $button("#take").disabled = !store.twin;
 }
 $button("#take").addEventListener("click", () => {
-    const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
+    const who = store.state?.controller ?? null;
+    const action = who === null ? "acquire" : who === store.session ? "release" : "force";
     void command("session.control", { action }, "Control");
 });
 const me = $input("#person");
@@ -81,7 +84,9 @@ $button("#estop").addEventListener("click", () => void estop());
 const SEEN_MS = 1000;
 let shown = null;
 function release(s) {
-    const stop = isDown(s) ? s.safety.stop : null, reset = $button("#reset"), ask = $dialog("#reset-dialog");
+    const stop = isDown(s) ? s.safety.stop : null;
+    const reset = $button("#reset");
+    const ask = $dialog("#reset-dialog");
     reset.hidden = stop === null;
     $button("#xrays-off").hidden = stop === null || !s.tube.on;
     if (stop === shown)
@@ -95,7 +100,8 @@ function release(s) {
     }, SEEN_MS);
 }
 $button("#reset").addEventListener("click", () => {
-    const ask = $dialog("#reset-dialog"), s = store.state;
+    const ask = $dialog("#reset-dialog");
+    const s = store.state;
     if (ask.open || !s) {
         ask.close();
         return;

@@ -20,13 +20,19 @@ const TRUTH = {
     dS_x: ["source aside", "mm", 1, 0, "edges double, as of the axis"],
 };
 const STEPS = [
-    ["story-bend", "1  Misalign",
-        "Choose how wrong the geometry is; the bead phantom goes onto the stage."],
+    [
+        "story-bend",
+        "1  Misalign",
+        "Choose how wrong the geometry is; the bead phantom goes onto the stage.",
+    ],
     ["story-scan", "2  Scan it", "One turn, reconstructed with the wrong geometry."],
     ["story-fit", "3  Calibrate", "The phantom's beads tell where axis, panel and source are."],
     ["story-apply", "4  Apply", "What was found comes into force."],
-    ["story-again", "5  Scan it again",
-        "The same turn, the right geometry. Share it from the volume."],
+    [
+        "story-again",
+        "5  Scan it again",
+        "The same turn, the right geometry. Share it from the volume.",
+    ],
 ];
 let step = 0;
 let job = null;
@@ -37,7 +43,12 @@ const rms = [];
 const slider = (name) => $(`#story-${name}`);
 const [first] = STEPS[0];
 const card = el("details", { class: "card", id: "story" }, el("summary", {}, "Misalign: what a wrong geometry does, in five steps"), ...Object.entries(TRUTH).map(([name, [what, unit, most, start, does]]) => el("div", { title: does }, el("label", { for: `story-${name}` }, `${what} `, el("output", { id: `story-${name}-is`, class: "mono" }), ` ${unit}`), el("input", {
-    type: "range", id: `story-${name}`, min: -most, max: most, step: most / 50, value: start,
+    type: "range",
+    id: `story-${name}`,
+    min: -most,
+    max: most,
+    step: most / 50,
+    value: start,
     oninput: () => says(),
 }))), ...STEPS.map(([id, button]) => el("button", { id, class: "small", disabled: id !== first }, button)), el("div", { id: "story-says", class: "small-text", "aria-live": "polite" }), el("div", { id: "story-found", class: "small-text mono" }));
 $("#tab-calibrate").prepend(card);

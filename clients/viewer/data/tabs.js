@@ -28,7 +28,9 @@ export function tab(name, step = false) {
     emit("tab", name);
 }
 $("#tabs").addEventListener("keydown", (e) => {
-    const all = $$("#tabs button"), i = all.indexOf(e.target), step = e.key === "ArrowRight" ? 1 : e.key === "ArrowLeft" ? -1 : 0;
+    const all = $$("#tabs button");
+    const i = all.indexOf(e.target);
+    const step = e.key === "ArrowRight" ? 1 : e.key === "ArrowLeft" ? -1 : 0;
     const next = step
         ? all.at((i + step) % all.length)
         : e.key === "Home"

@@ -2,7 +2,12 @@
 import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
-const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
+const NAMES = {
+    iso: "Isometric",
+    beam: "Beam’s eye",
+    side: "Side",
+    free: "Free",
+};
 const open = new Map();
 $("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current = null;
@@ -10,18 +15,20 @@ export let current = null;
 const query = new URLSearchParams(location.search);
 export let webgl = true;
 export const software = (() => {
-    const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
+    const gl = document.createElement("canvas").getContext("webgl");
+    const info = gl?.getExtension("WEBGL_debug_renderer_info");
     const name = gl && info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
     webgl = Boolean(gl);
     gl?.getExtension("WEBGL_lose_context")?.loseContext();
     return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
 })();
-// With one the scenes have shadows and an environment that shines in metal; `?light=fine` or `plain` says otherwise.
+// With one the scenes have shadows and an environment that shines in metal; `?light=fine` or
+// `plain` says otherwise.
 export const fine = query.has("light") ? query.get("light") === "fine" : !software;
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
-// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
-// with the machine.
+// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's
+// eye has none: it moves with the machine.
 async function preset(view, box) {
     if (view === "beam")
         return "";
@@ -30,7 +37,8 @@ async function preset(view, box) {
     if (!camera?.position || !camera.look_at || !camera.fov)
         return "";
     const { position, look_at, fov } = camera;
-    return `initialCameraPosition=${position.join()}&initialCameraLookAt=${look_at.join()}&initialCameraFov=${fov}&`;
+    const from = `initialCameraPosition=${position.join()}`;
+    return `${from}&initialCameraLookAt=${look_at.join()}&initialCameraFov=${fov}&`;
 }
 async function start({ box, iframe, src }, view) {
     const found = await preset(view, box);
@@ -40,8 +48,10 @@ async function start({ box, iframe, src }, view) {
 function frame(view) {
     const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
     const iframe = el("iframe", { title: NAMES[view] });
-    iframe.addEventListener("load", () => { if (iframe.contentWindow)
-        emit("frame", iframe.contentWindow); }); // keys.js listens in it, too
+    iframe.addEventListener("load", () => {
+        if (iframe.contentWindow)
+            emit("frame", iframe.contentWindow);
+    }); // keys.js listens in it, too
     const tag = el("span", { class: "tag" }, NAMES[view]);
     const box = el("div", { class: "view", "data-view": view });
     if (view === "beam") {
@@ -49,30 +59,45 @@ function frame(view) {
         box.append(crop, tag);
         return { box, iframe, crop, tag, src };
     }
-    const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
+    const home = el("button", {
+        class: "home",
+        title: "Back to this view's preset",
+        onclick: () => call("viewer.camera", { view }),
+    }, "⌂");
     const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
     box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
     const sample = el("img", { alt: "" });
-    sample.addEventListener("error", () => { sample.hidden = true; });
-    sample.addEventListener("load", () => { sample.hidden = false; });
+    sample.addEventListener("error", () => {
+        sample.hidden = true;
+    });
+    sample.addEventListener("load", () => {
+        sample.hidden = false;
+    });
     box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample));
     return { box, iframe, tag, src, sample };
 }
 const closer = (view) => call("viewer.camera", { view, sample: true }).catch(() => { });
-export function nearSample() { for (const view of open.keys())
-    if (view !== "beam")
-        void closer(view); }
-const still = $("#still"), CLOSE_UP_MS = 700;
+export function nearSample() {
+    for (const view of open.keys())
+        if (view !== "beam")
+            void closer(view);
+}
+const still = $("#still");
+const CLOSE_UP_MS = 700;
 const STILL_AGAIN_MS = 1000;
 let live = false;
 // A busy server answers late with no picture: ask again until a frame has drawn the scene.
 function missing() {
     still.hidden = true;
-    setTimeout(() => { if (!live)
-        window.still(still, window.firstView, $("#views")); }, STILL_AGAIN_MS);
+    setTimeout(() => {
+        if (!live)
+            window.still(still, window.firstView, $("#views"));
+    }, STILL_AGAIN_MS);
 }
 still.addEventListener("error", missing);
-still.addEventListener("load", () => { still.hidden = live; });
+still.addEventListener("load", () => {
+    still.hidden = live;
+});
 if (still.complete && !still.naturalWidth)
     missing();
 window.addEventListener("message", (e) => {
@@ -84,9 +109,17 @@ window.addEventListener("message", (e) => {
         still.hidden = true;
     }
 });
-let posed = "", seenAt = -Infinity;
+let posed = "";
+let seenAt = -Infinity;
 on("state", (s) => {
-    const now = JSON.stringify([s.sample, s.correction, store.layers, store.opacity, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
+    const now = JSON.stringify([
+        s.sample,
+        s.correction,
+        store.layers,
+        store.opacity,
+        Object.values(s.axes).map((a) => a.position.toFixed(1)),
+        document.documentElement.dataset.theme,
+    ]);
     if (now === posed || performance.now() < seenAt + CLOSE_UP_MS)
         return;
     posed = now;
@@ -120,7 +153,10 @@ export function layout(asked, step = false) {
     }
     const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
     const views = $("#views");
-    if (views.childElementCount && wanted.length === 1 && which !== "beam" && !open.has(wanted[0])) {
+    if (views.childElementCount &&
+        wanted.length === 1 &&
+        which !== "beam" &&
+        !open.has(wanted[0])) {
         still.hidden = false;
         window.still(still, which, views);
     }
@@ -148,9 +184,11 @@ export function layout(asked, step = false) {
     fit(true);
 }
 let last = "";
-// Size and place the beam's frame so that the detector's image fills the crop, whatever the piercing point.
+// Size and place the beam's frame so that the detector's image fills the crop, whatever the
+// piercing point.
 export function fit(force = false) {
-    const parts = open.get("beam"), f = store.framing;
+    const parts = open.get("beam");
+    const f = store.framing;
     if (!parts?.crop || !f)
         return;
     const { clientWidth: w, clientHeight: h } = parts.box;
@@ -159,11 +197,26 @@ export function fit(force = false) {
         return;
     last = key;
     const width = Math.max(40, Math.min(w - 24, (h - 24) / f.aspect));
-    const set = (node, values) => { for (const [k, v] of Object.entries(values))
-        node.style.setProperty(k, `${v}px`); };
-    set(parts.crop, { width, height: width * f.aspect, left: (w - width) / 2, top: (h - width * f.aspect) / 2 });
-    set(parts.iframe, { width: f.width * width, height: f.height * width, left: -f.left * width, top: -f.top * width });
+    const set = (node, values) => {
+        for (const [k, v] of Object.entries(values))
+            node.style.setProperty(k, `${v}px`);
+    };
+    set(parts.crop, {
+        width,
+        height: width * f.aspect,
+        left: (w - width) / 2,
+        top: (h - width * f.aspect) / 2,
+    });
+    set(parts.iframe, {
+        width: f.width * width,
+        height: f.height * width,
+        left: -f.left * width,
+        top: -f.top * width,
+    });
     parts.tag.textContent = f.exact ? "Beam’s eye" : "Beam’s eye (oblique)";
 }
 on("state", () => fit());
-new ResizeObserver(() => { fit(); posed = ""; }).observe($("#views"));
+new ResizeObserver(() => {
+    fit();
+    posed = "";
+}).observe($("#views"));

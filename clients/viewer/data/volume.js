@@ -1,7 +1,8 @@
-// A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes it. It comes here as a whole, as slices that
-// scroll and in three dimensions, and beside the truth of its sample.
-import { below, beside as valuesBeside } from "./plot_axes.js";
-import { $, $button, $canvas, $input, $select, bars, cleared, clicks, curve, el, fixed, keep, setText, slid, words } from "./dom.js";
+// A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes
+// it. It comes here as a whole, as slices that scroll and in three dimensions, and beside the
+// truth of its sample.
+import { along, curve, histogram } from "./plots.js";
+import { $, $button, $canvas, $input, $select, clicks, el, fixed, keep, setText, slid, words, } from "./dom.js";
 import { call, on, store } from "./link.js";
 import { folder } from "./data.js";
 import { extent, index, slices, valueOf } from "./slices.js";
@@ -9,19 +10,49 @@ import { raycast } from "./raycast.js";
 import { shared } from "./shared.js";
 import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
-const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
-const SHOWN = { volume: "volume", sigma: "noise (standard deviation)", bias_bound: "bound of the bias", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
-const size = $select("#volume-side"), note = $("#volume-note"), progress = $("#volume-progress"), shown = $select("#volume-shown");
-const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), ends = [$input("#volume-low"), $input("#volume-high")], level = $input("#volume-level");
+const KEY = "flexdt-volume";
+const STARTING = "starting; dark, flat and a first image are needed";
+const EXACT_MS = 60;
+const SHOWN = {
+    volume: "volume",
+    sigma: "noise (standard deviation)",
+    bias_bound: "bound of the bias",
+    other: "the other geometry",
+    truth: "truth of the sample",
+    difference: "volume − truth",
+};
+const size = $select("#volume-side");
+const note = $("#volume-note");
+const progress = $("#volume-progress");
+const shown = $select("#volume-shown");
+const histogramHost = $("#volume-histogram");
+const chart = histogram(histogramHost);
+const profileHost = $("#volume-profile");
+const plot = curve(profileHost);
+const ends = [$input("#volume-low"), $input("#volume-high")];
+const level = $input("#volume-level");
 size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 // The past scan whose volume is wanted; else it is the running one's.
-let past = null, asked = null, told = null, pointer = null, of = {}, wanting = false, late = false, comparing = false;
+let past = null;
+let asked = null;
+let told = null;
+let pointer = null;
+let of = {};
+let wanting = false;
+let late = false;
+let comparing = false;
 const blocks = new Map();
-const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
-let tried = false, solid = null;
+const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => {
+    solid?.cross(three.cross);
+    drawProfile();
+});
+let tried = false;
+let solid = null;
 function ask() {
-    const running = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null, name = past ?? running, wish = size.value && name ? `${name} ${size.value} ${past ? "past" : ""}` : "";
+    const running = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null;
+    const name = past ?? running;
+    const wish = size.value && name ? `${name} ${size.value} ${past ? "past" : ""}` : "";
     if (wish === (asked ?? ""))
         return;
     const before = asked;
@@ -35,10 +66,12 @@ function ask() {
             if (asked !== wish)
                 return;
             setText(note, words(error));
-            setTimeout(() => { if (asked === wish) {
-                asked = null;
-                ask();
-            } }, 1000);
+            setTimeout(() => {
+                if (asked === wish) {
+                    asked = null;
+                    ask();
+                }
+            }, 1000);
         });
     forget();
     progress.hidden = past === null;
@@ -61,13 +94,28 @@ function forget() {
     offer(["volume"]);
     large(false);
 }
-function choose() { if (!size.value)
-    past = null; if (!past)
-    keep(KEY, size.value); ask(); }
-function cancel() { past = null; size.value = localStorage.getItem(KEY) ?? ""; ask(); }
-function large(to) { document.body.classList.toggle("whole", to); $("#volume-large").ariaPressed = String(to); three.draw(); solid?.draw(); }
+function choose() {
+    if (!size.value)
+        past = null;
+    if (!past)
+        keep(KEY, size.value);
+    ask();
+}
+function cancel() {
+    past = null;
+    size.value = localStorage.getItem(KEY) ?? "";
+    ask();
+}
+function large(to) {
+    document.body.classList.toggle("whole", to);
+    $("#volume-large").ariaPressed = String(to);
+    three.draw();
+    solid?.draw();
+}
 // With `compared` the truth is asked for as soon as the volume is there.
-let thenCompare = false, reveal = false, kept = null;
+let thenCompare = false;
+let reveal = false;
+let kept = null;
 export function reconstruct(name, compared = false) {
     past = name;
     thenCompare = compared;
@@ -77,7 +125,12 @@ export function reconstruct(name, compared = false) {
     ask();
     $("#volume-card").scrollIntoView({ block: "nearest" });
 }
-export function watch() { size.value ||= "128"; past = null; reveal = true; ask(); }
+export function watch() {
+    size.value ||= "128";
+    past = null;
+    reveal = true;
+    ask();
+}
 on("reconstruct", (name) => reconstruct(name));
 on("job", (job) => {
     ask();
@@ -85,9 +138,13 @@ on("job", (job) => {
         setText(note, `the scan has ended (${job.state}) before its first slices`);
     }
 });
-on("state", (s) => { if (s.job)
-    ask(); });
-on("open", () => { asked = null; });
+on("state", (s) => {
+    if (s.job)
+        ask();
+});
+on("open", () => {
+    asked = null;
+});
 on("volume", (m) => {
     if (!asked?.startsWith(`${m.name} `) || m.past !== (past !== null))
         return;
@@ -97,17 +154,28 @@ on("volume", (m) => {
         return;
     }
     told = m;
-    const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `, working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
+    const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
+    const working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
     progress.hidden = m.past ? m.done === 1 && !working : true;
-    progress.value = working ? m.comparing ?? 0 : m.done ?? 0;
+    progress.value = working ? (m.comparing ?? 0) : (m.done ?? 0);
     if (!m.size) {
         setText(note, `${other}reconstructing: ${fixed(100 * (m.done ?? 0), 0)} %`);
         return;
     }
     if (m.past)
         setText($button("#volume-cancel"), "Close");
-    const facts = [`${m.views ?? "–"} of ${m.of ?? "–"} views`, `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`, m.geometry, m.uncovered && m.uncovered > 5e-4 ? `${fixed(100 * m.uncovered, 1)} % without data (grey)` : "",
-        m.binning ? `flexdt reconstruct --binning ${m.binning}` : "", working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "", m.not_compared, ...(m.doubts ?? [])];
+    const facts = [
+        `${m.views ?? "–"} of ${m.of ?? "–"} views`,
+        `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`,
+        m.geometry,
+        m.uncovered && m.uncovered > 5e-4
+            ? `${fixed(100 * m.uncovered, 1)} % without data (grey)`
+            : "",
+        m.binning ? `flexdt reconstruct --binning ${m.binning}` : "",
+        working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "",
+        m.not_compared,
+        ...(m.doubts ?? []),
+    ];
     setText(note, other + facts.filter(Boolean).join(" · "));
     if (m.volumes)
         offer(m.volumes, Object.keys(m.compared ?? {})[1]);
@@ -146,10 +214,16 @@ function parted() {
     solid.draw();
 }
 splitter.addEventListener("input", parted);
-function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error) => setText(note, words(error))); }
+function compare() {
+    comparing = true;
+    $button("#volume-compare").disabled = true;
+    void call("viewer.compare", of).catch((error) => setText(note, words(error)));
+}
 async function fetched(name) {
     const head = await call("viewer.block", { ...of, what: name }).catch(() => null);
-    const raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
+    const raw = head?.url
+        ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null)
+        : null;
     if (!head?.shape || !raw || !told)
         return null;
     if (raw.byteLength !== 2 * head.shape.reduce((a, n) => a * n))
@@ -157,7 +231,8 @@ async function fetched(name) {
     const voxel_mm = (told.voxel_mm ?? 0) * (head.factor ?? 1);
     return { ...head, codes: new Uint16Array(raw), voxel_mm };
 }
-// The volume that is chosen, once; of one that grows the newest, one at a time: what is told meanwhile is fetched afterwards.
+// The volume that is chosen, once; of one that grows the newest, one at a time: what is told
+// meanwhile is fetched afterwards.
 async function want() {
     if (wanting) {
         late = true;
@@ -165,7 +240,8 @@ async function want() {
     }
     wanting = true;
     late = false;
-    const mine = asked, name = shown.value;
+    const mine = asked;
+    const name = shown.value;
     let block = blocks.get(name) ?? null;
     if (!block) {
         block = await fetched(name);
@@ -189,9 +265,10 @@ function show(block) {
     const first = !three.block;
     for (const id of [".slices", "#volume-tools", "#volume-large"])
         $(id).hidden = false;
-    // The window is kept between volume, truth and the other geometry; errors have their own; while one grows it is chosen anew.
+    // The window is kept between volume, truth and the other geometry; errors have their own;
+    // while one grows it is chosen anew.
     const same = kept && past && !block.own;
-    three.show(block, same ? kept ?? block.window : block.window);
+    three.show(block, same ? (kept ?? block.window) : block.window);
     if (!tried) {
         tried = true;
         const made = raycast($canvas("#volume-ray"), Number(new URLSearchParams(location.search).get("rays")) || 0);
@@ -212,14 +289,37 @@ function show(block) {
 }
 shown.addEventListener("change", () => void want());
 // Ends of the window and the surface's value, in parts of the block's range about its window.
-const range = () => { const b = three.block; if (!b)
-    return [0, 1]; const [l, h] = b.window, d = h - l; return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)]; };
-const part = (v) => { const [l, h] = range(); return (1000 * (v - l)) / (h - l); }, value = (p) => { const [l, h] = range(); return l + (p * (h - l)) / 1000; };
-function put() { ends.forEach((end, k) => { end.value = String(part(three.window[k])); }); seen(); }
-function seen() { if (!three.block?.own) {
-    kept = three.window;
-    solid?.window(kept);
-} drawHistogram(); drawProfile(); point(pointer); }
+const range = () => {
+    const b = three.block;
+    if (!b)
+        return [0, 1];
+    const [l, h] = b.window;
+    const d = h - l;
+    return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)];
+};
+const part = (v) => {
+    const [l, h] = range();
+    return (1000 * (v - l)) / (h - l);
+};
+const value = (p) => {
+    const [l, h] = range();
+    return l + (p * (h - l)) / 1000;
+};
+function put() {
+    ends.forEach((end, k) => {
+        end.value = String(part(three.window[k]));
+    });
+    seen();
+}
+function seen() {
+    if (!three.block?.own) {
+        kept = three.window;
+        solid?.window(kept);
+    }
+    drawHistogram();
+    drawProfile();
+    point(pointer);
+}
 // The surface begins at Otsu's threshold of all that is shown.
 function surface() {
     if (!three.block)
@@ -229,40 +329,63 @@ function surface() {
     level.value = String(part(low + ((high - low) * otsu(counts)) / counts.length));
     turned();
 }
-function turned() { if (!solid)
-    return; solid.level = value(level.valueAsNumber); solid.cut = Number($select("#volume-cut").value); solid.most = $select("#volume-way").value === "most"; solid.cross(three.cross); solid.draw(); drawHistogram(); }
+function turned() {
+    if (!solid)
+        return;
+    solid.level = value(level.valueAsNumber);
+    solid.cut = Number($select("#volume-cut").value);
+    solid.most = $select("#volume-way").value === "most";
+    solid.cross(three.cross);
+    solid.draw();
+    drawHistogram();
+}
 for (const end of ends)
-    end.addEventListener("input", () => { const [l, h] = ends.map((e) => value(e.valueAsNumber)); three.look([l, Math.max(h, l + 1e-6)]); seen(); });
+    end.addEventListener("input", () => {
+        const [l, h] = ends.map((e) => value(e.valueAsNumber));
+        three.look([l, Math.max(h, l + 1e-6)]);
+        seen();
+    });
 for (const id of ["#volume-level", "#volume-cut", "#volume-way"])
     $(id).addEventListener("input", turned);
-$select("#volume-tool").addEventListener("change", () => { three.profiling = $select("#volume-tool").value === "profile"; drawProfile(); });
-slid(chart, (at) => { const to = 1000 * at, [l, h] = ends.map((e) => Math.abs(e.valueAsNumber - to)), end = ends[l <= h ? 0 : 1]; end.value = String(to); end.dispatchEvent(new Event("input")); });
+$select("#volume-tool").addEventListener("change", () => {
+    three.profiling = $select("#volume-tool").value === "profile";
+    drawProfile();
+});
+slid(chart.area, (at) => {
+    const to = 1000 * at;
+    const [l, h] = ends.map((e) => Math.abs(e.valueAsNumber - to));
+    const end = ends[l <= h ? 0 : 1];
+    end.value = String(to);
+    end.dispatchEvent(new Event("input"));
+});
 function drawHistogram() {
-    const b = three.block, room = cleared(chart), style = getComputedStyle(chart), [l, h] = range();
-    if (!b)
+    if (!three.block)
         return;
-    const counts = three.histogram([l, h]), step = (h - l) / counts.length;
-    room[0].fillStyle = style.getPropertyValue("--accent");
-    bars(room, counts, (k) => { const v = l + (k + 0.5) * step; room[0].globalAlpha = v < three.window[0] || v > three.window[1] ? 0.3 : 1; });
-    room[0].globalAlpha = 1;
-    room[0].fillStyle = style.getPropertyValue("--warn");
-    room[0].fillRect((room[1] * level.valueAsNumber) / 1000, 0, 2, room[2]);
-    below(chart, l, h, "per mm");
+    const colour = getComputedStyle(histogramHost).getPropertyValue("--warn");
+    chart.draw({
+        counts: three.histogram(range()),
+        range: range(),
+        unit: "per mm",
+        window: three.window,
+        marks: [{ at: value(level.valueAsNumber), colour, handle: false }],
+    });
 }
 function drawProfile() {
     const line = three.profiling ? three.profile() : null;
-    plot.hidden = !line;
+    profileHost.hidden = !line;
     if (three.profiling && !line)
         setText($("#volume-at"), "drag a line in a slice");
     if (!line)
         return;
-    const known = line.values.filter(Number.isFinite), low = Math.min(...known), high = Math.max(...known);
-    curve(plot, line.values, low, high);
-    valuesBeside(plot, low, high, "per mm");
-    below(plot, 0, line.mm, "mm");
-    setText($("#volume-at"), known.length ? `${fixed(line.mm, 2)} mm · ${fixed(low, 5)} to ${fixed(high, 5)} per mm` : "no data along this line");
+    const { values, mm } = line;
+    plot.draw({ places: along(mm, values.length), values, unit: "mm", of: "per mm" });
+    const known = values.filter(Number.isFinite);
+    const ends = `${fixed(Math.min(...known), 5)} to ${fixed(Math.max(...known), 5)} per mm`;
+    const said = known.length ? `${fixed(mm, 2)} mm · ${ends}` : "no data along this line";
+    setText($("#volume-at"), said);
 }
-// The value under the pointer: of the codes at once, and as exact as the volume is when the pointer rests.
+// The value under the pointer: of the codes at once, and as exact as the volume is when the
+// pointer rests.
 let due;
 function point(place) {
     const b = three.block;
@@ -274,22 +397,35 @@ function point(place) {
         setText($("#volume-at"), "point at a slice");
         return;
     }
-    const mm = place.map((v, k) => fixed((v + 0.5 - extent(b)[k] / 2) * b.voxel_mm, 2)).join(", "), code = b.codes[index(b, place)];
+    const mm = place
+        .map((v, k) => fixed((v + 0.5 - extent(b)[k] / 2) * b.voxel_mm, 2))
+        .join(", ");
+    const code = b.codes[index(b, place)];
     const say = (text) => setText($("#volume-at"), `(${mm}) mm  ${text}`);
     say(code ? `${fixed(valueOf(b, code), 5)} per mm` : "no data cover this voxel");
     const at = place.map((v) => Math.floor((v + 0.5) * b.factor));
     due = window.setTimeout(async () => {
-        const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
+        const exact = await call("viewer.voxel", { ...of, at }).catch(() => null);
+        const v = exact?.[shown.value];
         if (pointer !== place || typeof v !== "number")
             return;
-        const { sigma, bias_bound: bias } = shown.value === "volume" ? exact ?? {} : {};
-        say(`${v.toPrecision(8)} per mm${sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`}${bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`}`);
+        const { sigma, bias_bound: bias } = shown.value === "volume" ? (exact ?? {}) : {};
+        const noise = sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`;
+        const off = bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`;
+        say(`${v.toPrecision(8)} per mm${noise}${off}`);
     }, EXACT_MS);
 }
 // As measured with each geometry, beside the truth.
-const ROWS = [["attenuation", "attenuation", 1, 5, "/mm"], ["void", "void within outlines", 100, 2, "%"], ["x_mm", "size along x", 1, 2, "mm"], ["y_mm", "along y", 1, 2, "mm"], ["z_mm", "along z", 1, 2, "mm"]];
+const ROWS = [
+    ["attenuation", "attenuation", 1, 5, "/mm"],
+    ["void", "void within outlines", 100, 2, "%"],
+    ["x_mm", "size along x", 1, 2, "mm"],
+    ["y_mm", "along y", 1, 2, "mm"],
+    ["z_mm", "along z", 1, 2, "mm"],
+];
 export function table(rows) {
-    const made = Object.entries(rows), cell = (tag, text) => el(tag, {}, text);
+    const made = Object.entries(rows);
+    const cell = (tag, text) => el(tag, {}, text);
     return el("table", {}, el("tr", {}, cell("th", ""), cell("th", "truth"), ...made.map(([name]) => cell("th", name))), ...ROWS.map(([key, text, times, digits, unit]) => el("tr", {}, cell("td", `${text} [${unit}]`), cell("td", fixed(times * made[0][1][key][1], digits)), ...made.map(([, f]) => cell("td", fixed(times * f[key][0], digits))))), el("tr", {}, cell("td", "rms difference [/mm]"), cell("td", "–"), ...made.map(([, f]) => cell("td", fixed(f.rms, 5)))));
 }
 function compared(rows) {
@@ -299,17 +435,27 @@ function compared(rows) {
 }
 // The volumes that there are; the one that was chosen stays so.
 function offer(names, other = SHOWN.other) {
-    const chosen = shown.value, there = Object.keys(SHOWN).filter((name) => names.includes(name));
+    const chosen = shown.value;
+    const there = Object.keys(SHOWN).filter((name) => names.includes(name));
     if (there.length === shown.options.length)
         return;
     shown.replaceChildren(...there.map((name) => el("option", { value: name }, name === "other" ? other : SHOWN[name])));
     shown.value = names.includes(chosen) ? chosen : "volume";
 }
-clicks({ "volume-cancel": cancel, "volume-compare": compare, "volume-large": () => large(!document.body.classList.contains("whole")), "volume-share": () => { if (three.block && told)
-        void shared(three, solid, told); } });
-window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("whole")) {
-    e.stopPropagation();
-    large(false);
-} }, true);
+clicks({
+    "volume-cancel": cancel,
+    "volume-compare": compare,
+    "volume-large": () => large(!document.body.classList.contains("whole")),
+    "volume-share": () => {
+        if (three.block && told)
+            void shared(three, solid, told);
+    },
+});
+window.addEventListener("keydown", (e) => {
+    if (e.key === "Escape" && document.body.classList.contains("whole")) {
+        e.stopPropagation();
+        large(false);
+    }
+}, true);
 // For tests: what is shown.
 export const look = () => ({ three, solid, told, of });

@@ -2,9 +2,9 @@
 // #.
 import { base64 } from "./dom.js";
 
-const MOST = 6000,
-  DUE_MS = 300,
-  KEY = "flexdt-script"; // a longer script stays in this browser's tab
+const MOST = 6000;
+const DUE_MS = 300;
+const KEY = "flexdt-script"; // a longer script stays in this browser's tab
 export const asked = (name: string): string | null =>
   new URLSearchParams(location.search).get(name);
 

@@ -3,10 +3,10 @@ import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } fro
 import type { AxisState, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 
-const LEASE_S = 0.5,
-  MOST_S = 10,
-  RENEW_MS = 180,
-  SETTLE_MS = 400;
+const LEASE_S = 0.5;
+const MOST_S = 10;
+const RENEW_MS = 180;
+const SETTLE_MS = 400;
 const GROUPS: Array<[title: string, tint: string, axes: Record<string, string>]> = [
   ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
   [
@@ -44,9 +44,9 @@ interface Main {
   axes: string[];
   shift: (s: State, v: number) => number;
 }
-const sod = (s: State) => s.geometry.SOD_mm,
-  sdd = (s: State) => s.geometry.SDD_mm,
-  high = () => store.framing?.sample_height_mm ?? NaN;
+const sod = (s: State) => s.geometry.SOD_mm;
+const sdd = (s: State) => s.geometry.SDD_mm;
+const high = () => store.framing?.sample_height_mm ?? NaN;
 const MAINS: Main[] = [
   {
     words: "Source to sample",
@@ -107,12 +107,12 @@ const held = new Map<string, { axis: string; timer: number }>();
 export function jogStart(axis: string, direction: number, token: string): void {
   if (held.has(token)) return;
   const renew = () => {
-    const all = store.state,
-      state = all?.axes[axis];
+    const all = store.state;
+    const state = all?.axes[axis];
     if (!all || !state) return;
     // The lease runs on the twin's clock, the renewals on ours.
-    const pace = all.clock.speed_up,
-      lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
+    const pace = all.clock.speed_up;
+    const lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
     const top = state.speed ?? JOG_FALLBACK[state.unit];
     const velocity = direction * top * Number($select("#jog-speed").value);
     void command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then(
@@ -168,9 +168,9 @@ function mainRow(main: Main, state: State) {
   if (axes.some((name) => !(name in state.axes))) return [];
   const input = field({ "aria-label": words }, enter, () => input.blur());
   function enter() {
-    const text = input.value,
-      value = parsed(text),
-      s = store.state;
+    const text = input.value;
+    const value = parsed(text);
+    const s = store.state;
     input.blur();
     if (!s || !(value > 0 || (axes.length > 1 && Number.isFinite(value)))) {
       emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`);
@@ -291,8 +291,8 @@ function axisRow(name: string, axis: AxisState, what: string) {
     waiting: 0,
   };
   function enter() {
-    const text = number.value,
-      value = parsed(text);
+    const text = number.value;
+    const value = parsed(text);
     number.blur();
     if (Number.isFinite(value)) void move(name, value);
     else emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
@@ -367,8 +367,8 @@ function refresh(state: State) {
   drawMains(state);
 }
 // Motors are one level below; this browser remembers whether they are open.
-const motors = $<HTMLDetailsElement>("#motors"),
-  MOTORS = "flexdt-motors";
+const motors = $<HTMLDetailsElement>("#motors");
+const MOTORS = "flexdt-motors";
 motors.open = localStorage.getItem(MOTORS) === "open";
 motors.addEventListener("toggle", () => keep(MOTORS, motors.open ? "open" : "closed"));
 

@@ -2,7 +2,13 @@
 import { nextStep } from "./calibrate_next.js";
 import { $, $$, $button, $input, chosen, clicks, el, fixed, words } from "./dom.js";
 import { call, command, emit, on } from "./link.js";
-import type { CalibrationAlignResult, Correction, Estimated, FitReport, Requests } from "./viewer.js";
+import type {
+  CalibrationAlignResult,
+  Correction,
+  Estimated,
+  FitReport,
+  Requests,
+} from "./viewer.js";
 import { know } from "./compare.js";
 import { open } from "./data.js";
 
@@ -10,40 +16,101 @@ clicks({ revert, fit });
 $input("#fit-phantom").addEventListener("input", named);
 
 type Parameters = Record<string, number | null>;
-const values = (parameters: object): Record<string, unknown> => Object.fromEntries(Object.entries(parameters).map(([k, v]: [string, unknown]) => [k, typeof v === "number" ? v : (v as { value?: unknown } | null)?.value]));
+const values = (parameters: object): Record<string, unknown> =>
+  Object.fromEntries(
+    Object.entries(parameters).map(([k, v]: [string, unknown]) => [
+      k,
+      typeof v === "number" ? v : (v as { value?: unknown } | null)?.value,
+    ]),
+  );
 // The parameters of a report, or of a plain list of them: all of them numbers, or none is taken.
 export function parametersOf(report: unknown): Record<string, number> {
-  const object = (o: unknown): o is Record<string, unknown> => o !== null && typeof o === "object" && !Array.isArray(o);
+  const object = (o: unknown): o is Record<string, unknown> =>
+    o !== null && typeof o === "object" && !Array.isArray(o);
   const given = object(report) && "parameters" in report ? report.parameters : report;
-  if (!object(report) || !object(given) || !Object.keys(given).length) throw new Error("there are no parameters in it");
-  if (report.identifiable === false) throw new Error("it says that its numbers are not identifiable");
-  const found = values(given), bad = Object.keys(found).filter((k) => !Number.isFinite(found[k]));
+  if (!object(report) || !object(given) || !Object.keys(given).length)
+    throw new Error("there are no parameters in it");
+  if (report.identifiable === false)
+    throw new Error("it says that its numbers are not identifiable");
+  const found = values(given);
+  const bad = Object.keys(found).filter((k) => !Number.isFinite(found[k]));
   if (bad.length) throw new Error(`no number: ${bad.slice(0, 5).join(", ")}`);
   return found as Record<string, number>;
 }
-const unit = (name: string) => (name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm");
+const unit = (name: string) =>
+  name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm";
+// Outliers that a report names.
+const LISTED = 3;
 // What the thesis's names mean, in the words of the page.
 const MEANS: Record<string, string | undefined> = {
-  dO_x: "axis sideways", dO_y: "axis height", dO_z: "source to axis", alpha: "start angle", tau_x: "sample off the axis, sideways", tau_z: "sample off the axis, along the beam",
-  dD_x: "detector sideways", dD_y: "detector height", dD_z: "source to detector", dS_x: "focal spot sideways", dS_y: "focal spot height",
-  axis_column: "image of the axis, column", axis_angle: "image of the axis, angle",
-  det_roll: "detector roll", det_pitch: "detector pitch", det_yaw: "detector yaw", axis_tilt_x: "axis towards the detector", axis_tilt_z: "axis sideways tilt", angle_scale: "scale of angles",
+  dO_x: "axis sideways",
+  dO_y: "axis height",
+  dO_z: "source to axis",
+  alpha: "start angle",
+  tau_x: "sample off the axis, sideways",
+  tau_z: "sample off the axis, along the beam",
+  dD_x: "detector sideways",
+  dD_y: "detector height",
+  dD_z: "source to detector",
+  dS_x: "focal spot sideways",
+  dS_y: "focal spot height",
+  axis_column: "image of the axis, column",
+  axis_angle: "image of the axis, angle",
+  det_roll: "detector roll",
+  det_pitch: "detector pitch",
+  det_yaw: "detector yaw",
+  axis_tilt_x: "axis towards the detector",
+  axis_tilt_z: "axis sideways tilt",
+  angle_scale: "scale of angles",
 };
 // Decimals that leave `digits` significant ones.
-const decimals = (v: number, digits: number) => Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(v) || 1))));
-function table(parameters: Parameters, sigmas: Record<string, number | null> = {}, units: Record<string, string> = {}) {
-  const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
-  return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
-    const sigma = sigmas[k] ?? 0, d = sigma > 0 ? decimals(sigma, 2) : decimals((v ?? 0) - (k === "angle_scale" ? 1 : 0), 3);
-    return el("tr", {}, el("td", {}, MEANS[k] ?? k, MEANS[k] ? el("span", { class: "muted small-text" }, ` ${k}`) : null), el("td", { class: "n" }, fixed(v, d)),
-      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, (units[k] ?? unit(k)).replace(/^1$/, "")));
-  }));
+const decimals = (v: number, digits: number) =>
+  Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(v) || 1))));
+function table(
+  parameters: Parameters,
+  sigmas: Record<string, number | null> = {},
+  units: Record<string, string> = {},
+) {
+  const shown = Object.entries(parameters).filter(([k, v]) =>
+    k === "angle_scale" ? v !== 1 : v !== 0,
+  );
+  return el(
+    "table",
+    { class: "plain mono" },
+    ...shown.map(([k, v]) => {
+      const sigma = sigmas[k] ?? 0;
+      const d =
+        sigma > 0 ? decimals(sigma, 2) : decimals((v ?? 0) - (k === "angle_scale" ? 1 : 0), 3);
+      return el(
+        "tr",
+        {},
+        el(
+          "td",
+          {},
+          MEANS[k] ?? k,
+          MEANS[k] ? el("span", { class: "muted small-text" }, ` ${k}`) : null,
+        ),
+        el("td", { class: "n" }, fixed(v, d)),
+        el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""),
+        el("td", { class: "muted" }, (units[k] ?? unit(k)).replace(/^1$/, "")),
+      );
+    }),
+  );
 }
 // Says whether the correction is in force.
-export async function apply(parameters: Record<string, number>, source: string | null, comment = ""): Promise<boolean> {
-  const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
+export async function apply(
+  parameters: Record<string, number>,
+  source: string | null,
+  comment = "",
+): Promise<boolean> {
+  const answer = await command(
+    "calibration.apply",
+    { parameters, source, comment },
+    "Not applied",
+  );
   if (!answer) return false;
-  emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
+  // warnings come by the log
+  emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`);
   void refresh();
   return true;
 }
@@ -55,7 +122,9 @@ async function remove(name: string) {
 async function revert() {
   const answer = await command("calibration.revert", {}, "Not undone");
   if (!answer) return;
-  const now = answer.correction ? `${answer.correction.name} is in force again` : "nominal geometry";
+  const now = answer.correction
+    ? `${answer.correction.name} is in force again`
+    : "nominal geometry";
   emit("note", "good", "Correction", `undone: ${now}`);
   void refresh();
 }
@@ -68,83 +137,207 @@ export async function refresh(): Promise<void> {
   if (!answer.corrections.length) box.append(el("div", { class: "muted" }, "none yet"));
   for (const c of [...answer.corrections].reverse()) {
     const again = () => void apply(c.parameters, c.source, `again: ${c.name}`);
-    box.append(el("div", {},
-      el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)),
-      ...(c.name === answer.current ? [el("b", {}, "in force")] : [
-        el("button", { class: "small", onclick: again }, "apply"), el("button", { class: "small", onclick: () => remove(c.name) }, "delete")])));
+    box.append(
+      el(
+        "div",
+        {},
+        el("span", { title: c.comment }, c.name),
+        el("span", { class: "muted small-text" }, dated(c)),
+        ...(c.name === answer.current
+          ? [el("b", {}, "in force")]
+          : [
+              el("button", { class: "small", onclick: again }, "apply"),
+              el("button", { class: "small", onclick: () => remove(c.name) }, "delete"),
+            ]),
+      ),
+    );
   }
 }
 const dated = (correction: Correction) => correction.date.slice(0, 16).replace("T", " ");
 chosen($input("#correction-file"), async (file) => {
-  try { await apply(parametersOf(JSON.parse(await file.text())), file.name); }
-  catch (error) { emit("note", "error", "Not applied", `${file.name}: ${words(error)}`); }
+  try {
+    await apply(parametersOf(JSON.parse(await file.text())), file.name);
+  } catch (error) {
+    emit("note", "error", "Not applied", `${file.name}: ${words(error)}`);
+  }
 });
 
 async function datasets() {
   const answer = await call("viewer.datasets").catch(() => null);
   if (!answer) return;
-  const box = $("#datasets"), chosen = new Set(ticked());
+  const box = $("#datasets");
+  const chosen = new Set(ticked());
   box.textContent = "";
-  if (!answer.datasets.some((each) => each.present)) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
+  if (!answer.datasets.some((each) => each.present))
+    box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
   for (const d of answer.datasets.filter((each) => each.present)) {
     const tick = el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) });
-    box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.present} frames`)));
+    box.append(
+      el(
+        "div",
+        {},
+        el("label", {}, tick, d.name),
+        el("span", { class: "muted small-text" }, `${d.present} frames`),
+      ),
+    );
   }
 }
-function named() { $("#fit-scale").hidden = $("#fit-scale-label").hidden = $input("#fit-phantom").value !== "unknown"; }
-const wanted = () => ({ phantom: $input("#fit-phantom").value, tracks: true, scale: $("#fit-scale").hidden ? null : $input("#fit-scale").value || null });
+function named() {
+  $("#fit-scale").hidden = $("#fit-scale-label").hidden =
+    $input("#fit-phantom").value !== "unknown";
+}
+const wanted = () => ({
+  phantom: $input("#fit-phantom").value,
+  tracks: true,
+  scale: $("#fit-scale").hidden ? null : $input("#fit-scale").value || null,
+});
 const ticked = () => $$<HTMLInputElement>("#datasets input:checked").map((i) => i.value);
 function fit() {
   const names = ticked();
-  if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
+  if (!names.length) {
+    emit("note", "warning-note", "Calibrate", "choose a data set");
+    return;
+  }
   void estimate("calibration.fit", { datasets: names, ...wanted() }, names, "No calibration");
 }
-async function estimate<M extends "calibration.fit" | "calibration.align">(method: M, params: Requests[M], names: string[], title: string) {
-  $button("#fit").disabled = true; $("#fit-note").textContent = `${names.join(", ")}: running…`; $("#fit-report").textContent = "";
-  const r: Partial<FitReport & CalibrationAlignResult> | null = await command(method, params, title);
-  $button("#fit").disabled = false; $("#fit-note").textContent = "";
+async function estimate<M extends "calibration.fit" | "calibration.align">(
+  method: M,
+  params: Requests[M],
+  names: string[],
+  title: string,
+) {
+  $button("#fit").disabled = true;
+  $("#fit-note").textContent = `${names.join(", ")}: running…`;
+  $("#fit-report").textContent = "";
+  const r: Partial<FitReport & CalibrationAlignResult> | null = await command(
+    method,
+    params,
+    title,
+  );
+  $button("#fit").disabled = false;
+  $("#fit-note").textContent = "";
   if (!r) return;
-  const scan = know(r.tracks?.datasets ?? []), { correction, parameters = {} } = r;
-  const of = <W extends "value" | "sigma" | "unit">(some: Record<string, Pick<Estimated, W>>, what: W) => Object.fromEntries(Object.entries(some).map(([k, v]) => [k, v[what]]));
-  const shown = (some: Record<string, Pick<Estimated, "value" | "sigma" | "unit">>) => table(of(some, "value"), of(some, "sigma"), of(some, "unit"));
-  const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · sum of squares ${fixed(Math.abs(r.cost_reduction_pct ?? 0), 1)} % ${(r.cost_reduction_pct ?? 0) < 0 ? "above" : "below"} that before` : `  ${names[0]}, without a phantom`;
-  const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !correction, onclick: () => { if (correction) void apply(correction, names.join(", ")); } };
-  const compared = { id: "fit-compare", class: "small", disabled: !scan, title: "Where the beads were predicted before and after, over the radiographs",
-    onclick: () => open(scan, null, true) };
+  const scan = know(r.tracks?.datasets ?? []);
+  const { correction, parameters = {} } = r;
+  const of = <W extends "value" | "sigma" | "unit">(
+    some: Record<string, Pick<Estimated, W>>,
+    what: W,
+  ) => Object.fromEntries(Object.entries(some).map(([k, v]) => [k, v[what]]));
+  const shown = (some: Record<string, Pick<Estimated, "value" | "sigma" | "unit">>) =>
+    table(of(some, "value"), of(some, "sigma"), of(some, "unit"));
+  const reduced = r.cost_reduction_pct ?? 0;
+  const side = reduced < 0 ? "above" : "below";
+  const squares = `sum of squares ${fixed(Math.abs(reduced), 1)} % ${side} that before`;
+  const figures = r.tracks
+    ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · ${squares}`
+    : `  ${names[0]}, without a phantom`;
+  const applied = {
+    id: "fit-apply",
+    class: "small primary",
+    disabled: !r.identifiable || !correction,
+    onclick: () => {
+      if (correction) void apply(correction, names.join(", "));
+    },
+  };
+  const compared = {
+    id: "fit-compare",
+    class: "small",
+    disabled: !scan,
+    title: "Where the beads were predicted before and after, over the radiographs",
+    onclick: () => open(scan, null, true),
+  };
   const actions = {
     compare: scan ? () => open(scan, null, true) : null,
-    again: (free: string[]) => estimate("calibration.fit", { datasets: names, ...wanted(), free }, names, "No calibration"),
+    again: (free: string[]) =>
+      estimate(
+        "calibration.fit",
+        { datasets: names, ...wanted(), free },
+        names,
+        "No calibration",
+      ),
   };
-  const [use, ...why] = (r.verdict ?? (r.identifiable ? "Identifiable" : "Not identifiable")).split(": ");
-  const left = (r.outliers ?? []).map((o) => `bead ${o.marker} of frame ${o.frame} (${fixed(o.px ?? 0, 2)} px)`);
+  const [use, ...why] = (
+    r.verdict ?? (r.identifiable ? "Identifiable" : "Not identifiable")
+  ).split(": ");
+  const left = (r.outliers ?? []).map(
+    (o) => `bead ${o.marker} of frame ${o.frame} (${fixed(o.px ?? 0, 2)} px)`,
+  );
+  const more = left.length > LISTED ? ` and ${left.length - LISTED} more` : "";
   $("#fit-report").append(
-    el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""),
+    el(
+      "div",
+      {},
+      el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use),
+      why.length ? `: ${why.join(": ")}` : "",
+    ),
     ...(r.next ?? []).map((line) => nextStep(line, actions)),
     ...(r.image_space ?? []).map(shown),
-    el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""),
-    shown(parameters), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
-    ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)),
-    el("div", { class: "row", style: "margin-top:7px" },
-      el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
+    el(
+      "div",
+      { class: "muted" },
+      figures,
+      left.length ? ` · left out: ${left.slice(0, LISTED).join(", ")}${more}` : "",
+    ),
+    shown(parameters),
+    ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
+    ...Object.entries(r.refused ?? {}).map(([name, why]) =>
+      el("div", { class: "muted" }, `${name}: ${why}`),
+    ),
+    ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)),
+    el(
+      "div",
+      { class: "row", style: "margin-top:7px" },
+      el("button", applied, "Apply"),
+      r.tracks ? el("button", compared, "Compare over a radiograph") : null,
+    ),
+  );
 }
 on("calibrate", async (dataset, sample, markers) => {
   emit("show-tab", "calibrate");
   await datasets();
-  for (const tick of $$<HTMLInputElement>("#datasets input")) tick.checked = tick.value === dataset;
-  if (sample && !(markers && wanted().phantom === "unknown")) { $input("#fit-phantom").value = sample; named(); }
-  void estimate("calibration.fit", { datasets: [dataset], ...wanted(), markers: markers ?? null }, [dataset], "No calibration");
+  for (const tick of $$<HTMLInputElement>("#datasets input"))
+    tick.checked = tick.value === dataset;
+  if (sample && !(markers && wanted().phantom === "unknown")) {
+    $input("#fit-phantom").value = sample;
+    named();
+  }
+  void estimate(
+    "calibration.fit",
+    { datasets: [dataset], ...wanted(), markers: markers ?? null },
+    [dataset],
+    "No calibration",
+  );
 });
-on("align", (dataset) => { emit("show-tab", "calibrate"); void estimate("calibration.align", { name: dataset }, [dataset], "Not aligned"); });
+on("align", (dataset) => {
+  emit("show-tab", "calibrate");
+  void estimate("calibration.align", { name: dataset }, [dataset], "Not aligned");
+});
 let name: string | null | undefined;
 on("state", (state) => {
   const c = state.correction;
   $button("#revert").disabled = !c;
   if (name === (c?.name ?? null)) return;
   name = c?.name ?? null;
-  $("#in-force").replaceChildren(...c ? [el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters)]
-    : [el("span", { class: "muted" }, "none: nominal geometry")]);
+  $("#in-force").replaceChildren(
+    ...(c
+      ? [
+          el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)),
+          table(c.parameters),
+        ]
+      : [el("span", { class: "muted" }, "none: nominal geometry")]),
+  );
   void refresh();
 });
-on("session", () => { void refresh(); void datasets(); });
-on("job", (job) => { if (["done", "incomplete"].includes(job.state)) void datasets(); });
-on("tab", (tab) => { if (tab === "calibrate") { void refresh(); void datasets(); } });
+on("session", () => {
+  void refresh();
+  void datasets();
+});
+on("job", (job) => {
+  if (["done", "incomplete"].includes(job.state)) void datasets();
+});
+on("tab", (tab) => {
+  if (tab === "calibrate") {
+    void refresh();
+    void datasets();
+  }
+});

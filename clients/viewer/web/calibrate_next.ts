@@ -3,8 +3,14 @@
 import { $button, $select, el } from "./dom.js";
 import { emit } from "./link.js";
 
-interface Next { words: string; act: () => unknown }
-export interface Actions { again: (free: string[]) => unknown; compare: (() => unknown) | null }
+interface Next {
+  words: string;
+  act: () => unknown;
+}
+export interface Actions {
+  again: (free: string[]) => unknown;
+  compare: (() => unknown) | null;
+}
 
 function composed(): void {
   emit("show-tab", "scan");

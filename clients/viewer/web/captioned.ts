@@ -60,6 +60,9 @@ export async function captioned(url: string): Promise<Blob> {
   context.fillStyle = "#e5eaf1";
   lines().forEach((line, k) => context.fillText(line, left, image.height + 14 + 18 * k));
   return new Promise((resolve, reject) => {
-    canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture"))), "image/png");
+    canvas.toBlob(
+      (blob) => (blob ? resolve(blob) : reject(new Error("no picture"))),
+      "image/png",
+    );
   });
 }

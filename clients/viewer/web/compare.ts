@@ -5,10 +5,10 @@ import type { Pair, Shown, TrackedFrame, TrackedScan } from "./viewer.js";
 import { emit, on, store } from "./link.js";
 import * as marks from "./marks.js";
 
-const AMBER = "#ffb454",
-  GREEN = "#36e28f",
-  BLUE = "#7cc4ff",
-  REACH = 8;
+const AMBER = "#ffb454";
+const GREEN = "#36e28f";
+const BLUE = "#7cc4ff";
+const REACH = 8;
 // Folder -> where a fit of this page found its beads, and put them before and after.
 const tracks = new Map<string, TrackedScan>();
 const again = () => emit("image", store.image);
@@ -116,8 +116,8 @@ let made: Shown | null = null;
 const column = (i: Shown) =>
   mode.value === "curtain" ? Math.round((i.shape[1] * Number(curtain.value)) / 1000) : 0;
 export function beside(i: Shown, virtual: Uint16Array): Shown {
-  const cols = i.shape[1],
-    from = column(i);
+  const cols = i.shape[1];
+  const from = column(i);
   if (made?.of === i && made.from === from) return made;
   const pixels = i.pixels.slice();
   for (let k = 0; k < pixels.length; k += cols)
@@ -132,8 +132,8 @@ export function words(i: Shown | null): string {
 // Dragging the curtain in the picture; `pixel` is a CSS pixel in its coordinates.
 let held = false;
 export function press(place: Pair, pixel: number): boolean {
-  const i = store.image,
-    [c] = place;
+  const i = store.image;
+  const [c] = place;
   return (
     marks.press(place, REACH * pixel) ||
     (held =
@@ -167,8 +167,8 @@ function rms(measured: TrackedFrame["measured"], predicted: TrackedFrame["after"
   return off.length ? Math.sqrt(off.reduce((sum, d) => sum + d * d, 0) / off.length) : null;
 }
 function tell() {
-  const scan = scanned(),
-    f = shown(store.image);
+  const scan = scanned();
+  const f = shown(store.image);
   beads.hidden = !scan;
   if (!scan) return;
   const label = $("#compare-before").closest("label");
@@ -195,10 +195,10 @@ export function draw(x: CanvasRenderingContext2D, i: Shown, unit: number): void 
     x.stroke();
   }
   marks.draw(x, unit);
-  const f = shown(i),
-    k = Number(times.value),
-    r = 9 * unit,
-    arm = 5 * unit;
+  const f = shown(i);
+  const k = Number(times.value);
+  const r = 9 * unit;
+  const arm = 5 * unit;
   if (!f) return;
   x.lineWidth = 1.5 * unit;
   for (const [name, colour] of [
@@ -209,10 +209,10 @@ export function draw(x: CanvasRenderingContext2D, i: Shown, unit: number): void 
     x.strokeStyle = colour;
     f[name]?.forEach((p, n) => {
       if (!p) return;
-      const m = f.measured[n],
-        [c, q] = m
-          ? [m[0] + k * (p[0] - m[0]) + 0.5, m[1] + k * (p[1] - m[1]) + 0.5]
-          : [p[0] + 0.5, p[1] + 0.5];
+      const m = f.measured[n];
+      const [c, q] = m
+        ? [m[0] + k * (p[0] - m[0]) + 0.5, m[1] + k * (p[1] - m[1]) + 0.5]
+        : [p[0] + 0.5, p[1] + 0.5];
       x.globalAlpha = m ? 1 : 0.4; // faint where no bead was seen
       x.beginPath();
       x.arc(c, q, r, 0, 7);

@@ -33,11 +33,11 @@ import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 
-const SEARCH_MS = 250,
-  AGAIN_MS = 500,
-  PLAYED = 300,
-  LEAST_MS = 60,
-  LEAST_PX = 76;
+const SEARCH_MS = 250;
+const AGAIN_MS = 500;
+const PLAYED = 300;
+const LEAST_MS = 60;
+const LEAST_PX = 76;
 const WORDS: Record<DatasetInfo["state"], string> = {
   complete: "complete",
   incomplete: "incomplete",
@@ -46,14 +46,14 @@ const WORDS: Record<DatasetInfo["state"], string> = {
 };
 // What is open: as it was told first, and once more when it had been measured (at fewer places).
 type Opened = DatasetResult & { whole?: DatasetResult };
-let listed: DatasetInfo[] = [],
-  told: Opened | null = null,
-  plan: Lanes | null = null,
-  index = 0,
-  next: number | null = null,
-  asking = false,
-  playing = false,
-  number = 0;
+let listed: DatasetInfo[] = [];
+let told: Opened | null = null;
+let plan: Lanes | null = null;
+let index = 0;
+let next: number | null = null;
+let asking = false;
+let playing = false;
+let number = 0;
 
 const search = $input("#data-search");
 clicks({ "data-more": () => list(listed.length) });
@@ -210,8 +210,8 @@ async function list(start = 0) {
   drawn = key;
   $button("#data-more").hidden = listed.length >= answer.total;
   const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
-  const none = search.value ? "none is found" : "none yet: run a scan",
-    all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
+  const none = search.value ? "none is found" : "none yet: run a scan";
+  const all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
   setText(
     $("#data-count"),
     answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all,
@@ -221,8 +221,8 @@ async function list(start = 0) {
       if (mine === number) void list();
     }, AGAIN_MS);
 }
-let typing: number | undefined,
-  drawn = "";
+let typing: number | undefined;
+let drawn = "";
 function listSoon() {
   clearTimeout(typing);
   typing = window.setTimeout(list, SEARCH_MS);
@@ -288,8 +288,8 @@ export async function open(
   remember({ data: name, frame: at }, step);
   emit("recorded", name);
   if (name === null || !told) return;
-  const i = told.info,
-    bare = !told.times_s;
+  const i = told.info;
+  const bare = !told.times_s;
   setText($("#record-name"), i.name);
   setText(
     $("#record-state"),
@@ -361,13 +361,13 @@ function note() {
 }
 function lanes() {
   if (!told) return;
-  const { kinds } = told,
-    times = told.times_s ?? told.indices,
-    curves: Lanes["curves"] = {},
-    units: Lanes["units"] = {};
+  const { kinds } = told;
+  const times = told.times_s ?? told.indices;
+  const curves: Lanes["curves"] = {};
+  const units: Lanes["units"] = {};
   for (const [name, values] of Object.entries(told.positions)) {
-    const known = values.filter((v) => v !== null),
-      moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
+    const known = values.filter((v) => v !== null);
+    const moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
     if (moves) {
       curves[name] = values;
       units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm";
@@ -391,12 +391,12 @@ function lanes() {
   };
   redraw();
 }
-let moment: number | null = null,
-  kept: number | undefined;
+let moment: number | null = null;
+let kept: number | undefined;
 function redraw() {
   if (!plan || panel.hidden) return;
-  const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2,
-    room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
+  const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2;
+  const room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
   drawTimeline(canvas, plan, moment, null, room);
   $("#stage").style.setProperty("--record", `${rest + Math.min(canvas.offsetHeight, room)}px`);
 }
@@ -413,15 +413,15 @@ async function show(wanted: number) {
   asking = true;
   const name = told.info.name;
   while (next !== null && still(name)) {
-    const at: number = next,
-      kinds: DatasetResult = told.whole ?? told,
-      k = kinds.indices.indexOf(at);
+    const at: number = next;
+    const kinds: DatasetResult = told.whole ?? told;
+    const k = kinds.indices.indexOf(at);
     next = null;
     // Dark and flat images have no line integrals; of an image between those told the answer says
     // what it is.
     const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
-    let about: AboutImage | null = null,
-      why = "";
+    let about: AboutImage | null = null;
+    let why = "";
     try {
       about = await call("viewer.recorded_image", {
         index: at,
@@ -516,8 +516,8 @@ on("state", () => {
 slid(canvas, (part) => {
   void play(false);
   if (!plan || !told) return;
-  const { times, duration_s } = plan,
-    t = part * duration_s;
+  const { times, duration_s } = plan;
+  const t = part * duration_s;
   const k = times.reduce(
     (best, v, i) => (Math.abs(v - t) < Math.abs(times[best] - t) ? i : best),
     0,
@@ -545,9 +545,9 @@ window.addEventListener("keydown", (e) => {
 // A viewer that was started again knows nothing of it; a page that was loaded again asks for what
 // its address names: once the viewer has seen the twin, and this page has its own connection to
 // it.
-let lost = false,
-  first = true,
-  seen = false;
+let lost = false;
+let first = true;
+let seen = false;
 function ready() {
   if (!seen || !store.session) return;
   if (first) {
@@ -568,8 +568,8 @@ on("layers", () => {
 });
 on("session", ready);
 export function restore(): void {
-  const name = asked("data"),
-    at = asked("frame") === null ? null : Number(asked("frame")) || 0;
+  const name = asked("data");
+  const at = asked("frame") === null ? null : Number(asked("frame")) || 0;
   if (name !== (told?.info.name ?? null)) void open(name, at);
   else if (told && at !== null) void show(at);
 }

@@ -1,9 +1,10 @@
 // The scan designer: bars for voxel and tube; what the wished scan will look like. A change of
 // the wish rewrites the script, unless somebody else's stands there.
-import { $input, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
+import { $input, bytes, el, fixed, seconds, setText, words } from "./dom.js";
 import { differences, listed, only, sampleOf, type Fingerprint } from "./fingerprint.js";
-import type { ExposurePrediction, TransmissionShares } from "./viewer.js";
+import type { ExposurePrediction, Pair, TransmissionShares } from "./viewer.js";
 import { call, emit, on, store } from "./link.js";
+import { histogram } from "./plots.js";
 import { effect } from "./signals.js";
 import { exposure_ms, frames, kind, setExposure, wished as wishedScan } from "./scan_wish.js";
 
@@ -51,7 +52,7 @@ const FILTER = "MATERIAL:MM beside the machine’s own, put there by hand: alumi
 const DETAIL = "What is to be seen on the darkest ray: MATERIAL:MM or void:MM";
 const WANTED = "Contrast to noise of the detail that is wished for";
 const facts = el("div", { id: "design-facts", class: "small-text", "aria-live": "polite" });
-const chart = el("canvas", {
+const host = el("div", {
   id: "design-chart",
   role: "img",
   "aria-label": "Predicted histogram of transmission",
@@ -68,7 +69,8 @@ const opened = () => {
   if (card.open) void begin();
 };
 const card = el("details", { id: "designer", ontoggle: opened });
-card.append(el("summary", {}, "Design a scan"), form, chart, facts);
+card.append(el("summary", {}, "Design a scan"), form, host, facts);
+const chart = histogram(host);
 export const place = (node: HTMLElement): void => node.append(card);
 
 function value(name: Bar): number {
@@ -169,7 +171,7 @@ async function predict(): Promise<void> {
 }
 function fail(why: string): void {
   setText(facts, why);
-  chart.hidden = true;
+  host.hidden = true;
 }
 
 const part = (v: number) => `${fixed(100 * v, v && v < 0.1 ? 1 : 0)} %`;
@@ -207,14 +209,11 @@ function best({ best: settings, asked: own }: ExposurePrediction, asked: Asked):
   return `best at ${fixed(first.kV, 0)} kV${filter}: ${fixed(first.cnr ?? 0, 2)}`;
 }
 function draw({ edges, shares }: TransmissionShares): void {
-  chart.hidden = false;
-  const room = cleared(chart);
-  const style = getComputedStyle(chart);
-  const counts = shares.map((share) => 1000 * share);
-  bars(room, counts, (k) => {
-    const colour = edges[k] < DARK_TRANSMISSION ? "--warn" : "--accent";
-    room[0].fillStyle = style.getPropertyValue(colour);
-  });
+  host.hidden = false;
+  const range: Pair = [edges[0], edges[edges.length - 1]];
+  const colour = getComputedStyle(host).getPropertyValue("--warn");
+  const marks = [{ at: DARK_TRANSMISSION, colour, handle: false }];
+  chart.draw({ counts: shares, range, unit: "transmission", window: range, marks });
 }
 on("state", (s) => {
   if (!begun()) return;

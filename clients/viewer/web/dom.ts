@@ -29,12 +29,7 @@ type Handlers = {
 };
 export type Attributes = Handlers & {
   readonly [name: string]:
-    | string
-    | number
-    | boolean
-    | null
-    | undefined
-    | Handlers[keyof Handlers];
+    string | number | boolean | null | undefined | Handlers[keyof Handlers];
 };
 export function el<T extends keyof HTMLElementTagNameMap>(
   tag: T,
@@ -97,8 +92,8 @@ export function numeric(
 ): HTMLInputElement {
   input.addEventListener("input", () => input.classList.add("typed"));
   input.addEventListener("keydown", (e) => {
-    const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0,
-      value = parsed(input.value);
+    const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0;
+    const value = parsed(input.value);
     if (e.key === "Enter" && !e.repeat) apply();
     if (e.key === "Escape") back();
     if (step && Number.isFinite(value)) {
@@ -146,9 +141,9 @@ export function putGrey(
 ): void {
   canvas.width = cols;
   canvas.height = rows;
-  const x = context2d(canvas),
-    out = x.createImageData(cols, rows),
-    d = new Uint32Array(out.data.buffer);
+  const x = context2d(canvas);
+  const out = x.createImageData(cols, rows);
+  const d = new Uint32Array(out.data.buffer);
   for (let k = 0; k < d.length; k++) d[k] = 0xff000000 | (grey(k) * 0x010101);
   x.putImageData(out, 0, 0);
 }
@@ -161,50 +156,8 @@ export function putImage(
   putGrey(canvas, shape, (k) => raw.charCodeAt(k));
   return canvas;
 }
-// A canvas with as many pixels as it takes on the screen, empty: what draws in it, width, height.
-export function cleared(
-  canvas: HTMLCanvasElement,
-): [context: CanvasRenderingContext2D, width: number, height: number] {
-  canvas.width = canvas.clientWidth * devicePixelRatio;
-  canvas.height = canvas.clientHeight * devicePixelRatio;
-  return [context2d(canvas), canvas.width, canvas.height];
-}
-// Values along a line as a curve; what is no number has no point.
-export function curve(
-  canvas: HTMLCanvasElement,
-  values: number[],
-  low: number,
-  high: number,
-): void {
-  const [x, w, h] = cleared(canvas);
-  x.strokeStyle = getComputedStyle(canvas).getPropertyValue("--accent");
-  x.lineWidth = 1.5 * devicePixelRatio;
-  x.beginPath();
-  values.forEach((v, k) => {
-    if (Number.isFinite(v))
-      x.lineTo(
-        (w * k) / Math.max(1, values.length - 1),
-        h - 3 - ((h - 6) * (v - low)) / (high - low || 1),
-      );
-  });
-  x.stroke();
-}
-// How often each value occurs, as its logarithm, so that what is rare shows beside much air.
-export function bars(
-  [x, w, h]: ReturnType<typeof cleared>,
-  counts: ArrayLike<number>,
-  style: (k: number) => void,
-): void {
-  const n = counts.length,
-    most = Math.log1p(Math.max(...Array.from(counts)));
-  for (let k = 0; k < n; k++) {
-    const high = (h * Math.log1p(counts[k])) / most;
-    style(k);
-    x.fillRect((w * k) / n, h - high, Math.max(1, w / n - 1), high);
-  }
-}
 // Pressed or dragged: which part of its width the pointer is at.
-export function slid(canvas: HTMLCanvasElement, to: (part: number) => unknown): void {
+export function slid(canvas: HTMLElement, to: (part: number) => unknown): void {
   const tell = (e: PointerEvent) => {
     const b = canvas.getBoundingClientRect();
     to(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)));

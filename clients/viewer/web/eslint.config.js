@@ -7,6 +7,7 @@ export default tseslint.config({
   extends: [tseslint.configs.strictTypeChecked],
   languageOptions: { parserOptions: { projectService: true } },
   rules: {
+    "one-var": ["error", "never"],
     "@typescript-eslint/restrict-template-expressions": ["error", { allowNumber: true }],
     "@typescript-eslint/no-confusing-void-expression": "off",
     "@typescript-eslint/no-unnecessary-condition": "off", // takes what others change meanwhile for what it was

@@ -10,8 +10,8 @@ export function fixed(value: number | null | undefined, digits = 2): string {
 export function seconds(s: number | null | undefined): string {
   if (!isNumber(s)) return "–";
   s = Math.round(s);
-  const h = Math.floor(s / 3600),
-    m = Math.floor((s % 3600) / 60);
+  const h = Math.floor(s / 3600);
+  const m = Math.floor((s % 3600) / 60);
   return h
     ? `${h} h ${String(m).padStart(2, "0")} min`
     : m

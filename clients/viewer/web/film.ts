@@ -1,7 +1,17 @@
-// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it, and its
-// difference from a frame that was kept.
-import { below } from "./plot_axes.js";
-import { $, $button, $canvas, $input, $select, bars, cleared, context2d, fixed, setText, slid } from "./dom.js";
+// The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn
+// over it, and its difference from a frame that was kept.
+import { histogram as plotted } from "./plots.js";
+import {
+  $,
+  $button,
+  $canvas,
+  $input,
+  $select,
+  context2d,
+  fixed,
+  setText,
+  slid,
+} from "./dom.js";
 import type { Four, Kind, Pair, Shown } from "./viewer.js";
 import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
@@ -9,77 +19,141 @@ import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 import { signed } from "./slices.js";
 
-const canvas = $canvas("#film-canvas"), context = context2d(canvas), film = $("#film");
-const buffer = document.createElement("canvas"), pixels2d = context2d(buffer);
+const canvas = $canvas("#film-canvas");
+const context = context2d(canvas);
+const film = $("#film");
+const buffer = document.createElement("canvas");
+const pixels2d = context2d(buffer);
 // Zoom is relative to the whole image fitted in; x, y is the middle in pixels of the image.
 const view = { zoom: 1, x: 0, y: 0 };
-const SLIMMEST = 0.75, FLATTEST = 3; // of the film; a narrower image gets black edges
+const SLIMMEST = 0.75;
+const FLATTEST = 3; // of the film; a narrower image gets black edges
 const CLICK = 4; // pixels of the screen that a click may move
-const SATURATED = 0xff3040ff, STARVED = 0xff30b0ff; // drawn in red and orange
-let range: Pair = [0, 1], windowed: Pair = [0, 1], due = false, stamps: number[] = [], quiet: number | undefined, pointer: Pair | null = null;
+const SATURATED = 0xff3040ff;
+const STARVED = 0xff30b0ff; // drawn in red and orange
+let range: Pair = [0, 1];
+let windowed: Pair = [0, 1];
+let due = false;
+let stamps: number[] = [];
+let quiet: number | undefined;
+let pointer: Pair | null = null;
 export const shown = { count: 0, at: 0 };
 
 let reference: Shown | null = null;
-// What is shown: the newest image, its virtual one, or by how much it differs from that or from the reference, as
-// an image of its own.
+// What is shown: the newest image, its virtual one, or by how much it differs from that or from
+// the reference, as an image of its own.
 function frame(): Shown | null {
   const i = store.image;
   if (!i) return null;
-  const { virtual } = i, way = virtual ? compare.how() : "";
+  const { virtual } = i;
+  const way = virtual ? compare.how() : "";
   if (virtual && (way === "virtual" || way === "curtain")) return compare.beside(i, virtual);
-  const r = virtual && way === "difference" ? { ...i, pixels: virtual } : $input("#difference").checked ? reference : null;
+  const r =
+    virtual && way === "difference"
+      ? { ...i, pixels: virtual }
+      : $input("#difference").checked
+        ? reference
+        : null;
   if (!r || r.kind !== i.kind || r.full.join() !== i.full.join()) return i;
   if (apart?.of === i && apart.from === r.pixels) return apart;
-  const [rows, cols] = i.shape, f = r.shape[1] / cols, values = new Float32Array(rows * cols);
+  const [rows, cols] = i.shape;
+  const f = r.shape[1] / cols;
+  const values = new Float32Array(rows * cols);
   for (let k = 0; k < values.length; k++) {
-    const row = Math.min(r.shape[0] - 1, Math.floor((Math.floor(k / cols) + 0.5) * f)), col = Math.min(r.shape[1] - 1, Math.floor(((k % cols) + 0.5) * f));
-    values[k] = i.low + i.scale * i.pixels[k] - (r.low + r.scale * r.pixels[row * r.shape[1] + col]);
+    const row = Math.min(r.shape[0] - 1, Math.floor((Math.floor(k / cols) + 0.5) * f));
+    const col = Math.min(r.shape[1] - 1, Math.floor(((k % cols) + 0.5) * f));
+    values[k] =
+      i.low + i.scale * i.pixels[k] - (r.low + r.scale * r.pixels[row * r.shape[1] + col]);
   }
-  const sizes = values.filter((_, k) => k % EVERY === 0).map(Math.abs).sort(), span = Math.max(1e-6, 1.2 * sizes[Math.floor(0.995 * sizes.length)]);
-  const scale = Math.max(span, values.reduce((a, v) => Math.max(a, Math.abs(v)), 0)) / 32767;
-  return (apart = { ...i, of: i, from: r.pixels, signed: true, low: -32768 * scale, scale, pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768), window: [-span, span] });
+  const sizes = values
+    .filter((_, k) => k % EVERY === 0)
+    .map(Math.abs)
+    .sort();
+  const span = Math.max(1e-6, 1.2 * sizes[Math.floor(0.995 * sizes.length)]);
+  const scale =
+    Math.max(
+      span,
+      values.reduce((a, v) => Math.max(a, Math.abs(v)), 0),
+    ) / 32767;
+  return (apart = {
+    ...i,
+    of: i,
+    from: r.pixels,
+    signed: true,
+    low: -32768 * scale,
+    scale,
+    pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768),
+    window: [-span, span],
+  });
 }
 let apart: Shown | null = null;
 export function value(column: number, row: number): number {
   const i = frame();
   if (!i) return NaN;
-  const f = i.full[1] / i.shape[1], c = Math.floor((column + 0.5) / f), r = Math.floor((row + 0.5) / f);
-  return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0] ? NaN : i.low + i.scale * i.pixels[r * i.shape[1] + c];
+  const f = i.full[1] / i.shape[1];
+  const c = Math.floor((column + 0.5) / f);
+  const r = Math.floor((row + 0.5) / f);
+  return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0]
+    ? NaN
+    : i.low + i.scale * i.pixels[r * i.shape[1] + c];
 }
 
-// Values between which a pixel is neither starved nor saturated: the twin says so with each image. Counts of a
-// recorded one are judged by the same camera, its line integrals by nothing that is known.
-function good(i: Shown): Pair { const f = i.flags ?? store.state?.image; return (i.kind === "counts" ? f?.good_counts : i.flags?.good_lines) ?? [NaN, NaN]; }
+// Values between which a pixel is neither starved nor saturated: the twin says so with each
+// image. Counts of a recorded one are judged by the same camera, its line integrals by nothing
+// that is known.
+function good(i: Shown): Pair {
+  const f = i.flags ?? store.state?.image;
+  return (i.kind === "counts" ? f?.good_counts : i.flags?.good_lines) ?? [NaN, NaN];
+}
 function limits(i: Shown): Pair {
   if (i.signed) return i.window;
   if (i.kind === "counts") return [0, Math.max(good(i)[1] || 0, i.window[1])];
   return [Math.min(0, i.low), Math.max(i.low + i.scale * 65535, 0.1)];
 }
 
-const lowEnd = () => $input("#low").valueAsNumber, highEnd = () => $input("#high").valueAsNumber;
+const lowEnd = () => $input("#low").valueAsNumber;
+const highEnd = () => $input("#high").valueAsNumber;
 function chooseWindow(i: Shown) {
   range = limits(i);
   const span = range[1] - range[0];
   if ($input("#auto-window").checked) {
     windowed = i.window;
-    $input("#low").value = String((1000 * (windowed[0] - range[0])) / span); $input("#high").value = String((1000 * (windowed[1] - range[0])) / span);
+    $input("#low").value = String((1000 * (windowed[0] - range[0])) / span);
+    $input("#high").value = String((1000 * (windowed[1] - range[0])) / span);
   } else windowed = [range[0] + (span * lowEnd()) / 1000, range[0] + (span * highEnd()) / 1000];
 }
 
 function develop(i: Shown) {
   const [rows, cols] = i.shape;
-  if (buffer.width !== cols || buffer.height !== rows) { buffer.width = cols; buffer.height = rows; }
-  const out = pixels2d.createImageData(cols, rows), data = new Uint32Array(out.data.buffer);
-  const low = windowed[0], high = windowed[1] > low ? windowed[1] : low + 1e-6;
-  const a = (255 * i.scale) / (high - low), b = (255 * (i.low - low)) / (high - low), flip = $input("#invert").checked;
-  const gamma = i.signed ? 1 : $input("#gamma").valueAsNumber, tone = Uint8Array.from({ length: 256 }, (_, g) => Math.round(255 * (g / 255) ** (1 / gamma)));
-  const counts = i.kind === "counts", flags = $input("#show-flags").checked && !i.signed && !(counts && unlit(i)), p = i.pixels;
-  const [least, most] = good(i).map((v) => (v - i.low) / i.scale), top = most - (i.code === "jpeg" ? 128.5 : 0.5); // half a step of the code
+  if (buffer.width !== cols || buffer.height !== rows) {
+    buffer.width = cols;
+    buffer.height = rows;
+  }
+  const out = pixels2d.createImageData(cols, rows);
+  const data = new Uint32Array(out.data.buffer);
+  const low = windowed[0];
+  const high = windowed[1] > low ? windowed[1] : low + 1e-6;
+  const a = (255 * i.scale) / (high - low);
+  const b = (255 * (i.low - low)) / (high - low);
+  const flip = $input("#invert").checked;
+  const gamma = i.signed ? 1 : $input("#gamma").valueAsNumber;
+  const tone = Uint8Array.from({ length: 256 }, (_, g) =>
+    Math.round(255 * (g / 255) ** (1 / gamma)),
+  );
+  const counts = i.kind === "counts";
+  const flags = $input("#show-flags").checked && !i.signed && !(counts && unlit(i));
+  const p = i.pixels;
+  const [least, most] = good(i).map((v) => (v - i.low) / i.scale);
+  const top = most - (i.code === "jpeg" ? 128.5 : 0.5); // half a step of the code
   for (let k = 0; k < data.length; k++) {
-    let g = a * p[k] + b; g = tone[g < 0 ? 0 : g > 255 ? 255 : g | 0];
+    let g = a * p[k] + b;
+    g = tone[g < 0 ? 0 : g > 255 ? 255 : g | 0];
     if (flip) g = 255 - g;
     data[k] = i.signed ? signed(g) : 0xff000000 | (g << 16) | (g << 8) | g;
-    if (flags) { if (p[k] < least) data[k] = counts ? STARVED : SATURATED; else if (p[k] >= top) data[k] = counts ? SATURATED : STARVED; }
+    if (flags) {
+      if (p[k] < least) data[k] = counts ? STARVED : SATURATED;
+      else if (p[k] >= top) data[k] = counts ? SATURATED : STARVED;
+    }
   }
   pixels2d.putImageData(out, 0, 0);
 }
@@ -87,18 +161,34 @@ function develop(i: Shown) {
 // An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
 const unlit = (i: Shown | null) => i !== null && !i.recorded && i.origin?.lit === false;
 function beam(i: Shown | null) {
-  const tube = store.state?.tube, off = unlit(i);
+  const tube = store.state?.tube;
+  const off = unlit(i);
   $("#film-beam").hidden = !off;
-  if (off) setText($("#film-beam"), tube?.on && !tube.ready ? "X-rays warming up" : i?.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
+  if (off)
+    setText(
+      $("#film-beam"),
+      tube?.on && !tube.ready
+        ? "X-rays warming up"
+        : i?.kind === "counts"
+          ? "X-rays off: dark image"
+          : "X-rays off: drawn as though on",
+    );
 }
-// The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
+// The part of the beam that comes through: from the thickest place (all but one in a hundred
+// let more through) on.
 function transmission(i: Shown) {
-  if (i.kind !== "line_integral" || i.signed) return i.signed ? `difference from the ${i.from === reference?.pixels ? "reference" : "virtual image"}` : "transmission: choose line integral";
+  if (i.kind !== "line_integral" || i.signed)
+    return i.signed
+      ? `difference from the ${i.from === reference?.pixels ? "reference" : "virtual image"}`
+      : "transmission: choose line integral";
   const through = [];
-  for (let k = 0; k < i.pixels.length; k += EVERY) through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
+  for (let k = 0; k < i.pixels.length; k += EVERY)
+    through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
   through.sort((a, b) => a - b);
-  const dark = through[Math.floor(0.01 * through.length)], mean = through.reduce((a, v) => a + v, 0) / through.length;
-  return `transmission ${(100 * dark).toFixed(1)} % or less in 1 % of the pixels · ${(100 * mean).toFixed(1)} % in the mean`;
+  const dark = through[Math.floor(0.01 * through.length)];
+  const mean = through.reduce((a, v) => a + v, 0) / through.length;
+  const darkest = `${(100 * dark).toFixed(1)} % or less in 1 % of the pixels`;
+  return `transmission ${darkest} · ${(100 * mean).toFixed(1)} % in the mean`;
 }
 
 export function draw(): void {
@@ -108,14 +198,30 @@ export function draw(): void {
   $input("#difference").disabled = !reference;
   $("#film-recorded").hidden = !store.recorded;
   if (store.recorded) setText($("#film-recorded"), compare.words(i));
-  if (!i) { canvas.width = canvas.height = 1; setText($("#film-note"), ""); tell(); measure.tell(null, value); return; }
-  chooseWindow(i); develop(i);
-  film.style.aspectRatio = String(Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0])));
-  const dpr = Math.min(devicePixelRatio, 2), w = Math.round(film.clientWidth * dpr), h = Math.round(film.clientHeight * dpr);
-  if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
+  if (!i) {
+    canvas.width = canvas.height = 1;
+    setText($("#film-note"), "");
+    tell();
+    measure.tell(null, value);
+    return;
+  }
+  chooseWindow(i);
+  develop(i);
+  film.style.aspectRatio = String(
+    Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0])),
+  );
+  const dpr = Math.min(devicePixelRatio, 2);
+  const w = Math.round(film.clientWidth * dpr);
+  const h = Math.round(film.clientHeight * dpr);
+  if (canvas.width !== w || canvas.height !== h) {
+    canvas.width = w;
+    canvas.height = h;
+  }
   clampView();
   const s = dpr * scale();
-  context.setTransform(1, 0, 0, 1, 0, 0); context.fillStyle = "#05070a"; context.fillRect(0, 0, w, h);
+  context.setTransform(1, 0, 0, 1, 0, 0);
+  context.fillStyle = "#05070a";
+  context.fillRect(0, 0, w, h);
   context.imageSmoothingEnabled = view.zoom < 2;
   context.setTransform(s, 0, 0, s, w / 2 - view.x * s, h / 2 - view.y * s);
   context.drawImage(buffer, 0, 0, i.full[1], i.full[0]);
@@ -127,21 +233,37 @@ export function draw(): void {
   setText($("#transmission"), transmission(i));
   film.classList.toggle("zoomed", view.zoom >= 2);
   $("#film-note").dataset.seq = String(i.seq);
-  shown.count++; shown.at = performance.now();
-  stamps.push(shown.at); stamps = stamps.filter((t) => shown.at - t < 2000);
-  setText($("#film-rate"), stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "");
-  clearTimeout(quiet); quiet = window.setTimeout(() => setText($("#film-rate"), ""), 2000);
+  shown.count++;
+  shown.at = performance.now();
+  stamps.push(shown.at);
+  stamps = stamps.filter((t) => shown.at - t < 2000);
+  setText(
+    $("#film-rate"),
+    stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "",
+  );
+  clearTimeout(quiet);
+  quiet = window.setTimeout(() => setText($("#film-rate"), ""), 2000);
   tell();
-  const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2)), zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
-  const alone = reference && $input("#difference").checked && !i.signed ? "  ·  no difference: the reference is of another kind or size" : "";
-  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`);
+  const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2));
+  const zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
+  const alone =
+    reference && $input("#difference").checked && !i.signed
+      ? "  ·  no difference: the reference is of another kind or size"
+      : "";
+  setText(
+    $("#film-note"),
+    `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`,
+  );
 }
 
 // What the window leaves out is pale.
-const BINS = 128, EVERY = 7;
-const chart = $canvas("#histogram");
+const BINS = 128;
+const EVERY = 7;
+const host = $("#histogram");
+const chart = plotted(host);
 export function histogram(i: Shown, [low, high]: Pair): Float64Array {
-  const counts = new Float64Array(BINS), step = BINS / (high - low);
+  const counts = new Float64Array(BINS);
+  const step = BINS / (high - low);
   for (let k = 0; k < i.pixels.length; k += EVERY) {
     const bin = Math.floor((i.low + i.scale * i.pixels[k] - low) * step);
     counts[Math.min(BINS - 1, Math.max(0, bin))]++;
@@ -149,31 +271,38 @@ export function histogram(i: Shown, [low, high]: Pair): Float64Array {
   return counts;
 }
 function drawHistogram(i: Shown) {
-  const [chart2d, w, h] = cleared(chart), step = (range[1] - range[0]) / BINS, at = (v: number) => (w * (v - range[0])) / (range[1] - range[0]);
-  const style = getComputedStyle(chart);
-  chart2d.fillStyle = style.getPropertyValue("--accent");
-  bars([chart2d, w, h], histogram(i, range), (k) => {
-    const middle = range[0] + (k + 0.5) * step;
-    chart2d.globalAlpha = middle < windowed[0] || middle > windowed[1] ? 0.3 : 1;
+  const text = getComputedStyle(host).getPropertyValue("--text");
+  chart.draw({
+    counts: histogram(i, range),
+    range,
+    unit: i.kind === "counts" ? "counts" : "−log T",
+    window: windowed,
+    marks: windowed.map((at) => ({ at, colour: text, handle: true })),
   });
-  chart2d.globalAlpha = 1; chart2d.fillStyle = style.getPropertyValue("--text");
-  const wide = 6 * devicePixelRatio;
-  for (const v of windowed) {
-    const x = Math.min(w - 1, Math.max(1, at(v)));
-    chart2d.fillRect(x - 1, 0, 2, h); chart2d.fillRect(x - wide / 2, 0, wide, wide); chart2d.fillRect(x - wide / 2, h - wide, wide, wide);
-  }
-  below(chart, range[0], range[1], i.kind === "counts" ? "counts" : "−log T");
 }
 // The nearer end of the window follows the pointer.
 let pulled: HTMLInputElement | null = null;
-slid(chart, (part) => {
+slid(chart.area, (part) => {
   const to = 1000 * part;
-  pulled ??= Math.abs(to - lowEnd()) <= Math.abs(to - highEnd()) ? $input("#low") : $input("#high");
-  pulled.value = String(to); pulled.dispatchEvent(new Event("input"));
+  pulled ??=
+    Math.abs(to - lowEnd()) <= Math.abs(to - highEnd()) ? $input("#low") : $input("#high");
+  pulled.value = String(to);
+  pulled.dispatchEvent(new Event("input"));
 });
-for (const end of ["pointerup", "pointercancel"]) chart.addEventListener(end, () => { pulled?.dispatchEvent(new Event("change")); pulled = null; });
+for (const end of ["pointerup", "pointercancel"])
+  chart.area.addEventListener(end, () => {
+    pulled?.dispatchEvent(new Event("change"));
+    pulled = null;
+  });
+const percent = (part: number) => `${(100 * part).toFixed(part && part < 0.1 ? 1 : 0)} %`;
 on("state", (s) => {
-  for (const what of ["saturated", "starved"] as const) setText($(`#${what}`), store.recorded ? `${what}: not judged in a recorded image` : `${what} ${s.image ? `${(100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0)} %` : "–"}`);
+  for (const what of ["saturated", "starved"] as const)
+    setText(
+      $(`#${what}`),
+      store.recorded
+        ? `${what}: not judged in a recorded image`
+        : `${what} ${s.image ? percent(s.image[what]) : "–"}`,
+    );
   if ($("#film-beam").hidden === unlit(store.image)) ask(); // a dark image has no flags
   beam(store.image);
 });
@@ -182,113 +311,239 @@ function overlay(i: Shown, s: number, dpr: number) {
   context.lineWidth = (1.5 * dpr) / s;
   if ($input("#show-beads").checked) {
     context.strokeStyle = "#36e28f";
-    for (const [c, r] of i.beads) { context.beginPath(); context.arc(c + 0.5, r + 0.5, (9 * dpr) / s, 0, 7); context.stroke(); }
+    for (const [c, r] of i.beads) {
+      context.beginPath();
+      context.arc(c + 0.5, r + 0.5, (9 * dpr) / s, 0, 7);
+      context.stroke();
+    }
   }
   compare.draw(context, i, dpr / s);
   const g = store.state?.geometry;
   if (g && !i.recorded) {
-    const [c, r] = g.piercing_point_px, d = (7 * dpr) / s;
-    context.strokeStyle = "#5ab0ff"; context.beginPath();
-    context.moveTo(c + 0.5 - d, r + 0.5); context.lineTo(c + 0.5 + d, r + 0.5); context.moveTo(c + 0.5, r + 0.5 - d); context.lineTo(c + 0.5, r + 0.5 + d); context.stroke();
+    const [c, r] = g.piercing_point_px;
+    const d = (7 * dpr) / s;
+    context.strokeStyle = "#5ab0ff";
+    context.beginPath();
+    context.moveTo(c + 0.5 - d, r + 0.5);
+    context.lineTo(c + 0.5 + d, r + 0.5);
+    context.moveTo(c + 0.5, r + 0.5 - d);
+    context.lineTo(c + 0.5, r + 0.5 + d);
+    context.stroke();
   }
 }
 
-function ask() { if (!due) { due = true; requestAnimationFrame(draw); } }
+function ask() {
+  if (!due) {
+    due = true;
+    requestAnimationFrame(draw);
+  }
+}
 // CSS pixels a pixel of the image: fitted in, and zoomed.
-function fitted() { const i = store.image; return i ? Math.min(film.clientWidth / i.full[1], film.clientHeight / i.full[0]) : 1; }
-function scale() { return fitted() * view.zoom; }
+function fitted() {
+  const i = store.image;
+  return i ? Math.min(film.clientWidth / i.full[1], film.clientHeight / i.full[0]) : 1;
+}
+function scale() {
+  return fitted() * view.zoom;
+}
 function at([x, y]: Pair): Pair {
-  const box = canvas.getBoundingClientRect(), s = scale();
-  return [(x - box.left - box.width / 2) / s + view.x, (y - box.top - box.height / 2) / s + view.y];
+  const box = canvas.getBoundingClientRect();
+  const s = scale();
+  return [
+    (x - box.left - box.width / 2) / s + view.x,
+    (y - box.top - box.height / 2) / s + view.y,
+  ];
 }
 function clampView() {
-  const i = store.image, s = scale();
+  const i = store.image;
+  const s = scale();
   if (!i) return;
-  const inside = (middle: number, size: number, room: number) => (size <= room ? size / 2 : Math.min(Math.max(middle, room / 2), size - room / 2));
-  view.x = inside(view.x, i.full[1], film.clientWidth / s); view.y = inside(view.y, i.full[0], film.clientHeight / s);
+  const inside = (middle: number, size: number, room: number) =>
+    size <= room ? size / 2 : Math.min(Math.max(middle, room / 2), size - room / 2);
+  view.x = inside(view.x, i.full[1], film.clientWidth / s);
+  view.y = inside(view.y, i.full[0], film.clientHeight / s);
 }
 // The value under the pointer, also when the image changes under it.
 function tell() {
   const i = frame();
-  if (!i || !pointer) { setText($("#pixel"), "point at the image"); return; }
-  const [c, r] = at(pointer).map(Math.floor), v = value(c, r);
-  const plain = i.kind === "counts" ? `${fixed(v, 0)} counts` : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`;
-  const words = i.signed ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than ${i.virtual ? "the virtual image" : "the reference"}` : plain;
+  if (!i || !pointer) {
+    setText($("#pixel"), "point at the image");
+    return;
+  }
+  const [c, r] = at(pointer).map(Math.floor);
+  const v = value(c, r);
+  const plain =
+    i.kind === "counts"
+      ? `${fixed(v, 0)} counts`
+      : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`;
+  const other = i.virtual ? "the virtual image" : "the reference";
+  const words = i.signed
+    ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than ${other}`
+    : plain;
   setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${words}` : "–");
 }
-// The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are on): a PNG.
+// The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are
+// on): a PNG.
 export function picture(): string | null {
   const i = frame();
   if (!i) return null;
   const whole = document.createElement("canvas");
-  whole.width = i.full[1]; whole.height = i.full[0];
-  chooseWindow(i); develop(i);
+  whole.width = i.full[1];
+  whole.height = i.full[0];
+  chooseWindow(i);
+  develop(i);
   context2d(whole).drawImage(buffer, 0, 0, whole.width, whole.height);
   return whole.toDataURL("image/png");
 }
 function zoomTo(zoom: number, place: Pair | null = null) {
-  const before = scale(), [x, y] = place ? at(place) : [view.x, view.y];
+  const before = scale();
+  const [x, y] = place ? at(place) : [view.x, view.y];
   view.zoom = zoom;
-  view.x = x - ((x - view.x) * before) / scale(); view.y = y - ((y - view.y) * before) / scale();
+  view.x = x - ((x - view.x) * before) / scale();
+  view.y = y - ((y - view.y) * before) / scale();
   ask();
 }
-canvas.addEventListener("wheel", (e) => {
-  e.preventDefault();
-  if (store.image) zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [e.clientX, e.clientY]);
-}, { passive: false });
-let drag: Four | null = null, down: Pair = [0, 0];
+canvas.addEventListener(
+  "wheel",
+  (e) => {
+    e.preventDefault();
+    if (store.image)
+      zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [
+        e.clientX,
+        e.clientY,
+      ]);
+  },
+  { passive: false },
+);
+let drag: Four | null = null;
+let down: Pair = [0, 0];
 function place(e: PointerEvent, { full: [rows, cols] }: Shown): Pair {
-  const [c, r] = at([e.clientX, e.clientY]), inside = (v: number, n: number) => Math.min(n - 1, Math.max(0, Math.floor(v)));
+  const [c, r] = at([e.clientX, e.clientY]);
+  const inside = (v: number, n: number) => Math.min(n - 1, Math.max(0, Math.floor(v)));
   return [inside(c, cols), inside(r, rows)];
 }
 canvas.addEventListener("pointerdown", (e) => {
-  canvas.setPointerCapture(e.pointerId); down = [e.clientX, e.clientY];
+  canvas.setPointerCapture(e.pointerId);
+  down = [e.clientX, e.clientY];
   const i = store.image;
-  if (i && (measure.press(place(e, i)) || compare.press(at([e.clientX, e.clientY]), 1 / scale()))) ask();
+  if (
+    i &&
+    (measure.press(place(e, i)) || compare.press(at([e.clientX, e.clientY]), 1 / scale()))
+  )
+    ask();
   else drag = [e.clientX, e.clientY, view.x, view.y];
 });
-canvas.addEventListener("pointerup", (e) => { if (Math.hypot(e.clientX - down[0], e.clientY - down[1]) < CLICK) marks.click(at(down)); });
-for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; measure.release(); compare.release(); });
+canvas.addEventListener("pointerup", (e) => {
+  if (Math.hypot(e.clientX - down[0], e.clientY - down[1]) < CLICK) marks.click(at(down));
+});
+for (const end of ["pointerup", "pointercancel"])
+  canvas.addEventListener(end, () => {
+    drag = null;
+    measure.release();
+    compare.release();
+  });
 canvas.addEventListener("pointermove", (e) => {
   pointer = [e.clientX, e.clientY];
   const i = store.image;
-  if ((i && (measure.drag(place(e, i)) || compare.drag(at(pointer)))) || measure.follows()) ask();
-  if (drag) { view.x = drag[2] - (e.clientX - drag[0]) / scale(); view.y = drag[3] - (e.clientY - drag[1]) / scale(); clampView(); ask(); }
+  if ((i && (measure.drag(place(e, i)) || compare.drag(at(pointer)))) || measure.follows())
+    ask();
+  if (drag) {
+    view.x = drag[2] - (e.clientX - drag[0]) / scale();
+    view.y = drag[3] - (e.clientY - drag[1]) / scale();
+    clampView();
+    ask();
+  }
   tell();
 });
-canvas.addEventListener("pointerleave", () => { pointer = null; tell(); if (measure.follows()) ask(); });
-const STEPS: Record<string, Pair | undefined> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+canvas.addEventListener("pointerleave", () => {
+  pointer = null;
+  tell();
+  if (measure.follows()) ask();
+});
+const STEPS: Record<string, Pair | undefined> = {
+  ArrowLeft: [-1, 0],
+  ArrowRight: [1, 0],
+  ArrowUp: [0, -1],
+  ArrowDown: [0, 1],
+};
 const TIMES: Record<string, number | undefined> = { "+": 1.25, "=": 1.25, "-": 0.8 };
 canvas.addEventListener("keydown", (e) => {
-  const step = STEPS[e.key], times = TIMES[e.key];
-  if (!store.image || e.ctrlKey || e.metaKey || e.altKey || (!step && !times && !["0", "Enter"].includes(e.key))) return;
-  e.preventDefault(); e.stopPropagation();
+  const step = STEPS[e.key];
+  const times = TIMES[e.key];
+  if (
+    !store.image ||
+    e.ctrlKey ||
+    e.metaKey ||
+    e.altKey ||
+    (!step && !times && !["0", "Enter"].includes(e.key))
+  )
+    return;
+  e.preventDefault();
+  e.stopPropagation();
   if (e.key === "Enter") marks.click([view.x, view.y]);
   else if (step && marks.shift(step, e.shiftKey)) return;
-  else if (step) { view.x += (40 * step[0]) / scale(); view.y += (40 * step[1]) / scale(); ask(); } else zoomTo(times ? Math.min(40, Math.max(1, view.zoom * times)) : 1);
+  else if (step) {
+    view.x += (40 * step[0]) / scale();
+    view.y += (40 * step[1]) / scale();
+    ask();
+  } else zoomTo(times ? Math.min(40, Math.max(1, view.zoom * times)) : 1);
 });
 measure.start(ask);
 $button("#keep-reference").addEventListener("click", () => {
   reference = store.image;
-  emit("note", reference ? "good" : "warning-note", "Reference", reference ? "this image is kept; tick “difference” to see what changes" : "no image has come yet");
+  emit(
+    "note",
+    reference ? "good" : "warning-note",
+    "Reference",
+    reference
+      ? "this image is kept; tick “difference” to see what changes"
+      : "no image has come yet",
+  );
   ask();
 });
-$input("#difference").addEventListener("change", () => { $input("#auto-window").checked = true; });
+$input("#difference").addEventListener("change", () => {
+  $input("#auto-window").checked = true;
+});
 const reset = () => zoomTo(1);
 canvas.addEventListener("dblclick", reset);
 $button("#film-reset").addEventListener("click", reset);
-$button("#film-actual").addEventListener("click", () => zoomTo(1 / (fitted() * Math.min(devicePixelRatio, 2))));
+$button("#film-actual").addEventListener("click", () =>
+  zoomTo(1 / (fitted() * Math.min(devicePixelRatio, 2))),
+);
 // Neither end of the window goes past the other.
-$input("#low").addEventListener("input", () => { $input("#low").value = String(Math.min(lowEnd(), highEnd() - 1)); });
-$input("#high").addEventListener("input", () => { $input("#high").value = String(Math.max(highEnd(), lowEnd() + 1)); });
-for (const id of ["#low", "#high"]) $(id).addEventListener("input", () => { $input("#auto-window").checked = false; ask(); });
-for (const id of ["#low", "#high", "#auto-window"]) $(id).addEventListener("change", () => {
-  const own = !$input("#auto-window").checked && store.image?.kind === "line_integral" && !frame()?.signed;
-  call("viewer.window", own ? { low: windowed[0], high: windowed[1] } : {}).catch(() => {}); ask();
+$input("#low").addEventListener("input", () => {
+  $input("#low").value = String(Math.min(lowEnd(), highEnd() - 1));
 });
-for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window", "#difference"]) $(id).addEventListener("change", ask);
-$input("#gamma").addEventListener("input", () => { setText($("#gamma-is"), fixed($input("#gamma").valueAsNumber)); ask(); });
-$select("#kind").addEventListener("change", () => { $input("#auto-window").checked = true; call("viewer.feed", { kind: $select("#kind").value as Kind }).catch(() => {}); });
+$input("#high").addEventListener("input", () => {
+  $input("#high").value = String(Math.max(highEnd(), lowEnd() + 1));
+});
+for (const id of ["#low", "#high"])
+  $(id).addEventListener("input", () => {
+    $input("#auto-window").checked = false;
+    ask();
+  });
+for (const id of ["#low", "#high", "#auto-window"])
+  $(id).addEventListener("change", () => {
+    const own =
+      !$input("#auto-window").checked &&
+      store.image?.kind === "line_integral" &&
+      !frame()?.signed;
+    call("viewer.window", own ? { low: windowed[0], high: windowed[1] } : {}).catch(() => {});
+    ask();
+  });
+for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window", "#difference"])
+  $(id).addEventListener("change", ask);
+$input("#gamma").addEventListener("input", () => {
+  setText($("#gamma-is"), fixed($input("#gamma").valueAsNumber));
+  ask();
+});
+$select("#kind").addEventListener("change", () => {
+  $input("#auto-window").checked = true;
+  call("viewer.feed", { kind: $select("#kind").value as Kind }).catch(() => {});
+});
 on("image", ask);
-on("open", () => { if ($select("#kind").value !== "line_integral") call("viewer.feed", { kind: $select("#kind").value as Kind }).catch(() => {}); });
+on("open", () => {
+  if ($select("#kind").value !== "line_integral")
+    call("viewer.feed", { kind: $select("#kind").value as Kind }).catch(() => {});
+});
 new ResizeObserver(ask).observe(film);

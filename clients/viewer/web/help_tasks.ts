@@ -21,7 +21,21 @@ const TASKS: Array<[wish: string, how: string, act: () => unknown]> = [
 ];
 
 export function tasks(close: () => void): HTMLElement {
-  return el("div", { class: "help-tasks" }, ...TASKS.map(([wish, how, act]) =>
-    el("button", { onclick: () => { close(); act(); } },
-      el("b", {}, wish), el("span", { class: "muted small-text" }, how))));
+  return el(
+    "div",
+    { class: "help-tasks" },
+    ...TASKS.map(([wish, how, act]) =>
+      el(
+        "button",
+        {
+          onclick: () => {
+            close();
+            act();
+          },
+        },
+        el("b", {}, wish),
+        el("span", { class: "muted small-text" }, how),
+      ),
+    ),
+  );
 }

@@ -2,11 +2,11 @@
 import { $, $button, $dialog, keep } from "./dom.js";
 import { on } from "./link.js";
 
-const KEY = "flexdt-right",
-  LEAST = 280,
-  STEP = 32;
-const page = $("main"),
-  splitter = $("#splitter");
+const KEY = "flexdt-right";
+const LEAST = 280;
+const STEP = 32;
+const page = $("main");
+const splitter = $("#splitter");
 let wide: number | null = null;
 function set(width: number) {
   const most = Math.max(LEAST, page.clientWidth - $("#left").offsetWidth - 160);

@@ -22,7 +22,12 @@ import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { fine, layout } from "./views.js";
 
-declare global { interface Window { flexdt: unknown; firstView: string } }
+declare global {
+  interface Window {
+    flexdt: unknown;
+    firstView: string;
+  }
+}
 function theme(dark: boolean, tell = true) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   localStorage.setItem("flexdt-theme", dark ? "dark" : "light");

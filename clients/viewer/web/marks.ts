@@ -5,10 +5,10 @@ import type { Mark, Pair } from "./viewer.js";
 import { emit, on, store } from "./link.js";
 
 const COLOUR = "#ff3ca0";
-let marks: Mark[] = [],
-  last: Mark | null = null,
-  held = false,
-  of: string | null = null;
+let marks: Mark[] = [];
+let last: Mark | null = null;
+let held = false;
+let of: string | null = null;
 const projection = () => store.image?.recorded?.projection ?? null;
 const here = () => marks.filter((m) => m.frame === projection());
 
@@ -29,8 +29,8 @@ const toggle = el(
   },
   "Mark beads",
 );
-const said = el("span", { class: "muted small-text", "aria-live": "polite" }),
-  list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
+const said = el("span", { class: "muted small-text", "aria-live": "polite" });
+const list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
 function choose(wanted: boolean) {
   tools.hidden = !wanted;
   toggle.setAttribute("aria-pressed", String(wanted));
@@ -111,10 +111,10 @@ on("image", tell);
 
 // Places are in the picture's coordinates: the middle of its first pixel is (0.5, 0.5) there.
 export function click([column, line]: Pair): void {
-  const frame = projection(),
-    bead = $input("#mark-bead"),
-    number = Math.max(0, Math.round(bead.valueAsNumber || 0)),
-    marker = String(number);
+  const frame = projection();
+  const bead = $input("#mark-bead");
+  const number = Math.max(0, Math.round(bead.valueAsNumber || 0));
+  const marker = String(number);
   if (tools.hidden || frame === null) return;
   last = { frame, marker, column: column - 0.5, row: line - 0.5 };
   marks = [...marks.filter((m) => m.frame !== frame || m.marker !== marker), last];
@@ -135,8 +135,8 @@ export function press([column, line]: Pair, reach: number): boolean {
   }
   return held;
 }
-let start: Pair = [0, 0],
-  slack = 0;
+let start: Pair = [0, 0];
+let slack = 0;
 export function drag([column, line]: Pair): boolean {
   if (held && last && Math.hypot(column - start[0], line - start[1]) >= slack) {
     slack = 0;
@@ -165,8 +165,8 @@ export function draw(x: CanvasRenderingContext2D, unit: number): void {
   x.font = `${13 * unit}px sans-serif`;
   x.beginPath();
   for (const m of here()) {
-    const c = m.column + 0.5,
-      r = m.row + 0.5;
+    const c = m.column + 0.5;
+    const r = m.row + 0.5;
     x.moveTo(c - arm, r);
     x.lineTo(c + arm, r);
     x.moveTo(c, r - arm);

@@ -1,29 +1,62 @@
-// Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region, the ray of a pixel. Places are
-// (column, row) of the full image; what was marked stays and is measured anew in every image.
-import { below, beside } from "./plot_axes.js";
-import { $, $canvas, $select, curve, field, fixed, parsed, setText, words } from "./dom.js";
+// Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region,
+// the ray of a pixel. Places are (column, row) of the full image; what was marked stays and is
+// measured anew in every image.
+import { along, curve } from "./plots.js";
+import { $, $select, field, fixed, parsed, setText, words } from "./dom.js";
 import type { Pair, Shown } from "./viewer.js";
 import { call } from "./link.js";
 
-const LOUPE = { radius: 72, times: 4 }, SAMPLES = 512;
+const LOUPE = { radius: 72, times: 4 };
+const SAMPLES = 512;
 type Places = number[];
-const HINTS: Record<string, string> = { pan: "", loupe: "", profile: "drag a line, or type its ends: column row column row", region: "drag a box, or type its corners: column row column row",
-  ray: "click a pixel, or type it: column row" };
+const HINTS: Record<string, string> = {
+  pan: "",
+  loupe: "",
+  profile: "drag a line, or type its ends: column row column row",
+  region: "drag a box, or type its corners: column row column row",
+  ray: "click a pixel, or type it: column row",
+};
 const shapes: Record<string, Places | null> = { profile: null, region: null, ray: null };
 const many = () => (tool === "ray" ? 2 : 4);
-let tool = "pan", drawing = false, redraw: () => void = () => {};
+let tool = "pan";
+let drawing = false;
+let redraw: () => void = () => {};
 
-const typed = field({ id: "measure-at", "aria-label": "Ends of the line, corners of the box, or the pixel: column row, column row" }, apply, () => { typed.classList.remove("typed"); redraw(); });
+const typed = field(
+  {
+    id: "measure-at",
+    "aria-label": "Ends of the line, corners of the box, or the pixel: column row, column row",
+  },
+  apply,
+  () => {
+    typed.classList.remove("typed");
+    redraw();
+  },
+);
 $("#measure-row").prepend(typed);
 function apply() {
-  const found = typed.value.trim().split(/[\s;]+|,\s+/).map(parsed);
-  if (found.length === many() && found.every(Number.isFinite)) { shapes[tool] = found.map(Math.round); typed.classList.remove("typed"); redraw(); }
-  else setText($("#measured"), `${many() === 2 ? "two" : "four"} numbers: ${HINTS[tool].split(": ")[1]}`);
+  const found = typed.value
+    .trim()
+    .split(/[\s;]+|,\s+/)
+    .map(parsed);
+  if (found.length === many() && found.every(Number.isFinite)) {
+    shapes[tool] = found.map(Math.round);
+    typed.classList.remove("typed");
+    redraw();
+  } else
+    setText(
+      $("#measured"),
+      `${many() === 2 ? "two" : "four"} numbers: ${HINTS[tool].split(": ")[1]}`,
+    );
 }
 
 export function start(again: () => void): void {
   redraw = again;
-  $select("#tool").addEventListener("change", () => { tool = $select("#tool").value; typed.classList.remove("typed"); again(); });
+  $select("#tool").addEventListener("change", () => {
+    tool = $select("#tool").value;
+    typed.classList.remove("typed");
+    again();
+  });
 }
 // Whether a press or a move of the pointer is the tool's, and not the picture's.
 export function press(place: Pair): boolean {
@@ -31,83 +64,170 @@ export function press(place: Pair): boolean {
   if (drawing) shapes[tool] = [...place, ...place].slice(0, many());
   return drawing;
 }
-export function drag(place: Pair): boolean { if (drawing) shapes[tool]?.splice(many() - 2, 2, ...place); return drawing; }
-export function release(): void { if (drawing) { drawing = false; redraw(); } }
+export function drag(place: Pair): boolean {
+  if (drawing) shapes[tool]?.splice(many() - 2, 2, ...place);
+  return drawing;
+}
+export function release(): void {
+  if (drawing) {
+    drawing = false;
+    redraw();
+  }
+}
 export const follows = (): boolean => tool === "loupe";
 
-// The pixels of a box whose corners are both within it: how many, mean, deviation, least and greatest.
+// The pixels of a box whose corners are both within it: how many, mean, deviation, least and
+// greatest.
 export function region(i: Shown, [c0, r0, c1, r1]: Places) {
-  const f = i.full[1] / i.shape[1], inside = (v: number, n: number) => Math.min(n - 1, Math.max(0, Math.floor((v + 0.5) / f)));
-  const [left, right] = [c0, c1].sort((a, b) => a - b).map((v) => inside(v, i.shape[1])), [top, bottom] = [r0, r1].sort((a, b) => a - b).map((v) => inside(v, i.shape[0]));
-  let n = 0, mean = 0, m2 = 0, low = Infinity, high = -Infinity;
-  for (let r = top; r <= bottom; r++) for (let c = left; c <= right; c++) {
-    const v = i.low + i.scale * i.pixels[r * i.shape[1] + c], d = v - mean;
-    n++; mean += d / n; m2 += d * (v - mean); low = Math.min(low, v); high = Math.max(high, v);
-  }
+  const f = i.full[1] / i.shape[1];
+  const inside = (v: number, n: number) =>
+    Math.min(n - 1, Math.max(0, Math.floor((v + 0.5) / f)));
+  const [left, right] = [c0, c1].sort((a, b) => a - b).map((v) => inside(v, i.shape[1]));
+  const [top, bottom] = [r0, r1].sort((a, b) => a - b).map((v) => inside(v, i.shape[0]));
+  let n = 0;
+  let mean = 0;
+  let m2 = 0;
+  let low = Infinity;
+  let high = -Infinity;
+  for (let r = top; r <= bottom; r++)
+    for (let c = left; c <= right; c++) {
+      const v = i.low + i.scale * i.pixels[r * i.shape[1] + c];
+      const d = v - mean;
+      n++;
+      mean += d / n;
+      m2 += d * (v - mean);
+      low = Math.min(low, v);
+      high = Math.max(high, v);
+    }
   return { n, mean, deviation: n > 1 ? Math.sqrt(m2 / (n - 1)) : NaN, low, high };
 }
-// The values along a line, from pixel centre to pixel centre, at most a pixel apart where they are few enough.
+// The values along a line, from pixel centre to pixel centre, at most a pixel apart where they
+// are few enough.
 type Value = (column: number, row: number) => number;
 export function profile(value: Value, [c0, r0, c1, r1]: Places): number[] {
   const n = Math.min(SAMPLES, Math.ceil(Math.hypot(c1 - c0, r1 - r0)) + 1);
-  return Array.from({ length: n }, (_, k) => { const t = n > 1 ? k / (n - 1) : 0; return value(Math.round(c0 + t * (c1 - c0)), Math.round(r0 + t * (r1 - r0))); });
+  return Array.from({ length: n }, (_, k) => {
+    const t = n > 1 ? k / (n - 1) : 0;
+    return value(Math.round(c0 + t * (c1 - c0)), Math.round(r0 + t * (r1 - r0)));
+  });
 }
 
 // Over the picture, in its coordinates; `unit` is a CSS pixel.
 export function draw(x: CanvasRenderingContext2D, unit: number): void {
-  for (const [name, colour] of [["profile", "#ffd54a"], ["region", "#7cf0ff"], ["ray", "#ff3ca0"]]) {
+  for (const [name, colour] of [
+    ["profile", "#ffd54a"],
+    ["region", "#7cf0ff"],
+    ["ray", "#ff3ca0"],
+  ]) {
     const s = shapes[name];
     if (!s || tool !== name) continue;
-    x.strokeStyle = colour; x.lineWidth = 1.5 * unit; x.beginPath();
-    if (name === "ray") { x.arc(s[0] + 0.5, s[1] + 0.5, 6 * unit, 0, 7); } else if (name === "profile") { x.moveTo(s[0] + 0.5, s[1] + 0.5); x.lineTo(s[2] + 0.5, s[3] + 0.5); } else {
-      const [left, right] = [s[0], s[2]].sort((a, b) => a - b), [top, bottom] = [s[1], s[3]].sort((a, b) => a - b);
+    x.strokeStyle = colour;
+    x.lineWidth = 1.5 * unit;
+    x.beginPath();
+    if (name === "ray") {
+      x.arc(s[0] + 0.5, s[1] + 0.5, 6 * unit, 0, 7);
+    } else if (name === "profile") {
+      x.moveTo(s[0] + 0.5, s[1] + 0.5);
+      x.lineTo(s[2] + 0.5, s[3] + 0.5);
+    } else {
+      const [left, right] = [s[0], s[2]].sort((a, b) => a - b);
+      const [top, bottom] = [s[1], s[3]].sort((a, b) => a - b);
       x.rect(left, top, right - left + 1, bottom - top + 1);
     }
     x.stroke();
   }
 }
-export function loupe(x: CanvasRenderingContext2D, buffer: HTMLCanvasElement, i: Shown, [c, r]: Pair, unit: number): void {
-  const radius = LOUPE.radius * unit, t = LOUPE.times;
-  x.save(); x.beginPath(); x.arc(c, r, radius, 0, 7); x.clip(); x.imageSmoothingEnabled = false;
-  x.fillStyle = "#05070a"; x.fillRect(c - radius, r - radius, 2 * radius, 2 * radius);
+export function loupe(
+  x: CanvasRenderingContext2D,
+  buffer: HTMLCanvasElement,
+  i: Shown,
+  [c, r]: Pair,
+  unit: number,
+): void {
+  const radius = LOUPE.radius * unit;
+  const t = LOUPE.times;
+  x.save();
+  x.beginPath();
+  x.arc(c, r, radius, 0, 7);
+  x.clip();
+  x.imageSmoothingEnabled = false;
+  x.fillStyle = "#05070a";
+  x.fillRect(c - radius, r - radius, 2 * radius, 2 * radius);
   x.drawImage(buffer, c - c * t, r - r * t, i.full[1] * t, i.full[0] * t);
   x.restore();
-  x.strokeStyle = "#cfe3ff"; x.lineWidth = 1.5 * unit; x.beginPath(); x.arc(c, r, radius, 0, 7); x.stroke();
+  x.strokeStyle = "#cfe3ff";
+  x.lineWidth = 1.5 * unit;
+  x.beginPath();
+  x.arc(c, r, radius, 0, 7);
+  x.stroke();
 }
 
 // The ray of a pixel of the live image at rest: a line in the scenes, and what it goes through.
-let rayed = "", through = "";
+let rayed = "";
+let through = "";
 function ray(i: Shown | null) {
-  const s = tool === "ray" && i && !i.recorded && !drawing && i.code === "deflate" ? shapes.ray : null, key = s && i ? `${s.join()} ${i.seq}` : "";
+  const s =
+    tool === "ray" && i && !i.recorded && !drawing && i.code === "deflate" ? shapes.ray : null;
+  const key = s && i ? `${s.join()} ${i.seq}` : "";
   if (key === rayed) return;
   if (rayed && !s) call("viewer.ray").catch(() => {});
-  rayed = key; through = s ? "…" : "";
-  if (s) void call("viewer.ray", { pixel: [s[0], s[1]] }).then(({ paths_mm, length_mm }) => {
-    const parts = Object.entries(paths_mm).filter(([, mm]) => mm > 1e-4).map(([name, mm]) => `${name} ${fixed(mm, 3)} mm`);
-    return `${parts.join(" · ") || "nothing in its way"} · ${fixed(length_mm, 1)} mm from the focal spot`;
-  }, words).then((said) => { if (rayed === key) { through = said; redraw(); } });
+  rayed = key;
+  through = s ? "…" : "";
+  if (s)
+    void call("viewer.ray", { pixel: [s[0], s[1]] })
+      .then(({ paths_mm, length_mm }) => {
+        const parts = Object.entries(paths_mm)
+          .filter(([, mm]) => mm > 1e-4)
+          .map(([name, mm]) => `${name} ${fixed(mm, 3)} mm`);
+        const met = parts.join(" · ") || "nothing in its way";
+        return `${met} · ${fixed(length_mm, 1)} mm from the focal spot`;
+      }, words)
+      .then((said) => {
+        if (rayed === key) {
+          through = said;
+          redraw();
+        }
+      });
 }
 
-const plot = $canvas("#profile");
+const host = $("#profile");
+const plot = curve(host);
 // What was marked, measured in this image.
 export function tell(i: Shown | null, value: Value): void {
-  const s = shapes[tool], marks = tool in shapes;
+  const s = shapes[tool];
+  const marks = tool in shapes;
   ray(i);
-  $("#measure-row").hidden = !marks; plot.hidden = tool !== "profile" || !s || !i;
+  $("#measure-row").hidden = !marks;
+  host.hidden = tool !== "profile" || !s || !i;
   if (!marks) return;
-  if (!typed.classList.contains("typed") && document.activeElement !== typed) typed.value = s ? s.join(" ") : "";
-  if (!s || !i) { setText($("#measured"), HINTS[tool]); return; }
-  if (tool === "ray") { setText($("#measured"), i.recorded ? "of live images only" : through || "at rest only"); return; }
-  const number = (v: number) => fixed(v, i.kind === "counts" ? 1 : 4);
-  if (tool === "region") {
-    const m = region(i, s), ratio = m.deviation > 0 ? ` · signal to noise ${fixed(m.mean / m.deviation, 1)}` : "";
-    setText($("#measured"), `mean ${number(m.mean)} ± ${number(m.deviation)} · ${number(m.low)} to ${number(m.high)} · ${m.n} pixels${ratio}`);
+  if (!typed.classList.contains("typed") && document.activeElement !== typed)
+    typed.value = s ? s.join(" ") : "";
+  if (!s || !i) {
+    setText($("#measured"), HINTS[tool]);
     return;
   }
-  const values = profile(value, s).filter(Number.isFinite), low = Math.min(...values), high = Math.max(...values);
-  if (!values.length) { setText($("#measured"), "outside the image"); return; }
-  setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(Math.hypot(s[2] - s[0], s[3] - s[1]), 1)} px`);
-  curve(plot, values, low, high);
-  beside(plot, low, high, i.kind === "counts" ? "counts" : "");
-  below(plot, 0, Math.hypot(s[2] - s[0], s[3] - s[1]), "px");
+  if (tool === "ray") {
+    setText($("#measured"), i.recorded ? "of live images only" : through || "at rest only");
+    return;
+  }
+  const number = (v: number) => fixed(v, i.kind === "counts" ? 1 : 4);
+  if (tool === "region") {
+    const m = region(i, s);
+    const ratio = m.deviation > 0 ? ` · signal to noise ${fixed(m.mean / m.deviation, 1)}` : "";
+    const mean = `mean ${number(m.mean)} ± ${number(m.deviation)}`;
+    const ends = `${number(m.low)} to ${number(m.high)}`;
+    setText($("#measured"), `${mean} · ${ends} · ${m.n} pixels${ratio}`);
+    return;
+  }
+  const values = profile(value, s).filter(Number.isFinite);
+  const low = Math.min(...values);
+  const high = Math.max(...values);
+  if (!values.length) {
+    setText($("#measured"), "outside the image");
+    return;
+  }
+  const length_px = Math.hypot(s[2] - s[0], s[3] - s[1]);
+  setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(length_px, 1)} px`);
+  const of = i.kind === "counts" ? "counts" : "−log T";
+  plot.draw({ places: along(length_px, values.length), values, unit: "px", of });
 }

@@ -34,8 +34,8 @@ const TIPS: Record<string, string | undefined> = {
   "axis column": "Column in which the rotation axis appears",
 };
 const cells = [...ROWS.map(([name]) => name), "beam"].map((name) => {
-  const dd = el("dd"),
-    tip = TIPS[name];
+  const dd = el("dd");
+  const tip = TIPS[name];
   $("#readouts").append(el("dt", {}, tip ? term(name, tip) : name), dd);
   return dd;
 });

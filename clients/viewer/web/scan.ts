@@ -34,17 +34,17 @@ import * as designer from "./designer.js";
 import { isOver } from "./job_words.js";
 import { wished } from "./scan_wish.js";
 
-const text = $<HTMLTextAreaElement>("#script"),
-  gutter = $("#gutter"),
-  ink = $("#paint div"),
-  LINE_PX = 16;
-let written = [""],
-  worst = new Map<number, "hit" | "soft">(),
-  problems: Problem[] = [],
-  plan: (Lanes & PlanDocument) | null = null,
-  planned = "",
-  lost = false,
-  sent = "";
+const text = $<HTMLTextAreaElement>("#script");
+const gutter = $("#gutter");
+const ink = $("#paint div");
+const LINE_PX = 16;
+let written = [""];
+let worst = new Map<number, "hit" | "soft">();
+let problems: Problem[] = [];
+let plan: (Lanes & PlanDocument) | null = null;
+let planned = "";
+let lost = false;
+let sent = "";
 
 designer.place($("#tab-scan .card"));
 clicks({
@@ -83,8 +83,8 @@ const said = (line: number) =>
 // The lines in sight, under the text itself, which is transparent: component, command, values,
 // comments.
 function paint() {
-  const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1),
-    count = Math.ceil(text.clientHeight / LINE_PX) + 2;
+  const first = Math.max(0, Math.floor(text.scrollTop / LINE_PX) - 1);
+  const count = Math.ceil(text.clientHeight / LINE_PX) + 2;
   ink.replaceChildren(
     ...written
       .slice(first, first + count)
@@ -163,8 +163,8 @@ export function setScript(value: string): void {
 }
 export function goTo(line: number | null): void {
   if (!line) return;
-  const lines = text.value.split("\n"),
-    start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
+  const lines = text.value.split("\n");
+  const start = lines.slice(0, line - 1).reduce((n, l) => n + l.length + 1, 0);
   text.focus();
   text.setSelectionRange(start, start + (lines[line - 1]?.length ?? 0));
   text.scrollTop = Math.max(0, (line - 5) * 16);
@@ -194,8 +194,8 @@ on("design", () => {
 });
 // What stands elsewhere than a scan's script would put it may be meant so.
 function offer(moved: Record<string, Pair>, kept: string[]) {
-  const axes = Object.entries(moved),
-    unit = (axis: string) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
+  const axes = Object.entries(moved);
+  const unit = (axis: string) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");
   if (kept.length)
     $("#report").prepend(el("div", { id: "kept" }, `kept where it stands: ${kept.join(", ")}`));
   if (!axes.length) return;
@@ -453,9 +453,9 @@ function bring(script: string) {
 }
 on("script", bring);
 
-let asking = false,
-  next: [number | null] | null = null,
-  at: number | null = null;
+let asking = false;
+let next: [number | null] | null = null;
+let at: number | null = null;
 export async function scrub(time: number | null): Promise<void> {
   at = time;
   next = [time];
@@ -477,8 +477,8 @@ function redraw() {
     at,
     store.job && !isOver(store.job) ? store.job.elapsed_s : null,
   );
-  const now = at,
-    step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
+  const now = at;
+  const step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
   $("#scrub-at").textContent =
     at === null
       ? `${seconds(plan.duration_s)} in all`

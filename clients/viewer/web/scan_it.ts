@@ -25,7 +25,9 @@ let mine: string | null = null;
 let busy = false;
 
 // Size of what turns, across and upright, in mm; null where nobody has said it.
-function turning({ sample: { size_mm: size } }: State): [across: number, upright: number] | null {
+function turning({
+  sample: { size_mm: size },
+}: State): [across: number, upright: number] | null {
   return size ? [Math.hypot(size[0], size[1]), size[2]] : null;
 }
 // The voxel size [um] at which the sample fills the image.
@@ -63,7 +65,8 @@ export async function scanIt(named: string = sample.value): Promise<string | nul
   go.disabled = true;
   try {
     const other = named && named !== store.state?.sample.name;
-    if (other && !(await command("sample.set", { name: named }, "The sample stays"))) return null;
+    if (other && !(await command("sample.set", { name: named }, "The sample stays")))
+      return null;
     const state = await call("state.get").catch(() => null);
     const made = state && (await script(state));
     const asked = made && { text: made.text, speed_up: "max" as const };

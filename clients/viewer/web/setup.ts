@@ -3,10 +3,8 @@ import {
   $,
   $$,
   $button,
-  $canvas,
   $input,
   $select,
-  cleared,
   clicks,
   el,
   fixed,
@@ -25,9 +23,10 @@ import type {
 } from "./viewer.js";
 import { differences, listed, only, type Fingerprint } from "./fingerprint.js";
 import { call, command, emit, on, store } from "./link.js";
+import { curve } from "./plots.js";
 
-const ROI = ["l", "t", "r", "b"],
-  SIX = ["x", "y", "z", "rx", "ry", "rz"] as const;
+const ROI = ["l", "t", "r", "b"];
+const SIX = ["x", "y", "z", "rx", "ry", "rz"] as const;
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
 for (const input of $$<HTMLInputElement>("#tab-setup .num")) {
   numeric(
@@ -59,8 +58,9 @@ clicks({
 const of = (id: string) => $<HTMLInputElement | HTMLSelectElement>(`#${id}`);
 const typed = (id: string) => $(`#${id}`).classList.contains("typed");
 function put(id: string, value: number | string | null, digits = 0) {
-  const input = of(id),
-    text = typeof value === "number" ? String(Number(value.toFixed(digits))) : (value ?? "");
+  const input = of(id);
+  const text =
+    typeof value === "number" ? String(Number(value.toFixed(digits))) : (value ?? "");
   input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
   if (typed(id) || input.value === text) return;
   if (input instanceof HTMLSelectElement && ![...input.options].some((o) => o.value === text))
@@ -73,11 +73,11 @@ function takeBack(...ids: string[]) {
 }
 // The numbers of some fields; null, and they show the state again, if one is none.
 function numbers(...ids: string[]) {
-  const values = ids.map((id) => parsed(of(id).value)),
-    wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
+  const values = ids.map((id) => parsed(of(id).value));
+  const wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
   for (const id of wrong) {
-    const input = of(id),
-      name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
+    const input = of(id);
+    const name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
     emit("note", "error", "Not applied", `${name}: “${input.value}” is not a number`);
   }
   takeBack(...wrong);
@@ -96,19 +96,19 @@ async function apply<M extends "tube.set" | "camera.set">(
   fields: Record<string, string | string[]>,
   title: string,
 ) {
-  const params: Record<string, unknown> = {},
-    ids = Object.values(fields).flat();
+  const params: Record<string, unknown> = {};
+  const ids = Object.values(fields).flat();
   for (const [name, its] of Object.entries(fields)) {
     const some = [its].flat();
     if (!some.some(typed)) continue;
-    const list = of(some[0]),
-      values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
+    const list = of(some[0]);
+    const values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
     if (!values) return;
     params[name] = Array.isArray(its) ? values : values[0];
   }
   if (!Object.keys(params).length) return;
-  const same = untouched(ids),
-    taken = await command(method, params as Requests[M], title);
+  const same = untouched(ids);
+  const taken = await command(method, params as Requests[M], title);
   if (taken)
     for (const id of same()) $(`#${id}`).classList.remove("typed"); // the state comes by itself
   else takeBack(...same());
@@ -129,16 +129,16 @@ function setCamera() {
   );
 }
 async function setSample() {
-  const ids = SIX.map((k) => `off-${k}`),
-    values = numbers(...ids);
+  const ids = SIX.map((k) => `off-${k}`);
+  const values = numbers(...ids);
   if (!values) return;
   const offset: Placement = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
-  const same = untouched(["sample", ...ids]),
-    answer = await command(
-      "sample.set",
-      { name: $select("#sample").value, offset },
-      "The sample stays",
-    );
+  const same = untouched(["sample", ...ids]);
+  const answer = await command(
+    "sample.set",
+    { name: $select("#sample").value, offset },
+    "The sample stays",
+  );
   if (answer) for (const id of same()) $(`#${id}`).classList.remove("typed");
   else takeBack(...same());
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", "Sample", warning);
@@ -161,8 +161,8 @@ async function deleteSample() {
 export async function list(): Promise<void> {
   const answer = await call("sample.list").catch(() => null);
   if (!answer) return;
-  const select = $select("#sample"),
-    chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");
+  const select = $select("#sample");
+  const chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");
   select.textContent = "";
   for (const s of answer.samples)
     select.append(
@@ -226,6 +226,7 @@ function outdatePrediction(): void {
   predicted = null;
   setText($("#predicted"), `made for another ${listed(differ)}: predict again`);
 }
+const beam = curve($("#spectrum"), true);
 let spectrumOf: number | null = null;
 async function spectrum(kV: number) {
   if (spectrumOf === kV || $("#tab-setup").hidden) return;
@@ -236,8 +237,6 @@ async function spectrum(kV: number) {
     PHYSICS[kind] ?? "This twin does not say how it makes its images.";
   const s = await call("viewer.spectrum", { kV }).catch(words);
   if (spectrumOf !== kV) return;
-  const canvas = $canvas("#spectrum"),
-    [x, w, h] = cleared(canvas);
   if (typeof s === "string") {
     $("#filters").textContent = "–";
     $("#spectrum-note").textContent = s;
@@ -250,14 +249,9 @@ async function spectrum(kV: number) {
   const used = kind === "ideal" ? " · not used by this physics" : "";
   $("#spectrum-note").textContent =
     `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
-  const most = Math.max(...s.photons),
-    last = Math.max(kV, 1);
-  x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent");
-  x.beginPath();
-  x.moveTo(0, h);
-  s.photons.forEach((n, k) => x.lineTo((w * s.energy_keV[k]) / last, h - ((h - 2) * n) / most));
-  x.lineTo(w, h);
-  x.fill();
+  const places = s.energy_keV.filter((keV) => keV <= Math.max(kV, 1));
+  const values = s.photons.slice(0, places.length);
+  beam.draw({ places, values, unit: "keV", of: "photons" });
 }
 on("tab", () => {
   if (store.state) void spectrum(store.state.tube.kV);
@@ -274,8 +268,8 @@ function show(state: State) {
   void spectrum(state.tube.kV);
   put("kV", state.tube.kV, 2);
   put("power", state.tube.power_W, 2);
-  const xrays = $button("#beam"),
-    { on, ready } = state.tube;
+  const xrays = $button("#beam");
+  const { on, ready } = state.tube;
   xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "Switch X-rays on";
   xrays.classList.toggle("beam-on", on);
   xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";

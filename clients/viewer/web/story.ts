@@ -25,13 +25,19 @@ const TRUTH: Record<string, Offset> = {
   dS_x: ["source aside", "mm", 1, 0, "edges double, as of the axis"],
 };
 const STEPS: Array<[id: string, button: string, says: string]> = [
-  ["story-bend", "1  Misalign",
-    "Choose how wrong the geometry is; the bead phantom goes onto the stage."],
+  [
+    "story-bend",
+    "1  Misalign",
+    "Choose how wrong the geometry is; the bead phantom goes onto the stage.",
+  ],
   ["story-scan", "2  Scan it", "One turn, reconstructed with the wrong geometry."],
   ["story-fit", "3  Calibrate", "The phantom's beads tell where axis, panel and source are."],
   ["story-apply", "4  Apply", "What was found comes into force."],
-  ["story-again", "5  Scan it again",
-    "The same turn, the right geometry. Share it from the volume."],
+  [
+    "story-again",
+    "5  Scan it again",
+    "The same turn, the right geometry. Share it from the volume.",
+  ],
 ];
 let step = 0;
 let job: string | null = null;
@@ -42,20 +48,38 @@ const rms: number[] = [];
 
 const slider = (name: string) => $<HTMLInputElement>(`#story-${name}`);
 const [first] = STEPS[0];
-const card = el("details", { class: "card", id: "story" },
+const card = el(
+  "details",
+  { class: "card", id: "story" },
   el("summary", {}, "Misalign: what a wrong geometry does, in five steps"),
   ...Object.entries(TRUTH).map(([name, [what, unit, most, start, does]]) =>
-    el("div", { title: does },
-      el("label", { for: `story-${name}` }, `${what} `,
-        el("output", { id: `story-${name}-is`, class: "mono" }), ` ${unit}`),
+    el(
+      "div",
+      { title: does },
+      el(
+        "label",
+        { for: `story-${name}` },
+        `${what} `,
+        el("output", { id: `story-${name}-is`, class: "mono" }),
+        ` ${unit}`,
+      ),
       el("input", {
-        type: "range", id: `story-${name}`, min: -most, max: most, step: most / 50, value: start,
+        type: "range",
+        id: `story-${name}`,
+        min: -most,
+        max: most,
+        step: most / 50,
+        value: start,
         oninput: () => says(),
-      }))),
+      }),
+    ),
+  ),
   ...STEPS.map(([id, button]) =>
-    el("button", { id, class: "small", disabled: id !== first }, button)),
+    el("button", { id, class: "small", disabled: id !== first }, button),
+  ),
   el("div", { id: "story-says", class: "small-text", "aria-live": "polite" }),
-  el("div", { id: "story-found", class: "small-text mono" }));
+  el("div", { id: "story-found", class: "small-text mono" }),
+);
 $("#tab-calibrate").prepend(card);
 
 function chosen(): Record<string, number> {
@@ -111,7 +135,10 @@ async function fit(): Promise<void> {
   show("Finding beads in all images …");
   const asked = { datasets: [dataset], phantom: PHANTOM, free: FREE };
   const report = await call("calibration.fit", asked).catch((error: unknown) => words(error));
-  if (typeof report === "string") { failed(report); return; }
+  if (typeof report === "string") {
+    failed(report);
+    return;
+  }
   const { correction } = report;
   if (!correction || !report.identifiable) {
     failed(`Nothing is applied: ${report.verdict}`);
@@ -124,7 +151,11 @@ async function fit(): Promise<void> {
     const seen = one
       ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}`
       : "not estimated: back to nominal";
-    return el("div", {}, `${what}: told ${fixed(slider(name).valueAsNumber, 2)} ${unit}, ${seen}`);
+    return el(
+      "div",
+      {},
+      `${what}: told ${fixed(slider(name).valueAsNumber, 2)} ${unit}, ${seen}`,
+    );
   });
   $("#story-found").replaceChildren(...rows);
   next();
@@ -145,7 +176,10 @@ on("job", (told: JobStatus) => {
 on("volume", (volume) => {
   if (!waiting || !volume.past || volume.name !== dataset) return;
   const problem = volume.problem ?? volume.not_compared;
-  if (problem) { failed(problem); return; }
+  if (problem) {
+    failed(problem);
+    return;
+  }
   if (!volume.compared) return;
   rms.push(Object.values(volume.compared)[0].rms);
   next();

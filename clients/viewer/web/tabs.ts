@@ -35,9 +35,9 @@ export function tab(name: string, step = false): void {
   emit("tab", name);
 }
 $("#tabs").addEventListener("keydown", (e) => {
-  const all = $$("#tabs button"),
-    i = all.indexOf(e.target as HTMLElement),
-    step = e.key === "ArrowRight" ? 1 : e.key === "ArrowLeft" ? -1 : 0;
+  const all = $$("#tabs button");
+  const i = all.indexOf(e.target as HTMLElement);
+  const step = e.key === "ArrowRight" ? 1 : e.key === "ArrowLeft" ? -1 : 0;
   const next = step
     ? all.at((i + step) % all.length)
     : e.key === "Home"

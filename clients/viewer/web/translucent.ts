@@ -33,15 +33,23 @@
     depthMask.call(context, true);
   }
   gl.drawElements = function (...all) {
-    withoutDepth(this, () => { drawElements.apply(this, all); });
+    withoutDepth(this, () => {
+      drawElements.apply(this, all);
+    });
   };
   gl.drawArrays = function (...all) {
-    withoutDepth(this, () => { drawArrays.apply(this, all); });
+    withoutDepth(this, () => {
+      drawArrays.apply(this, all);
+    });
   };
   gl.drawElementsInstanced = function (...all) {
-    withoutDepth(this, () => { drawElementsInstanced.apply(this, all); });
+    withoutDepth(this, () => {
+      drawElementsInstanced.apply(this, all);
+    });
   };
   gl.drawArraysInstanced = function (...all) {
-    withoutDepth(this, () => { drawArraysInstanced.apply(this, all); });
+    withoutDepth(this, () => {
+      drawArraysInstanced.apply(this, all);
+    });
   };
 })();

@@ -4,47 +4,69 @@ import type { View } from "./viewer.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 
-const NAMES: Record<View, string> = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
+const NAMES: Record<View, string> = {
+  iso: "Isometric",
+  beam: "Beam’s eye",
+  side: "Side",
+  free: "Free",
+};
 type Layout = View | "four" | "none";
-interface Frame { box: HTMLElement; iframe: HTMLIFrameElement; crop?: HTMLElement; tag: HTMLElement; src: string; sample?: HTMLImageElement }
+interface Frame {
+  box: HTMLElement;
+  iframe: HTMLIFrameElement;
+  crop?: HTMLElement;
+  tag: HTMLElement;
+  src: string;
+  sample?: HTMLImageElement;
+}
 const open = new Map<View, Frame>();
-$("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
+$("#view-switch").append(
+  ...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) =>
+    el("button", { "data-layout": name, onclick: () => layout(name, true) }, words),
+  ),
+);
 export let current: Layout | null = null;
 
 // Without a graphics processor every picture costs processor time that the radiograph needs more.
 const query = new URLSearchParams(location.search);
 export let webgl = true;
 export const software = (() => {
-  const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const gl = document.createElement("canvas").getContext("webgl");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
   const name = gl && info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
   webgl = Boolean(gl);
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
 })();
-// With one the scenes have shadows and an environment that shines in metal; `?light=fine` or `plain` says otherwise.
+// With one the scenes have shadows and an environment that shines in metal; `?light=fine` or
+// `plain` says otherwise.
 export const fine = query.has("light") ? query.get("light") === "fine" : !software;
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
 
-// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
-// with the machine.
+// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's
+// eye has none: it moves with the machine.
 async function preset(view: View, box: HTMLElement): Promise<string> {
   if (view === "beam") return "";
   const aspect = Math.min(20, Math.max(0.05, box.clientWidth / Math.max(1, box.clientHeight)));
   const camera = await call("viewer.preset", { view, aspect }).catch(() => null);
   if (!camera?.position || !camera.look_at || !camera.fov) return "";
   const { position, look_at, fov } = camera;
-  return `initialCameraPosition=${position.join()}&initialCameraLookAt=${look_at.join()}&initialCameraFov=${fov}&`;
+  const from = `initialCameraPosition=${position.join()}`;
+  return `${from}&initialCameraLookAt=${look_at.join()}&initialCameraFov=${fov}&`;
 }
 async function start({ box, iframe, src }: Frame, view: View): Promise<void> {
   const found = await preset(view, box);
-  if (open.get(view)?.iframe === iframe && !iframe.src) iframe.src = src.replace("?", `?${found}`);
+  if (open.get(view)?.iframe === iframe && !iframe.src)
+    iframe.src = src.replace("?", `?${found}`);
 }
 
 function frame(view: View): Frame {
   const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
   const iframe = el("iframe", { title: NAMES[view] });
-  iframe.addEventListener("load", () => { if (iframe.contentWindow) emit("frame", iframe.contentWindow); }); // keys.js listens in it, too
+  iframe.addEventListener("load", () => {
+    if (iframe.contentWindow) emit("frame", iframe.contentWindow);
+  }); // keys.js listens in it, too
   const tag = el("span", { class: "tag" }, NAMES[view]);
   const box = el("div", { class: "view", "data-view": view });
   if (view === "beam") {
@@ -52,30 +74,60 @@ function frame(view: View): Frame {
     box.append(crop, tag);
     return { box, iframe, crop, tag, src };
   }
-  const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
+  const home = el(
+    "button",
+    {
+      class: "home",
+      title: "Back to this view's preset",
+      onclick: () => call("viewer.camera", { view }),
+    },
+    "⌂",
+  );
   const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
   box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
   const sample = el("img", { alt: "" });
-  sample.addEventListener("error", () => { sample.hidden = true; });
-  sample.addEventListener("load", () => { sample.hidden = false; });
-  box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample));
+  sample.addEventListener("error", () => {
+    sample.hidden = true;
+  });
+  sample.addEventListener("load", () => {
+    sample.hidden = false;
+  });
+  box.append(
+    el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample),
+  );
   return { box, iframe, tag, src, sample };
 }
 const closer = (view: View) => call("viewer.camera", { view, sample: true }).catch(() => {});
-export function nearSample(): void { for (const view of open.keys()) if (view !== "beam") void closer(view); }
+export function nearSample(): void {
+  for (const view of open.keys()) if (view !== "beam") void closer(view);
+}
 
-// What the viewer computes: the view until its frame has drawn the machine, and the sample, large, beside it.
-declare global { interface Window { still: (image: HTMLImageElement, view: string, size: { clientWidth: number; clientHeight: number }) => void } }
-const still = $<HTMLImageElement>("#still"), CLOSE_UP_MS = 700;
+// What the viewer computes: the view until its frame has drawn the machine, and the sample,
+// large, beside it.
+declare global {
+  interface Window {
+    still: (
+      image: HTMLImageElement,
+      view: string,
+      size: { clientWidth: number; clientHeight: number },
+    ) => void;
+  }
+}
+const still = $<HTMLImageElement>("#still");
+const CLOSE_UP_MS = 700;
 const STILL_AGAIN_MS = 1000;
 let live = false;
 // A busy server answers late with no picture: ask again until a frame has drawn the scene.
 function missing(): void {
   still.hidden = true;
-  setTimeout(() => { if (!live) window.still(still, window.firstView, $("#views")); }, STILL_AGAIN_MS);
+  setTimeout(() => {
+    if (!live) window.still(still, window.firstView, $("#views"));
+  }, STILL_AGAIN_MS);
 }
 still.addEventListener("error", missing);
-still.addEventListener("load", () => { still.hidden = live; });
+still.addEventListener("load", () => {
+  still.hidden = live;
+});
 if (still.complete && !still.naturalWidth) missing();
 window.addEventListener("message", (e) => {
   for (const { box, iframe } of open.values()) {
@@ -85,16 +137,26 @@ window.addEventListener("message", (e) => {
     still.hidden = true;
   }
 });
-let posed = "", seenAt = -Infinity;
+let posed = "";
+let seenAt = -Infinity;
 on("state", (s) => {
-  const now = JSON.stringify([s.sample, s.correction, store.layers, store.opacity, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
+  const now = JSON.stringify([
+    s.sample,
+    s.correction,
+    store.layers,
+    store.opacity,
+    Object.values(s.axes).map((a) => a.position.toFixed(1)),
+    document.documentElement.dataset.theme,
+  ]);
   if (now === posed || performance.now() < seenAt + CLOSE_UP_MS) return;
-  posed = now; seenAt = performance.now();
+  posed = now;
+  seenAt = performance.now();
   closeUps();
 });
 // The sample in each pane, close up: what holds source and detector shows it small.
 function closeUps() {
-  for (const { sample } of open.values()) if (sample?.parentElement) window.still(sample, "sample", sample.parentElement);
+  for (const { sample } of open.values())
+    if (sample?.parentElement) window.still(sample, "sample", sample.parentElement);
 }
 
 // Without WebGL there are no scenes; all the rest works.
@@ -102,7 +164,13 @@ function bare() {
   document.body.dataset.webgl = "none";
   live = true;
   still.hidden = true;
-  $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
+  $("#views").replaceChildren(
+    el(
+      "p",
+      { class: "bare muted" },
+      "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without.",
+    ),
+  );
   for (const button of $$<HTMLButtonElement>("#view-switch button")) button.disabled = true;
 }
 
@@ -111,40 +179,73 @@ export function layout(asked: string, step = false): void {
   if (which === current) return;
   remember({ view: which }, step);
   current = which;
-  if (!webgl) { bare(); return; }
-  const wanted: View[] = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
+  if (!webgl) {
+    bare();
+    return;
+  }
+  const wanted: View[] =
+    which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
   const views = $("#views");
-  if (views.childElementCount && wanted.length === 1 && which !== "beam" && !open.has(wanted[0])) { still.hidden = false; window.still(still, which, views); }
-  else if (wanted.length !== 1 || which === "beam") still.hidden = true;
+  if (
+    views.childElementCount &&
+    wanted.length === 1 &&
+    which !== "beam" &&
+    !open.has(wanted[0])
+  ) {
+    still.hidden = false;
+    window.still(still, which, views);
+  } else if (wanted.length !== 1 || which === "beam") still.hidden = true;
   views.dataset.layout = which;
-  for (const [view, parts] of open) if (!wanted.includes(view)) { parts.box.remove(); open.delete(view); }
+  for (const [view, parts] of open)
+    if (!wanted.includes(view)) {
+      parts.box.remove();
+      open.delete(view);
+    }
   for (const view of wanted) {
     const parts = open.get(view) ?? frame(view);
     open.set(view, parts);
     if (!parts.box.isConnected) views.append(parts.box);
   }
   for (const [view, parts] of open) if (!parts.iframe.src) void start(parts, view);
-  for (const button of $$("#view-switch button")) button.setAttribute("aria-pressed", String(button.dataset.layout === which));
+  for (const button of $$("#view-switch button"))
+    button.setAttribute("aria-pressed", String(button.dataset.layout === which));
   localStorage.setItem("flexdt-layout", which);
   closeUps();
   fit(true);
 }
 
 let last = "";
-// Size and place the beam's frame so that the detector's image fills the crop, whatever the piercing point.
+// Size and place the beam's frame so that the detector's image fills the crop, whatever the
+// piercing point.
 export function fit(force = false): void {
-  const parts = open.get("beam"), f = store.framing;
+  const parts = open.get("beam");
+  const f = store.framing;
   if (!parts?.crop || !f) return;
   const { clientWidth: w, clientHeight: h } = parts.box;
   const key = JSON.stringify([f, w, h]);
   if (!force && key === last) return;
   last = key;
   const width = Math.max(40, Math.min(w - 24, (h - 24) / f.aspect));
-  const set = (node: HTMLElement, values: Record<string, number>) => { for (const [k, v] of Object.entries(values)) node.style.setProperty(k, `${v}px`); };
-  set(parts.crop, { width, height: width * f.aspect, left: (w - width) / 2, top: (h - width * f.aspect) / 2 });
-  set(parts.iframe, { width: f.width * width, height: f.height * width, left: -f.left * width, top: -f.top * width });
+  const set = (node: HTMLElement, values: Record<string, number>) => {
+    for (const [k, v] of Object.entries(values)) node.style.setProperty(k, `${v}px`);
+  };
+  set(parts.crop, {
+    width,
+    height: width * f.aspect,
+    left: (w - width) / 2,
+    top: (h - width * f.aspect) / 2,
+  });
+  set(parts.iframe, {
+    width: f.width * width,
+    height: f.height * width,
+    left: -f.left * width,
+    top: -f.top * width,
+  });
   parts.tag.textContent = f.exact ? "Beam’s eye" : "Beam’s eye (oblique)";
 }
 
 on("state", () => fit());
-new ResizeObserver(() => { fit(); posed = ""; }).observe($("#views"));
+new ResizeObserver(() => {
+  fit();
+  posed = "";
+}).observe($("#views"));

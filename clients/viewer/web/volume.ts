@@ -1,7 +1,21 @@
-// A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes it. It comes here as a whole, as slices that
-// scroll and in three dimensions, and beside the truth of its sample.
-import { below, beside as valuesBeside } from "./plot_axes.js";
-import { $, $button, $canvas, $input, $select, bars, cleared, clicks, curve, el, fixed, keep, setText, slid, words } from "./dom.js";
+// A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes
+// it. It comes here as a whole, as slices that scroll and in three dimensions, and beside the
+// truth of its sample.
+import { along, curve, histogram } from "./plots.js";
+import {
+  $,
+  $button,
+  $canvas,
+  $input,
+  $select,
+  clicks,
+  el,
+  fixed,
+  keep,
+  setText,
+  slid,
+  words,
+} from "./dom.js";
 import { call, on, store } from "./link.js";
 import type { Block, Figures, Live, Name, Pair, Vector, VolumeMessage } from "./viewer.js";
 import { folder } from "./data.js";
@@ -11,57 +25,127 @@ import { shared } from "./shared.js";
 import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
 
-const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
-const SHOWN: Record<Name, string> = { volume: "volume", sigma: "noise (standard deviation)", bias_bound: "bound of the bias", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
-const size = $select("#volume-side"), note = $("#volume-note"), progress = $<HTMLProgressElement>("#volume-progress"), shown = $select("#volume-shown");
-const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), ends = [$input("#volume-low"), $input("#volume-high")] as const, level = $input("#volume-level");
+const KEY = "flexdt-volume";
+const STARTING = "starting; dark, flat and a first image are needed";
+const EXACT_MS = 60;
+const SHOWN: Record<Name, string> = {
+  volume: "volume",
+  sigma: "noise (standard deviation)",
+  bias_bound: "bound of the bias",
+  other: "the other geometry",
+  truth: "truth of the sample",
+  difference: "volume − truth",
+};
+const size = $select("#volume-side");
+const note = $("#volume-note");
+const progress = $<HTMLProgressElement>("#volume-progress");
+const shown = $select("#volume-shown");
+const histogramHost = $("#volume-histogram");
+const chart = histogram(histogramHost);
+const profileHost = $("#volume-profile");
+const plot = curve(profileHost);
+const ends = [$input("#volume-low"), $input("#volume-high")] as const;
+const level = $input("#volume-level");
 size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 
 // The past scan whose volume is wanted; else it is the running one's.
-let past: string | null = null, asked: string | null = null, told: VolumeMessage | null = null, pointer: Vector | null = null, of: Live = {}, wanting = false, late = false, comparing = false;
+let past: string | null = null;
+let asked: string | null = null;
+let told: VolumeMessage | null = null;
+let pointer: Vector | null = null;
+let of: Live = {};
+let wanting = false;
+let late = false;
+let comparing = false;
 const blocks = new Map<string, Block>();
-const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
-let tried = false, solid: Exclude<ReturnType<typeof raycast>, string> | null = null;
+const three = slices(
+  { top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") },
+  point,
+  () => {
+    solid?.cross(three.cross);
+    drawProfile();
+  },
+);
+let tried = false;
+let solid: Exclude<ReturnType<typeof raycast>, string> | null = null;
 
 function ask() {
-  const running = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null, name = past ?? running, wish = size.value && name ? `${name} ${size.value} ${past ? "past" : ""}` : "";
+  const running = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null;
+  const name = past ?? running;
+  const wish = size.value && name ? `${name} ${size.value} ${past ? "past" : ""}` : "";
   if (wish === (asked ?? "")) return;
   const before = asked;
-  asked = wish; told = null; comparing = false;
+  asked = wish;
+  told = null;
+  comparing = false;
   // The folder comes a moment after the job: what is refused is asked again.
   of = { name, side: Number(size.value) as 128, past: past !== null };
-  if (wish || before) call("viewer.live", wish ? of : {}).catch((error: unknown) => {
-    if (asked !== wish) return;
-    setText(note, words(error));
-    setTimeout(() => { if (asked === wish) { asked = null; ask(); } }, 1000);
-  });
+  if (wish || before)
+    call("viewer.live", wish ? of : {}).catch((error: unknown) => {
+      if (asked !== wish) return;
+      setText(note, words(error));
+      setTimeout(() => {
+        if (asked === wish) {
+          asked = null;
+          ask();
+        }
+      }, 1000);
+    });
   forget();
-  progress.hidden = past === null; progress.value = 0; $button("#volume-cancel").hidden = past === null; setText($button("#volume-cancel"), "Cancel");
+  progress.hidden = past === null;
+  progress.value = 0;
+  $button("#volume-cancel").hidden = past === null;
+  setText($button("#volume-cancel"), "Cancel");
   setText($("#volume-title"), past ? `Volume of ${past}` : wish ? "Volume so far" : "Volume");
   setText(note, !wish ? "" : past ? "reading the images …" : STARTING);
 }
 function forget() {
-  blocks.clear(); three.show(null); kept = null;
-  three.beside = null; solid?.beside(null); $("#volume-beside").hidden = true;
+  blocks.clear();
+  three.show(null);
+  kept = null;
+  three.beside = null;
+  solid?.beside(null);
+  $("#volume-beside").hidden = true;
   for (const id of [".slices", "#volume-tools", "#volume-large"]) $(id).hidden = true;
   $("#volume-compared").textContent = "";
   offer(["volume"]);
   large(false);
 }
-function choose() { if (!size.value) past = null; if (!past) keep(KEY, size.value); ask(); }
-function cancel() { past = null; size.value = localStorage.getItem(KEY) ?? ""; ask(); }
-function large(to: boolean) { document.body.classList.toggle("whole", to); $("#volume-large").ariaPressed = String(to); three.draw(); solid?.draw(); }
+function choose() {
+  if (!size.value) past = null;
+  if (!past) keep(KEY, size.value);
+  ask();
+}
+function cancel() {
+  past = null;
+  size.value = localStorage.getItem(KEY) ?? "";
+  ask();
+}
+function large(to: boolean) {
+  document.body.classList.toggle("whole", to);
+  $("#volume-large").ariaPressed = String(to);
+  three.draw();
+  solid?.draw();
+}
 // With `compared` the truth is asked for as soon as the volume is there.
-let thenCompare = false, reveal = false, kept: Pair | null = null;
+let thenCompare = false;
+let reveal = false;
+let kept: Pair | null = null;
 export function reconstruct(name: string, compared = false): void {
-  past = name; thenCompare = compared;
+  past = name;
+  thenCompare = compared;
   if (!size.value || size.value === "128") size.value = "256";
   reveal = true;
   ask();
   $("#volume-card").scrollIntoView({ block: "nearest" });
 }
-export function watch(): void { size.value ||= "128"; past = null; reveal = true; ask(); }
+export function watch(): void {
+  size.value ||= "128";
+  past = null;
+  reveal = true;
+  ask();
+}
 on("reconstruct", (name) => reconstruct(name));
 on("job", (job) => {
   ask();
@@ -69,27 +153,51 @@ on("job", (job) => {
     setText(note, `the scan has ended (${job.state}) before its first slices`);
   }
 });
-on("state", (s) => { if (s.job) ask(); });
-on("open", () => { asked = null; });
+on("state", (s) => {
+  if (s.job) ask();
+});
+on("open", () => {
+  asked = null;
+});
 
 on("volume", (m) => {
   if (!asked?.startsWith(`${m.name} `) || m.past !== (past !== null)) return;
-  if (m.problem) { setText(note, m.problem); progress.hidden = true; return; }
+  if (m.problem) {
+    setText(note, m.problem);
+    progress.hidden = true;
+    return;
+  }
   told = m;
-  const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `, working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
+  const other =
+    m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
+  const working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
   progress.hidden = m.past ? m.done === 1 && !working : true;
-  progress.value = working ? m.comparing ?? 0 : m.done ?? 0;
-  if (!m.size) { setText(note, `${other}reconstructing: ${fixed(100 * (m.done ?? 0), 0)} %`); return; }
+  progress.value = working ? (m.comparing ?? 0) : (m.done ?? 0);
+  if (!m.size) {
+    setText(note, `${other}reconstructing: ${fixed(100 * (m.done ?? 0), 0)} %`);
+    return;
+  }
   if (m.past) setText($button("#volume-cancel"), "Close");
-  const facts = [`${m.views ?? "–"} of ${m.of ?? "–"} views`, `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`, m.geometry, m.uncovered && m.uncovered > 5e-4 ? `${fixed(100 * m.uncovered, 1)} % without data (grey)` : "",
-    m.binning ? `flexdt reconstruct --binning ${m.binning}` : "", working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "", m.not_compared, ...(m.doubts ?? [])];
+  const facts = [
+    `${m.views ?? "–"} of ${m.of ?? "–"} views`,
+    `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`,
+    m.geometry,
+    m.uncovered && m.uncovered > 5e-4
+      ? `${fixed(100 * m.uncovered, 1)} % without data (grey)`
+      : "",
+    m.binning ? `flexdt reconstruct --binning ${m.binning}` : "",
+    working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "",
+    m.not_compared,
+    ...(m.doubts ?? []),
+  ];
   setText(note, other + facts.filter(Boolean).join(" · "));
   if (m.volumes) offer(m.volumes, Object.keys(m.compared ?? {})[1]);
   if (m.views !== undefined && (!m.past || !blocks.size)) void want();
   if (m.compared) compared(m.compared);
   if (m.compared && m.volumes?.includes("truth")) void beside();
   $button("#volume-compare").disabled = !m.past || m.comparing !== undefined;
-  if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing) compare();
+  if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing)
+    compare();
 });
 // The truth beside the scan, under one slider.
 const splitter = $input("#volume-split");
@@ -113,25 +221,44 @@ function parted() {
   solid.draw();
 }
 splitter.addEventListener("input", parted);
-function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error: unknown) => setText(note, words(error))); }
+function compare() {
+  comparing = true;
+  $button("#volume-compare").disabled = true;
+  void call("viewer.compare", of).catch((error: unknown) => setText(note, words(error)));
+}
 
 async function fetched(name: Name): Promise<Block | null> {
   const head = await call("viewer.block", { ...of, what: name }).catch(() => null);
-  const raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
+  const raw = head?.url
+    ? await fetch(head.url).then(
+        (r) => r.arrayBuffer(),
+        () => null,
+      )
+    : null;
   if (!head?.shape || !raw || !told) return null;
   if (raw.byteLength !== 2 * head.shape.reduce((a, n) => a * n)) return null;
   const voxel_mm = (told.voxel_mm ?? 0) * (head.factor ?? 1);
   return { ...(head as Block), codes: new Uint16Array(raw), voxel_mm };
 }
-// The volume that is chosen, once; of one that grows the newest, one at a time: what is told meanwhile is fetched afterwards.
+// The volume that is chosen, once; of one that grows the newest, one at a time: what is told
+// meanwhile is fetched afterwards.
 async function want() {
-  if (wanting) { late = true; return; }
-  wanting = true; late = false;
-  const mine = asked, name = shown.value as Name;
+  if (wanting) {
+    late = true;
+    return;
+  }
+  wanting = true;
+  late = false;
+  const mine = asked;
+  const name = shown.value as Name;
   let block = blocks.get(name) ?? null;
   if (!block) {
     block = await fetched(name);
-    if (block && name === "difference") { const end = Math.max(...(blocks.get("volume")?.window ?? [0, 1])) / 2; block.signed = true; block.window = [-end, end]; }
+    if (block && name === "difference") {
+      const end = Math.max(...(blocks.get("volume")?.window ?? [0, 1])) / 2;
+      block.signed = true;
+      block.window = [-end, end];
+    }
     if (block) block.own = block.signed || name === "sigma" || name === "bias_bound";
     if (block && past) blocks.set(name, block);
   }
@@ -142,26 +269,61 @@ async function want() {
 function show(block: Block) {
   const first = !three.block;
   for (const id of [".slices", "#volume-tools", "#volume-large"]) $(id).hidden = false;
-  // The window is kept between volume, truth and the other geometry; errors have their own; while one grows it is chosen anew.
+  // The window is kept between volume, truth and the other geometry; errors have their own;
+  // while one grows it is chosen anew.
   const same = kept && past && !block.own;
-  three.show(block, same ? kept ?? block.window : block.window);
+  three.show(block, same ? (kept ?? block.window) : block.window);
   if (!tried) {
     tried = true;
-    const made = raycast($canvas("#volume-ray"), Number(new URLSearchParams(location.search).get("rays")) || 0);
-    if (typeof made === "string") $("#volume-ray").replaceWith(el("p", { class: "muted small-text" }, made)); else solid = made;
+    const made = raycast(
+      $canvas("#volume-ray"),
+      Number(new URLSearchParams(location.search).get("rays")) || 0,
+    );
+    if (typeof made === "string")
+      $("#volume-ray").replaceWith(el("p", { class: "muted small-text" }, made));
+    else solid = made;
   }
   if (!block.own) solid?.show(block);
   put();
   if (!same && !block.own) surface();
-  if (first && reveal) { reveal = false; $("#volume-card").scrollIntoView({ block: "start" }); }
+  if (first && reveal) {
+    reveal = false;
+    $("#volume-card").scrollIntoView({ block: "start" });
+  }
 }
 shown.addEventListener("change", () => void want());
 
 // Ends of the window and the surface's value, in parts of the block's range about its window.
-const range = (): Pair => { const b = three.block; if (!b) return [0, 1]; const [l, h] = b.window, d = h - l; return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)]; };
-const part = (v: number) => { const [l, h] = range(); return (1000 * (v - l)) / (h - l); }, value = (p: number) => { const [l, h] = range(); return l + (p * (h - l)) / 1000; };
-function put() { ends.forEach((end, k) => { end.value = String(part(three.window[k])); }); seen(); }
-function seen() { if (!three.block?.own) { kept = three.window; solid?.window(kept); } drawHistogram(); drawProfile(); point(pointer); }
+const range = (): Pair => {
+  const b = three.block;
+  if (!b) return [0, 1];
+  const [l, h] = b.window;
+  const d = h - l;
+  return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)];
+};
+const part = (v: number) => {
+  const [l, h] = range();
+  return (1000 * (v - l)) / (h - l);
+};
+const value = (p: number) => {
+  const [l, h] = range();
+  return l + (p * (h - l)) / 1000;
+};
+function put() {
+  ends.forEach((end, k) => {
+    end.value = String(part(three.window[k]));
+  });
+  seen();
+}
+function seen() {
+  if (!three.block?.own) {
+    kept = three.window;
+    solid?.window(kept);
+  }
+  drawHistogram();
+  drawProfile();
+  point(pointer);
+}
 // The surface begins at Otsu's threshold of all that is shown.
 function surface() {
   if (!three.block) return;
@@ -170,58 +332,133 @@ function surface() {
   level.value = String(part(low + ((high - low) * otsu(counts)) / counts.length));
   turned();
 }
-function turned() { if (!solid) return; solid.level = value(level.valueAsNumber); solid.cut = Number($select("#volume-cut").value); solid.most = $select("#volume-way").value === "most"; solid.cross(three.cross); solid.draw(); drawHistogram(); }
-for (const end of ends) end.addEventListener("input", () => { const [l, h] = ends.map((e) => value(e.valueAsNumber)); three.look([l, Math.max(h, l + 1e-6)]); seen(); });
-for (const id of ["#volume-level", "#volume-cut", "#volume-way"]) $(id).addEventListener("input", turned);
-$select("#volume-tool").addEventListener("change", () => { three.profiling = $select("#volume-tool").value === "profile"; drawProfile(); });
-slid(chart, (at) => { const to = 1000 * at, [l, h] = ends.map((e) => Math.abs(e.valueAsNumber - to)), end = ends[l <= h ? 0 : 1]; end.value = String(to); end.dispatchEvent(new Event("input")); });
+function turned() {
+  if (!solid) return;
+  solid.level = value(level.valueAsNumber);
+  solid.cut = Number($select("#volume-cut").value);
+  solid.most = $select("#volume-way").value === "most";
+  solid.cross(three.cross);
+  solid.draw();
+  drawHistogram();
+}
+for (const end of ends)
+  end.addEventListener("input", () => {
+    const [l, h] = ends.map((e) => value(e.valueAsNumber));
+    three.look([l, Math.max(h, l + 1e-6)]);
+    seen();
+  });
+for (const id of ["#volume-level", "#volume-cut", "#volume-way"])
+  $(id).addEventListener("input", turned);
+$select("#volume-tool").addEventListener("change", () => {
+  three.profiling = $select("#volume-tool").value === "profile";
+  drawProfile();
+});
+slid(chart.area, (at) => {
+  const to = 1000 * at;
+  const [l, h] = ends.map((e) => Math.abs(e.valueAsNumber - to));
+  const end = ends[l <= h ? 0 : 1];
+  end.value = String(to);
+  end.dispatchEvent(new Event("input"));
+});
 function drawHistogram() {
-  const b = three.block, room = cleared(chart), style = getComputedStyle(chart), [l, h] = range();
-  if (!b) return;
-  const counts = three.histogram([l, h]), step = (h - l) / counts.length;
-  room[0].fillStyle = style.getPropertyValue("--accent");
-  bars(room, counts, (k) => { const v = l + (k + 0.5) * step; room[0].globalAlpha = v < three.window[0] || v > three.window[1] ? 0.3 : 1; });
-  room[0].globalAlpha = 1; room[0].fillStyle = style.getPropertyValue("--warn");
-  room[0].fillRect((room[1] * level.valueAsNumber) / 1000, 0, 2, room[2]);
-  below(chart, l, h, "per mm");
+  if (!three.block) return;
+  const colour = getComputedStyle(histogramHost).getPropertyValue("--warn");
+  chart.draw({
+    counts: three.histogram(range()),
+    range: range(),
+    unit: "per mm",
+    window: three.window,
+    marks: [{ at: value(level.valueAsNumber), colour, handle: false }],
+  });
 }
 function drawProfile() {
   const line = three.profiling ? three.profile() : null;
-  plot.hidden = !line;
+  profileHost.hidden = !line;
   if (three.profiling && !line) setText($("#volume-at"), "drag a line in a slice");
   if (!line) return;
-  const known = line.values.filter(Number.isFinite), low = Math.min(...known), high = Math.max(...known);
-  curve(plot, line.values, low, high);
-  valuesBeside(plot, low, high, "per mm");
-  below(plot, 0, line.mm, "mm");
-  setText($("#volume-at"), known.length ? `${fixed(line.mm, 2)} mm · ${fixed(low, 5)} to ${fixed(high, 5)} per mm` : "no data along this line");
+  const { values, mm } = line;
+  plot.draw({ places: along(mm, values.length), values, unit: "mm", of: "per mm" });
+  const known = values.filter(Number.isFinite);
+  const ends = `${fixed(Math.min(...known), 5)} to ${fixed(Math.max(...known), 5)} per mm`;
+  const said = known.length ? `${fixed(mm, 2)} mm · ${ends}` : "no data along this line";
+  setText($("#volume-at"), said);
 }
-// The value under the pointer: of the codes at once, and as exact as the volume is when the pointer rests.
+// The value under the pointer: of the codes at once, and as exact as the volume is when the
+// pointer rests.
 let due: number | undefined;
 function point(place: Vector | null) {
   const b = three.block;
-  pointer = place; clearTimeout(due);
+  pointer = place;
+  clearTimeout(due);
   if (three.profiling) return;
-  if (!b || !place) { setText($("#volume-at"), "point at a slice"); return; }
-  const mm = place.map((v, k) => fixed((v + 0.5 - extent(b)[k] / 2) * b.voxel_mm, 2)).join(", "), code = b.codes[index(b, place)];
+  if (!b || !place) {
+    setText($("#volume-at"), "point at a slice");
+    return;
+  }
+  const mm = place
+    .map((v, k) => fixed((v + 0.5 - extent(b)[k] / 2) * b.voxel_mm, 2))
+    .join(", ");
+  const code = b.codes[index(b, place)];
   const say = (text: string) => setText($("#volume-at"), `(${mm}) mm  ${text}`);
   say(code ? `${fixed(valueOf(b, code), 5)} per mm` : "no data cover this voxel");
   const at = place.map((v) => Math.floor((v + 0.5) * b.factor)) as Vector;
   due = window.setTimeout(async () => {
-    const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
+    const exact = await call("viewer.voxel", { ...of, at }).catch(() => null);
+    const v = exact?.[shown.value];
     if (pointer !== place || typeof v !== "number") return;
-    const { sigma, bias_bound: bias } = shown.value === "volume" ? exact ?? {} : {};
-    say(`${v.toPrecision(8)} per mm${sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`}${bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`}`);
+    const { sigma, bias_bound: bias } = shown.value === "volume" ? (exact ?? {}) : {};
+    const noise = sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`;
+    const off = bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`;
+    say(`${v.toPrecision(8)} per mm${noise}${off}`);
   }, EXACT_MS);
 }
 
 // As measured with each geometry, beside the truth.
-const ROWS: Array<[key: Exclude<keyof Figures, "rms">, words: string, times: number, digits: number, unit: string]> = [["attenuation", "attenuation", 1, 5, "/mm"], ["void", "void within outlines", 100, 2, "%"], ["x_mm", "size along x", 1, 2, "mm"], ["y_mm", "along y", 1, 2, "mm"], ["z_mm", "along z", 1, 2, "mm"]];
+const ROWS: Array<
+  [
+    key: Exclude<keyof Figures, "rms">,
+    words: string,
+    times: number,
+    digits: number,
+    unit: string,
+  ]
+> = [
+  ["attenuation", "attenuation", 1, 5, "/mm"],
+  ["void", "void within outlines", 100, 2, "%"],
+  ["x_mm", "size along x", 1, 2, "mm"],
+  ["y_mm", "along y", 1, 2, "mm"],
+  ["z_mm", "along z", 1, 2, "mm"],
+];
 export function table(rows: Record<string, Figures>): HTMLElement {
-  const made = Object.entries(rows), cell = (tag: "td" | "th", text: string) => el(tag, {}, text);
-  return el("table", {}, el("tr", {}, cell("th", ""), cell("th", "truth"), ...made.map(([name]) => cell("th", name))),
-    ...ROWS.map(([key, text, times, digits, unit]) => el("tr", {}, cell("td", `${text} [${unit}]`), cell("td", fixed(times * made[0][1][key][1], digits)), ...made.map(([, f]) => cell("td", fixed(times * f[key][0], digits))))),
-    el("tr", {}, cell("td", "rms difference [/mm]"), cell("td", "–"), ...made.map(([, f]) => cell("td", fixed(f.rms, 5)))));
+  const made = Object.entries(rows);
+  const cell = (tag: "td" | "th", text: string) => el(tag, {}, text);
+  return el(
+    "table",
+    {},
+    el(
+      "tr",
+      {},
+      cell("th", ""),
+      cell("th", "truth"),
+      ...made.map(([name]) => cell("th", name)),
+    ),
+    ...ROWS.map(([key, text, times, digits, unit]) =>
+      el(
+        "tr",
+        {},
+        cell("td", `${text} [${unit}]`),
+        cell("td", fixed(times * made[0][1][key][1], digits)),
+        ...made.map(([, f]) => cell("td", fixed(times * f[key][0], digits))),
+      ),
+    ),
+    el(
+      "tr",
+      {},
+      cell("td", "rms difference [/mm]"),
+      cell("td", "–"),
+      ...made.map(([, f]) => cell("td", fixed(f.rms, 5))),
+    ),
+  );
 }
 function compared(rows: Record<string, Figures>) {
   if ($("#volume-compared").childElementCount) return;
@@ -229,12 +466,33 @@ function compared(rows: Record<string, Figures>) {
 }
 // The volumes that there are; the one that was chosen stays so.
 function offer(names: Name[], other = SHOWN.other) {
-  const chosen = shown.value, there = (Object.keys(SHOWN) as Name[]).filter((name) => names.includes(name));
+  const chosen = shown.value;
+  const there = (Object.keys(SHOWN) as Name[]).filter((name) => names.includes(name));
   if (there.length === shown.options.length) return;
-  shown.replaceChildren(...there.map((name) => el("option", { value: name }, name === "other" ? other : SHOWN[name])));
+  shown.replaceChildren(
+    ...there.map((name) =>
+      el("option", { value: name }, name === "other" ? other : SHOWN[name]),
+    ),
+  );
   shown.value = names.includes(chosen as Name) ? chosen : "volume";
 }
-clicks({ "volume-cancel": cancel, "volume-compare": compare, "volume-large": () => large(!document.body.classList.contains("whole")), "volume-share": () => { if (three.block && told) void shared(three, solid, told); } });
-window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("whole")) { e.stopPropagation(); large(false); } }, true);
+clicks({
+  "volume-cancel": cancel,
+  "volume-compare": compare,
+  "volume-large": () => large(!document.body.classList.contains("whole")),
+  "volume-share": () => {
+    if (three.block && told) void shared(three, solid, told);
+  },
+});
+window.addEventListener(
+  "keydown",
+  (e) => {
+    if (e.key === "Escape" && document.body.classList.contains("whole")) {
+      e.stopPropagation();
+      large(false);
+    }
+  },
+  true,
+);
 // For tests: what is shown.
 export const look = () => ({ three, solid, told, of });

@@ -2,8 +2,8 @@
 // viewer's own methods: the methods that the page calls, and the types and fields that it names.
 // Answers have all their fields; what a request may leave out bears a "?".
 export type AxisState = {
-  position: number; target: number; velocity: number; limits: [number, number]; moving: boolean; unit: "mm" | "deg";
-  speed: number | null; virtual: boolean
+  position: number; target: number; velocity: number; limits: [number, number]; moving: boolean;
+  unit: "mm" | "deg"; speed: number | null; virtual: boolean
 };
 export type Block = {
   name?: string | null; side?: 128 | 192 | 256 | 512; past?: boolean;
@@ -12,42 +12,50 @@ export type Block = {
 export type CalibrationAlign = { name: string };
 export type CalibrationAlignResult = {
   identifiable: boolean; parameters: Record<string, Estimated>; refused: Record<string, string>;
-  warnings: Array<string>; correction: Record<string, number> | null; motion: Array<Record<string, JsonValue>> | null
+  warnings: Array<string>; correction: Record<string, number> | null;
+  motion: Array<Record<string, JsonValue>> | null
 };
 export type CalibrationDelete = { name: string };
 export type CalibrationFit = {
-  datasets: Array<string>; phantom: string; free?: Array<string> | null; steps?: number; tracks?: boolean;
-  markers?: Array<Mark> | null; scale?: string | null
+  datasets: Array<string>; phantom: string; free?: Array<string> | null; steps?: number;
+  tracks?: boolean; markers?: Array<Mark> | null; scale?: string | null
 };
 export type CalibrationFitResult = {
-  identifiable: boolean; parameters: Record<string, Estimated>; correction: Record<string, number> | null;
-  rms_px: number | null; steps: Array<CalibrationStep>; tracks: Record<string, JsonValue> | null;
-  problems: Array<CalibrationProblem>
+  identifiable: boolean; parameters: Record<string, Estimated>;
+  correction: Record<string, number> | null; rms_px: number | null; steps: Array<CalibrationStep>;
+  tracks: Record<string, JsonValue> | null; problems: Array<CalibrationProblem>
 };
 export type CalibrationProblem = { code: string; severity: "error" | "warning"; text: string };
 export type CalibrationStep = { frames: number };
 export type Camera = { view?: "iso" | "beam" | "side" | "free"; sample?: boolean };
 export type CameraPart = {
-  mode: string; roi: [number, number, number, number]; exposure_ms: number; averages: number; frames: number
+  mode: string; roi: [number, number, number, number]; exposure_ms: number; averages: number;
+  frames: number
 };
 export type CameraSet = {
   exposure_ms?: number | null; mode?: string | null; roi?: [number, number, number, number] | null;
   averages?: number | null; frames?: number | null
 };
 export type CameraState = {
-  mode: string; exposure_ms: number; roi: [number, number, number, number]; averages: number; frames: number;
-  shape: [number, number]; pixel_mm: number
+  mode: string; exposure_ms: number; roi: [number, number, number, number]; averages: number;
+  frames: number; shape: [number, number]; pixel_mm: number
 };
 export type CheckCollision = { line: number | null; time_s: number; pair: Array<string> };
 export type CheckResult = {
-  ok: boolean; problems: Array<Problem>; steps: Array<CheckStep>; duration_s: number; frames: number; bytes: number;
-  collisions: Array<CheckCollision>; min_clearance_mm: number | null; min_clearance_pair: Array<string> | null
+  ok: boolean; problems: Array<Problem>; steps: Array<CheckStep>; duration_s: number;
+  frames: number; bytes: number; collisions: Array<CheckCollision>; min_clearance_mm: number | null;
+  min_clearance_pair: Array<string> | null
 };
-export type CheckStep = { line: number | null; start_s: number; duration_s: number; what: string };
-export type ClockState = { time_s: number; speed_up: number | "max"; real_time_factor: number | null };
+export type CheckStep = {
+  line: number | null; start_s: number; duration_s: number; what: string
+};
+export type ClockState = {
+  time_s: number; speed_up: number | "max"; real_time_factor: number | null
+};
 export type Compose = {
-  kind?: "fly" | "step" | "tiled" | "helical" | "calibration"; frames?: number; exposure_ms?: number;
-  kV?: number | null; power_W?: number | null; voxel_um?: number | null; keep?: Array<string>
+  kind?: "fly" | "step" | "tiled" | "helical" | "calibration"; frames?: number;
+  exposure_ms?: number; kV?: number | null; power_W?: number | null; voxel_um?: number | null;
+  keep?: Array<string>
 };
 export type Control = { action: "acquire" | "release" | "force" };
 export type ControlResult = { controller: string | null; yours: boolean };
@@ -55,7 +63,8 @@ export type Correct = {
   parameters: Record<string, number>; name?: string | null; comment?: string; source?: string | null
 };
 export type Correction = {
-  name: string; date: string; parameters: Record<string, number>; comment: string; source: string | null
+  name: string; date: string; parameters: Record<string, number>; comment: string;
+  source: string | null
 };
 export type CorrectionDeleted = { name: string };
 export type CorrectionListResult = { corrections: Array<Correction>; current: string | null };
@@ -63,18 +72,24 @@ export type CorrectionPart = {
   name: string; date: string; parameters: Record<string, number>; comment?: string
 };
 export type CorrectionResult = { correction: Correction | null; warnings: Array<string> };
-export type DatasetGet = { name: string; points?: number; measure?: boolean; script?: boolean };
+export type DatasetGet = {
+  name: string; points?: number; measure?: boolean; script?: boolean
+};
 export type DatasetInfo = {
   name: string; modified: number; started: string | null; duration_s: number | null;
-  state: "complete" | "incomplete" | "running" | "unknown"; reason: string; projections: number; present: number;
-  machine: string | null; sample: string; kV: number | null; power_W: number | null; exposure_ms: number | null;
-  mode: string | null; shape: [number, number] | null; problem: string; thumbnail: ImageValue | null
+  state: "complete" | "incomplete" | "running" | "unknown"; reason: string; projections: number;
+  present: number; machine: string | null; sample: string; kV: number | null;
+  power_W: number | null; exposure_ms: number | null; mode: string | null;
+  shape: [number, number] | null; problem: string; thumbnail: ImageValue | null
 };
-export type DatasetListResult = { datasets: Array<DatasetInfo>; total: number; unread: number; left_out: number };
+export type DatasetListResult = {
+  datasets: Array<DatasetInfo>; total: number; unread: number; left_out: number
+};
 export type DatasetResult = {
   info: DatasetInfo; images: number; indices: Array<number>; files: Array<string>;
-  kinds: Array<"dark" | "flat" | "projection">; present: Array<boolean>; times_s: Array<number> | null;
-  positions: Record<string, Array<number | null>>; same_machine: boolean; counts: Array<number | null> | null;
+  kinds: Array<"dark" | "flat" | "projection">; present: Array<boolean>;
+  times_s: Array<number> | null; positions: Record<string, Array<number | null>>;
+  same_machine: boolean; counts: Array<number | null> | null;
   clearance_mm: Array<number | null> | null; clearance_of: string; script: string | null
 };
 export type Datasets = { search?: string; start?: number };
@@ -82,32 +97,35 @@ export type Empty = Record<string, never>;
 export type Estimated = { value: number | null; sigma: number | null; unit: string };
 export type Export = { format?: "html" | "viser"; replay?: boolean };
 export type ExposurePredict = {
-  sample?: string | null; kV?: number | null; power_W?: number | null; filter?: string; exposure_ms?: number | null;
-  averages?: number | null; mode?: string | null; roi?: [number, number, number, number] | null; frames?: number;
-  kind?: "fly" | "step" | "tiled" | "helical" | "calibration" | null; sod_mm?: number | null; sdd_mm?: number | null;
-  detail?: string
+  sample?: string | null; kV?: number | null; power_W?: number | null; filter?: string;
+  exposure_ms?: number | null; averages?: number | null; mode?: string | null;
+  roi?: [number, number, number, number] | null; frames?: number;
+  kind?: "fly" | "step" | "tiled" | "helical" | "calibration" | null; sod_mm?: number | null;
+  sdd_mm?: number | null; detail?: string
 };
 export type ExposurePrediction = {
-  sample: string; transmission: TransmissionShares; saturated: number; starved: number; detail: string;
-  asked: PredictedSetting; best: Array<PredictedSetting>; frames: number; seconds: number; bytes: number;
-  assumed: Array<string>
+  sample: string; transmission: TransmissionShares; saturated: number; starved: number;
+  detail: string; asked: PredictedSetting; best: Array<PredictedSetting>; frames: number;
+  seconds: number; bytes: number; assumed: Array<string>
 };
 export type Feed = { kind: "line_integral" | "counts" };
 export type GeometryState = {
-  SOD_mm: number; SDD_mm: number; magnification: number; voxel_size_mm: number; piercing_point_px: [number, number];
-  field_of_view_mm: [number, number]; cone_angle_deg: number | null; axis_column_px: number | null
+  SOD_mm: number; SDD_mm: number; magnification: number; voxel_size_mm: number;
+  piercing_point_px: [number, number]; field_of_view_mm: [number, number];
+  cone_angle_deg: number | null; axis_column_px: number | null
 };
 export type HelloResult = {
   protocol: string; server: string; machine: string; profile: string | null; session: string | null;
   physics: string | null; instance: string | null
 };
 export type ImageFlags = {
-  time: number | null; saturated: number; starved: number; truncated: Array<"left" | "right" | "top" | "bottom">;
-  good_counts: [number, number] | null; good_lines: [number, number] | null
+  time: number | null; saturated: number; starved: number;
+  truncated: Array<"left" | "right" | "top" | "bottom">; good_counts: [number, number] | null;
+  good_lines: [number, number] | null
 };
 export type ImageOrigin = {
-  sample: string | null; revision: string | null; material: string | null; offset: SamplePlacement; lit: boolean;
-  kV: number; power_W: number; mode: string; exposure_ms: number; averages: number;
+  sample: string | null; revision: string | null; material: string | null; offset: SamplePlacement;
+  lit: boolean; kV: number; power_W: number; mode: string; exposure_ms: number; averages: number;
   roi: [number, number, number, number]; correction: string | null
 };
 export type ImageValue = { shape: Array<number>; data: string };
@@ -117,20 +135,24 @@ export type JobForgetResult = { jobs: Array<string> };
 export type JobListResult = { jobs: Array<JobStatus> };
 export type JobRef = { job?: string | null };
 export type JobStatus = {
-  job: string; state: "queued" | "running" | "paused" | "done" | "failed" | "aborted" | "incomplete"; name: string;
-  dataset: string | null; frames_done: number; frames_total: number; elapsed_s: number; remaining_s: number | null;
-  time: number; speed_up: number | "max"; real_time_factor: number | null; error: Record<string, unknown> | null;
-  warnings: Array<string>; step: number | null; line: number | null; what: string; ended_by: string | null;
+  job: string;
+  state: "queued" | "running" | "paused" | "done" | "failed" | "aborted" | "incomplete";
+  name: string; dataset: string | null; frames_done: number; frames_total: number;
+  elapsed_s: number; remaining_s: number | null; time: number; speed_up: number | "max";
+  real_time_factor: number | null; error: Record<string, unknown> | null; warnings: Array<string>;
+  step: number | null; line: number | null; what: string; ended_by: string | null;
   start: Record<string, number> | null
 };
 export type Jog = { axis: string; velocity: number; lease_s?: number };
 export type JsonValue = unknown;
 export type Layers = {
-  beam?: boolean | null; panel?: boolean | null; axis?: boolean | null; margin?: boolean | null;
-  sample?: boolean | null; machine?: boolean | null; names?: boolean | null; labels?: boolean | null;
-  opacity?: number | null
+  beam?: boolean | null; panel?: boolean | null; axis?: boolean | null; ranges?: boolean | null;
+  margin?: boolean | null; sample?: boolean | null; machine?: boolean | null;
+  names?: boolean | null; labels?: boolean | null; opacity?: number | null
 };
-export type Live = { name?: string | null; side?: 128 | 192 | 256 | 512; past?: boolean };
+export type Live = {
+  name?: string | null; side?: 128 | 192 | 256 | 512; past?: boolean
+};
 export type Mark = {
   frame: number; marker: string; column: number; row: number; sigma?: number | null
 };
@@ -138,24 +160,31 @@ export type Move = {
   targets: Record<string, number>; relative?: boolean; wait?: boolean; plan?: boolean
 };
 export type MoveResult = {
-  duration_s: number; warnings: Array<string>; moves: Array<Record<string, number>> | null; arrived: boolean | null
+  duration_s: number; warnings: Array<string>; moves: Array<Record<string, number>> | null;
+  arrived: boolean | null
 };
-export type Placement = { x?: number; y?: number; z?: number; rx?: number; ry?: number; rz?: number };
+export type Placement = {
+  x?: number; y?: number; z?: number; rx?: number; ry?: number; rz?: number
+};
 export type Plan = { text?: string | null };
 export type PredictedSetting = {
-  kV: number; filter: string; exposure_ms: number; averages: number; cnr: number | null; kerma_mGy: number
+  kV: number; filter: string; exposure_ms: number; averages: number; cnr: number | null;
+  kerma_mGy: number
 };
 export type Preset = { view?: "iso" | "beam" | "side" | "free"; aspect?: number };
 export type Problem = {
-  severity: "error" | "warning"; code: string; line: number | null; column: number | null; message: string
+  severity: "error" | "warning"; code: string; line: number | null; column: number | null;
+  message: string
 };
 export type Ray = { pixel?: [number, number] | null };
 export type Recorded = { name?: string | null };
-export type RecordedImage = { index: number; kind?: "line_integral" | "counts"; virtual?: boolean };
+export type RecordedImage = {
+  index: number; kind?: "line_integral" | "counts"; virtual?: boolean
+};
 export type Reset = { stop?: number | null };
 export type SafetyState = {
-  state: string; estop: boolean; message: string; stop: number; stopped_by: string | null; clearance_mm: number | null;
-  pair: Array<string> | null; warnings: Array<string>
+  state: string; estop: boolean; message: string; stop: number; stopped_by: string | null;
+  clearance_mm: number | null; pair: Array<string> | null; warnings: Array<string>
 };
 export type SampleDelete = { name: string };
 export type SampleDeleteResult = { name: string; bytes: number };
@@ -164,20 +193,25 @@ export type SampleInfo = {
   size_mm: [number, number, number] | null; uploaded: boolean
 };
 export type SampleListResult = { samples: Array<SampleInfo>; materials: Array<string> };
-export type SamplePart = { name: "" | string; material?: string | null; offset?: Placement };
-export type SamplePlacement = { x: number; y: number; z: number; rx: number; ry: number; rz: number };
+export type SamplePart = {
+  name: "" | string; material?: string | null; offset?: Placement
+};
+export type SamplePlacement = {
+  x: number; y: number; z: number; rx: number; ry: number; rz: number
+};
 export type SampleResult = { sample: SampleState; warnings: Array<string> };
 export type SampleSet = {
   name?: string | null; file?: string | null; material?: string | null; offset?: Placement | null
 };
 export type SampleState = {
-  name: string | null; material: string | null; offset: SamplePlacement; size_mm: [number, number, number] | null;
-  description: string; revision: string | null
+  name: string | null; material: string | null; offset: SamplePlacement;
+  size_mm: [number, number, number] | null; description: string; revision: string | null
 };
 export type SampleUpload = {
   name: string; kind?: "mesh" | "voxels" | "scene";
-  format: "stl" | "obj" | "ply" | "glb" | "off" | "raw" | "json" | "toml"; total: number; start?: number; data: string;
-  unit?: "um" | "mm" | "cm" | "m" | "inch" | null; material?: string | null; shape?: [number, number, number] | null;
+  format: "stl" | "obj" | "ply" | "glb" | "off" | "raw" | "json" | "toml"; total: number;
+  start?: number; data: string; unit?: "um" | "mm" | "cm" | "m" | "inch" | null;
+  material?: string | null; shape?: [number, number, number] | null;
   voxel_mm?: [number, number, number] | null
 };
 export type Scene = {
@@ -188,30 +222,43 @@ export type Scene = {
 export type SceneLoad = { document: Scene };
 export type SceneResult = { document: Record<string, JsonValue> };
 export type SceneSave = { name?: string | null };
-export type Screenshot = { view?: "iso" | "beam" | "side" | "free"; width?: number; height?: number };
-export type ScriptInput = { text?: string | null; name?: string | null; speed_up?: number | "max" | null };
+export type Screenshot = {
+  view?: "iso" | "beam" | "side" | "free"; width?: number; height?: number
+};
+export type ScriptInput = {
+  text?: string | null; name?: string | null; speed_up?: number | "max" | null
+};
 export type Scrub = { time_s?: number | null };
 export type Spectrum = { kV: number };
 export type State = {
-  time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState; sample: SampleState;
-  geometry: GeometryState; safety: SafetyState; job: JobStatus | null; correction: Correction | null; clock: ClockState;
-  controller: string | null; image: ImageFlags | null; unsaved: string | null; projector: string | null
+  time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState;
+  sample: SampleState; geometry: GeometryState; safety: SafetyState; job: JobStatus | null;
+  correction: Correction | null; clock: ClockState; controller: string | null;
+  image: ImageFlags | null; unsaved: string | null; projector: string | null
 };
 export type Stopped = {
-  time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState; sample: SampleState;
-  geometry: GeometryState; safety: SafetyState; job: JobStatus | null; correction: Correction | null; clock: ClockState;
-  controller: string | null; image: ImageFlags | null; unsaved: string | null; projector: string | null
+  time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState;
+  sample: SampleState; geometry: GeometryState; safety: SafetyState; job: JobStatus | null;
+  correction: Correction | null; clock: ClockState; controller: string | null;
+  image: ImageFlags | null; unsaved: string | null; projector: string | null
 };
-export type SubmitResult = { job: string; dataset: string | null; warnings: Array<string> };
+export type SubmitResult = {
+  job: string; dataset: string | null; warnings: Array<string>
+};
 export type Theme = { dark?: boolean; fine?: boolean };
-export type TransmissionShares = { least: number; p1: number; edges: Array<number>; shares: Array<number> };
+export type TransmissionShares = {
+  least: number; p1: number; edges: Array<number>; shares: Array<number>
+};
 export type TubePart = { kV: number; power_W: number; on?: boolean };
-export type TubeSet = { kV?: number | null; power_W?: number | null; on?: boolean | null };
+export type TubeSet = {
+  kV?: number | null; power_W?: number | null; on?: boolean | null
+};
 export type TubeState = {
   on: boolean; kV: number; power_W: number; ready: boolean; ready_in_s: number | null
 };
 export type UploadResult = {
-  name: string; received: number; complete: boolean; sample: SampleInfo | null; warnings: Array<string>
+  name: string; received: number; complete: boolean; sample: SampleInfo | null;
+  warnings: Array<string>
 };
 export type Voxel = {
   name?: string | null; side?: 128 | 192 | 256 | 512; past?: boolean; at: Array<number>
