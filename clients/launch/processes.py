@@ -165,7 +165,7 @@ class LocalTwin:
 
     Args:
         data: folder for all that the twin writes; None for a temporary one, deleted at the end.
-        sample: on the stage at start; None for the twin's own (lego, or the one it had).
+        sample: on the stage at start; None for the twin's own (gear, or the one it had).
         machine: description of the scanner, a shipped name or a file; None for the FleX-ray.
         profile: calibration profile; None for the machine's default.
         physics: how images are made: ideal, mono or poly.

@@ -24,7 +24,8 @@ from flexdt.runtime.process import (
 from flexdt.runtime.process_settings import TwinSettings
 from flexdt.runtime.settings import parse
 
-DEFAULT_SAMPLE = "lego"
+DEFAULT_SAMPLE = "gear"
+"""On the stage of a new twin: without metal, so that a first scan has no streaks."""
 SWITCH_S = 0.001
 """Longest time that a worker thread keeps the interpreter from the event loop [s]."""
 PATIENCE_S = 10.0

@@ -17,6 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexdt.phantoms import load_phantom
+from flexdt.server.twin.main import DEFAULT_SAMPLE
+
 pytestmark = pytest.mark.timeout(120)
 
 
@@ -238,3 +241,13 @@ def test_a_bad_configuration_is_one_readable_line(
     assert says in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
+
+
+def test_a_new_twin_shows_a_sample_without_metal() -> None:
+    """Streaks of metal are a poor first volume."""
+    phantom = load_phantom(DEFAULT_SAMPLE)
+    bodies = [s.material for s in phantom.surfaces]
+    assert bodies
+    assert len(phantom.beads) == 0
+    inside = {*bodies, *(s.material for s in phantom.scene.solids)}
+    assert inside <= {"abs", "pla", "water", "air"}

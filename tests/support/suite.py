@@ -148,7 +148,7 @@ def shared_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedS
 
     data = tmp_path_factory.mktemp("shared") / "data"
     with Servers(
-        {"data": data, "speed-up": "max"}, data.parent / "servers.log"
+        {"data": data, "speed-up": "max", "sample": "lego"}, data.parent / "servers.log"
     ) as running:
         with TwinClient(*running.address) as twin:
             scene = twin.save_scene()

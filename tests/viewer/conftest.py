@@ -69,7 +69,14 @@ class Process:
 class Lab:
     """Projector, twin and viewer; each may be ended and started again on its port."""
 
-    def __init__(self, folder: Path, speed_up: str) -> None:
+    def __init__(self, folder: Path, speed_up: str, sample: str = "lego") -> None:
+        """Start the processes.
+
+        Args:
+            folder: for logs and data.
+            speed_up: of the twin's clock.
+            sample: on the stage at the first start; "" for the twin's own.
+        """
         self.folder, self.log, self.module = folder, folder / "log", ""
         self.data = folder / "data"
         self.projector = Process(
@@ -79,8 +86,14 @@ class Lab:
             "--data", str(self.data), "--speed-up", speed_up,
             "--projector", f"127.0.0.1:{self.projector.port}",
         )  # fmt: skip
+        first = ("--sample", sample) if sample else ()
         self.twin = Process(
-            "flexdt.server.twin.main", "--port", "0", *self.twin_words, log=self.log
+            "flexdt.server.twin.main",
+            "--port",
+            "0",
+            *self.twin_words,
+            *first,
+            log=self.log,
         )
         self.viewer_words = (
             "--twin",

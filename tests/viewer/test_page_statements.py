@@ -34,7 +34,7 @@ SEEDS = 500
 ACTIONS = 8
 SMALL: dict[str, Any] = {"mode": "HW4SW1High", "roi": (700, 500, 1212, 1012)}
 """A camera whose images cost little."""
-SAMPLES = ("lego", "square", "empty", "normal")
+SAMPLES = ("gear", "lego", "square", "empty", "normal")
 
 
 class History:

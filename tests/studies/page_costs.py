@@ -1,0 +1,285 @@
+"""What the page costs: bytes at load, its first picture, its rest, "Scan it" and the story.
+
+    python tests/studies/page_costs.py [load] [rest] [scan] [story] [--shots DIR]
+
+Starts a lab of its own, with what a new twin has on its stage, and a browser without graphics
+hardware. Processor seconds are those of the servers and of the browser apart; wall seconds mean
+something on a quiet machine alone, so the load average stands beside them. `load`: JavaScript of
+page and viser, raw and as sent, and the seconds to the first radiograph and picture of the
+scene, cold and warm. `rest`: servers with one page open and nothing moving. `scan`: from a
+browser that has never been here to a volume beside its truth. `story`: Misalign's five steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from flexdt.clients.launch.processes import Servers
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from docs.tools.page_pictures import CHROMIUM, FLAGS
+
+SIZE = {"width": 1440, "height": 900}
+PATIENCE_MS = 900_000
+REST_S = 60.0
+"""How long a page at rest is watched."""
+SETTLING_MS = 20_000
+"""From the first picture to rest: scenes fade in, and pictures are compressed ahead."""
+PICTURE = (
+    "document.querySelector('#still')?.naturalWidth > 0 || window.flexdt?.store.image"
+)
+IMAGE = "window.flexdt?.store.image && flexdt.store.session"
+LIVE = "document.querySelector('.view.live') !== null"
+COMPARED = "document.querySelector('#volume-compared').childElementCount > 0"
+WRONG = {"dO_x": 0.6, "det_roll": 1.5}
+"""What the sliders of Misalign say [mm, deg]."""
+STEPS = ("bend", "scan", "fit", "apply", "again")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Wall seconds, and processor seconds of servers and of browser."""
+
+    wall_s: float
+    servers_s: float
+    browser_s: float
+
+    def since(self, other: Moment) -> str:
+        """Say what has passed between two moments."""
+        return (
+            f"{self.wall_s - other.wall_s:.1f} s wall, "
+            f"{self.servers_s - other.servers_s:.1f} CPU s of the servers, "
+            f"{self.browser_s - other.browser_s:.1f} of the browser "
+            f"(load average {os.getloadavg()[0]:.1f})"
+        )
+
+
+class Meter:
+    """Adds up processor seconds, those of processes that have ended included.
+
+    Args:
+        servers: process id of the supervisor.
+    """
+
+    def __init__(self, servers: int) -> None:
+        self._servers = servers
+        self._ended = {"servers": 0.0, "browser": 0.0}
+        self._seen: dict[tuple[str, int], float] = {}
+
+    def now(self) -> Moment:
+        """Read the clocks of all processes."""
+        own = {p.pid: p for p in psutil.Process().children(recursive=True)}
+        lab = {self._servers} | {
+            p.pid for p in psutil.Process(self._servers).children(recursive=True)
+        }
+        for pid, process in own.items():
+            with_kind = ("servers" if pid in lab else "browser", pid)
+            try:
+                used = process.cpu_times()
+            except psutil.Error:
+                continue
+            self._seen[with_kind] = used.user + used.system
+        total = dict.fromkeys(self._ended, 0.0)
+        for (kind, _), seconds in self._seen.items():
+            total[kind] += seconds
+        return Moment(time.monotonic(), total["servers"], total["browser"])
+
+    def until(self, page: Any, condition: str) -> Moment:
+        """Wait for a condition of the page, reading the clocks meanwhile."""
+        while not page.evaluate(condition):
+            self.now()
+            page.wait_for_timeout(100)
+        return self.now()
+
+
+@contextmanager
+def browsing(play: Any) -> Iterator[Any]:
+    """A context of a browser that has never been here."""
+    browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    context = browser.new_context(viewport=SIZE)
+    context.set_default_timeout(PATIENCE_MS)
+    yield context
+    browser.close()
+
+
+def opened(context: Any, url: str, **query: str) -> Any:
+    """A page with its first radiograph."""
+    page = context.new_page()
+    asked = {"patience": "100", "theme": "light", **query}
+    page.goto(f"{url}?" + "&".join(f"{k}={v}" for k, v in asked.items()))
+    page.wait_for_function(IMAGE)
+    return page
+
+
+def load(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
+    """Print bytes of JavaScript and the seconds to the first pictures."""
+    with browsing(play) as context:
+        for visit in ("cold", "warm"):
+            page = context.new_page()
+            sizes: dict[str, list[float]] = {}
+            network = context.new_cdp_session(page)
+            network.send("Network.enable")
+            scripts: dict[str, str] = {}
+            network.on(
+                "Network.responseReceived",
+                lambda e, kept=scripts: kept.__setitem__(
+                    e["requestId"],
+                    e["response"]["url"] if "script" in e["response"]["mimeType"] else "",
+                ),
+            )
+            raw: dict[str, int] = {}
+            network.on(
+                "Network.dataReceived",
+                lambda e, kept=raw: kept.__setitem__(
+                    e["requestId"], kept.get(e["requestId"], 0) + e["dataLength"]
+                ),
+            )
+            network.on(
+                "Network.loadingFinished",
+                lambda e, names=scripts, kept=sizes, whole=raw: kept.setdefault(
+                    names.get(e["requestId"], ""),
+                    [e["encodedDataLength"], whole.get(e["requestId"], 0)],
+                ),
+            )
+            begun = meter.now()
+            page.goto(f"{url}?patience=100&theme=light", wait_until="commit")
+            picture = meter.until(page, PICTURE)
+            image = meter.until(page, IMAGE)
+            live = meter.until(page, LIVE)
+            print(f"{visit}: first picture {picture.since(begun)}")
+            print(f"{visit}: radiograph {image.since(begun)}")
+            print(f"{visit}: live scene {live.since(begun)}")
+            js = {name: size for name, size in sizes.items() if name.endswith(".js")}
+            for what, chosen in (
+                ("viser's", [v for k, v in js.items() if "/viser-" in k]),
+                ("the page's", [v for k, v in js.items() if "/viser-" not in k]),
+            ):
+                sent, whole = (sum(size[k] for size in chosen) / 1e3 for k in (0, 1))
+                print(
+                    f"{visit}: {what} JavaScript {sent:.0f} kB sent, {whole:.0f} kB raw"
+                )
+            if shots:
+                page.screenshot(path=shots / f"load-{visit}.png")
+            page.close()
+
+
+def rest(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
+    """Print what the servers and the browser take while nothing moves."""
+    with browsing(play) as context:
+        page = opened(context, url)
+        page.wait_for_timeout(SETTLING_MS)
+        begun = meter.now()
+        page.wait_for_timeout(1000 * REST_S)
+        ended = meter.now()
+        seconds = ended.wall_s - begun.wall_s
+        servers = (ended.servers_s - begun.servers_s) / seconds
+        browser = (ended.browser_s - begun.browser_s) / seconds
+        print(
+            f"rest: servers {100 * servers:.1f} % of a core, browser {100 * browser:.1f} % "
+            f"in {seconds:.0f} s"
+        )
+        if shots:
+            page.screenshot(path=shots / "rest.png")
+
+
+def scan(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
+    """Print what it takes from nothing to a volume beside its truth, by one click."""
+    with browsing(play) as context:
+        begun = meter.now()
+        page = opened(context, url)
+        shown = meter.now()
+        page.click("#scan-it")
+        page.wait_for_function("flexdt.store.job?.state === 'running'")
+        for percent in (35, 70):
+            meter.until(
+                page, f"{AGED} >= {percent} || flexdt.store.job?.state === 'done'"
+            )
+            if shots:
+                page.screenshot(path=shots / f"scan-{percent}.png")
+        scanned = meter.until(page, "flexdt.store.job?.state === 'done'")
+        whole = meter.until(
+            page, "flexdt.volume().told?.past && flexdt.volume().three.block"
+        )
+        compared = meter.until(page, COMPARED)
+        for what, moment in (
+            ("page", shown),
+            ("scan", scanned),
+            ("volume", whole),
+            ("volume beside its truth", compared),
+        ):
+            print(f"scan it: {what} after {moment.since(begun)}")
+        if shots:
+            page.wait_for_timeout(3000)
+            page.screenshot(path=shots / "scan-done.png")
+
+
+AGED = "100 * flexdt.store.job.frames_done / flexdt.store.job.frames_total"
+
+
+def story(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
+    """Print what each of Misalign's steps takes."""
+    with browsing(play) as context:
+        page = opened(context, url, tab="calibrate")
+        page.click("#story summary")
+        for name, value in WRONG.items():
+            page.evaluate(
+                "([id, v]) => { const s = document.getElementById(id); s.value = v;"
+                " s.dispatchEvent(new Event('input')); }",
+                [f"story-{name}", value],
+            )
+        begun = last = meter.now()
+        for step, follower in zip(STEPS, (*STEPS[1:], None), strict=True):
+            page.locator(f"#story-{step}.primary:enabled").click()
+            ready = (
+                f"document.querySelector('#story-{follower}.primary:enabled')"
+                if follower
+                else "document.querySelector('#story-says').innerText.includes('Sharp again')"
+            )
+            now = meter.until(page, f"!!({ready})")
+            print(f"story: {step} {now.since(last)}: {page.inner_text('#story-says')}")
+            last = now
+            if shots:
+                page.wait_for_timeout(1500)
+                page.screenshot(path=shots / f"story-{step}.png")
+        print(f"story: whole {last.since(begun)}")
+        print(page.inner_text("#story-found"))
+
+
+PARTS = {"load": load, "rest": rest, "scan": scan, "story": story}
+
+
+def main() -> None:
+    from playwright.sync_api import sync_playwright
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", help="all of them")
+    parser.add_argument("--shots", type=Path, help="folder for screenshots")
+    given = parser.parse_args()
+    if given.shots:
+        given.shots.mkdir(parents=True, exist_ok=True)
+    for name in given.parts or PARTS:
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder) / "servers.log"
+            with (
+                Servers({"data": Path(folder) / "data"}, log, viewer=True) as servers,
+                sync_playwright() as play,
+            ):
+                PARTS[name](
+                    play, str(servers.viewer_url), Meter(servers.pid), given.shots
+                )
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
