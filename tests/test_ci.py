@@ -7,6 +7,7 @@ import json
 import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,75 @@ def test_every_campaign_is_in_a_weekly_job() -> None:
     assert len(marked) > 40
     left = [p for p in marked if not any(p.is_relative_to(place) for place in places)]
     assert [path.relative_to(ROOT).as_posix() for path in left] == []
+
+
+STEP_KEYS = {
+    "name",
+    "run",
+    "uses",
+    "with",
+    "if",
+    "env",
+    "id",
+    "shell",
+    "working-directory",
+}
+MADE = re.compile(r"> (\S+/\S+)")
+"""A file that a step writes for later ones."""
+EXPRESSION = re.compile(r"\$\{\{.*?\}\}")
+"""What a runner replaces before the shell reads a command."""
+
+
+def steps() -> list[tuple[str, dict[str, Any]]]:
+    """Each step of each workflow, with the name of its place."""
+    return [
+        (f"{path.name}, {name}, step {i}", step)
+        for path in sorted(WORKFLOWS.glob("*.yml"))
+        for name, job in workflow(path.name)["jobs"].items()
+        for i, step in enumerate(job["steps"], 1)
+    ]
+
+
+def test_every_step_of_the_workflows_is_a_sound_command() -> None:
+    """Shells read each command, and what it names of this repository is there."""
+    made = {file for _, step in steps() for file in MADE.findall(step.get("run", ""))}
+    for where, step in steps():
+        assert set(step) <= STEP_KEYS, where
+        assert ("run" in step) != ("uses" in step), where
+        if "run" not in step:
+            assert re.fullmatch(r"[\w.-]+/[\w./-]+@v\d+", step["uses"]), where
+            continue
+        text = EXPRESSION.sub("expression", step["run"])
+        read = subprocess.run(
+            ["bash", "-n"], input=text, capture_output=True, text=True, check=False
+        )
+        assert read.returncode == 0, (where, read.stderr)
+        for target in re.findall(r"\bmake ([a-z][a-z-]*)", text):
+            assert target in {*targets(), "expression"}, (where, target)
+        for file in re.findall(
+            r"(?:^|\s)((?:\.ci|docker|tests|extensions)/[\w./-]+)", text
+        ):
+            assert file in made or (ROOT / file).exists(), (where, file)
+
+
+@pytest.mark.slow
+def test_programs_of_the_weekly_workflow_take_their_options() -> None:
+    lines = "\n".join(commands(workflow("weekly.yml")["jobs"]["others"]))
+    called = re.findall(r"\.venv/bin/(?:python )?(\S+\.py|flexdt \w+)(.*)", lines)
+    assert len({program for program, _ in called}) >= 3
+    for program, words in called:
+        begin = [program] if program.endswith(".py") else ["-m", "flexdt.clients.cli"]
+        begin += program.split()[1:]
+        told = subprocess.run(
+            [sys.executable, *begin, "--help"],
+            cwd=ROOT, capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+        for option in re.findall(r"--[a-z-]+", words):
+            assert re.search(rf"{option}\b", told), (program, option)
+        first = words.split()[0]
+        choices = re.match(r"usage: \S+ .*\{([\w,]+)\}", told)
+        if choices and not first.startswith("--"):
+            assert first in choices[1].split(","), (program, first)
 
 
 NEEDS = re.compile(r"`[^`\n]*(?:CHECKOUT|evidence --data|--leap )[^`\n]*`")
