@@ -45,6 +45,7 @@ from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.planning.sample_findings import (
+    SampleForecast,
     SampleProbe,
     sample_probes,
     sample_problems,
@@ -499,8 +500,8 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, 
     scanner = plan.machine
     chain = chain_through(parts, detector_of(scanner.detector), tube_of(scanner.tube))
     probes = sample_probes(plan)
-    shares = [_shares(parts, chain, probe) for probe in probes]
-    return sample_problems(probes, shares, open_beam_problems(plan))
+    shares = tuple(_shares(parts, chain, probe) for probe in probes)
+    return sample_problems(SampleForecast(probes, shares), open_beam_problems(plan))
 
 
 def _shares(parts: Sequence[Channel], chain: Chain, probe: SampleProbe) -> CountShares:

@@ -43,6 +43,13 @@ from flexdt.twin.script import (
 )
 from flexdt.twin.script.parse import LIGHT_BYTES, is_light
 from flexdt.twin.script.planning.plan_values import SampleSize
+from flexdt.twin.script.planning.sample_findings import (
+    SampleForecast,
+    SampleProbe,
+    sample_probes,
+    sample_problems,
+)
+from flexdt.twin.script.problems import in_order
 
 MAX_PARALLEL_CHECKS: Final = 2
 """Largest number of checks in worker processes at a time; others wait."""
@@ -89,12 +96,13 @@ class CheckInput:
             return is_light(script)
         return len(self.wish.poses.text) <= LIGHT_BYTES
 
-    def report(self, bytes_at_most: int | None = None) -> CheckReport:
+    def report(self, bytes_at_most: int | None = None, swept: bool = True) -> CheckReport:
         """Parse, plan and check the scan, collisions included where the machine has
         bodies; blocks.
 
         Args:
             bytes_at_most: largest size of the report; None for no limit.
+            swept: whether collisions are looked for.
 
         Returns:
             The dry-run report; problems of the scan are in it, not raised.
@@ -105,7 +113,7 @@ class CheckInput:
         wish = self.wish
         machine = self.machine
         sweep: dry_run.CollisionCheck | None = None
-        if machine.components:
+        if swept and machine.components:
             sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
         if wish.poses is None:
             return dry_run.check_script(
@@ -171,15 +179,34 @@ class Checks:
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
         self._turn = asyncio.Semaphore(MAX_PARALLEL_CHECKS)
 
-    async def report(self, matter: CheckInput, codec: Codec) -> Sequence[bytes]:
+    async def report(
+        self, matter: CheckInput, codec: Codec, seen: SampleForecast | None = None
+    ) -> Sequence[bytes]:
         """Compute the dry-run report, encoded in portions.
+
+        Args:
+            matter: the scan and its conditions.
+            codec: of the answer.
+            seen: the pixels behind the sample on the stage.
 
         Raises:
             RpcError: -32008, it is larger than an answer may be or takes too long.
         """
         if self._here(matter):
-            return await self._threaded(lambda: _encoded(matter, codec))
-        return await self._workers.ask(_encoded, _bare(matter), codec)
+            return await self._threaded(lambda: _encoded(matter, codec, seen))
+        return await self._workers.ask(_encoded, _bare(matter), codec, seen)
+
+    async def probes(self, matter: CheckInput) -> tuple[SampleProbe, ...]:
+        """Choose rays of a scan's projections from which its counts are predicted.
+
+        Raises:
+            RpcError: -32008, planning takes too long.
+        """
+        if self._here(matter):
+            return await self._threaded(lambda: probes_of(matter))
+        [packed] = await self._workers.ask(packed_probes, _bare(matter))
+        found: tuple[SampleProbe, ...] = pickle.loads(packed)
+        return found
 
     async def sound(self, matter: CheckInput) -> Checked:
         """Parse, plan and sweep a scan, here or in a worker process, and return it if it
@@ -258,19 +285,37 @@ def _bare(matter: CheckInput) -> CheckInput:
     )
 
 
-def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
+def probes_of(matter: CheckInput) -> tuple[SampleProbe, ...]:
+    """Choose the rays of a scan's projections; none of a scan with errors. Blocks."""
+    report = matter.report(swept=False)
+    return () if report.errors else sample_probes(report.plan)
+
+
+def packed_probes(matter: CheckInput) -> list[bytes]:
+    """Choose the rays of a scan's projections in a worker process, pickled."""
+    return [pickle.dumps(probes_of(matter))]
+
+
+def _encoded(
+    matter: CheckInput, codec: Codec, seen: SampleForecast | None
+) -> list[bytes]:
     """Compute a dry-run report and encode it in pieces of `ANSWER_PIECE` bytes; runs in a
     worker.
 
     Args:
         matter: the scan to be checked.
         codec: of the connection that asked.
+        seen: the prediction behind the sample, whose problems join the report; None without.
 
     Raises:
         RpcError: -32008, the report is larger than an answer may be.
     """
     most = MAX_ANSWER[codec]
-    report = matter.report(most).to_dict()
+    found = matter.report(most)
+    if seen is not None and not found.errors:
+        more = sample_problems(seen, found.problems)
+        found = replace(found, problems=in_order((*found.problems, *more)))
+    report = found.to_dict()
     if codec is Codec.JSON:
         data = write_json(report)
     else:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
-from typing import Final
 
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
@@ -23,11 +22,11 @@ from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params, problem
 from flexdt.runtime.files.dataset_folder import dated_name, read_document
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes
-from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
 from flexdt.server.scans.jobs import Jobs
+from flexdt.server.scans.sample_prediction import forecast_sample, predict_counts
 from flexdt.server.scans.scan_job import Job, JobInputs, Prepare, is_complete
 from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
@@ -45,38 +44,15 @@ from flexdt.twin.dataset.file_names import (
     plain_name,
 )
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
-from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import check_cone_vec
-from flexdt.twin.physics.predicted_beam import CountShares, PredictedExposure
+from flexdt.twin.physics.predicted_beam import PredictedExposure
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
-from flexdt.twin.script import ScanPlan, ScriptProblem, StartState
-from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
-from flexdt.twin.script.planning.sample_findings import (
-    SampleProbe,
-    predicted_exposures,
-    sample_probes,
-    sample_problems,
-)
+from flexdt.twin.script import ScanPlan, StartState
+from flexdt.twin.script.planning.sample_findings import SampleForecast
 
 RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are not data sets."""
-PREDICTION_PATIENCE_S: Final = 1.0
-"""Longest wait of a submission for a busy projector, before it continues without a
-prediction of the sample [s]."""
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted counts of a scan's projections.
-
-    Attributes:
-        exposures: of each setting of tube and camera, for the data set.
-        problems: warnings of pixels behind the sample, for the user who submits.
-    """
-
-    exposures: tuple[PredictedExposure, ...]
-    problems: tuple[ScriptProblem, ...]
 
 
 @dataclass(eq=False, repr=False)
@@ -110,10 +86,6 @@ class Submissions:
     version: str
     room: DiskRoom
     checks: Checks = field(default_factory=Checks)
-    _predicting: set[asyncio.Task[list[CountShares | None]]] = field(
-        default_factory=set, init=False
-    )
-    """Running predictions."""
     _numbered: tuple[str, int] = field(default=("", 1), init=False)
     """Day, and number of the last scan named on it."""
 
@@ -124,14 +96,23 @@ class Submissions:
             RpcError: -32008, it takes too long, too much memory, or is too large for an
                 answer.
         """
-        matter = await self._matter(wish, self.start(), self.scanner.sample)
-        return Encoded(tuple(await self.checks.report(matter, codec)))
+        sample = self.scanner.sample
+        matter = await self._matter(wish, self.start(), sample)
+        seen = await self._sample_seen(matter, sample)
+        return Encoded(tuple(await self.checks.report(matter, codec, seen)))
+
+    async def _sample_seen(
+        self, matter: CheckInput, sample: Sample
+    ) -> SampleForecast | None:
+        """Predict the pixels behind the sample on the stage; None without a sample."""
+        if not sample.name:
+            return None
+        probes = await self.checks.probes(matter)
+        return await forecast_sample(self.radiography, sample, probes)
 
     def close(self) -> None:
-        """End the processes of checks and predictions."""
+        """End the processes of checks."""
         self.checks.close()
-        for task in self._predicting:
-            task.cancel()
 
     async def submit(
         self,
@@ -310,7 +291,7 @@ class Submissions:
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         await self.radiography.require_room(begin.sample)
-        predicted = await self._predicted(begin, checked.plan)
+        predicted = await predict_counts(self.radiography, begin, checked.plan)
         warnings = [*checked.warnings, *(p.where_and_what for p in predicted.problems)]
         if resume:
             there = sum(n.endswith(".tif") for n in self.root.folder(name).names())
@@ -348,70 +329,12 @@ class Submissions:
             same = final is checked and begun.begin.sample == asked.begin.sample
             counts = predicted
             if not same:
-                counts = await self._predicted(begun.begin, final.plan)
+                counts = await predict_counts(self.radiography, begun.begin, final.plan)
             return await asyncio.to_thread(
                 self._open, begun, final.plan, name, resume, counts.exposures
             )
 
         return checked.plan, prepare, warnings
-
-    async def _predicted(self, begin: StartConditions, plan: ScanPlan) -> Prediction:
-        """Predict the counts of a scan's projections; those behind the sample only if the
-        projector answers.
-
-        Args:
-            begin: sample and physics of the scan.
-            plan: of the scan.
-        """
-        probes = sample_probes(plan)
-        shares = await self._shares(begin, probes)
-
-        def judged() -> Prediction:
-            known = open_beam_problems(plan, begin.physics)
-            return Prediction(
-                predicted_exposures(plan, probes, shares, begin.physics),
-                sample_problems(probes, shares, known),
-            )
-
-        return await asyncio.to_thread(judged)
-
-    async def _shares(
-        self, begin: StartConditions, probes: Sequence[SampleProbe]
-    ) -> list[CountShares | None]:
-        """Predict saturated and starved pixels of each probe of the sample.
-
-        A failed prediction ends no submission: errors of the sample are reported by the
-        scan itself.
-
-        Args:
-            begin: sample and physics of the scan.
-            probes: settings and views of the plan.
-
-        Returns:
-            Shares for each probe; all None if the projector fails or does not answer
-            within `PREDICTION_PATIENCE_S`.
-        """
-        radiography = replace(
-            self.radiography, physics=begin.physics, scatter=begin.scatter
-        )
-
-        async def each() -> list[CountShares | None]:
-            with suppress(ProjectorUnavailable, RpcError, TwinError):
-                return [
-                    await radiography.predicted_shares(begin.sample, one)
-                    for one in probes
-                ]
-            return [None] * len(probes)
-
-        task = asyncio.create_task(each())
-        self._predicting.add(task)
-        task.add_done_callback(self._predicting.discard)
-        # The data sent to the projector meanwhile are needed by the scan as well: no
-        # cancelling.
-        done, _ = await asyncio.wait({task}, timeout=PREDICTION_PATIENCE_S)
-        if done:
-            return task.result()
-        return [None] * len(probes)
 
     async def _matter(
         self, wish: ScanSource, start: StartState, shown: Sample

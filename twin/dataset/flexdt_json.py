@@ -422,6 +422,8 @@ class PredictedEntry(_Model):
     """Share of starved pixels of the projections; null: unknown."""
     doubts: list[str] = Field(default_factory=list)
     """Warnings of the prediction about the setting."""
+    unpredicted: str = ""
+    """Reason why the two shares are unknown; empty in older files."""
 
     @classmethod
     def of(cls, predicted: PredictedExposure) -> PredictedEntry:
@@ -435,6 +437,7 @@ class PredictedEntry(_Model):
             saturated=None if shares is None else _rounded(shares.saturated),
             starved=None if shares is None else _rounded(shares.starved),
             doubts=list(predicted.doubts),
+            unpredicted=predicted.unpredicted,
         )
 
 

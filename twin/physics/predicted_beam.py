@@ -90,6 +90,7 @@ class PredictedExposure:
             None where the physics has no spectrum for the voltage.
         shares: of the pixels behind the sample; None where that is not known.
         doubts: objections to the setting, each with a setting that would do.
+        unpredicted: reason why `shares` is None, in words; empty if nothing was asked.
     """
 
     kV: float
@@ -98,6 +99,7 @@ class PredictedExposure:
     open_beam_fill: float | None = None
     shares: CountShares | None = None
     doubts: tuple[str, ...] = ()
+    unpredicted: str = ""
 
 
 def counts_behind(

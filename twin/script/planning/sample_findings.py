@@ -1,7 +1,7 @@
 """Warn of projections of a plan whose pixels the sample starves, or nothing shades enough.
 
 The plan has no sample: `sample_probes` chooses the rays, the caller projects the sample
-along them, and `predicted_exposures` judges the counts.
+along them into a `SampleForecast`, and `predicted_exposures` judges the counts.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ PROBE_RAYS: Final = 128
 """Least number of rays along the longer side of a panel, if it has so many pixels."""
 SHARE_NAMES: Final = ("saturated", "starved")
 """Members of `CountShares`; warnings have codes such as `starved_pixels`."""
+UNPREDICTED: Final = "saturated and starved pixels behind the sample are not predicted"
+"""Beginning of the warning that gives the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,21 @@ class SampleProbe:
     cone_vec: ConeVec
     pixels_a_side: int
     indices: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SampleForecast:
+    """The predicted pixels behind the sample on the stage.
+
+    Attributes:
+        probes: from `sample_probes`.
+        shares: of the pixels of each probe's views; None where they are not predicted.
+        unpredicted: reason for that, in words; empty if all are predicted.
+    """
+
+    probes: tuple[SampleProbe, ...]
+    shares: tuple[CountShares | None, ...]
+    unpredicted: str = ""
 
 
 def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
@@ -106,22 +123,22 @@ def shares_behind(
 
 
 def predicted_exposures(
-    plan: ScanPlan,
-    probes: Sequence[SampleProbe],
-    shares: Sequence[CountShares | None],
-    physics: Physics = "poly",
+    plan: ScanPlan, forecast: SampleForecast, physics: Physics = "poly"
 ) -> tuple[PredictedExposure, ...]:
     """Predict each setting of a plan's projections, with what speaks against it.
 
     Args:
-        plan: that the probes are of.
-        probes: from `sample_probes`.
-        shares: of the pixels of each probe's views; None where the sample is not known.
+        plan: that the forecast is of.
+        forecast: of the pixels behind the sample.
         physics: how counts are made.
     """
-    return tuple(
+    made = [
         _predicted(plan, probe, seen, physics)
-        for probe, seen in zip(probes, shares, strict=True)
+        for probe, seen in zip(forecast.probes, forecast.shares, strict=True)
+    ]
+    return tuple(
+        one if one.shares else replace(one, unpredicted=forecast.unpredicted)
+        for one in made
     )
 
 
@@ -154,27 +171,30 @@ def _predicted(
 
 
 def sample_problems(
-    probes: Sequence[SampleProbe],
-    shares: Sequence[CountShares | None],
-    known: Sequence[ScriptProblem] = (),
+    forecast: SampleForecast, known: Sequence[ScriptProblem] = ()
 ) -> tuple[ScriptProblem, ...]:
     """Warn of settings whose projections have saturated or starved pixels.
 
     Args:
-        probes: from `sample_probes`.
-        shares: of the pixels of each probe's views.
+        forecast: of the pixels behind the sample.
         known: warnings of the open beam, which explain pixels of the same kind.
 
     Returns:
-        Warnings `saturated_pixels` and `starved_pixels`.
+        Warnings `saturated_pixels` and `starved_pixels`; one `unpredicted_pixels` with
+        the reason, if pixels are not predicted.
     """
     explained = {(p.code, p.line) for p in known}
-    return tuple(
+    found = [
         ScriptProblem("warning", f"{name}_pixels", probe.line, 1, text)
-        for probe, seen in zip(probes, shares, strict=True)
+        for probe, seen in zip(forecast.probes, forecast.shares, strict=True)
         for name, text in _sentences(seen)
         if (f"{name}_open_beam", probe.line) not in explained
-    )
+    ]
+    if forecast.unpredicted:
+        line = min(probe.line for probe in forecast.probes)
+        what = f"{UNPREDICTED}: {forecast.unpredicted}"
+        found.append(ScriptProblem("warning", "unpredicted_pixels", line, 1, what))
+    return tuple(found)
 
 
 def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:
