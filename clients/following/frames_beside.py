@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from flexdt.library.datasets.pictures import png
@@ -131,6 +130,8 @@ def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
         >>> round(columns, 1), round(rows, 1)
         (-3.0, 2.0)
     """
+    import cv2
+
     (columns, rows), _ = cv2.phaseCorrelate(
         virtual.astype(np.float64), real.astype(np.float64)
     )

@@ -168,8 +168,6 @@ class Panel:
             TwinError: an image of another shape than those in which the distortion was
                 found.
         """
-        import cv2
-
         if not any(self.coefficients):
             return image
         if image.shape != self.model.shape:
@@ -179,6 +177,8 @@ class Panel:
                 self.model.shape,
                 ": the panel's distortion is of those",
             )
+        import cv2
+
         out = cv2.remap(
             image, *self._map, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
         )

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -84,6 +83,8 @@ def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
 
 def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
     """Make the shape of the panel's image (rows, cols, 3), in front of the panel."""
+    import cv2
+
     (cols, rows), (first, right, _, down) = IMAGE_CELLS, world.corners - world.normal
     colors = cv2.resize(rgb, IMAGE_CELLS, interpolation=cv2.INTER_AREA).reshape(-1, 3)
     y, x = (part[..., None] for part in np.mgrid[: rows + 1, : cols + 1])
@@ -115,6 +116,8 @@ def drawn(
         size: (width, height) [px].
         dark: the page's background.
     """
+    import cv2
+
     fine = SMOOTH if size[0] * size[1] <= SMALL_PX else 1
     width, height = (fine * side for side in size)
     above, below = (np.array(color, dtype=np.float32) for color in GROUND[dark])
@@ -144,6 +147,8 @@ def drawn(
 
 def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
     """Encode as good a JPEG as fits into `most` bytes (or the worst)."""
+    import cv2
+
     for quality in (85, 75, 60, 40):
         coded = cv2.imencode(
             ".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
