@@ -10,8 +10,6 @@ from typing import Any, Final, Protocol
 
 WIDTH_CHARS: Final = 24
 """Characters of a bar on a terminal."""
-LEFT_FROM: Final = 0.02
-"""Fraction done from which the time left is said."""
 NARROWEST_CHARS: Final = 20
 """Columns of a terminal that is taken for one that does not say its width, if it has fewer."""
 
@@ -25,7 +23,9 @@ class Shown(Protocol):
 
     bar: bool
 
-    def show(self, what: str, done: float | None, seconds: float) -> None:
+    def show(
+        self, what: str, done: float | None, seconds: float, left_s: float | None
+    ) -> None:
         """Draw it as it is now."""
 
     def close(self) -> None:
@@ -54,23 +54,24 @@ def in_notebook() -> bool:
     return getattr(shell, "kernel", None) is not None
 
 
-def told_time(done: float | None, seconds: float) -> str:
+def told_time(done: float | None, seconds: float, left_s: float | None) -> str:
     """Say how far work is and how long it takes.
 
     Args:
         done: fraction; None where nobody knows.
         seconds: since it began.
+        left_s: estimate of the time left [s]; None where there is none.
 
     Example:
-        >>> told_time(0.25, 10.0), told_time(None, 3.2)
+        >>> told_time(0.25, 10.0, 30.0), told_time(None, 3.2, None)
         ('25 %, 10 s, about 30 s left', '3 s')
     """
     if done is None:
         return f"{seconds:.0f} s"
     done = min(max(done, 0.0), 1.0)
     text = f"{100 * done:.0f} %, {seconds:.0f} s"
-    if LEFT_FROM <= done < 1.0:
-        text += f", about {seconds * (1.0 - done) / done:.0f} s left"
+    if left_s is not None:
+        text += f", about {left_s:.0f} s left"
     return text
 
 
@@ -82,9 +83,11 @@ class Lines:
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
 
-    def show(self, what: str, done: float | None, seconds: float) -> None:
+    def show(
+        self, what: str, done: float | None, seconds: float, left_s: float | None
+    ) -> None:
         """Write a line."""
-        self._log.warning("flexdt: still %s (%s)", what, told_time(done, seconds))
+        self._log.warning("flexdt: still %s (%s)", what, told_time(done, seconds, left_s))
 
     def close(self) -> None:
         """Leave the lines where they are."""
@@ -95,12 +98,15 @@ class TerminalBar:
 
     bar = True
 
-    def show(self, what: str, done: float | None, seconds: float) -> None:
+    def show(
+        self, what: str, done: float | None, seconds: float, left_s: float | None
+    ) -> None:
         """Draw over what was drawn before."""
-        text = f"{what} {told_time(done, seconds)}"
+        time = told_time(done, seconds, left_s)
+        text = f"{what} {time}"
         if done is not None:
             full = round(WIDTH_CHARS * min(max(done, 0.0), 1.0))
-            text = f"{what} [{'#' * full}{'.' * (WIDTH_CHARS - full)}] {told_time(done, seconds)}"
+            text = f"{what} [{'#' * full}{'.' * (WIDTH_CHARS - full)}] {time}"
         columns = shutil.get_terminal_size().columns
         kept = text
         if columns > NARROWEST_CHARS:
@@ -129,12 +135,14 @@ class NotebookBar:
     def __init__(self) -> None:
         self._handle: Any = None
 
-    def show(self, what: str, done: float | None, seconds: float) -> None:
+    def show(
+        self, what: str, done: float | None, seconds: float, left_s: float | None
+    ) -> None:
         """Draw over what was drawn before."""
         value = ""
         if done is not None:
             value = f' value="{done:.3f}"'
-        text = f"{html.escape(what)} {told_time(done, seconds)}"
+        text = f"{html.escape(what)} {told_time(done, seconds, left_s)}"
         self._draw(
             f'<progress max="1"{value} aria-label="{html.escape(what)}"></progress> {text}'
         )

@@ -25,6 +25,10 @@ SILENT_S = 2.0
 """Time for which work goes on unseen, and between two lines of the log [s]."""
 DRAWN_S: Final = 0.5
 """Time between two drawings of a bar [s]."""
+RATED_FRACTION: Final = 0.1
+"""Progress from whose duration the time left is estimated."""
+FOLLOWED: Final = frozenset({"compiling"})
+"""First words of works that follow each other as one wait."""
 LOG: Final = logging.getLogger("flexdt.progress")
 """Logs lines where there is no bar, and at INFO how long each work took."""
 
@@ -38,6 +42,7 @@ class _Work:
         begun: when it began, or the first of the works of its kind that follow each other [s].
         due: when it is shown next [s].
         done: fraction; None where nobody says.
+        rated_from: first fraction above 0, and when it was done [s].
         inner: name of the work within it, "" if there is none.
         shown: the bar; None before it is drawn.
         lock: held while it is drawn or ended.
@@ -47,6 +52,7 @@ class _Work:
     begun: float
     due: float
     done: float | None = None
+    rated_from: tuple[float, float] = (0.0, 0.0)
     inner: str = ""
     shown: Shown | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -54,7 +60,29 @@ class _Work:
 
     def advance(self, done: float) -> None:
         """Note the fraction that is done."""
-        self.done = done
+        if self.done is None and done > 0.0:
+            self.rated_from = done, time.monotonic()
+        if done > 0.0:
+            self.done = done
+
+    def left_s(self, now: float) -> float | None:
+        """Estimate the time left, from the pace after the first fraction [s].
+
+        What comes before that is preparation, such as a kernel that is compiled.
+
+        Args:
+            now: time [s].
+
+        Returns:
+            None before `RATED_FRACTION` has been done at that pace, and at the end.
+        """
+        if self.done is None or self.done >= 1.0:
+            return None
+        first, since = self.rated_from
+        paced = self.done - first
+        if paced < RATED_FRACTION:
+            return None
+        return (now - since) * (1.0 - self.done) / paced
 
     def tell(self) -> None:
         """Show it as it is now."""
@@ -67,8 +95,9 @@ class _Work:
                 what = f"{self.what}: {self.inner}"
             else:
                 what = self.what
-            self.shown.show(what, self.done, time.monotonic() - self.begun)
-            self.due = time.monotonic() + (DRAWN_S if self.shown.bar else SILENT_S)
+            now = time.monotonic()
+            self.shown.show(what, self.done, now - self.begun, self.left_s(now))
+            self.due = now + (DRAWN_S if self.shown.bar else SILENT_S)
 
     def end(self) -> None:
         """Take its bar away."""
@@ -166,7 +195,7 @@ class _Threads(threading.local):
 _teller = _Teller()
 _threads = _Threads()
 _last: dict[str, tuple[float, float]] = {}
-"""First word of a work -> when the first of those that follow each other began and the last
+"""Word of `FOLLOWED` -> when the first of those that follow each other began and the last
 ended: one kernel compiles after another."""
 
 
@@ -212,7 +241,10 @@ def _shown(what: str) -> Iterator[_Work]:
     """Have a work shown until it ends."""
     kind = what.split(" ", maxsplit=1)[0]
     now = time.monotonic()
-    begun, ended = _last.get(kind, (now, now))
+    begun = now
+    ended = now
+    if kind in FOLLOWED:
+        begun, ended = _last.get(kind, (now, now))
     if now > ended + SILENT_S:
         begun = now
     work = _Work(what, begun, max(now, begun + SILENT_S))

@@ -114,6 +114,7 @@ def test_a_program_that_handles_the_log_gets_lines(
     monkeypatch.undo()
     monkeypatch.setattr(progress_lines, "SILENT_S", 0.05)
     with long_work.during("measuring") as advance:
+        advance(0.25)
         advance(0.5)
         until(lambda: caplog.messages)
     assert caplog.messages[0].startswith("flexdt: still measuring (50 %, 0 s, about ")
@@ -135,6 +136,39 @@ def test_works_that_follow_each_other_are_one_wait(
     assert "preview" not in screen.getvalue()[before:]
 
 
+def test_the_same_call_once_more_begins_at_0_s(
+    screen: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second call of four neither shows what the first took nor is shown sooner."""
+    monkeypatch.setattr(progress_lines, "SILENT_S", 0.3)
+    for _ in range(4):
+        with long_work.during("calibrating"):
+            time.sleep(0.1)
+    assert screen.getvalue() == ""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_time_left_follows_the_pace_and_not_the_preparation(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel compiles for a drawn time, then each percent takes as long as the others."""
+    rng = np.random.default_rng(6400 + seed)
+    prepared, percent_s = rng.uniform(5.0, 60.0), rng.uniform(0.05, 2.0)
+    now = 0.0
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: now)
+    work = progress_lines._Work("reconstructing", 0.0, 0.0)
+    work.advance(0.0)
+    assert work.left_s(now) is None
+    for percent in range(1, 101):
+        now = prepared + percent * percent_s
+        work.advance(percent / 100.0)
+        left = work.left_s(now)
+        if percent <= 10 or percent == 100:
+            assert left is None
+        else:
+            assert left == pytest.approx((100 - percent) * percent_s)
+
+
 def test_a_notebook_s_bar_is_one_display(monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
 
@@ -146,8 +180,8 @@ def test_a_notebook_s_bar_is_one_display(monkeypatch: pytest.MonkeyPatch) -> Non
     fake = types.SimpleNamespace(HTML=str, display=display)
     monkeypatch.setitem(sys.modules, "IPython.display", fake)  # type: ignore[arg-type]
     bar = progress_bars.NotebookBar()
-    bar.show("a < b", 0.5, 3.0)
-    bar.show("a < b", None, 4.0)
+    bar.show("a < b", 0.5, 3.0, 3.0)
+    bar.show("a < b", None, 4.0, None)
     bar.close()
     assert shown == [
         '<progress max="1" value="0.500" aria-label="a &lt; b"></progress> '
