@@ -1,7 +1,7 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Accuracy, Grid
-from flexdt.twin.reconstruction.acquisition.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.acquisition.coverage import LostVoxels
 from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
@@ -24,6 +24,7 @@ __all__ = [
     "Bias",
     "Grid",
     "Hardening",
+    "LostVoxels",
     "Minimised",
     "Polychromatic",
     "Step",
@@ -37,8 +38,6 @@ __all__ = [
     "fdk_parts",
     "field_of_view",
     "hardening",
-    "layer_warnings",
-    "lost_layers",
     "minimise_tv",
     "ring_errors",
     "sart",

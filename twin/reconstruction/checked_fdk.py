@@ -22,7 +22,7 @@ from flexdt.twin.projection.operators import (
     require_finite,
     require_line_integrals,
 )
-from flexdt.twin.reconstruction.acquisition.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.acquisition.coverage import LostVoxels
 from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.feldkamp.backprojection import CHUNK, PIXELS
@@ -62,7 +62,8 @@ def fdk(
 
     Warns:
         UserWarning: even places may be off by more than some per cent, and why; layers of the
-            grid lie above or below what the panel sees.
+            grid lie above or below what the panel sees, or most voxels are not seen from all
+            sides.
 
     Examples:
         A cube of 0.02 / mm, projected and reconstructed:
@@ -148,7 +149,7 @@ def checked_fdk(
     volume = fdk_parts(
         parts, cone_vec, shape, like, window, progress, truncation, errors=errors
     )
-    said = layer_warnings(lost_layers(volume.data), len(volume.data))
+    said = LostVoxels.of(volume.data).warnings()
     if not errors:
         return volume, said
     bias = bias_of(image, cone_vec, shape, truncation)

@@ -67,6 +67,7 @@ from flexdt.twin.plausibility.volume_grid import voxel_findings
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.reconstruction import (
     Grid,
+    LostVoxels,
     Polychromatic,
     Truncation,
     bias_of,
@@ -74,8 +75,6 @@ from flexdt.twin.reconstruction import (
     fdk_parts,
     field_of_view,
     hardening,
-    layer_warnings,
-    lost_layers,
     truncation_of,
     with_errors,
 )
@@ -490,13 +489,13 @@ def _here(
             return views, None, []
         # Before images are prepared: this looks at images as they were recorded.
         bias = _bias(views)
-        lost = 0
+        lost = LostVoxels()
         for slab in _fdk_slabs(task, views, kept, plan, work):
             write(slab.data)
             slices.take(slab.data)
-            lost += lost_layers(slab.data)
+            lost += LostVoxels.of(slab.data)
             del slab  # before there is another
-    return views, bias, layer_warnings(lost, grid.shape[0])
+    return views, bias, lost.warnings()
 
 
 def _fdk_slabs(
@@ -607,7 +606,7 @@ def reconstruct_volume(
             volume = next(slabs)
         else:
             volume = _in_a_file(slabs, grid, folder)
-    doubts = layer_warnings(lost_layers(volume.data), grid.shape[0])
+    doubts = LostVoxels.of(volume.data).warnings()
     if errors:
         volume = with_errors(volume, bias=bias)
         doubts = [*bias_warnings(bias, volume), *doubts]

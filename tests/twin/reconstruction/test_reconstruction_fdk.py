@@ -950,3 +950,32 @@ def test_images_without_an_edge_have_no_outline_to_fit(
     found = truncation_of(lambda i: images[i], scan, (16, 48))
     assert (found is None) == (value == 0.0)
     assert found is None or not any(found.prisms)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_voxels_that_are_not_seen_from_all_sides_are_told(seed: int) -> None:
+    """A panel far aside needs a whole turn; of less, most of the grid has no value."""
+    rng = np.random.default_rng(6410 + seed)
+    aside = float(rng.choice([-1.0, 1.0]) * rng.uniform(50.0, 60.0))
+    arc_deg = float(rng.uniform(200.0, 320.0))
+    like = Grid((1, 72, 72), 2.0)
+    for angles in (np.arange(0.0, arc_deg, 3.0), np.arange(0.0, 360.0, 3.0)):
+        scan = ConeVec.circular(
+            sod=600,
+            sdd=1059,
+            angles=angles,
+            shape=(6, 100),
+            pixel=1.44,
+            offset=(aside, 0.0),
+        )
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            found = fdk(
+                np.ones((len(scan), 6, 100), np.float32), scan, like, errors=False
+            )
+        lost = float(np.isnan(found.data).mean())
+        told = [str(w.message) for w in said if "from all sides" in str(w.message)]
+        assert bool(told) == (lost > 0.5)
+        assert (len(angles) == 120) == (lost < 0.4)
+        for one in told:
+            assert float(one.split(" %")[0]) == pytest.approx(100 * lost, abs=4.0)

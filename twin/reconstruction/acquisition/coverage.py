@@ -99,24 +99,58 @@ def first_and_steps(like: Volume) -> tuple[list[float], list[float]]:
     return [float(places[0]) for places in like.centers()], list(like.voxel_xyz)
 
 
-def lost_layers(data: Float32Array) -> int:
-    """Count the layers of a volume (nz, ny, nx) without a value, by every fourth voxel of
-    a side.
+@dataclass(frozen=True)
+class LostVoxels:
+    """Voxels of FDK without a value, by every fourth voxel of a layer's sides.
+
+    Attributes:
+        layers: of the grid that were examined.
+        lost_layers: without any value.
+        voxels: examined in the other layers.
+        lost_voxels: without a value among those.
     """
-    return int(np.isnan(data[:, ::4, ::4]).all(axis=(1, 2)).sum())
+
+    layers: int = 0
+    lost_layers: int = 0
+    voxels: int = 0
+    lost_voxels: int = 0
+
+    @classmethod
+    def of(cls, data: Float32Array) -> LostVoxels:
+        """Count those of a volume (nz, ny, nx)."""
+        lost = np.isnan(data[:, ::4, ::4]).reshape(len(data), -1)
+        held = lost[~lost.all(axis=1)]
+        return cls(len(data), len(data) - len(held), held.size, int(held.sum()))
+
+    def __add__(self, more: LostVoxels) -> LostVoxels:
+        """Add those of further layers."""
+        return LostVoxels(
+            self.layers + more.layers,
+            self.lost_layers + more.lost_layers,
+            self.voxels + more.voxels,
+            self.lost_voxels + more.lost_voxels,
+        )
+
+    def warnings(self) -> list[str]:
+        """List warnings of lost layers, and of voxels that are not seen from all sides."""
+        said = []
+        if self.lost_layers:
+            said.append(
+                f"{self.lost_layers} of {self.layers} layers of the grid lie outside what "
+                "the panel sees; their voxels are NaN"
+            )
+        if self.lost_voxels > LOST_SHARE * self.voxels:
+            share = 100.0 * self.lost_voxels / self.voxels
+            said.append(
+                f"{share:.0f} % of the voxels are not seen from all sides and are NaN: "
+                "more angles, a panel nearer to the middle, or a smaller grid"
+            )
+        return said
 
 
-def layer_warnings(lost: int, layers: int) -> list[str]:
-    """List a warning if some of a grid's layers are lost."""
-    if not lost:
-        return []
-    return [
-        f"{lost} of {layers} layers of the grid lie outside what the panel sees; their "
-        "voxels are "
-        "NaN"
-    ]
-
-
+LOST_SHARE = 0.5
+"""Share of lost voxels above which a warning is given; corners of a grid are lost in most
+scans whose panel cuts the object off."""
 DEPTHS = 64
 """Number of depths at which shares are tabulated."""
 HELIX_TAPER_RAD = 0.2
