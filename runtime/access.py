@@ -111,14 +111,14 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
 
     Args:
         words: as on the command line.
-        default: limits to change.
+        default: limits to change; not changed itself.
         others: names that are not its own and are passed over.
-
-    Raises:
-        AccessError: no such limit, or not a number above zero; lists the limits.
 
     Returns:
         `default` with the values of those words that are its own.
+
+    Raises:
+        AccessError: no such limit, or not a number above zero; lists the limits.
     """
     names: tuple[str, ...] = limit_names(default)
     out: _L = default
@@ -175,6 +175,10 @@ def is_rebound(host: str) -> bool:
 
 def check_bind(host: str, token: str | None) -> None:
     """Check that an address that others can reach is protected by a token.
+
+    Args:
+        host: where a server is to listen.
+        token: that clients must bring; None for none.
 
     Raises:
         AccessError: no token for a non-loopback address, or a token too short to be one.
@@ -242,7 +246,13 @@ def client_tls(
 
 
 def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    """Make a server's TLS context from PEM files; None if none are given.
+    """Make a server's TLS context from PEM files.
+
+    Args:
+        certificate, key: the files; both or none.
+
+    Returns:
+        The context; None if no files are given.
 
     Raises:
         AccessError: only one of the two is given, or a file is invalid.

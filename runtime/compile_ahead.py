@@ -127,7 +127,8 @@ def is_compiled(group: str) -> bool:
 
 
 def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
-    """Compile the missing groups, as many at a time as there are cores.
+    """Compile the missing groups, each in a process of its own, as many at a time as
+    there are cores; block until done.
 
     Args:
         groups: names, of `GROUPS`.

@@ -212,12 +212,17 @@ def _foreign(host: str) -> bool:
 def _application(
     pages: Pages, token: str | None, *, loopback: bool
 ) -> Callable[..., list[bytes]]:
-    """Make the pages a WSGI application of the running event loop.
+    """Make the pages a WSGI application, whose pages are made in turns of the running
+    event loop.
 
     Args:
         pages: path -> function that makes the page.
         token: required beyond `OPEN_PAGES`; None: of no client.
         loopback: whether requests of other sites' pages are rejected by their Host.
+
+    Returns:
+        The application; errors are empty pages with a status: 401, 403, 404, 405, and 503
+        if the loop is held.
     """
     loop = asyncio.get_running_loop()
 
@@ -331,7 +336,7 @@ def watching_pages(
     *,
     failed: Callable[[], bool] = lambda: False,
 ) -> Pages:
-    """Make the pages of a running server.
+    """Make the pages `/healthz` and `/metrics` of a running server.
 
     Args:
         health: content of `/healthz` in addition to its status.

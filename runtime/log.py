@@ -168,7 +168,10 @@ class Sparing:
         error: bool = False,
         **facts: object,
     ) -> None:
-        """Write a line like `log`, or count it; its kind is the event unless given.
+        """Write a line like `log`, or count it if there were too many of its kind; its
+        kind is the event unless given.
+
+        The next line of the kind states the number left out.
 
         Args:
             event: name of the event.
@@ -197,7 +200,8 @@ class Sparing:
 def set_up(
     stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False
 ) -> None:
-    """Send this program's log to `stream` as JSON lines (for a process's main).
+    """Send this program's log to `stream` as JSON lines, in place of earlier targets (for
+    a process's main).
 
     Args:
         stream: where to.

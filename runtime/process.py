@@ -167,7 +167,7 @@ class ListeningServer:
         *,
         serving: bool = True,
     ) -> None:
-        """Accept connections.
+        """Take an address and accept connections on it.
 
         Args:
             made: makes the protocol of a connection.
@@ -294,7 +294,16 @@ async def first_of(*events: asyncio.Event) -> None:
 
 
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
-    """Print the JSON line of a ready server, with its process id; freeze garbage collection."""
+    """Print the JSON line of a ready server, with its process id; freeze garbage
+    collection.
+
+    The measure of how long the loop is held begins here.
+
+    Args:
+        server: its kind, the value of `ready`.
+        facts: further members of the line.
+        out: where to; None: standard output.
+    """
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
         # What is there now stays: looking through it for garbage would take 0.1 s each time.
@@ -313,7 +322,10 @@ def announce_bound(server: str, host: str, port: int) -> None:
 
 
 def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:
-    """Run the work to its end; print an error on standard error.
+    """Run the work of a process to its end in an event loop of its own; print an error on
+    standard error.
+
+    The limit on open descriptors is raised first.
 
     SIGINT ends the process at once until the work calls `stop_signal`: nobody has been
     promised anything yet, and an exception within asyncio's loop can lose the turn of a
@@ -325,7 +337,7 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
             announces that it is ready.
 
     Returns:
-        Exit code.
+        Exit code: that of the work, or INVALID, USAGE or REFUSED after an error.
     """
     _allow_descriptors()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:

@@ -85,7 +85,9 @@ class _Work:
         return (now - since) * (1.0 - self.done) / paced
 
     def tell(self) -> None:
-        """Show it as it is now."""
+        """Show the work's name and fraction as they are now, unless it has ended, and set
+        when to show it next.
+        """
         with self.lock:
             if self.ended or not LOG.isEnabledFor(logging.WARNING):
                 return
@@ -116,7 +118,7 @@ class _Teller:
         self._thread: threading.Thread | None = None
 
     def add(self, work: _Work) -> None:
-        """Show a work from when it is due."""
+        """Add a work, to be shown from when it is due; start the thread that shows works."""
         with self._changed:
             sooner = all(work.due < other.due for other in self._works)
             self._works.append(work)
@@ -134,6 +136,9 @@ class _Teller:
             self._works.remove(work)
 
     def _run(self) -> None:
+        """Show each work when it is due, again and again; runs in a thread until the
+        process ends.
+        """
         while True:
             with self._changed:
                 now = time.monotonic()
@@ -211,14 +216,16 @@ os.register_at_fork(after_in_child=_forget)
 
 @contextmanager
 def told(what: str, progress: Progress = None) -> Iterator[Advance]:
-    """Show the work that goes on inside.
+    """Show the work that goes on inside the context, from when it takes seconds.
 
     Args:
-        what: its name, such as "calibrating". Work of the same name within it is the same work.
-        progress: the caller's choice.
+        what: its name, such as "calibrating". Work of the same name within it is the same
+            work.
+        progress: the caller's choice: a function that takes the fraction done; False
+            shows nothing.
 
     Yields:
-        What takes the fraction done.
+        The function that takes the fraction done, 0 to 1.
     """
     works = _threads.works
     if callable(progress):
@@ -238,7 +245,13 @@ def told(what: str, progress: Progress = None) -> Iterator[Advance]:
 
 @contextmanager
 def _shown(what: str) -> Iterator[_Work]:
-    """Have a work shown until it ends."""
+    """Show a work until the context ends, and log the time it took.
+
+    Work of the same kind shortly after is shown as one that goes on.
+
+    Args:
+        what: name; its first word is its kind.
+    """
     kind = what.split(" ", maxsplit=1)[0]
     now = time.monotonic()
     begun = now
@@ -270,7 +283,9 @@ def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
 
 @contextmanager
 def _lent(outer: _Work | None, what: str) -> Iterator[None]:
-    """Lend a work that is shown the name of one within it."""
+    """Show a work under the name of one within it until the context ends; None shows
+    nothing.
+    """
     if outer is None:
         yield
         return

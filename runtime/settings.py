@@ -97,11 +97,14 @@ def has_parameters(
 
 
 def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
-    """Read settings from words; None after the help, which is printed.
+    """Read settings from the words of a command line; `--help` is printed.
 
     Args:
         settings: class of the process or command.
         words: of the command line, `sys.argv`'s where left out.
+
+    Returns:
+        The settings; None after the help.
 
     Raises:
         Exception: typer's usage errors, of any version; they have a `format_message`.
@@ -137,7 +140,7 @@ def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
 
 
 def words(given: Mapping[str, object]) -> list[str]:
-    """Convert options to words of a command line.
+    """Convert options to words of a command line; the inverse of `read`.
 
     Args:
         given: name -> value; None and False are left out, True is a bare flag, a list or

@@ -119,7 +119,11 @@ class Supervisor:
     _running: dict[str, Process] = field(default_factory=dict)
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Start everything, look after it until `stop` is set, then stop everything.
+        """Start everything, restart services that end until `stop` is set, then stop
+        everything.
+
+        Args:
+            stop: set from outside.
 
         Raises:
             ServiceError: a service left by itself at its first start.
@@ -155,7 +159,8 @@ class Supervisor:
             await asyncio.gather(*keepers, return_exceptions=True)
 
     async def _keep(self, start: _Start) -> None:
-        """Start a service whenever it ends.
+        """Start a service whenever it ends, after a growing pause, and note each end;
+        ends only by cancellation.
 
         Args:
             start: the service and the events of its start.
@@ -195,10 +200,13 @@ class Supervisor:
             await asyncio.sleep(pause)
 
     async def _spawn(self, service: Service) -> Process:
-        """Start and record a service's process; raise `_Ended` if the system has no room.
+        """Start and record a service's process, which ends with its parent.
 
         Args:
             service: with its command.
+
+        Raises:
+            _Ended: the system has no room for a process.
         """
         try:
             process = await asyncio.create_subprocess_exec(
@@ -263,11 +271,12 @@ class Supervisor:
             await asyncio.gather(ready, end, return_exceptions=True)
 
     async def _lines(self, process: Process, start: _Start) -> None:
-        """Read the address from the `bound` and `ready` lines, up to `ready`; skip others.
+        """Read a service's output up to `ready`: record the address of `bound` and
+        `ready` lines, skip others.
 
         Args:
             process: of the service.
-            start: the service and the events of its start.
+            start: the service and the events of its start; `bound` is set here.
         """
         assert process.stdout is not None
         name = start.service.name

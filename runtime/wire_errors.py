@@ -73,7 +73,15 @@ def is_user_error(error: Exception) -> bool:
 
 
 def from_root(said: object, root: Path) -> object:
-    """Replace paths below the folder `root` in nested values by relative ones."""
+    """Replace paths below the folder `root` in nested values by relative ones.
+
+    Args:
+        said: text, mapping or list; other values stay.
+        root: the data directory.
+
+    Returns:
+        A new value of the same form.
+    """
     match said:
         case str():
             below = said.replace(str(root) + os.sep, "")

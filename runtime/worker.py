@@ -50,6 +50,7 @@ def receive_parts(channel: socket.socket) -> list[bytes]:
 
 
 def _exactly(channel: socket.socket, size: int) -> bytearray:
+    """Read `size` bytes from a socket; raise EOFError if the other end is gone."""
     data = bytearray(size)
     view = memoryview(data)
     at = 0
@@ -86,7 +87,7 @@ def peak_bytes() -> int:
 
 
 def answer(request: Sequence[bytes]) -> list[bytes]:
-    """Do one piece of work; return its parts after b"done", or how it failed.
+    """Do one piece of work within its processor time; errors are returned, not raised.
 
     Args:
         request: seconds allowed, the pickled call, and its binary arguments.
@@ -126,7 +127,9 @@ def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> li
 
 
 def main() -> int:
-    """Work until the parent is gone."""
+    """Limit this process's memory, then answer requests until the parent is gone; return
+    the exit code.
+    """
     channel = socket.socket(fileno=int(sys.argv[1]))
     limit("RLIMIT_AS", int(sys.argv[2]))
     limit("RLIMIT_CORE", 0)

@@ -128,6 +128,10 @@ class Worker:
     def _wait(self, seconds: float) -> None:
         """Wait for the first byte of an answer.
 
+        Args:
+            seconds: of processor time that the work may take; doing nothing for so long
+                ends the wait, too.
+
         Raises:
             TimeoutError: the work has used, or done nothing for, so much time.
         """
@@ -148,7 +152,7 @@ class Worker:
                     raise TimeoutError
 
     def _died(self, work: Work, seconds: float) -> RpcError:
-        """Kill the process and make the error for its end."""
+        """Kill the process and make the error -32008 for its end; returned, not raised."""
         self.kill()
         return RpcError(
             Code.TOO_LARGE,
@@ -195,7 +199,8 @@ class Workers:
         return bool(self._idle)
 
     async def ask(self, work: Work, *arguments: object, raw: Parts = ()) -> list[bytes]:
-        """Have one piece of work done; it is stopped if this is cancelled.
+        """Have one piece of work done by an idle or a new worker; it is stopped if this
+        is cancelled.
 
         Args:
             work: function that a worker calls.
@@ -206,7 +211,7 @@ class Workers:
             The parts that the function returns.
 
         Raises:
-            RpcError: as `Worker.ask`.
+            RpcError, RuntimeError: as `Worker.ask`.
         """
         async with self._turn:
             loop = asyncio.get_running_loop()

@@ -118,7 +118,12 @@ class PastScan:
 
 
 def standing(scan: PastScan, machine: Machine) -> PastScan:
-    """Return the scan with its motors, camera and the zero offsets behind its printed figures.
+    """Return the scan with motor positions, camera and the zero offsets behind its
+    printed figures.
+
+    Args:
+        scan: with the content of its settings text.
+        machine: whose motors and camera these are.
 
     Raises:
         TwinError: its texts do not say them, or contradict themselves.
@@ -155,11 +160,16 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 
 
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
-    """Read the settings that its script asks for: axis -> target when the settings file is
-    written, and settings of camera and tube, by the names of `ScanSettings`, at the first
-    projection.
+    """Read the settings that a scan's script asks for.
 
-    `projections` counts all that it saves: those of sequences, and single images.
+    Args:
+        scan: with the commands of its script.
+        machine: whose axes the script names.
+
+    Returns:
+        Axis -> target when the settings file is written; settings of camera and tube, by
+        the names of `ScanSettings`, at the first projection; and `projections`, the
+        number of all that it saves, in sequences and as single images.
     """
     now: dict[str, Any] = {}
     moved: dict[str, Any] = {}
@@ -207,7 +217,15 @@ class Scanner(NamedTuple):
 
 
 def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
-    """Which scanner a scan says it is of: by its texts, or else by the limits of its motors."""
+    """Identify the scanner of a scan: by its texts, or else by the limits of its motors.
+
+    Args:
+        scan: with its texts and log.
+        known: machines that it may be of.
+
+    Returns:
+        Name of the machine ("" if unknown), serial number, and what identified it.
+    """
     texts = [text for text in (scan.settings, scan.second) if text is not None]
     serial = next((text.serial for text in texts if text.serial), "")
     for text in texts:
@@ -235,7 +253,12 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
 
 
 def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
-    """Folders by scanner, in words, where they are of more than one; "" otherwise."""
+    """List folders by scanner, in words, where they are of more than one; "" otherwise.
+
+    Args:
+        scans: of which the folders are named.
+        known: machines that they may be of.
+    """
     told = {scan.name: scanner_of(scan, known) for scan in scans}
     serials = {one.serial for one in told.values()} - {""}
     machines = {one.machine for one in told.values()} - {""}
@@ -259,8 +282,14 @@ def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
 def contradictions(
     scans: Sequence[PastScan], shipped: Machine, fitted: Machine
 ) -> Iterator[Finding]:
-    """Find where texts, scripts, images and replies of the scans and the shipped machine state
-    things differently; `fitted` has the signs and limits that the scans show."""
+    """Yield where texts, scripts, images and replies of the scans and the shipped machine
+    state things differently.
+
+    Args:
+        scans: that are compared.
+        shipped: machine of the file.
+        fitted: machine with the signs and limits that the scans show.
+    """
     said: dict[str, list[tuple[Any, list[str]]]] = {}
     lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
     every = [
@@ -311,7 +340,12 @@ def contradictions(
 
 
 def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
-    """(name, value, who) of what a scan's own parts say of the same thing."""
+    """Yield (name, value, who) of what a scan's own parts state of the same thing.
+
+    Args:
+        scan: with texts, script and images.
+        machine: whose axes, limits and signs count.
+    """
     s = scan.settings
     camera = scan.camera
     if s is None:
@@ -350,7 +384,13 @@ def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
 
 
 def _alike(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
-    """(name, value) of what should be alike in all scans."""
+    """Yield (name, value) of what should be alike in all scans: scanner, pixel, rates,
+    limits, offsets.
+
+    Args:
+        scan: with texts and log.
+        machine: whose axes count.
+    """
     s = scan.settings
     for name in ("scanner_name", "scanner_type", "serial", "original_pixel_mm"):
         if getattr(s, name, None) not in (None, ""):
@@ -415,12 +455,17 @@ class ZeroOffsets(NamedTuple):
 def zero_offsets(
     scans: Sequence[PastScan], machine: Machine, usual: Profile
 ) -> ZeroOffsets:
-    """Zero offsets and drift.
+    """Estimate zero offsets and their drift from all scans; scans that contradict the
+    others are findings.
 
     Args:
         scans: the oldest first, those without a date last.
         machine: whose.
         usual: offsets where no text states any.
+
+    Returns:
+        The profile, a line (value, sigma, drift) for each offset, the axis columns by
+        scan [px], findings, and questions that further scans would answer.
     """
     base = next(
         (scan.profile for scan in reversed(scans) if scan.profile is not None), usual
@@ -516,8 +561,18 @@ def zero_offsets(
 def _axis(
     machine: Machine, scan: PastScan, base: Profile, roll: float
 ) -> tuple[float, ...]:
-    """Return the axis's column [px] with the offsets of `base`, and its slopes [px/mm] with
-    axs_tan and det_tan, in which it is linear."""
+    """Compute the axis's column in the image, and how it depends on axs_tan and det_tan
+    (linearly).
+
+    Args:
+        machine: of the scan.
+        scan: with positions and camera.
+        base: offsets.
+        roll: of the detector [deg].
+
+    Returns:
+        Column [px] with the offsets of `base`, and its two slopes [px/mm].
+    """
     own = scan.profile or base
     camera = scan.camera or machine.detector.camera
     middle = (np.array(camera.shape[::-1]) - 1) / 2
@@ -536,13 +591,20 @@ def _axis(
 def _fit(
     sides: FloatArray, values: FloatArray, sigmas: FloatArray, scans: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weighted least squares of rows, of which the first `scans` belong to a scan each.
+    """Fit by weighted least squares of rows, of which the first `scans` belong to a scan
+    each.
 
-    The scan that contradicts the others most is left out while it does so by `FAR_OFF` sigmas
-    and enough remain.
+    The scan that contradicts the others most is left out while it does so by `FAR_OFF`
+    sigmas and enough remain.
+
+    Args:
+        sides: (m, k) design matrix.
+        values: (m,) right-hand sides.
+        sigmas: (m,) of the values.
+        scans: number of rows that belong to scans.
 
     Returns:
-        Values, covariance, and the residuals of all scans in sigmas.
+        Values (k,), covariance (k, k), and the residuals of all scans in sigmas.
     """
     a, b = sides / sigmas[:, None], values / sigmas
     kept = np.ones(len(b), dtype=bool)

@@ -31,8 +31,14 @@ class TwinError(ValueError):
 
     @classmethod
     def instead(cls, said: str, asked: object, allowed: object, **where: object) -> Self:
-        """Make the error whose message is `said` and what is allowed; `where` goes into its
-        data.
+        """Make the error whose message is `said` and what is allowed; returned, not
+        raised.
+
+        Args:
+            said: the problem, in words.
+            asked: value that is not allowed, for the data.
+            allowed: a value, or a list of values; its words end the message.
+            **where: further members of the data.
 
         Example:
             >>> error = TwinError.instead("no unit 'mile'", "mile", ("mm", "m"))
@@ -93,6 +99,12 @@ def require_within(
     what: str, value: float, low: float, high: float, unit: str = ""
 ) -> None:
     """Check that a number is finite and from `low` to `high`.
+
+    Args:
+        what: name of the number, for the message.
+        value: that is checked.
+        low, high: allowed range.
+        unit: for message and data; "" for none.
 
     Raises:
         LimitError: it is not; the message says what it is.

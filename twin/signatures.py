@@ -81,6 +81,7 @@ def with_arguments_of(
     checkers."""
 
     def typed(function: Callable[..., Result]) -> Callable[P, Result]:
+        """Give the function the other's parameters, with its own result, and return it."""
         result = inspect.signature(function).return_annotation
         shown = inspect.signature(other).replace(return_annotation=result)
         function.__signature__ = shown  # type: ignore[attr-defined]
@@ -90,11 +91,11 @@ def with_arguments_of(
 
 
 def with_options_of(declared: type) -> Callable[[Thing], Thing]:
-    """Make a decorator: a function's `**options` are the keys of a TypedDict, each None by
-    default.
+    """Make a decorator: a function's `**options` are the keys of a TypedDict, each None
+    by default.
 
-    They stand in its signature, and their descriptions in its docstring, in place of the line
-    `options: OPTIONS` of its arguments.
+    They appear in its signature, and their descriptions in its docstring, in place of the
+    line `options: OPTIONS` of its arguments. The function itself is changed.
 
     Args:
         declared: the TypedDict, whose docstring has a last section `Args:`.
@@ -120,6 +121,9 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
 
 def public(thing: Thing) -> Thing:
     """Check calls of a function, or of a class and its methods (decorator).
+
+    Args:
+        thing: function, which is wrapped, or class, whose public methods are replaced.
 
     Raises:
         ArgumentError: when called with arguments that the signature does not allow.
@@ -157,6 +161,9 @@ def public(thing: Thing) -> Thing:
 
 
 def _checked(function: Thing, text: str) -> Thing:
+    """Wrap a function so that its arguments are checked; `text` is the docstring that
+    describes them.
+    """
     known = Known(function, text)
 
     @wraps(function)
@@ -220,7 +227,14 @@ class Known:
         return {name: kind for name, kind in found.items() if kind is not None}
 
     def checked(self, given: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-        """Return the keywords, under the names that the signature has.
+        """Check the arguments of a call.
+
+        Args:
+            given: positional arguments.
+            named: keyword arguments.
+
+        Returns:
+            The keyword arguments, under the names that the signature has.
 
         Raises:
             ArgumentError: arguments that the signature does not allow.
@@ -261,6 +275,16 @@ class Known:
         return [name for name in self.signature.parameters if name not in ("self", "cls")]
 
     def _renamed(self, where: str, named: dict[str, Any]) -> dict[str, Any]:
+        """Rename deprecated keyword arguments, with a DeprecationWarning.
+
+        Args:
+            where: name of the function, for messages.
+            named: keyword arguments.
+
+        Raises:
+            ArgumentError: a name that the function does not take; suggests the nearest
+                one.
+        """
         takes = self.signature.parameters
         if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in takes.values()):
             return named
@@ -287,6 +311,18 @@ class Known:
     def _mistake(
         self, where: str, name: str, label: str, value: object, values: Mapping[str, Any]
     ) -> ArgumentError:
+        """Make the error for an argument of a wrong kind; returned, not raised.
+
+        It quotes the argument's description, and says if two arguments seem to be
+        swapped.
+
+        Args:
+            where: name of the function.
+            name: parameter.
+            label: name under which the value was given.
+            value: that is not allowed.
+            values: all arguments of the call.
+        """
         *first, last = self.kinds[name].words
         words = last
         if first:
@@ -327,8 +363,13 @@ class Names(dict[str, Any]):
 
 
 def kind_of(annotation: Any) -> Kind | None:
-    """Return the kind of value that an annotation allows; None where it is no more than
-    anything.
+    """Find the kind of value that an annotation allows.
+
+    Args:
+        annotation: of a parameter, evaluated.
+
+    Returns:
+        The kind, with its words and its test; None where the annotation allows anything.
 
     Example:
         >>> kind_of(float | None).words, kind_of(tuple[int, int]).holds((3, 4.5))
@@ -395,8 +436,8 @@ def _is_truth(value: Any) -> bool:
 
 
 def _is_numbers(value: Any) -> bool:
-    """Whether an array can be made of it; what is not looked at, such as memory on a device, is
-    for the function to read.
+    """Return whether an array of numbers can be made of a value; memory on a device
+    counts unread.
     """
     import numpy as np
 
@@ -424,7 +465,13 @@ def _is_numbers(value: Any) -> bool:
 
 
 def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False) -> bool:
-    """Whether it is a list of so many members, or of several alike, each as its kind has it."""
+    """Return whether a value is a list whose members are of these kinds.
+
+    Args:
+        value: any.
+        kinds: of the members, in order; None allows anything.
+        several: whether any number of members of the one kind is allowed.
+    """
     if not (hasattr(value, "__len__") and hasattr(value, "__iter__")):
         return False
     alone = isinstance(value, str | bytes | Mapping) or getattr(value, "ndim", 1) == 0
@@ -441,6 +488,9 @@ def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False)
 
 
 def _named(kind: type) -> str:
+    """Return a type's name with its article, such as "an int"; "a path" for path-like
+    objects.
+    """
     name = "path"
     if kind.__name__ != "PathLike":
         name = kind.__name__
@@ -448,6 +498,9 @@ def _named(kind: type) -> str:
 
 
 def _shown(value: object) -> str:
+    """Format a value for a message: a short one itself, an array's shape, or the name of
+    its type.
+    """
     shape = getattr(value, "shape", None)
     if shape is not None and hasattr(value, "dtype"):
         return f"an array of shape {tuple(shape)}"

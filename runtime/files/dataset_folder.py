@@ -209,7 +209,11 @@ def opened(path: Path) -> BinaryIO:
 
 
 def list_folder(path: Path) -> Folder:
-    """List a folder; where reading is `confined`, links to files are left out.
+    """List the files of a folder; where reading is `confined`, links to files are left
+    out.
+
+    Args:
+        path: of the folder.
 
     Raises:
         DatasetMissingError: there is no such folder, or it cannot be read.
@@ -291,12 +295,15 @@ def read_image(
 def read_values(
     path: Path, shape: tuple[int, int] | None = None, kinds: str = "uf"
 ) -> npt.NDArray[np.uint16 | np.float32]:
-    """Read one TIFF image (rows, cols): counts as uint16 or, where `kinds` has an f, float32.
+    """Read one TIFF image: counts as uint16 or, where `kinds` has an f, float32.
 
     Args:
         path: of the file.
-        shape: that the image must have; None: any.
+        shape: (rows, cols) that the image must have; None: any.
         kinds: of values that are allowed: u, f.
+
+    Returns:
+        uint16 or float32 (rows, cols).
 
     Raises:
         DatasetMissingError: it is not there.
@@ -336,6 +343,9 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     Args:
         path: of the file.
         kinds: of values that are allowed: u, f.
+
+    Returns:
+        uint16 or float32 (rows, cols).
 
     Raises:
         DatasetFormatError: another kind of image, or larger than allowed.
@@ -387,10 +397,18 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
 def _check_kind(
     path: Path, shape: tuple[int, ...], kind: np.dtype[Any], kinds: str
 ) -> None:
-    """Refuse what is no image of counts or, where `kinds` has an f, of other values.
+    """Check that a TIFF holds one image of counts or, where `kinds` has an f, of other
+    values.
+
+    Args:
+        path: of the file, for the message.
+        shape: that its head states.
+        kind: type of its values.
+        kinds: that are allowed: u, f.
 
     Raises:
-        DatasetFormatError: says what is allowed, and how several images in one file are read.
+        DatasetFormatError: says what is allowed, and how several images in one file are
+            read.
     """
     allowed = [np.dtype(k) for k in (*COUNTS, "f4", "f8") if k[0] in kinds or k in COUNTS]
     if len(shape) == 2 and kind.newbyteorder("=") in allowed:

@@ -191,7 +191,12 @@ class Directory:
         self.sync()
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write a file in place from its beginning, and flush it; its size stays, or grows.
+        """Write a file in place from its beginning, and flush it to the disk; its size
+        stays, or grows.
+
+        Args:
+            name: of a file that exists.
+            data: its new first bytes.
 
         Raises:
             OSError: there is no such regular file, or the system refuses.
@@ -338,7 +343,8 @@ class Directory:
 
     @contextmanager
     def entries(self) -> Iterator[Iterator[os.DirEntry[str]]]:
-        """List everything in it, as `os.scandir`.
+        """Open the listing of everything in the directory, as `os.scandir`; closed with
+        the context.
 
         Raises:
             OSError: there is no such directory.
@@ -407,7 +413,11 @@ class Directory:
 
     @contextmanager
     def _opened(self) -> Iterator[int | None]:
-        """Open the descriptor for a call; None on a system without.
+        """Provide the directory's descriptor within the context, None on a system
+        without.
+
+        One below another is opened for the call and closed again; the topmost one cannot
+        be closed meanwhile.
 
         Raises:
             OSError: the folder has been closed.
@@ -463,13 +473,16 @@ class Directory:
                 return name, os.open(name, _NEW | flags, mode, dir_fd=fd)
 
     def _store(self, fd: int | None, name: str, data: memoryview) -> None:
-        """Write a file under a temporary name, flush it and rename it; nothing is
-        left of a failure.
+        """Write a file under a temporary name, flush it and rename it; nothing is left of
+        a failure.
 
         Args:
             fd: descriptor of the folder; None where the system has none.
-            name: of the file.
+            name: of the file; one of that name is replaced.
             data: its content.
+
+        Raises:
+            OSError: the system refuses.
         """
         temporary, file = self._temporary(fd, 0o644)
         try:
@@ -487,7 +500,14 @@ class Directory:
             raise
 
     def _failed(self, name: str, error: OSError, size: int) -> ds.DatasetWriteError:
-        """Convert a system error to DiskFullError or DatasetWriteError."""
+        """Convert a system error to DiskFullError or DatasetWriteError; returned, not
+        raised.
+
+        Args:
+            name: of the file.
+            error: of the system.
+            size: of the file [bytes].
+        """
         path = str(self.path / name)
         data = {
             "path": path,

@@ -104,13 +104,17 @@ class Changes:
     def put(
         self, folder: Directory, name: str, data: bytes, keep: Keep | None = None
     ) -> None:
-        """Write a file like `Directory.keep`, and keep the one it replaces until
-        `done` or `undo`.
+        """Write a file like `Directory.keep`, and keep the one it replaces until `done`
+        or `undo`.
 
         Args:
             folder, name, data: directory, file name and content.
             keep: writes it instead, and may do so on a full disk; spaces may follow the
                 data then.
+
+        Raises:
+            DatasetWriteError: the system cannot write; `undo` restores what was written
+                before.
         """
         before = self._before()
         old = None
@@ -170,7 +174,9 @@ class Changes:
         self._made.clear()
 
     def undo(self) -> None:
-        """Restore each file unless somebody else has changed it since; failures are logged."""
+        """Restore each file, in reverse order, unless somebody else has changed it since;
+        failures are logged.
+        """
         for change in reversed(self._made):
             try:
                 change.undo()
@@ -187,7 +193,15 @@ class Changes:
 
 
 def _second_name(folder: Directory, name: str, second: str) -> bool:
-    """Give a file a second name; False where there is no file.
+    """Give a file a second name, as a link or else as a copy.
+
+    Args:
+        folder: of the file.
+        name: of the file.
+        second: its second name; a file of that name is removed.
+
+    Returns:
+        Whether there is a file of the first name.
 
     Raises:
         DatasetWriteError: the system refuses.

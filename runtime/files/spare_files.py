@@ -51,11 +51,19 @@ class SpareFiles:
             self._refill()
 
     def _keep_in_spare(self, name: str, data: bytes) -> bool:
-        """Write a document into a spare file and rename it; False if there is none.
+        """Write a document into a spare file and rename that to the document's name.
+
+        The document that it replaces becomes a spare where it has the size of one.
 
         Args:
             name: of the document.
             data: its content.
+
+        Returns:
+            False if there is no usable spare file.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
         """
         for spare in sorted(self._there):
             self._there.discard(spare)

@@ -50,7 +50,7 @@ def plain_name(name: str, what: str = "file") -> str:
 
 
 def _reason(name: str) -> str | None:
-    """Return why a name is not allowed, or None if it is."""
+    """Return the rule that a name breaks, in words, or None if it is allowed."""
     if not name:
         return "is empty"
     if len(name) > MAX_NAME or len(name.encode("utf-8", "surrogatepass")) > 255:

@@ -182,6 +182,16 @@ class ScanRecord(ArrayValue):
 
         Settings are those at `write settings file`, or, for a script without that
         command, those at the first projection.
+
+        Args:
+            plan: of the scan.
+            name: of the data set.
+            started: date and time.
+            sample: None takes the plan's size.
+            noise: seed and figures of the noise.
+            correction: in force.
+            operator, version: for the documents.
+            predicted: exposures.
         """
         blocks = tuple(
             FrameBlock(g.kind, g.files, g.starts, g.camera, positions, g.xrays_on)
@@ -303,8 +313,15 @@ class ScanRecord(ArrayValue):
 
 
 def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
-    """Find the linear motor that is farthest from its place in the projections during
-    flats.
+    """Find the linear motor that takes the sample out of the beam for the flats.
+
+    Args:
+        machine: whose turning motors do not count.
+        blocks: images with their motor positions.
+
+    Returns:
+        The motor that moves most between projections and flats; "" if none moves more
+        than 1 mm.
     """
     flats = next((b for b in blocks if b.kind == "flat"), None)
     scans = next((b for b in blocks if b.kind == "projection"), None)
@@ -320,6 +337,7 @@ def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
 
 
 def _plain(name: str) -> str:
+    """Check a file name, for pydantic; raise ValueError for one that is not plain."""
     try:
         return plain_name(name)
     except DatasetNameError as error:
@@ -352,7 +370,9 @@ class FrameEntry(_Model):
 
     @classmethod
     def all_of(cls, record: ScanRecord, block: FrameBlock) -> Iterator[FrameEntry]:
-        """Yield the entries of a block."""
+        """Yield an entry for each image of a block, with its positions and nominal
+        cone_vec.
+        """
         rows = record.poses_of(block).cone_vec().rows.tolist()
         times = np.asarray(block.times_s).tolist()
         for i, (file, time, row) in enumerate(zip(block.files, times, rows, strict=True)):
@@ -427,7 +447,7 @@ class PredictedEntry(_Model):
 
     @classmethod
     def of(cls, predicted: PredictedExposure) -> PredictedEntry:
-        """Make the entry of a prediction."""
+        """Make the document's entry of a predicted exposure; figures are rounded."""
         shares = predicted.shares
         return cls(
             kV=predicted.kV,
@@ -479,7 +499,7 @@ class DatasetDocument(_Model):
 
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
-        """Make the document of a scan."""
+        """Make the document of a scan, with an entry for every image."""
         camera = record.camera
         rows, cols = camera.shape
         return cls(
@@ -554,6 +574,7 @@ class DatasetDocument(_Model):
         return self._camera(frame).shape
 
     def _camera(self, entry: FrameEntry | DetectorEntry) -> CameraSettings:
+        """Make the camera settings of an entry, with the modes of the document's machine."""
         detector = self.machine.get("detector")
         named = None
         if isinstance(detector, dict):
@@ -572,8 +593,17 @@ class DatasetDocument(_Model):
     ) -> Poses:
         """Compute nominal poses of the frames of one kind from their motor positions.
 
+        Args:
+            machine: whose geometry and sensor are used.
+            profile: zero offsets.
+            kind: of the frames.
+
+        Returns:
+            n poses, in the order of the frames; none without such frames.
+
         Raises:
             TwinError: `machine` does not have a motor, or a camera mode does not exist.
+            DatasetFormatError: frames name different motors.
         """
         chosen = [f for f in self.frames if f.kind == kind]
         parts = []
@@ -609,7 +639,11 @@ class DatasetDocument(_Model):
 
 
 def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
-    """Read `flexdt.json`.
+    """Parse and validate the text of `flexdt.json`.
+
+    Args:
+        text: its content.
+        file: name for error messages.
 
     Raises:
         DatasetFormatError: names file, key path, value and allowed values.

@@ -72,7 +72,15 @@ class LineIntegrals:
         return LineIntegrals(self.dark, self.log_open, dead, *_neighbours(dead))
 
     def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
-        """Convert an image of counts to line integrals, float32 (rows, cols), finite."""
+        """Convert an image of counts to line integrals; dead pixels are interpolated in
+        their row.
+
+        Args:
+            counts: (rows, cols).
+
+        Returns:
+            float32 (rows, cols), finite.
+        """
         out: Float32Array = np.subtract(counts, self.dark, dtype=np.float32)
         np.maximum(out, np.float32(MIN_COUNTS), out=out)
         np.log(out, out=out)
@@ -147,6 +155,9 @@ def binned_mean(
     Args:
         images: (..., rows, cols).
         factor: pixels along each edge of a block, or its rows and columns.
+
+    Returns:
+        float32 (..., rows, cols), coarse; `images` itself for a factor of 1.
     """
     if isinstance(factor, int):
         down, across = (factor, factor)

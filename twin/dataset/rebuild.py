@@ -49,14 +49,17 @@ class Rebuilt:
 
 
 def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
-    """Stage angle of images 0 to count - 1 by the smooth-scan rule: i * (last - start) / (N -
-    1).
+    """Compute stage angles of images 0 to count - 1 by the smooth-scan rule: i * (last -
+    start) / (N - 1).
 
     Args:
-        settings: gives N ("# projections"), start and last angle; rot_obj there is the run-up
-            position and does not enter.
+        settings: gives N ("# projections"), start and last angle; rot_obj there is the
+            run-up position and does not enter.
         count: number of images wanted.
         file: for error messages.
+
+    Returns:
+        Angles (count,) [deg].
 
     Raises:
         DatasetFormatError: the texts state no angles.
@@ -86,6 +89,9 @@ def rebuild(
 ) -> Rebuilt:
     """Compute poses of images 0 to count - 1 from the scanner's texts.
 
+    Motors and a profile that reproduces the printed figures are used where possible, else
+    the figures alone.
+
     Args:
         settings: read from the texts.
         count: number of projections.
@@ -93,6 +99,10 @@ def rebuild(
         machines: candidates; one alone is taken as it is.
         profiles: candidates of any machine; one alone is taken as it is.
         file: for error messages.
+
+    Returns:
+        Poses, machine and profile (None if unknown), motor positions, and notes on what
+        was assumed.
 
     Raises:
         DatasetFormatError: neither machine and motors nor the figures suffice.
@@ -153,6 +163,14 @@ def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]
     the printed SDD and COR are for the wrong one, and SDD is longer by the difference (as
     public corrections of such scans have it); the axis's shadow moves in proportion.
 
+    Args:
+        settings: read from the texts; not changed.
+        file: for error messages.
+
+    Returns:
+        The settings with the physical place, and the notes; `settings` itself and no
+        notes where nothing differs.
+
     Raises:
         DatasetFormatError: the detector would not be behind the axis.
     """
@@ -190,8 +208,15 @@ def _profile(
 ) -> tuple[Profile, str] | None:
     """Choose the given profile, or the one that reproduces the printed figures.
 
+    Args:
+        machine: whose profiles count.
+        profiles: candidates of any machine; one alone is taken as it is.
+        camera: of the images.
+        positions: motor -> (n,) positions [mm, deg].
+        printed: figures of the texts; None takes the machine's default profile.
+
     Returns:
-        the profile and the reason for the choice; None if no profile fits.
+        The profile and the reason for the choice; None if no profile fits.
     """
     if len(profiles) == 1:
         return profiles[0], ": as asked"
@@ -269,7 +294,20 @@ def _camera(
     file: str,
     modes: tuple[tuple[str, int], ...],
 ) -> CameraSettings | None:
-    """Compute camera settings for images of `shape`; None if the texts do not state them."""
+    """Make camera settings for images of `shape` from the texts.
+
+    Args:
+        settings: with ROI and mode.
+        shape: of the images (rows, cols).
+        file: for error messages.
+        modes: named modes of the machine.
+
+    Returns:
+        The settings; None if the texts do not state them.
+
+    Raises:
+        DatasetFormatError: ROI and mode give images of another shape.
+    """
     if settings.roi is None or settings.mode is None:
         return None
     try:
@@ -287,6 +325,9 @@ def _camera(
 
 
 def _agree(ours: Figures, printed: Figures) -> bool:
+    """Return whether figures agree with the printed ones, within `MATCH_MM`, `MATCH_PX`
+    and 1e-5 mm of pitch.
+    """
     slack = {"sod_mm": MATCH_MM, "sdd_mm": MATCH_MM, "pixel_mm": 1e-5}
     return all(
         abs(value - getattr(printed, name)) < slack.get(name, MATCH_PX)
@@ -295,6 +336,9 @@ def _agree(ours: Figures, printed: Figures) -> bool:
 
 
 def _default(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
+    """Find the default profile of a machine among `profiles`; zero offsets where it has
+    none, None where it is missing.
+    """
     if not machine.default_profile:
         return profile_of(machine)
     return next(

@@ -176,6 +176,9 @@ def settings_of(record: ScanRecord) -> ScanSettings:
     Counts of flats and offset images are exposures, as the scanner counts them: a flat
     averaged over 30 exposures counts 30. Start and last angle are those of the first and
     last projection.
+
+    Args:
+        record: of the scan; its settings pose gives the printed figures.
     """
     camera = record.camera
     machine = record.machine
@@ -238,7 +241,15 @@ def settings_of(record: ScanRecord) -> ScanSettings:
 
 
 def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
-    """List axis -> its line, virtual axes first, in the settings file's sign."""
+    """List the motors' lines of the settings file, virtual axes first, in the file's
+    sign.
+
+    Args:
+        record: of the scan.
+
+    Returns:
+        Axis -> position [mm, deg], speed and acceleration.
+    """
     out: dict[str, MotorLine] = {}
     machine = record.machine
     for name, virtual in machine.virtual_axes.items():

@@ -82,6 +82,9 @@ def parse_number(text: str) -> float:
 
 
 def _whole(text: str) -> int:
+    """Parse a whole number, which may be written with decimals; raise ValueError
+    otherwise.
+    """
     value = parse_number(text)
     if value != int(value):
         raise ValueError(text)
@@ -150,6 +153,7 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
 
 
 def _date(moment: datetime) -> str:
+    """Format a date line as the scanner does, with AM and PM."""
     hour = 12
     if moment.hour % 12:
         hour = moment.hour % 12
@@ -161,6 +165,7 @@ def _date(moment: datetime) -> str:
 
 
 def _motor(name: str, motor: MotorLine) -> str:
+    """Format a motor's line: position and, if known, speed and acceleration."""
     said = {name: motor.value, "speed": motor.speed, "acceleration": motor.acceleration}
     return " ; ".join(
         f"{key} : {value:f}" for key, value in said.items() if value is not None
@@ -199,9 +204,16 @@ def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
 def _read_line(
     line: str, rest: list[str], values: dict[str, Any], motors: dict[str, MotorLine]
 ) -> None:
-    """Read one line into `values` or `motors`.
+    """Read one line into `values` or `motors`; lines that say nothing known are skipped.
 
-    A date or a scan type may follow in `rest`, the lines after it.
+    Args:
+        line: without its end.
+        rest: the lines after it, where a date or a scan type may follow.
+        values: field of `ScanSettings` -> value; the first one given is kept.
+        motors: axis -> its line; likewise.
+
+    Raises:
+        ValueError: a figure is not a number.
     """
     upper = line.upper()
     if upper in (_START, _STOP):
@@ -242,6 +254,9 @@ def _split(line: str) -> tuple[str | None, str]:
 
 
 def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
+    """Read a value into the field of `values`, unless it is there; a serial number is
+    split off the type.
+    """
     if field == "scanner_type" and _SERIAL in value:
         value, serial = value.split(_SERIAL, 1)
         values.setdefault("serial", serial.strip().lstrip(":=").strip())
@@ -265,6 +280,7 @@ def _is_motor(key: str, value: str) -> bool:
 
 
 def _read_motor(value: str) -> MotorLine:
+    """Parse a motor's line: position and, where given, speed and acceleration."""
     first, *others = value.split(";")
     named = dict(_split(part.strip()) for part in others)
     return MotorLine(

@@ -95,6 +95,9 @@ def poses_of(
         angles: stage angle of each frame, (n,) [rad].
         source_x, source_z: focal spot [mm], world.
         axis_z: height of the sample's reference point [mm], world.
+
+    Returns:
+        n poses.
     """
     f, (rows, cols) = figures, shape
     axis_x = source_x + (f.cor_px - f.hc_px) * f.pixel_mm * f.sod_mm / f.sdd_mm

@@ -125,6 +125,7 @@ def _lines(entries: Mapping[str, Value]) -> str:
 
 
 def _utc(moment: datetime) -> str:
+    """Format a moment in UTC as the XRE file has it; one without a zone is taken for UTC."""
     if moment.tzinfo is None:
         utc = moment
     else:
@@ -133,8 +134,15 @@ def _utc(moment: datetime) -> str:
 
 
 def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
-    """Name -> entry: axis, piercing point, image, sample, source at the settings file's
-    moment."""
+    """Compute the entries of the XRE file's points of interest at the settings file's
+    moment.
+
+    Args:
+        record: of the scan.
+
+    Returns:
+        Name -> entry: axis, piercing point, image, sample, source, world.
+    """
     pose = record.settings_pose()
     source = pose.source[0]
     axis = pose.axis[0]
@@ -204,7 +212,9 @@ def _triple(vector: Sequence[float] | FloatArray) -> str:
 
 
 def _written(value: Value) -> str:
-    """Format one value by its type."""
+    """Format one value as the XRE file has its type: TRUE, whole number, six decimals,
+    quoted text.
+    """
     match value:
         case bool():
             return "TRUE" if value else "FALSE"

@@ -95,6 +95,7 @@ class XreSettings:
         return sections is None or sections <= 1.0
 
     def _entries(self, section: str) -> list[tuple[str, str]]:
+        """List the (key, value) entries of a section, whatever the case of its name."""
         return [
             entry
             for name, entries in self.sections.items()
@@ -110,7 +111,11 @@ def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatErro
 
 
 def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
-    """Read `data settings XRE.txt`; of a key given twice in a section the first counts.
+    """Parse `data settings XRE.txt`; of a key given twice in a section the first counts.
+
+    Args:
+        text: its content.
+        file: name for error messages.
 
     Raises:
         DatasetFormatError: there is no `[section]` in it.
@@ -132,6 +137,7 @@ def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
 
 
 def _unquoted(text: str) -> str:
+    """Remove quotes and escapes from a value, or a semicolon at its end."""
     value = text.strip()
     if len(value) >= 2 and value[0] == '"' and value[-1] == '"':
         return re.sub(r'\\([\\"])', r"\1", value[1:-1])

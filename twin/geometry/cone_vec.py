@@ -475,13 +475,16 @@ class ConeVec:
         )
 
     def _repr_html_(self) -> str:
+        """Format the facts as an HTML table, for notebooks."""
         cells = "".join(
             f"<tr><th>{k}</th><td>{v}</td></tr>" for k, v in self._facts().items()
         )
         return f"<table><caption>ConeVec</caption>{cells}</table>"
 
     def _facts(self) -> dict[str, str]:
-        """Sizes and distances in words, for printing."""
+        """Format sizes and distances for printing, under the keys views, detector, source
+        to detector and source to origin.
+        """
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
         if steps[0] == steps[1]:
             pitch = steps[0]
@@ -820,8 +823,12 @@ def check_shape(shape: Shape2) -> Shape2:
 
 
 def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
-    """Return stage angles [deg]: given ones, or a number of them from 0 on, even
+    """Return stage angles (n,) [deg]: given ones, or a number of them from 0 on, even
     over full turns.
+
+    Args:
+        angles: a number of views, or angles (n,) [deg].
+        turns: over which a number of views is spread; the end is not a view.
 
     Raises:
         GeometryError: no views, or an angle that is not finite.
@@ -843,7 +850,7 @@ def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray
 def _numbers(
     name: str, value: object, count: int, unit: str, *, repeated: bool = False
 ) -> tuple[float, ...]:
-    """Convert `count` finite numbers, or raise GeometryError.
+    """Convert one number or several to a tuple of `count` finite numbers.
 
     Args:
         name: of the argument, for the message.
@@ -851,6 +858,9 @@ def _numbers(
         count: how many.
         unit: for the message.
         repeated: whether one number is repeated.
+
+    Raises:
+        GeometryError: another number of them, or one that is not finite.
     """
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 and (repeated or count == 1):
@@ -913,8 +923,8 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
 
 
 def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> ConeVec:
-    """Check the sanity rules of thesis 4.8.3; return the argument, so it can
-    guard an expression.
+    """Check the sanity rules of thesis 4.8.3 (pitch, orthogonal sides, SDD above 0);
+    return the argument, so it can guard an expression.
 
     Args:
         cone_vec: the geometry to check.
@@ -925,7 +935,8 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
             one.
 
     Example:
-        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96),
+        pixel=0.15)
         >>> check_cone_vec(scan, 0.15) is scan
         True
     """

@@ -66,10 +66,11 @@ class Motion:
         return bool((difference <= 0.01 * np.nan_to_num(self.sigma)).all())
 
     def applied(self, poses: Poses, sign: float = 1.0) -> Poses:
-        """Add the deviations to axis, angle, source and detector of poses, `sign` times.
+        """Return poses with the deviations added to axis, angle, source and detector,
+        `sign` times.
 
         Args:
-            poses: of as many frames.
+            poses: of as many frames; not changed.
             sign: -1 removes the deviations to first order.
 
         Raises:

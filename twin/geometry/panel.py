@@ -80,11 +80,13 @@ class PanelModel:
         return out
 
     def terms(self, places: FloatArray) -> FloatArray:
-        """Compute shifts (..., 2, m) for a coefficient of 1 at places (..., 2),
-        pixels (column, row).
+        """Compute the shifts [px] that each coefficient of 1 causes at places.
 
         Args:
-            places: (..., 2), column and row.
+            places: (..., 2), column and row [px].
+
+        Returns:
+            (..., 2, m): shifts along columns and rows, for m coefficients.
         """
         rows, cols = self.shape
         middle = np.array([cols - 1, rows - 1]) / 2
@@ -162,7 +164,13 @@ class Panel:
         )
 
     def undistorted(self, image: Float32Array) -> Float32Array:
-        """Resample an image (rows, cols) as a panel without distortion would have taken it.
+        """Resample an image as a panel without distortion would have taken it.
+
+        Args:
+            image: (rows, cols).
+
+        Returns:
+            float32 (rows, cols); the image itself where there is no distortion.
 
         Raises:
             TwinError: an image of another shape than those in which the distortion was
@@ -185,7 +193,9 @@ class Panel:
         return np.asarray(out, dtype=np.float32)
 
     def to_json(self) -> dict[str, Any]:
-        """Convert to a document; `from_json` is its inverse."""
+        """Convert to a document with the keys model, shape, borders, coefficients and, if
+        any, lag; `from_json` is its inverse.
+        """
         return {
             "model": "cubic",
             "shape": list(self.model.shape),

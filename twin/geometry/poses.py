@@ -165,6 +165,12 @@ class Poses:
         assumed): thesis eq. 5.4 for T = 1. The rows are the world geometry under the
         inverse of that map. The detector is shifted by dD, then turned by det_yaw about
         v, det_pitch about the turned u, det_roll about the turned normal.
+
+        Args:
+            parameters: offsets [mm, rad].
+
+        Returns:
+            n views, one for each pose.
         """
         p = parameters
         tau = from_unity([p.tau_x, 0.0, p.tau_z])
