@@ -76,8 +76,7 @@ def new_machine_text(answers: Answers) -> str:
             values.
 
     Example:
-        >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0),
-        max_kV=90.0))
+        >>> text = new_machine_text(Answers("lab", "micro_ct", sod_mm=(80.0, 80.0), max_kV=90.0))
         >>> parse_machine(text).fixed["object_y"], len(text.splitlines()) < 20
         (80.0, True)
     """
