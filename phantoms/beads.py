@@ -280,7 +280,16 @@ def chiral_phantom() -> Phantom:
 
 
 def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> None:
-    """Check that every bead is inside the body; raise LimitError otherwise."""
+    """Check that every bead is inside the body.
+
+    Args:
+        centers: (k, 3) [mm].
+        radii: (k,) [mm].
+        size_mm: of the body, about the origin.
+
+    Raises:
+        LimitError: names the first bead that sticks out.
+    """
     room = np.asarray(size_mm) / 2.0 - np.abs(centers) - radii[:, None]
     if (room < -1e-9).any():
         i, axis = (int(v) for v in np.argwhere(room < -1e-9)[0])
@@ -297,7 +306,15 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
 def worst_overlap(
     centers: FloatArray, radii: FloatArray
 ) -> tuple[int, int, float] | None:
-    """Find the two beads that overlap most and by how much [mm], or None."""
+    """Find the two beads that overlap most.
+
+    Args:
+        centers: (k, 3) [mm].
+        radii: (k,) [mm].
+
+    Returns:
+        Their indices and the overlap [mm]; None if no beads overlap.
+    """
     worst: tuple[int, int, float] | None = None
     for i in range(len(centers) - 1):
         gap = (

@@ -86,6 +86,9 @@ def brick_shapes(
         studs: along x and y.
         floor: height of the brick's lower edge [mm].
         turn: about the axis [rad].
+
+    Returns:
+        (shape, sign): the block and its studs, the cavity, then the tubes in it.
     """
     rotation = stage_rotation(turn)
 

@@ -136,11 +136,15 @@ def chain_through(
 
 
 def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
-    """List bodies and factors: their projections times these add up to the
-    phantom's line integrals.
+    """List the bodies whose projections, times a factor each, add up to the phantom's
+    line integrals.
 
     Args:
         phantom: solids, surfaces and voxels.
+
+    Returns:
+        (body, factor): all solids as one scene; each mesh, as voxels where it cannot be
+        projected exactly; the voxels.
     """
     out: list[tuple[Body, float]] = []
     if phantom.scene.solids:
@@ -257,6 +261,10 @@ def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Ob
         size_mm: the phantom's extent along x, y, z [mm].
         voxels: about so many cubes fill that box.
 
+    Returns:
+        The amount of each material in each voxel, float32 (z, y, x, materials), and the
+        substances.
+
     Raises:
         PhantomError: a mesh that is not closed.
 
@@ -288,7 +296,14 @@ def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Ob
 
 
 def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
-    """Sample a body on a coarse grid: the part of each voxel that it fills."""
+    """Sample a body on a coarse grid: the part of each voxel that it fills, float32 (z,
+    y, x).
+
+    Args:
+        body: scene, mesh or fine voxels.
+        grid: the coarse grid.
+        box: its extent along x, y, z [mm].
+    """
     edge = grid.voxel_xyz[0]
     if isinstance(body, Scene):
         return voxelise(body, (), box, edge, SUB_COLUMNS).data

@@ -90,7 +90,11 @@ def fields(
         others: name -> reader of a field that may be left out.
 
     Returns:
-        Name -> result of its reader.
+        Name -> result of its reader; fields that are left out have no entry.
+
+    Raises:
+        PhantomError: no object, a missing or unknown key, or an error of a reader; names
+            the key path.
     """
     readers = {**needed, **others}
     for key in mapping(value, where):

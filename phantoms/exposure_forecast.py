@@ -95,7 +95,11 @@ class Transmission:
 
     @classmethod
     def of(cls, values: npt.NDArray[Any]) -> Transmission:
-        """Compute it from the pixels of images."""
+        """Compute least, quantiles and histogram of the transmission of all pixels.
+
+        Args:
+            values: of images, any shape, 1 for an open beam.
+        """
         flat = np.asarray(values, dtype=np.float64).ravel()
         counts, _ = np.histogram(np.maximum(flat, 0.0), TRANSMISSION_EDGES)
         p1, p5, median = np.quantile(flat, (0.01, 0.05, 0.5)).tolist()
@@ -455,12 +459,14 @@ class _SeenDetail:
     images: int
 
     def setting(self, layer: str, at: ExposureSettings) -> Setting:
-        """Compute contrast and dose of a setting; without contrast where a
-        pixel is saturated.
+        """Compute contrast to noise and dose of a setting.
 
         Args:
             layer: name of the filter.
             at: voltage, power and time.
+
+        Returns:
+            The setting; its contrast is None where a pixel is saturated.
         """
         chain = self.layers.chains[layer]
         plain, changed = (
@@ -545,8 +551,8 @@ class _Ray:
     def with_detail(
         self, detail: tuple[Substance | None, float], substances: Sequence[Substance]
     ) -> _Ray:
-        """Add so much of a substance to the ray, or remove it from the substance
-        that attenuates most.
+        """Return the ray with a detail: so much of a substance more, or less of what
+        attenuates most.
 
         Args:
             detail: substance and thickness [mm]; without a substance, a void of that

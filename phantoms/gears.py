@@ -83,7 +83,7 @@ def gear_phantom() -> Phantom:
 
 
 def _holes(plastic: Material) -> list[Solid]:
-    """Windows through the gear, and pores."""
+    """Make the holes of the gear as solids of negative attenuation: windows, then pores."""
     bottom, top, _ = LEVELS_MM
     shapes: list[Cylinder | Ellipsoid] = []
     for k in range(WINDOWS):
@@ -122,7 +122,18 @@ def _teeth(
     levels_mm: tuple[float, ...],
     slant_deg: float,
 ) -> list[Ring]:
-    """Rings (n, 3) of a gear from its bottom to its top."""
+    """Compute the rings of a gear's outer surface from its bottom to its top, turned by
+    the slant towards the middle.
+
+    Args:
+        teeth: number of teeth.
+        radii_mm: at the teeth's foot and tip.
+        levels_mm: bottom and top.
+        slant_deg: by which the ring at half the height is turned.
+
+    Returns:
+        Rings (n, 3) [mm], counter-clockwise seen from above.
+    """
     foot, tip = radii_mm
     angle = _angles()
     wave = np.clip(1.6 * np.cos(teeth * angle), -1.0, 1.0)

@@ -122,6 +122,9 @@ def stated_keV() -> float:
 def material(name: str) -> Material:
     """Look up the material called `name`, or parse FORMULA@DENSITY [g/cm3].
 
+    Args:
+        name: of a bundled material, in lower case, or a formula such as C8H8@1.05.
+
     Raises:
         UnknownNameError: lists the materials there are; or an unknown element.
         LimitError: a formula that cannot be read or an impossible density.
@@ -145,7 +148,7 @@ def material(name: str) -> Material:
 
 @lru_cache(maxsize=64)
 def _by_formula(name: str) -> Material:
-    """Make the material of FORMULA@DENSITY."""
+    """Make the material of FORMULA@DENSITY; the last 64 are cached."""
     substance = Substance.parse(name)
     return Material(
         name,

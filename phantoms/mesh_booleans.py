@@ -101,7 +101,13 @@ def _box(one: analytic.Solid | Surface) -> tuple[FloatArray, FloatArray]:
 
 
 def _filled(one: analytic.Solid | Surface) -> Surface:
-    """Convert the piece to a mesh of exactly its form.
+    """Convert a piece to a filled mesh of exactly its form.
+
+    Args:
+        one: mesh, box or convex solid.
+
+    Returns:
+        The mesh; a surface itself.
 
     Raises:
         PhantomError: a round solid or a hole.
@@ -126,11 +132,17 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
 
 
 def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
-    """Subtract the others from a filled mesh; None if nothing is left.
+    """Subtract the others from a filled mesh.
 
     Args:
         surface: filled.
         others: filled, that are taken away.
+
+    Returns:
+        What is left, in the surface's material; None if nothing is left.
+
+    Raises:
+        PhantomError: the surface of one meets itself.
     """
     import manifold3d
 
@@ -152,7 +164,7 @@ def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
 
 
 def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
-    """Find the faces of each connected surface."""
+    """Find the faces of each connected surface of a mesh, as arrays of indices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -179,7 +191,7 @@ def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
 def _solid(
     mesh: TriangleMesh, bodies: Sequence[npt.NDArray[np.int64]]
 ) -> manifold3d.Manifold:
-    """Unite the bodies, each without the cavities in it.
+    """Unite the bodies of a mesh, each without the cavities in it, as a manifold.
 
     Args:
         mesh: all bodies and cavities.

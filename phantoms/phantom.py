@@ -211,6 +211,9 @@ def assemble(
             and equal ones add up. Meshes, boxes and convex solids can be cut. Default:
             all alike.
 
+    Returns:
+        The phantom; one part alone is renamed.
+
     Raises:
         PhantomError: there are none, one of several is voxels, or one cannot be cut.
     """

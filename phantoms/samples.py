@@ -206,7 +206,7 @@ def _one(
     keep: bool,
     priority: Sequence[float] = (),
 ) -> Phantom:
-    """Convert a sample of any kind to a phantom.
+    """Convert a sample of any kind to a phantom; see `as_phantom` for the kinds.
 
     Args:
         sample, material, voxel_mm, priority: as for `as_phantom`.

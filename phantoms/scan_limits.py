@@ -47,7 +47,8 @@ def check_distances(
     sod_mm: float,
     sdd_mm: float,
 ) -> None:
-    """Check that the machine has an exposure and distances.
+    """Check that the machine has an exposure and distances, by composing a script of
+    them.
 
     Args:
         machine: whose camera and motors these are.

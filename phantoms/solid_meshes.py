@@ -60,6 +60,9 @@ def parts_of(
         voxels: ready grid, or None.
         beads: (k, 3) bead centres [mm]: spheres there are never holes.
         around: round solids are inside their meshes, not the other way round.
+
+    Returns:
+        Each with its material, and whether it is a hole.
     """
     import trimesh
 
@@ -80,7 +83,10 @@ def parts_of(
 
 
 def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
-    """Join all parts into one mesh, holes turned inside out.
+    """Join copies of all parts into one mesh, holes turned inside out.
+
+    Args:
+        parts: meshes [mm] with their marks for holes.
 
     Raises:
         PhantomError: there is nothing to join.
@@ -112,6 +118,9 @@ def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
     Args:
         solid: the solid.
         around: the mesh of a round shape encloses it instead of being inscribed.
+
+    Returns:
+        A new mesh; round shapes have many flat faces.
     """
     mesh = _mesh(solid.shape)
     if around and isinstance(solid.shape, analytic.Sphere | analytic.Ellipsoid):
@@ -145,7 +154,7 @@ def _ball_around() -> float:
 
 
 def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
-    """Make the mesh of a shape [mm].
+    """Make the mesh of a shape [mm]; round shapes are inscribed.
 
     Args:
         shape: of a solid.
@@ -176,6 +185,7 @@ def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
 
 
 def _placed(linear: FloatArray, center: tuple[float, float, float]) -> FloatArray:
+    """Make the (4, 4) matrix of a linear map (3, 3) and a shift to `center` [mm]."""
     transform = np.eye(4)
     transform[:3, :3] = linear
     transform[:3, 3] = center

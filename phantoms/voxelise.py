@@ -116,13 +116,16 @@ def _add_solid(
 def _add_surface(
     data: npt.NDArray[np.float32], surface: Surface, voxel_mm: float, oversample: int
 ) -> None:
-    """Add a filled mesh to `data` [z, y, x]; raise PhantomError if it is not closed.
+    """Add a filled mesh to `data`, in place.
 
     Args:
-        data: attenuation [1/mm], changed.
+        data: attenuation [1/mm], (z, y, x), changed.
         surface: closed.
         voxel_mm: spacing.
         oversample: columns per voxel along each of x and y.
+
+    Raises:
+        PhantomError: more than `MAX_LEAK_SHARE` of the columns do not end.
     """
     from flexdt.phantoms import voxelise_kernels as kernels
 
@@ -209,7 +212,16 @@ def _quadric(
 
 
 def _between_slabs(slabs: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
-    """Compute the interval where low <= n . p <= high for all slabs (k, 5) = n, low, high."""
+    """Compute the interval along z where low <= n . p <= high for all slabs.
+
+    Args:
+        slabs: (k, 5): normal (3), low, high [mm].
+        x: of the columns, broadcast with y [mm].
+        y: of the columns [mm].
+
+    Returns:
+        Lower and upper end [mm]; an empty interval ends before it begins.
+    """
     zero = np.zeros(np.broadcast_shapes(x.shape, y.shape))
     bottom = zero - np.inf
     top = zero + np.inf

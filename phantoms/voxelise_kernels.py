@@ -42,11 +42,16 @@ def _add_interval(data, iy, ix, low, high, value):
 
 @serial
 def add_convex(data, low, high, x0, y0, oversample, value):
-    """Add one convex solid given by its interval in each sub-column.
+    """Add one convex solid, given by its interval in each sub-column, to `data`.
 
-    data: [z, y, x]; low, high: (rows, cols) of sub-columns in voxel heights, low > high
-    where the column misses; x0, y0: indices of the first voxel; value: attenuation of one
-    sub-column's share.
+    Args:
+        data: (z, y, x), changed.
+        low: lower ends (rows, cols) of sub-columns [voxels].
+        high: upper ends; low > high where the column misses.
+        x0: index of the first voxel along x.
+        y0: index of the first voxel along y.
+        oversample: sub-columns a voxel along x and along y.
+        value: attenuation of one sub-column's share.
     """
     for j in range(low.shape[0]):
         for i in range(low.shape[1]):
@@ -64,10 +69,21 @@ def add_convex(data, low, high, x0, y0, oversample, value):
 @linked
 def _side(ax, ay, bx, by, px, py):
     """Compute the signed crossing of the ray from (px, py) towards +x with the edge a ->
-    b: -1, 0 or +1.
+    b.
 
     The end points are put in a fixed order first, so both triangles on an edge get the
     same answer to the last bit and no column slips through or counts twice.
+
+    Args:
+        ax: x of the edge's first end; likewise the other places.
+        ay: y of the edge's first end.
+        bx: x of its last end.
+        by: y of its last end.
+        px: x of the ray's origin.
+        py: y of the ray's origin.
+
+    Returns:
+        +1 for an edge that rises, -1 for one that falls, 0 without a crossing.
     """
     if (ay > py) == (by > py):
         return 0
@@ -116,8 +132,12 @@ def cross(triangles, starts, counts, heights, signs):
     """Count the surface crossings of every sub-column; write their heights and signs,
     too, unless `heights` is empty.
 
-    triangles: (n, 3, 3), x and y in sub-columns; counts: int32 (rows, cols), to be zero;
-    starts: (rows, cols) where in heights and signs those of a sub-column begin.
+    Args:
+        triangles: (n, 3, 3), x and y in sub-columns, z in voxels.
+        starts: (rows, cols), where in heights and signs those of a sub-column begin.
+        counts: int32 (rows, cols), to be zero; changed.
+        heights: of all crossings, changed; empty to count only.
+        signs: +1 or -1 of all crossings, changed.
     """
     listing = heights.size > 0
     for f in range(triangles.shape[0]):
@@ -145,10 +165,21 @@ def cross(triangles, starts, counts, heights, signs):
 
 @serial
 def add_surface(data, starts, counts, heights, signs, oversample, value):
-    """Fill between crossings wherever the winding number is not zero.
+    """Fill between crossings of `data` wherever the winding number is not zero.
 
-    Overlapping bodies fill once, inward shells are cavities. Returns the number of
-    columns whose crossings do not close.
+    Overlapping bodies fill once, inward shells are cavities.
+
+    Args:
+        data: (z, y, x), changed.
+        starts: (rows, cols), where in heights and signs those of a sub-column begin.
+        counts: (rows, cols) crossings of each sub-column.
+        heights: of all crossings [voxels].
+        signs: +1 or -1 of all crossings.
+        oversample: sub-columns a voxel along x and along y.
+        value: attenuation of one sub-column's share.
+
+    Returns:
+        The number of columns whose crossings do not close.
     """
     leaks = 0
     for j in range(counts.shape[0]):

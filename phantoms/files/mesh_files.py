@@ -345,6 +345,9 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
         raw: content.
         kind: one of `FORMATS`.
 
+    Returns:
+        The triangles alone, without colours and normals; they may be open.
+
     Raises:
         PhantomError: not readable, too large, or without triangles.
     """
@@ -390,8 +393,11 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
 
 
 def _check_ply(raw: bytes) -> None:
-    """Check that the header is there, small, and claims no more elements than
-    there are bytes.
+    """Check that a PLY header is there, small, and claims no more elements than there are
+    bytes.
+
+    Args:
+        raw: content of the file.
 
     Raises:
         ValueError: names the problem.
@@ -410,10 +416,13 @@ def _check_ply(raw: bytes) -> None:
 
 
 def _check_glb(raw: bytes) -> None:
-    """Check that the file refers to no other, claims no more than it holds, and puts each
-    node in one place.
+    """Check that a GLB file refers to no other, claims no more than it holds, and puts
+    each node in one place.
 
     trimesh allocates the claimed memory, and copies a mesh to each of its places.
+
+    Args:
+        raw: content of the file.
 
     Raises:
         ValueError: names the problem.
@@ -433,7 +442,8 @@ def _check_glb(raw: bytes) -> None:
 
 
 def _check_gltf(document: Any, total: int) -> None:
-    """Check the JSON document of a GLB file of `total` bytes.
+    """Check the JSON document of a GLB file: extensions, data in the file, sizes, places,
+    number of triangles.
 
     Args:
         document: of the file's JSON part.
@@ -485,7 +495,11 @@ def _check_gltf(document: Any, total: int) -> None:
 
 
 def _check_stl(raw: bytes) -> None:
-    """Compare the length of a binary file with the one that its head announces.
+    """Compare the length of a binary STL file with the one that its head announces; text
+    files pass.
+
+    Args:
+        raw: content of the file.
 
     Raises:
         ValueError: they differ.
@@ -512,6 +526,9 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
     Args:
         mesh: changed in place.
         label: of the mesh, for messages.
+
+    Returns:
+        `mesh`, or a new one where faces had to be turned.
 
     Raises:
         PhantomError: it is open.
@@ -573,7 +590,15 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | None:
-    """Convert the mesh to half-spaces if it is convex and has few planes, else return None."""
+    """Convert a mesh to half-spaces if it is convex and has at most `MAX_PLANES`.
+
+    Args:
+        mesh: closed, outward.
+        vertices: its vertices (v, 3) in place [mm].
+
+    Returns:
+        The polyhedron; None for any other mesh.
+    """
     if not mesh.is_convex:
         return None
     normals = np.asarray(mesh.face_normals, dtype=np.float64)

@@ -185,7 +185,19 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
 
 
 def solids_of(value: object, where: str) -> tuple[Solid, ...]:
-    """Read a solid `{kind, ..., material, replaces}` of a scene file, and the hole it fills."""
+    """Read a solid `{kind, ..., material, replaces}` of a scene file.
+
+    Args:
+        value: entry of the document.
+        where: its place, for messages.
+
+    Returns:
+        The solid, after the hole that it fills if it replaces another material.
+
+    Raises:
+        PhantomError, UnknownNameError: names the key path, the value and the allowed
+            ones.
+    """
     fields = dict(reading.mapping(value, where))
     made_of = material_of(reading.string(reading.get(fields, "material", where), where))
     instead = fields.pop("replaces", None)
@@ -317,7 +329,14 @@ def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
 
 
 def _spiral(value: object, where: str) -> tuple[int, float, str]:
-    """Read a spiral: number of beads, radius [mm], material.
+    """Read the spiral of a bead file.
+
+    Args:
+        value: entry of the document.
+        where: its place, for messages.
+
+    Returns:
+        Number of beads, radius [mm] (2 if left out), material (steel).
 
     Raises:
         PhantomError: names the field, its value and the allowed ones.
@@ -334,11 +353,15 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
 
 
 def sent_scene(text: bytes, *, name: str) -> Phantom:
-    """Parse the phantom of a text that names no other file, and check its size.
+    """Parse the phantom of a text that names no other file, and check its size and its
+    meshes.
 
     Args:
         text: UTF-8, TOML or JSON.
         name: the phantom gets; also for errors.
+
+    Returns:
+        The phantom, named `name`, with the extent of all its parts.
 
     Raises:
         PhantomError, UnknownNameError: names the key path, the value and the allowed

@@ -40,7 +40,15 @@ def filled_twice(vertices: FloatArray, faces: Faces) -> int:
 
 
 def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
-    """Find the faces of each connected surface."""
+    """Find the faces of each connected surface.
+
+    Args:
+        vertices: (v, 3).
+        faces: (f, 3).
+
+    Returns:
+        Indices of faces, an array for each surface.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

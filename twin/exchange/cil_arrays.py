@@ -46,7 +46,14 @@ ORIGINS: Final = {
 
 
 def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """Convert a geometry to CIL's arguments by name: `POSES`, `PANEL`.
+    """Convert a geometry to CIL's arguments.
+
+    Args:
+        geometry: with the detector's shape.
+
+    Returns:
+        Name (of `POSES` and `PANEL`) -> array: places and unit directions (n, 3) [mm],
+        numbers and sizes of pixels, origin of the panel.
 
     Raises:
         ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
@@ -67,6 +74,10 @@ def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 def read_cil(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert CIL's arguments to a geometry.
+
+    Args:
+        arrays: name -> array, as from `cil_arrays`.
+        file: for messages.
 
     Raises:
         ExchangeError: an argument is missing or not valid.

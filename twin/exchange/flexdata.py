@@ -195,7 +195,19 @@ def read_flexdata(
 
 
 def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
-    """Read one of `_NUMBERS` from a file, or its default if absent."""
+    """Read one of `_NUMBERS` from a file, or its default if absent.
+
+    Args:
+        name: of the value.
+        records: content of the file.
+        file: for messages.
+
+    Returns:
+        The numbers in the default's shape; NaN for one that was wrong and is not needed.
+
+    Raises:
+        ExchangeError: a wrong number of values, or one that is not finite.
+    """
     usual = np.array(_NUMBERS[name])
     given = records.get(name, usual.tolist())
     if isinstance(given, list):

@@ -119,6 +119,10 @@ def circle_of(
         format_name: format that needs a circle, for the message.
         tolerance_mm: largest deviation of any number of a view from the circle.
 
+    Returns:
+        Angles of the views, the axis's place, and source, detector, u and v at angle 0
+        [mm].
+
     Raises:
         ExchangeError: it is not a circle; names the view and its deviation.
     """
@@ -149,6 +153,10 @@ def circle_of(
 
 def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     """Return the pixel pitch (u, v) [mm] of a panel with rectangular pixels of one size.
+
+    Args:
+        cone_vec: n views.
+        format_name: format that needs such a panel, for the message.
 
     Raises:
         ExchangeError: u and v are not orthogonal, or their lengths vary; names the view.

@@ -70,8 +70,8 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
 
 
 def csv_text(geometry: ScanGeometry) -> str:
-    """Write one line a view: frame, file, stage angle [deg], then the twelve numbers
-    [mm].
+    """Format a geometry as CSV, one line a view: frame, file, stage angle [deg], then the
+    twelve numbers [mm].
     """
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
@@ -86,9 +86,12 @@ def csv_text(geometry: ScanGeometry) -> str:
 
 
 def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
-    """Read a table whose header names the twelve numbers, in any order.
+    """Parse a table whose header names the twelve numbers, in any order; other columns
+    are ignored.
 
-    Other columns are ignored.
+    Args:
+        text: of the table; a comment may state the detector's shape.
+        file: for messages.
 
     Raises:
         ExchangeError: names the line and what is missing.
@@ -124,7 +127,13 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
 
 
 def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """Convert a geometry to the arguments of `ts.cone_vec` by name, vectors as z, y, x.
+    """Convert a geometry to the arguments of `ts.cone_vec`.
+
+    Args:
+        geometry: with the detector's shape.
+
+    Returns:
+        Name -> array: shape (2,), and vectors (n, 3) as z, y, x [mm].
 
     Raises:
         ExchangeError: the detector's shape is unknown.
@@ -144,6 +153,10 @@ def read_tomosipo(
     arrays: Mapping[str, npt.NDArray[np.generic]], file: str = "<npz>"
 ) -> ScanGeometry:
     """Convert the arguments of `ts.cone_vec`, as in `tomosipo_arrays`, to a geometry.
+
+    Args:
+        arrays: name -> array.
+        file: for messages.
 
     Raises:
         ExchangeError: one is missing or has another shape.
@@ -171,7 +184,11 @@ def read_tomosipo(
 
 
 def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
-    """Convert rows (n, 12) that came from a file to a geometry.
+    """Check rows that came from a file, and make a geometry of them.
+
+    Args:
+        numbers: (n, 12) [mm].
+        file: for messages.
 
     Raises:
         ExchangeError: there are no rows, a number is not finite, or a panel has no size.
@@ -191,10 +208,16 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
 
 
 def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
-    """Read the twelve numbers of a row.
+    """Parse the twelve numbers of a row.
+
+    Args:
+        words: the cells.
+        file: for messages.
+        line: number of the line.
 
     Raises:
-        ExchangeError: names file and line.
+        ExchangeError: another number of cells, or one that is no number; names file and
+            line.
     """
     where: dict[str, object] = {"line": line, "path": file}
     try:
@@ -232,7 +255,7 @@ class _Document(BaseModel):
 
 
 def geometry_text(geometry: ScanGeometry) -> str:
-    """Write a geometry as JSON text, one line a view."""
+    """Format a geometry as the project's JSON file, one line a view."""
     if geometry.shape is not None:
         rows, cols = geometry.shape
     else:
@@ -261,10 +284,14 @@ def _rows(name: str, cone_vec: ConeVec) -> str:
 
 
 def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
-    """Read a geometry file.
+    """Parse and validate the project's JSON file of a geometry.
+
+    Args:
+        text: of the file.
+        file: for messages.
 
     Raises:
-        ExchangeError: names file and key.
+        ExchangeError: another kind or schema, or a wrong value; names file and key.
     """
     document = read_json(text, file)
     if (said := (document.get("kind"), document.get("schema"))) != (KIND, SCHEMA):
@@ -297,7 +324,12 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
 
 
 def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[str, Any]:
-    """Read a JSON object; it and the objects inside it are of type `kind`.
+    """Parse a JSON object; it and the objects inside it are of type `kind`.
+
+    Args:
+        text: of the file.
+        file: for messages.
+        kind: dict, or a class of it.
 
     Raises:
         ExchangeError: the text is not a JSON object.

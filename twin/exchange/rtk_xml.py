@@ -54,7 +54,10 @@ _ROOT = "RTKThreeDCircularGeometry"
 
 
 def rtk_text(geometry: ScanGeometry) -> str:
-    """Write the XML file.
+    """Format a geometry as RTK's XML, nine numbers and a matrix a view.
+
+    Args:
+        geometry: of a flat panel with rectangular pixels.
 
     Raises:
         ExchangeError: nine numbers cannot express a view.
@@ -76,7 +79,12 @@ def rtk_text(geometry: ScanGeometry) -> str:
 
 
 def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
-    """Compute the nine numbers (`NAMES`) of one cone_vec row.
+    """Compute the nine numbers of one cone_vec row: three angles [deg], then six lengths
+    [mm], in the order of `NAMES`.
+
+    Args:
+        row: (12,) [mm].
+        view: its index, for the message.
 
     Raises:
         ExchangeError: the source is in the panel's plane.
@@ -104,7 +112,12 @@ def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
 
 
 def matrix_of(values: tuple[float, ...]) -> FloatArray:
-    """Compute RTK's projection matrix (3, 4): its (x, y, z, 1) to the panel [mm]."""
+    """Compute RTK's projection matrix (3, 4), which maps RTK's (x, y, z, 1) to the panel
+    [mm].
+
+    Args:
+        values: the nine numbers of a view.
+    """
     gantry, out, turn = (math.radians(a) for a in values[:3])
     sid, sdd, sx, sy, px, py = values[3:]
     project = np.array(
@@ -198,7 +211,12 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
 
 
 def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
-    """Read the number of one XML element into `values`.
+    """Parse the number of one XML element and put it into `values`.
+
+    Args:
+        entry: the element; some are skipped.
+        values: name -> number of a view, changed.
+        file: for messages.
 
     Raises:
         ExchangeError: it is not finite, or an unknown element is not 0.

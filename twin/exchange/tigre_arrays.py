@@ -51,7 +51,14 @@ ANGLES: Final = "angles"
 
 
 def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """Convert a geometry to TIGRE's attributes by name, and `angles` [rad].
+    """Convert a geometry to the attributes of TIGRE's `Geometry`, and `angles` [rad].
+
+    Args:
+        geometry: with the detector's shape.
+
+    Returns:
+        Name -> array; an attribute that is the same in all views has one value, else one
+        a view.
 
     Raises:
         ExchangeError: skew pixels, several pixel sizes, an unknown shape, a horizontal
@@ -102,10 +109,16 @@ def _once(values: FloatArray) -> FloatArray:
 
 
 def _turns(axes: FloatArray) -> FloatArray:
-    """Find the turns (n, 3) about x, y and z [rad] whose product, Rz Ry Rx, is `axes` (n, 3,
-    3).
+    """Find the turns about x, y and z [rad] whose product, Rz Ry Rx, is `axes`.
 
-    Two triples give the same product; the one whose turns about x and z are small is taken.
+    Two triples give the same product; the one whose turns about x and z are small is
+    taken.
+
+    Args:
+        axes: (n, 3, 3) rotations.
+
+    Returns:
+        (n, 3) [rad].
     """
     pitch = np.arcsin(np.clip(-axes[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(axes[:, 2, 1], axes[:, 2, 2])
@@ -126,6 +139,10 @@ def _turns(axes: FloatArray) -> FloatArray:
 
 def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert TIGRE's attributes and angles to a geometry.
+
+    Args:
+        arrays: name -> array, as from `tigre_arrays`.
+        file: for messages.
 
     Raises:
         ExchangeError: an attribute is missing or not valid, or there is a centre of
