@@ -94,6 +94,9 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
 
 
 def _usage(error: Exception) -> tuple[str, ...]:
+    """Return the lines that explain a wrong use of the command line: the error, and where help
+    is.
+    """
     message = str(error.format_message())  # type: ignore[attr-defined]
     if message.startswith("Usage:"):  # no command was given: the message is the help page
         return tuple(message.splitlines())
@@ -167,6 +170,7 @@ def positions(data: object, file: str = "") -> list[str]:
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of an error's message; its type's name if it has none."""
     text = str(error).strip()
     if text:
         return text.splitlines()[0]

@@ -153,7 +153,15 @@ OPTIONS_WITH_VALUE: Final = ("--server", "--token-file")
 def own_first(
     words: Sequence[str], flags: Collection[str]
 ) -> tuple[list[str], list[str]]:
-    """Split words into these options of `COMMON`, with their values, and the other words."""
+    """Split words of the command line into options of `flexdt` itself and the others.
+
+    Args:
+        words: in order; after `--` none is an option.
+        flags: the options to take, of `COMMON`.
+
+    Returns:
+        These options with their values, and the other words.
+    """
     first = list[str]()
     rest = list[str]()
     more = iter(words)
@@ -172,7 +180,12 @@ class InSections(TyperGroup):
     """Lists its commands in `SECTIONS`, and takes `COMMON` anywhere on the command line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the options of `flexdt` itself that the command heeds before its name."""
+        """Parse the command line, with the options of `flexdt` itself that a command heeds put
+        before its name.
+
+        Fails with a usage error for an option that the command does not heed, or one without a
+        value.
+        """
         command: Any = self
         for word in own_first(args, COMMON)[1]:
             if word[:1] != "-" and hasattr(command, "commands"):
@@ -188,7 +201,7 @@ class InSections(TyperGroup):
         return list(super().parse_args(ctx, [*first, *rest]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the sections of the help page."""
+        """Write the commands to the help page, section by section; those of extensions last."""
         found = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
         named = {name for names in SECTIONS.values() for name in names}
         others = tuple(name for name in found if name not in named)
@@ -328,6 +341,7 @@ def _add(
 
 
 def _version(asked: bool) -> None:
+    """Print the version and exit, if asked for."""
     if asked:
         from importlib.metadata import version
 

@@ -52,6 +52,9 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 
     @wraps(command)
     def complete(context: typer.Context, **given: Any) -> None:
+        """Run the command with the arguments that it takes from `flexdt` itself: check that its
+        output files can be written, and print its answers, as lines or (--json) as documents.
+        """
         root = context.find_root().params
         if "context" in own:
             given["context"] = context

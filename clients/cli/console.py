@@ -159,6 +159,14 @@ class ProgressBar:
         clock: Callable[[], float] = time.monotonic,
         terminal: bool | None = None,
     ) -> None:
+        """Prepare a bar, which nothing draws yet.
+
+        Args:
+            title: of the work.
+            unit: of `done` and `total`.
+            clock: [s].
+            terminal: standard error is one; found out without.
+        """
         self._title = title
         self._unit = unit
         self._clock = clock
@@ -195,7 +203,14 @@ class ProgressBar:
         return self
 
     def update(self, done: float, total: float | None, text: str | None = None) -> None:
-        """Show `done` of `total`; `text` replaces the title."""
+        """Show progress: in the bar, or without a terminal as a line at most every
+        PLAIN_INTERVAL_S.
+
+        Args:
+            done: units.
+            total: units, or None if unknown.
+            text: replaces the title.
+        """
         if self._bar is not None and self._task is not None:
             self._bar.update(
                 self._task, completed=done, total=total, description=text or self._title
@@ -211,6 +226,7 @@ class ProgressBar:
         note(self._line(text or self._title, done, total, now - self._begun))
 
     def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:
+        """Make a line of text with what is done, its share and an estimate of the time left."""
         if not total:
             return f"{text}: {done:g} {self._unit}"
         if float(done).is_integer():

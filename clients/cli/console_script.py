@@ -185,7 +185,9 @@ def _not_lost(unraisable: object) -> None:
 
 
 def main() -> None:
-    """Run the command line of this process."""
+    """Run the command line of this process; an interrupt ends it without a traceback, even
+    while it is stuck.
+    """
     if (
         signal.getsignal(signal.SIGINT) != signal.default_int_handler
     ):  # a shell's `&` ignores it

@@ -59,6 +59,7 @@ def mode_names(typed: str) -> list[str]:
 
 
 def _axes() -> list[str]:
+    """List the default machine's axes, also virtual ones."""
     from flexdt.library.machines import machine
 
     found = machine(None)

@@ -262,6 +262,16 @@ class Core:
 def _require_same(
     topic: str, asked: Mapping[str, object], known: Mapping[str, object]
 ) -> None:
+    """Check that a topic is followed as before: its rate, and a projection's kind and binning.
+
+    Args:
+        topic: that is subscribed to again.
+        asked: parameters of the new subscription.
+        known: those of the earlier one.
+
+    Raises:
+        ValueError: they differ.
+    """
     view: tuple[str, ...]
     if topic == "projection":
         view = ("projection_kind", "projection_binning")
@@ -426,6 +436,7 @@ class AsyncTwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
+        """Prepare a client; nothing is sent before `connect`. Arguments: see the class."""
         link: Transport
         if transport is None:
             link = TcpTransport(host, port, ssl=ssl)
@@ -505,6 +516,9 @@ class AsyncTwinClient(SharedMethods):
 
 @functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
+    """Start the event loop of all synchronous clients in a thread of its own; it ends with the
+    process.
+    """
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="flexdt-clients", daemon=True).start()
     atexit.register(_end_links)
@@ -515,6 +529,7 @@ def _end_links() -> None:
     """End the connections of clients that were not closed, before the loop goes with Python."""
 
     async def cancel() -> None:
+        """Cancel all tasks of this loop but this one, and wait for their ends."""
         readers = asyncio.all_tasks() - {asyncio.current_task()}
         for reader in readers:
             reader.cancel()
@@ -577,6 +592,7 @@ class TwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
+        """Connect to the twin; arguments and errors: see the class."""
         self._client = AsyncTwinClient(
             host,
             port,
@@ -643,6 +659,9 @@ class TwinClient(SharedMethods):
         return Subscription(events, self._wait)
 
     def _perform(self, effect: Effect) -> object:
+        """Carry out an effect of a flow: calls of functions in this thread, where they may call
+        the client, all else in the loop's.
+        """
         if isinstance(
             effect, Tell
         ):  # in the thread that calls, where it may call the client

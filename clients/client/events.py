@@ -162,6 +162,15 @@ class AsyncSubscription:
         keep_alive: Callable[[], Awaitable[object]],
         cancel: Callable[[AsyncSubscription], Awaitable[object]],
     ) -> None:
+        """Prepare a subscription, which begins with `async with` or the first event.
+
+        Args:
+            topics: names of the topics.
+            max_queue: events that wait at most; older ones are dropped then, and counted.
+            start: subscribes.
+            keep_alive: reconnects if the connection is lost.
+            cancel: unsubscribes.
+        """
         self.topics = topics
         self.dropped = 0
         self._start = start
@@ -173,6 +182,7 @@ class AsyncSubscription:
         self._started = self._lost = self._closed = False
 
     async def __aenter__(self) -> AsyncSubscription:
+        """Subscribe, unless that has happened already."""
         if not self._started:
             self._started = True
             try:

@@ -77,6 +77,15 @@ class KeptConnection:
         on_change: Callable[[], None] = lambda: None,
         subscription: Mapping[str, object] | None = None,
     ) -> None:
+        """Prepare the connection; `run` opens it.
+
+        Args:
+            address: of the twin.
+            name: of this client, which the twin shows.
+            on_event: called with topic and parameters of each event.
+            on_change: called when the connection is made or lost.
+            subscription: parameters of `events.subscribe`, subscribed to after each connection.
+        """
         self.address = address
         self.name = name
         self.problem = "not connected yet"
@@ -110,7 +119,11 @@ class KeptConnection:
         return None
 
     async def run(self) -> None:
-        """Keep the connection until cancelled; may be called again after that."""
+        """Keep the connection until cancelled: connect again after each loss, with growing
+        pauses; may be called again after that.
+
+        `problem` says why there is none, and `on_change` is called when that changes.
+        """
         core = self._client.core
         pauses = back_off(FIRST_PAUSE_S)
         try:

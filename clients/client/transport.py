@@ -100,6 +100,18 @@ class TcpTransport:
         timeout_s: float = 5.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
+        """Prepare a connection.
+
+        Args:
+            host: name or address.
+            port: from 1 to 65535.
+            codec: of the messages.
+            timeout_s: limit of the time to connect.
+            ssl: for TLS; the server's certificate must name `host`.
+
+        Raises:
+            ValueError: another port.
+        """
         if type(port) is not int or not 1 <= port <= 65535:
             raise ValueError(f"port {port!r} is not a number from 1 to 65535")
         self.host = host
@@ -224,6 +236,13 @@ class Link:
         on_event: Callable[[Mapping[str, object]], None],
         on_end: Callable[[], None],
     ) -> None:
+        """Read messages from an open transport from now on, in a task.
+
+        Args:
+            transport: open.
+            on_event: called with the parameters of each event.
+            on_end: called when the connection has ended.
+        """
         self._transport = transport
         self._on_event = on_event
         self._on_end = on_end
@@ -297,6 +316,7 @@ class Link:
             self._on_end()
 
     def _take(self, message: Message) -> None:
+        """Give a message's answers to those who wait for them, and its events to `on_event`."""
         for item in self.calls.receive(message):
             match item:
                 case Answered(waiter) if not waiter.done():

@@ -442,6 +442,19 @@ def upload_voxels(
 def _upload(
     head: Mapping[str, object], data: bytes, progress: Callable[[int, int], object] | None
 ) -> Flow[scanner.UploadResult]:
+    """Upload a sample in parts, and report the progress.
+
+    Args:
+        head: parameters of each part: name, format and so on.
+        data: content of the file.
+        progress: called with the bytes received and all.
+
+    Returns:
+        The answer to the last part.
+
+    Raises:
+        ValueError: there are no data.
+    """
     total = len(data)
     done = None
     for start in range(0, total, CHUNK):

@@ -68,6 +68,7 @@ class FollowSession:
     unread_example: str = ""
 
     def __post_init__(self) -> None:
+        """Begin with nothing known of the machine, and note the clock's reading at midnight."""
         machine = self.follower.machine
         now = datetime.now()
         self.mirror = Mirror.of(machine)
@@ -77,9 +78,15 @@ class FollowSession:
         self._midnight = self.clock() - (now - midnight).total_seconds()
 
     def message(self, data: bytes, at: float | None = None, late_s: float = 0.0) -> None:
-        """Take one message, which came between `late_s` before `at` and `at`, or now.
+        """Take one message, which came between `late_s` before `at` and `at`: record it, update
+        the mirror, report alarms and executed lines.
 
         Messages that are no events are counted in `unread`.
+
+        Args:
+            data: content.
+            at: time by the session's clock [s]; now without.
+            late_s: how long it may have waited.
         """
         at = self.clock() if at is None else at
         self._keep(data, at, late_s)
@@ -110,6 +117,7 @@ class FollowSession:
         return time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
+        """Write a message to the recording, if there is one."""
         if self.record is not None:
             self.record.write(
                 format_recorded(Recorded(at - self._midnight, late_s, data))
@@ -117,6 +125,7 @@ class FollowSession:
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
+        """Replace the mirror, and report the alarms that are new in it."""
         new = mirror.raised - self.mirror.raised
         self.mirror = mirror
         for alarm in mirror.alarms[len(mirror.alarms) - new :] if new else ():

@@ -100,7 +100,14 @@ def setting(
 async def wait_ready(
     twin: ConnectedTwin, command: c.WaitXrayReady, progress: CommandProgress
 ) -> str:
-    """Wait until X-rays are ready: the script's polling loop as one command."""
+    """Wait until X-rays are ready: the script's polling loop as one command.
+
+    Returns:
+        "TRUE".
+
+    Raises:
+        Refusal: they are off, or not ready after READY_S.
+    """
     state = await twin.state()
     if not state.tube.on:
         raise Refusal("X-rays are off, so they will not be ready; tube xrayon first")
@@ -132,7 +139,14 @@ async def take_image(
 async def save_image(
     twin: ConnectedTwin, command: c.SaveImage, progress: CommandProgress
 ) -> str:
-    """Save the last image under the bare name of the path."""
+    """Save the last image under the bare name of the command's path, in the recording's folder.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        Refusal: no image was taken, the path has no name, or it cannot be written.
+    """
     if twin.image is None:
         raise Refusal("no image has been taken; camera take image first")
     name = image_name(command.path)
@@ -215,7 +229,16 @@ async def _go(
 
 
 async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> float:
-    """Clamp a target beyond a limit to the limit, where the machine does so."""
+    """Clamp a target beyond a limit to the limit, where the machine does so.
+
+    Args:
+        twin: connection and machine.
+        axis: that moves, also a virtual one.
+        target: of the command.
+
+    Returns:
+        The target that the twin gets; unchanged without a machine.
+    """
     machine = twin.machine
     if machine is None or not machine.has(axis):
         return target
@@ -230,9 +253,18 @@ async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> flo
 
 
 def rate_setting(what: Rate, digits: int) -> Action:
-    """Make the action that sets an axis's speed or acceleration for later moves."""
+    """Make the action that sets an axis's speed or acceleration for later moves.
+
+    Args:
+        what: which of both.
+        digits: decimals of the reply.
+
+    Returns:
+        The action; it clamps values as the machine does, and replies with the value.
+    """
 
     async def send(twin: ConnectedTwin, command: Any, progress: CommandProgress) -> str:
+        """Set the value, clamped as the machine does; returns it as text."""
         axis = command.component
         machine = twin.machine
         value: float = getattr(command, what)
@@ -250,6 +282,9 @@ def rate_setting(what: Rate, digits: int) -> Action:
 
 
 def _why(state: State) -> str:
+    """Return the reason of the safety state in brackets, with a leading blank; empty if all is
+    well.
+    """
     safety = state.safety
     if safety.state != "ok":
         return f" ({safety.message or safety.state})"
@@ -259,7 +294,11 @@ def _why(state: State) -> str:
 async def question(
     twin: ConnectedTwin, command: Question, progress: CommandProgress
 ) -> str:
-    """Answer with a part of the twin's state as text."""
+    """Answer with a part of the twin's state as text.
+
+    Returns:
+        "TRUE" or "FALSE", or a number with 10 decimals for positions and 6 for all else.
+    """
     value: object = (await twin.state()).model_dump(mode="json")
     for key in command.path:
         if isinstance(value, Mapping):
@@ -276,11 +315,14 @@ async def sequence(
 ) -> str:
     """Take an image sequence as a job of the twin, at rest or during the armed move.
 
+    The twin decides by its own clock when each image is taken, so the frames are where the
+    scanner's rule puts them, however slow the network is.
+
     Returns:
         Text of ACK. The armed move ends with the job: with its reply, or with its error.
 
-    The twin decides by its own clock when each image is taken, so the frames are where the
-    scanner's rule puts them, however slow the network is.
+    Raises:
+        Refusal: the twin refuses the job, or it fails.
     """
     armed = twin.armed
     twin.armed = None
@@ -404,6 +446,7 @@ async def _run(
 
 
 def _name_taken(refusal: Refusal) -> bool:
+    """Check whether the twin refused a job because its name is in use."""
     data = getattr(refusal.__cause__, "data", None)
     if isinstance(data, Mapping):
         problems = data.get("problems")

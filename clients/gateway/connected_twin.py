@@ -77,6 +77,14 @@ class ConnectedTwin:
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
+        """Take the connection and what commands of clients change.
+
+        Args:
+            link: to the twin.
+            root: folder for saved images.
+            machine: that of the twin without.
+            profile: that of the twin without.
+        """
         self.link = link
         self.root = root
         self._machine = machine
@@ -230,6 +238,7 @@ class ConnectedTwin:
         return self._scanner()[0]
 
     def _scanner(self) -> tuple[Machine | None, Profile | None]:
+        """Return machine and profile, those given or those the twin names; None where unknown."""
         hello = self.link.hello
         machine = self._machine
         try:

@@ -48,8 +48,9 @@ def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
 
 
 def _texts(row: CodeLine) -> tuple[str, ...]:
-    """Split a row into component, command and two arguments, also in the space-padded
-    form."""
+    """Split a row into component, command and two arguments, also in the space-padded form;
+    missing ones are empty.
+    """
     texts = [f.text for f in (row.columns if row.columns is not None else row.words())]
     if row.columns is not None:
         matched = None
@@ -184,6 +185,16 @@ class Echoes:
     def _begin(
         self, words: tuple[str, ...], state: State, now: float
     ) -> tuple[Exchange, AcquilaEvent, AcquilaEvent]:
+        """Make the exchange of a command that somebody else gave.
+
+        Args:
+            words: component, command and two arguments.
+            state: of the twin, which names its axes.
+            now: time [s].
+
+        Returns:
+            The exchange, the command's event and that of its reception.
+        """
         kind = component_type(words[0], state.axes) or "other"
         uuid = self.uuids.getrandbits(52) + 1
         tick = int(now * 1000) % 2**32
@@ -195,6 +206,7 @@ class Echoes:
         return exchange, command, exchange.received(now)
 
     def _end(self, state: State, reply: str | None = None) -> Iterator[AcquilaEvent]:
+        """End the script line under way: yield its last event, with a reply as its kind has it."""
         line = self._line
         self._line = None
         if line is None:

@@ -77,6 +77,17 @@ class Gateway:
     def __init__(
         self, twin: ConnectedTwin, host: str, port: int, inbound: int | None = None
     ) -> None:
+        """Bind both sockets.
+
+        Args:
+            twin: connection and state.
+            host: address, of this machine alone.
+            port: of the PUB socket; 0 for a free one.
+            inbound: port of the socket that receives; the next one without.
+
+        Raises:
+            OSError: a port is in use.
+        """
         check_loopback(host)
         self.twin = twin
         self.host = host
@@ -98,7 +109,9 @@ class Gateway:
         """Components on which commands of clients run."""
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Serve until cancelled: receive events, and echo what others do; then close recording
+        and sockets.
+        """
         echoes = asyncio.get_running_loop().create_task(self._echo())
         self._tasks.add(echoes)
         try:
@@ -119,6 +132,9 @@ class Gateway:
             self._context.destroy(linger=LINGER_MS)
 
     def _receive(self, frames: list[bytes]) -> None:
+        """Read an event from a message and begin its command; malformed ones are rejected with
+        an event.
+        """
         try:
             if len(frames) != 1:
                 raise AcquilaError(f"{len(frames)} frames")
@@ -165,8 +181,9 @@ class Gateway:
         self._start(self._guarded(work, event), key)
 
     async def _echo(self) -> None:
-        """Send clients the commands of others: over the twin's wire, from the viewer,
-        by a script."""
+        """Send clients the commands of others: over the twin's wire, from the viewer, by a
+        script. Runs until cancelled, also after errors.
+        """
         clock = asyncio.get_running_loop().time
         while True:
             await self.twin.news()
@@ -192,6 +209,7 @@ class Gateway:
     async def _guarded(
         self, work: Coroutine[Any, Any, None], event: AcquilaEvent
     ) -> None:
+        """Await the work of a command; log an error, and answer with ERR."""
         try:
             await work
         except Exception:
@@ -235,6 +253,9 @@ class Gateway:
         self._send(end)
 
     async def _do(self, event: AcquilaEvent, progress: CommandProgress) -> str:
+        """Carry out a command, after those of its component that came before; returns the
+        reply.
+        """
         if not self.twin.axes:
             await self.twin.state()
         command = read_command(event, self.twin.axes)
@@ -248,6 +269,9 @@ class Gateway:
     async def _act(
         self, event: AcquilaEvent, command: c.Command, progress: CommandProgress
     ) -> str:
+        """Run a command's action, and note its line in the recording's transcript unless it
+        fails.
+        """
         line = transcript_line(event, command)
         lines = self.twin.record().transcript
         if line is not None:
@@ -315,12 +339,14 @@ class Gateway:
                 self._log_failure("session.control")
 
     def _send(self, event: AcquilaEvent) -> None:
+        """Publish an event, and remember it as our own."""
         text = format_event(event)
         self._recent.append(hash(text))
         # A PUB socket never blocks: it drops messages that a slow subscriber does not take.
         self._out.send(text.encode("utf-8", "replace"))
 
     def _reject(self, why: str) -> None:
+        """Count a malformed event, log the first ones, and answer with ERR."""
         self._rejected += 1
         if self._rejected <= MAX_LOGGED:
             log("gateway event refused", logging.WARNING, reason=why)
@@ -337,6 +363,7 @@ class Gateway:
             log("gateway command failed", logging.ERROR, error=True, command=command)
 
     def _start(self, work: Coroutine[Any, Any, None], key: tuple[object, int]) -> None:
+        """Run work in a task; `key` marks its event as running until it ends."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
 
@@ -380,6 +407,7 @@ class Gateway:
         raise AssertionError("unreachable")
 
     def _socket(self, kind: int) -> zmq.asyncio.Socket:
+        """Make a socket of a ZeroMQ kind, with our time limits."""
         made = self._context.socket(kind)
         made.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         made.setsockopt(zmq.BACKLOG, BACKLOG)

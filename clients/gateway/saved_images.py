@@ -70,6 +70,16 @@ class Recording:
         started: datetime,
         version: str = "",
     ) -> None:
+        """Begin a recording; its folder is made with the first image.
+
+        Args:
+            root: folder of recordings.
+            path: output path of the client; its last part names the folder.
+            machine: for the texts; none are written without.
+            profile: for the texts.
+            started: when.
+            version: of the twin.
+        """
         self.root = root
         self.name = bare_name(path.rstrip("\\/ ")) or UNNAMED
         self.transcript: list[str] = []
@@ -205,6 +215,9 @@ class Recording:
         self._write_texts()
 
     def _write_texts(self) -> None:
+        """Write the transcript, and the settings texts if machine and profile are known, into
+        the folder.
+        """
         assert self._folder is not None
         text = "\r\n".join([*self.transcript, ""])
         self._folder.put(SCRIPT, text.encode("utf-8", "surrogateescape"))
@@ -282,6 +295,7 @@ def _positions(state: State) -> Mapping[str, float]:
 
 
 def _correction(state: State) -> NamedCorrection | None:
+    """Return the twin's correction as offsets with name and date; None without."""
     c = state.correction
     if c is None:
         return None
@@ -296,6 +310,7 @@ def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
         return (f.kind, f.mode, f.roi, f.exposure_ms, f.averages, f.xrays_on)
 
     def block(run: Sequence[FrameEntry]) -> FrameBlock:
+        """Make the block of a run of frames with one kind and camera setting."""
         first = run[0]
         camera = CameraSettings(
             first.mode, Roi(*first.roi), first.exposure_ms, first.averages

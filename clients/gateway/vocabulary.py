@@ -120,6 +120,11 @@ def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
 
 
 def _extra(event: AcquilaEvent, name: str) -> c.Command:
+    """Read a command that the grammar of scripts does not have.
+
+    Raises:
+        Refusal: the component does not know it; the message lists what it knows.
+    """
     table = _EXTRA.get(name, _EXTRA[""])
     asked = " ".join(event.command.lower().split())
     for command, make in table.items():

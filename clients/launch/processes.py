@@ -53,6 +53,13 @@ class Servers:
     def __init__(
         self, options: Mapping[str, object], log: Path, *, viewer: bool = False
     ) -> None:
+        """Prepare the servers; `start` starts them.
+
+        Args:
+            options: of `flexdt up`.
+            log: file of their log.
+            viewer: start the viewer, too.
+        """
         ports = {"port": 0, "projector-port": 0, "viewer-port": 0}
         self._words = words({**ports, **options, "no-viewer": not viewer})
         self._log_path = log
@@ -138,6 +145,11 @@ class Servers:
         return text.splitlines()[-lines:]
 
     def _wait_ready(self, process: subprocess.Popen[bytes]) -> dict[str, object]:
+        """Wait for the supervisor's `ready` line, however long, and return its document.
+
+        Raises:
+            ServersError: the process ended first; with the end of its log.
+        """
         assert process.stdout is not None
         for line in (
             process.stdout
@@ -197,6 +209,7 @@ class LocalTwin:
         viewer: bool = False,
         progress: Progress = None,
     ) -> None:
+        """Take the servers' options; they start on entering. Arguments: see the class."""
         self._progress = progress
         options = {
             "sample": sample,

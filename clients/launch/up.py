@@ -55,6 +55,7 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     for_twin = [x for x in options.limit if x not in for_viewer]
 
     def projector(known: Addresses) -> Sequence[str]:
+        """Return module and options of the projector."""
         given = {
             "host": LOOPBACK,
             "port": port_of("projector", options.projector_port, known),
@@ -63,6 +64,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         return ("flexdt.server.projector.main", *words(given))
 
     def twin(known: Addresses) -> Sequence[str]:
+        """Return module and options of the twin server; started again it goes on from its
+        state.
+        """
         own = {
             "port": port_of("twin", options.port, known),
             "projector": known["projector"],
@@ -78,6 +82,7 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         )
 
     def viewer(known: Addresses) -> Sequence[str]:
+        """Return module and options of the viewer."""
         own = {
             "port": port_of("viewer", options.viewer_port, known),
             "twin": known["twin"],
@@ -91,6 +96,7 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         )
 
     def gateway(known: Addresses) -> Sequence[str]:
+        """Return module and options of the gateway."""
         own = {
             "port": port_of("gateway", options.gateway_port or 0, known),
             "host": None,
@@ -134,8 +140,15 @@ def port_problem(option: str, host: str, port: int) -> str | None:
 
 
 def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
-    """Make the supervisor's `ready` line: the twin's address, and every process's by
-    name."""
+    """Make the supervisor's `ready` line: the twin's address, and every process's by name.
+
+    Args:
+        addresses: of the processes.
+        secure: the viewer's URL is https.
+
+    Returns:
+        JSON with ready, host, port, and an object for each process.
+    """
     twin = addresses["twin"]
     document: dict[str, object] = {"ready": "up", "host": twin.host, "port": twin.port}
     for name, address in addresses.items():

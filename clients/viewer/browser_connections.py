@@ -45,6 +45,7 @@ class BrowserConnection(ServerConnection):
     """A connection that is cut where a newer one needs its room, or where all hold too much."""
 
     def __init__(self, admission: Admission, *given: Any, **more: Any) -> None:
+        """Prepare a connection that counts against the limits of `admission`."""
         super().__init__(*given, **more)
         self._admission = admission
         self._held = 0

@@ -110,6 +110,15 @@ def replay_file(
 
 
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
+    """Return the content of an exported scene.
+
+    Args:
+        serializer: viser's, of the scene.
+        form: "html" or "viser".
+        dark: the page's colours.
+        title: of the page.
+        beside: HTML at its end.
+    """
     if form != "html":
         return bytes(serializer.serialize())
     page = re.sub(

@@ -43,6 +43,14 @@ class ImageFeed:
         take: Take,
         died: Callable[[], None] = lambda: None,
     ) -> None:
+        """Prepare a feed; `start` subscribes.
+
+        Args:
+            address: of the twin.
+            kind: of the images.
+            take: called in a thread with each image, and whether it is to be shown coarse.
+            died: called if a task fails.
+        """
         self.kind = kind
         self.newest: ShownImage | None = None
         self._take, self._died = take, died
@@ -55,7 +63,7 @@ class ImageFeed:
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
-        """Listen from now on."""
+        """Subscribe to the images, and take them from now on; nothing if that has happened."""
         if not self._tasks:
             wish = {
                 "topics": ["projection"],
@@ -88,6 +96,7 @@ class ImageFeed:
             self._due.set()
 
     def _arrived(self, topic: str, params: Mapping[str, object]) -> None:
+        """Keep the newest image, and wake the task that takes it."""
         if topic == "projection":
             hello = None if self._link is None else self._link.hello
             self._twin = "" if hello is None else hello.instance or ""
@@ -96,7 +105,8 @@ class ImageFeed:
 
     async def _work(self) -> None:
         """Take each new image coarse at once, and in full once no other follows within
-        `SETTLE_S`."""
+        `SETTLE_S`. Runs until cancelled; an image that cannot be shown is logged.
+        """
         shown_coarse, sound = False, True
         while True:
             try:

@@ -326,7 +326,9 @@ class Front:
     # -- WebSockets --------------------------------------------------------------------------
 
     async def _serve(self, connection: ServerConnection) -> None:
-        """Serve a WebSocket: a page, or a view up to the largest number of views."""
+        """Serve a WebSocket: a page, or a view up to the largest number of views; further views
+        are closed.
+        """
         assert connection.request is not None
         path = urlsplit(connection.request.path).path
         if (match := PAGE_PATH.fullmatch(path)) is not None:
@@ -364,6 +366,9 @@ class Front:
                 await asyncio.gather(*pumps, return_exceptions=True)
 
     async def _up(self, browser: ServerConnection, viser: ClientConnection) -> None:
+        """Relay messages from a browser to viser, without those that the message filter holds
+        back.
+        """
         async for message in browser:
             if (admitted := self.doorkeeper.admit(message)) is not None:
                 await viser.send(admitted)
@@ -407,6 +412,7 @@ def _same(given: str | None, wanted: str) -> bool:
 
 
 def _cookie(request: Request) -> str | None:
+    """Return the value of our cookie; None without."""
     for header in request.headers.get_all("Cookie"):
         for part in header.split(";"):
             name, _, value = part.strip().partition("=")
@@ -418,8 +424,18 @@ def _cookie(request: Request) -> str | None:
 def _kept(
     request: Request, body: bytes, kind: str, how_long: str = "no-cache"
 ) -> Response:
-    """Make a response that a browser may keep: sent again only where it has changed,
-    and packed."""
+    """Make a response that a browser may keep: sent again only where it has changed, and
+    packed.
+
+    Args:
+        request: with the tag that the browser has.
+        body: content.
+        kind: its type.
+        how_long: value of Cache-Control.
+
+    Returns:
+        "Not Modified" if the browser has this content.
+    """
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     more = {
         "ETag": tag,

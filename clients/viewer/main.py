@@ -107,12 +107,16 @@ def viewer_pages(viewer: Viewer) -> Pages:
     """
 
     def health() -> dict[str, object]:
+        """Return name and version of this server, and whether the twin is connected."""
         return {
             "server": f"flexdt viewer {version('flexdt')}",
             "twin": "connected" if viewer.link.connected else "not connected",
         }
 
     def figures() -> list[Metric]:
+        """List the metrics: pages, views, dropped messages, drawn states, connection, wrong
+        tokens.
+        """
         front = viewer.front
         return [
             gauge("flexdt_pages", "Pages open.", len(viewer.open_pages)),

@@ -141,12 +141,22 @@ class Page:
         what: str,
         died: Callable[[], None] = lambda: None,
     ) -> asyncio.Task[None]:
+        """Run work in a task that is cancelled when the page closes.
+
+        Args:
+            work: to run.
+            what: word for the log if it fails.
+            died: called if it fails.
+        """
         task = watched(work, what, died)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
     async def _read(self) -> None:
+        """Read the page's messages until it closes: acknowledgements, and requests, each
+        answered in a task.
+        """
         with contextlib.suppress(ConnectionClosed):
             async for message in self._connection:
                 if not isinstance(message, str):
@@ -178,6 +188,9 @@ class Page:
             self._dragging = self._start(self._follow(), "dragging")
 
     async def _follow(self) -> None:
+        """Send the axes' newest dragged targets to the twin, one request at a time, until none
+        is left; the page shows a refusal.
+        """
         while (targets := self._dragged) is not None:
             self._dragged = None
             try:
@@ -189,6 +202,7 @@ class Page:
             await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:
+        """Send what waits for the page, whenever there is something, until it closes."""
         with contextlib.suppress(ConnectionClosed):
             while True:
                 await self._due.wait()
@@ -221,6 +235,9 @@ class Page:
         return True
 
     def _took(self, slot: str) -> None:
+        """Note that the page has taken a message of a slot; quick pages get larger parts of
+        images.
+        """
         if not (sent := self._sent_at[slot]):
             return
         took_s = time.monotonic() - sent.popleft()
@@ -278,6 +295,12 @@ class Page:
                 self._busy -= 1
 
     async def _ask(self, method: str, params: dict[str, Any]) -> object:
+        """Call a method for the page: one of the viewer, or of the twin if pages may call it;
+        returns the result.
+
+        Raises:
+            RpcError: no such method, parameters that do not fit, or the twin refuses.
+        """
         if method in self._local:
             return await self._local[method](self, params)
         if method not in METHODS or method in HIDDEN:
@@ -292,6 +315,7 @@ class Page:
             raise
 
     def _fail(self, id: object, error: RpcError) -> None:
+        """Answer a request with an error."""
         data = without_bytes(error.data)
         self.say(
             "answer",
@@ -317,6 +341,9 @@ def _words(error: RpcError | ConnectionLost) -> str:
 
 def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
     """Read id and content of a message, unless it would take very much memory.
+
+    Returns:
+        The id, and the message as a dict.
 
     Raises:
         ValueError: it is no object with an id that can be answered.

@@ -146,7 +146,14 @@ class SceneClients:
                 self._put(client, preset.at(client.camera.aspect))
 
     def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
-        """Have a page's view look at a ball, (3,) [mm], from where it looks."""
+        """Turn a page's view towards a ball, from where it looks.
+
+        Args:
+            page: its id.
+            view: name of the view.
+            at: (3,) centre [mm].
+            radius_mm: of the ball, which fills the view.
+        """
         for client in self.of(page, view):
             aspect = client.camera.aspect
             preset = self.cameras[view].at(aspect)
@@ -219,6 +226,7 @@ class SceneClients:
         self.joined(client, who.page)
 
     def _gone(self, client: viser.ClientHandle) -> None:
+        """Forget a client that has closed."""
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)

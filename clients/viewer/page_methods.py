@@ -139,6 +139,11 @@ class Window(Params):
 
     @model_validator(mode="after")
     def _both(self) -> Window:
+        """Check that both ends or none are given, the lower first.
+
+        Raises:
+            ValueError: they are not.
+        """
         if (self.low is None) != (self.high is None):
             raise ValueError("give both low and high, or neither")
         if self.low is not None and self.high is not None and self.high <= self.low:
@@ -665,6 +670,11 @@ async def export(viewer: Viewer, page: Page, params: Export) -> object:
 
 @contextlib.contextmanager
 def _room(viewer: Viewer) -> Iterator[None]:
+    """Count an export while it is made.
+
+    Raises:
+        RpcError: too many are being made.
+    """
     if viewer.sharing >= MAX_SHARED:
         raise busy(
             f"{MAX_SHARED} pictures or exports are being made; try again when they are done"
@@ -689,6 +699,7 @@ def _data(viewer: Viewer) -> Path:
 
 
 def _offer(viewer: Viewer, name: str, content: bytes) -> dict[str, object]:
+    """Keep a file for download, the oldest of many dropped; returns its url, name and bytes."""
     key = secrets.token_hex(16)
     while len(viewer.downloads) >= 16:
         del viewer.downloads[next(iter(viewer.downloads))]

@@ -111,6 +111,11 @@ def work(parts: Sequence[bytes]) -> list[bytes]:
 
 
 def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
+    """Plan a script, and compute the source's path and the time line.
+
+    Raises:
+        RpcError: it takes too many images.
+    """
     plan = plan_text(text, machine, profile, state)
     images = sum(len(group) for group in plan.groups)
     if images > MAX_IMAGES:

@@ -55,8 +55,12 @@ class ShownImage:
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
-    """Choose a window [low, high] of all matter but the densest 2 %: beads do not set
-    it."""
+    """Choose the values of black and white: all matter but the densest 2 %, so that beads do
+    not set them.
+
+    Returns:
+        (low, high), high the greater one.
+    """
     pixels = np.asarray(image.pixels[::4, ::4], dtype=np.float32)
     if pixels.size == 0:
         return 0.0, 1.0
@@ -132,6 +136,11 @@ def packed(
 
 
 def _jpeg(raw: npt.NDArray[np.uint16]) -> bytes:
+    """Encode a grey image (rows, cols) as JPEG.
+
+    Raises:
+        ValueError: OpenCV cannot encode it.
+    """
     import cv2
 
     grey8 = np.rint(raw / 257.0).astype(np.uint8)

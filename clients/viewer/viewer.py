@@ -232,6 +232,7 @@ class Viewer:
             page.say(topic, data=without_bytes(data))
 
     def _state_came(self, data: Mapping[str, Any]) -> None:
+        """Keep a state of the twin, and wake the task that draws it; a new twin begins anew."""
         if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
             self._told = -1
         self._twin_time = float(data["time"])
@@ -306,6 +307,7 @@ class Viewer:
             self._tell_link(page)
 
     def _tell_link(self, page: Page) -> None:
+        """Send a page the state of the connection to the twin."""
         hello = self.link.hello
         page.say(
             "link",
@@ -389,6 +391,9 @@ class Viewer:
             page.show("state", text)
 
     async def _ready_lab(self) -> LabScene:
+        """Return the scene of the twin's machine and profile, built anew in a thread if they
+        have changed; pages get its layers.
+        """
         hello = self.link.hello
         machine = self._machine or builtin_machine(
             "flexray" if hello is None else hello.machine
@@ -405,6 +410,7 @@ class Viewer:
         return self.lab
 
     async def _dress(self, lab: LabScene, state: State) -> None:
+        """Show the sample's shape, and begin to fetch one that is missing."""
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.wear(self.look)
         self._built = self.scenes.said
@@ -412,7 +418,9 @@ class Viewer:
             self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
 
     async def _fetch(self, lab: LabScene, sample: SampleState) -> None:
-        """Fetch the mesh of an upload; a box is drawn until it has arrived."""
+        """Fetch the mesh of an upload, and show it if the sample is still on the stage; a box
+        is drawn until then. A failure is logged.
+        """
         try:
             stl = await sample_looks.fetch(self.link.request, sample)
             if stl is None:
@@ -478,6 +486,9 @@ class Viewer:
         )
 
     def _grown(self, line: str) -> None:
+        """Show a line of the reconstruction process: the surface in the scene, the slices in
+        pages that follow it.
+        """
         surface, slices = line.split("\t")
         if (told := json.loads(surface)) is not None and self.lab is not None:
             self.lab.show_surface(*mesh_of(told))

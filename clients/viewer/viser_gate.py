@@ -153,6 +153,7 @@ def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
 
 
 def _changes(nodes: Nodes) -> Iterator[Message]:
+    """Yield viser's messages that set the nodes' properties."""
     for name, properties in nodes.items():
         if (rest := dict(properties)).pop("visible", None) is not None:
             yield SetSceneNodeVisibilityMessage(name, properties["visible"])
@@ -174,8 +175,11 @@ def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
 def parted(html: bytes) -> tuple[bytes, bytes]:
     """Split viser's page into the page with MARK and its program as a script of its own.
 
-    The program is nearly all of the page, and the same for every view: as a file under
-    one name a browser fetches it once. A page that is built otherwise is not split.
+    The program is nearly all of the page, and the same for every view: as a file under one name
+    a browser fetches it once.
+
+    Returns:
+        Page and script; the whole page and nothing if it is built otherwise.
     """
     match = re.search(
         rb"<script((?: data-[a-z]+=\"[^\"]*\")+)>(.*?)</script>", html, re.DOTALL

@@ -26,6 +26,7 @@ def watched(
     """
 
     async def run() -> None:
+        """Await the work; log an error and call `died`."""
         try:
             await work
         except Exception:

@@ -26,6 +26,9 @@ class ClusterWatch(threading.Thread):
     """
 
     def __init__(self, client: Any, tend: Tend) -> None:
+        """Prepare a thread that watches a dask client; `tend` is called at intervals, and may
+        end the jobs.
+        """
         super().__init__(name="cluster watch", daemon=True)
         self._client = client
         self._tend = tend

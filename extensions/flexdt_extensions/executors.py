@@ -174,8 +174,16 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
 
 
 def _told(error: Exception, address: Any, killed: type[Exception]) -> CommandError | None:
-    """Make the error for people from an error of dask's; None: it is not one of
-    dask's."""
+    """Convert an error of dask's into one for people.
+
+    Args:
+        error: of any kind.
+        address: of the scheduler.
+        killed: dask's error on workers that died.
+
+    Returns:
+        The error; None if it is not one of dask's.
+    """
     if isinstance(error, CancelledError):
         return CommandError(
             f"the dask scheduler at {address} is lost; once there is one, run the "

@@ -140,8 +140,14 @@ def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
 
 
 def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
-    """Write a slab as `put`, from another process: files appear when complete, that of
-    `mark` last.
+    """Write a slab as `put`, from another process: files appear when complete, that of `mark`
+    last.
+
+    Args:
+        path: of the store.
+        grid: of the volume.
+        slab: its number.
+        values: (layers, ny, nx).
 
     Raises:
         OSError: it cannot be written; FileNotFoundError where the store is no longer there.
@@ -197,6 +203,7 @@ class VolumeFormat:
         held: list[Float32Array] = []
 
         def take(layers: Float32Array) -> None:
+            """Gather layers, and write each slab once all of it is there."""
             held.append(layers)
             while todo and sum(map(len, held)) >= todo[0][1][1] - todo[0][1][0]:
                 number, (first, last) = todo.pop(0)

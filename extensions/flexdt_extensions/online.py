@@ -89,8 +89,16 @@ class Online:
 
 
 def require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
-    """Check that there are tolerances, all for estimated parameters; raises as
-    `Online.done`."""
+    """Check that there are tolerances, all for estimated parameters.
+
+    Args:
+        free: names of the estimated parameters.
+        tolerance: parameter -> sigma.
+
+    Raises:
+        TwinError: no tolerance.
+        UnknownNameError: a parameter that is not estimated.
+    """
     if not tolerance:
         raise TwinError(
             "no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)}
@@ -195,6 +203,7 @@ def _first(state: Online) -> Online:
 
 
 def _renew(state: Online, start: Offsets) -> Online:
+    """Fit the geometry to all frames so far, from `start`; return the state with the fit."""
     assert state.poses is not None
     shapes = np.array([d.shape for d in state.detections], dtype=np.float64)
     fit = estimate_geometry(

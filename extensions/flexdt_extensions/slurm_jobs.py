@@ -59,6 +59,7 @@ class SlurmJobs:
     """
 
     def __init__(self, script: str, count: int) -> None:
+        """Prepare `count` jobs of a script; none is submitted yet."""
         self._script = script
         self._count = count
         self.jobs: list[Job] = []
@@ -158,6 +159,7 @@ class SlurmJobs:
         return lines
 
     def _waiting(self, queue: Mapping[str, str]) -> str:
+        """Describe which jobs are waited for, with their states in the queue (id -> state)."""
         shown = [
             f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN_JOBS]
         ]

@@ -147,6 +147,7 @@ def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _machine_priors(client: TwinClient) -> dict[str, float]:
+    """Return the priors of the twin's machine; the general ones if it does not ship."""
     try:
         machine = builtin_machine(client.server.machine)
     except UnknownNameError:

@@ -404,7 +404,16 @@ def _stated(
 def _measured(
     scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]
 ) -> PastScan:
-    """Add the poses of a scan, and its alignment; a failure becomes a question."""
+    """Add the poses of a past scan, and its alignment without a phantom.
+
+    Args:
+        scan: its texts and profile.
+        machine: that made it.
+        ask: called with the failure as a question.
+
+    Returns:
+        The scan with poses and alignment; without what failed.
+    """
     try:
         scan = tells.standing(scan, machine)
         if not scan.images:

@@ -147,6 +147,9 @@ def virtual(
 def _figures(
     residual: FloatArray, images: Float32Array | None
 ) -> dict[str, float | None]:
+    """Compute rms and largest length of residuals (n, k, 2) [px], and the rms of differences of
+    images, None without; by the names of FIGURES.
+    """
     length = np.linalg.norm(residual, axis=2)
     if images is None:
         of_images = None

@@ -94,6 +94,7 @@ def printable(text: str) -> str:
 
 
 def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
+    """Make the section on a script's problems, as HTML parts; empty without any."""
     if not problems:
         return []
     head = ("line", "severity", "code", "what")
@@ -103,6 +104,9 @@ def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
 
 
 def _clearance(found: Clearance | None) -> list[str]:
+    """Make the section with the plot of the clearance, as HTML parts; empty without a trace, a
+    sentence without matplotlib.
+    """
     if found is None or not found.trace:
         return []
     try:

@@ -167,7 +167,16 @@ def arrows(
 
 
 def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float) -> str:
-    """Draw the ellipse of a 2 x 2 covariance at `scale` standard deviations, about zero."""
+    """Draw the ellipse of a covariance about zero.
+
+    Args:
+        covariance: (2, 2).
+        names: of its two parameters, for the axes.
+        scale: standard deviations.
+
+    Returns:
+        SVG.
+    """
     values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     t = np.linspace(0, 2 * math.pi, 90)
     ring = vectors @ (
@@ -188,8 +197,16 @@ def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float
 def image_under(
     values: npt.ArrayLike, points: Sequence[Series], *, title: str, width: int = 730
 ) -> str:
-    """Draw a grey image (rows, cols) with points over it; their x and y are columns and
-    rows.
+    """Draw a grey image with points over it.
+
+    Args:
+        values: (rows, cols); black and white are percentiles.
+        points: their x and y are columns and rows.
+        title: of the figure.
+        width: of the figure [px].
+
+    Returns:
+        SVG.
     """
     data = np.asarray(values, dtype=np.float64)
     figure = blank(

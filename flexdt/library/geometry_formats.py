@@ -112,7 +112,11 @@ def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
 
 
 def from_tomosipo(geometry: Any) -> ConeVec:
-    """Convert a cone geometry of tomosipo; see `ConeVec.from_tomosipo`."""
+    """Convert a cone geometry of tomosipo, or its arrays by name; see `ConeVec.from_tomosipo`.
+
+    Raises:
+        GeometryError: no cone geometry; the message names what it lacks.
+    """
     if not isinstance(geometry, Mapping):
         if hasattr(geometry, "to_vec"):
             vectors = geometry.to_vec()
@@ -252,7 +256,16 @@ def load(
 
 
 def _json(path: Path, given: Given) -> ScanGeometry:
-    """Read our own document, or a CTSimU scenario: the document tells which."""
+    """Read our own document, or a CTSimU scenario: the document tells which.
+
+    Args:
+        path: file.
+        given: shape and pitch, which must agree with the file's or complete it.
+
+    Raises:
+        ExchangeError: the file is neither.
+        GeometryError: it contradicts `given`.
+    """
     if "file" in read_json(text_of(path), str(path)):
         return import_geometry(path, "ctsimu", given)
     own = load_geometry(path)
@@ -277,7 +290,15 @@ def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
 
 
 def _format(path: Path, among: Iterable[Format]) -> str:
-    """Return the name of the format with a file's ending; `OWN_ENDING` is flexdt's."""
+    """Return the name of the format with a file's ending; `OWN_ENDING` is flexdt's.
+
+    Args:
+        path: file.
+        among: the formats.
+
+    Raises:
+        ExchangeError: no format has this ending; the message lists all.
+    """
     by_ending = {
         ending: form.name
         for form in among
@@ -295,6 +316,11 @@ def _format(path: Path, among: Iterable[Format]) -> str:
 
 
 def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
+    """Convert one pixel edge, or two along columns and rows, to two floats [mm].
+
+    Raises:
+        GeometryError: they are not above 0.
+    """
     try:
         along_columns, along_rows = np.broadcast_to(
             np.asarray(pixel, dtype=np.float64), (2,)

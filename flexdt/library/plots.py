@@ -75,8 +75,18 @@ def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
 
 
 def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
-    """Plot the middle layer of a volume, or of its `sigma` or `bias_bound`; returns the
-    axes.
+    """Plot the middle layer of a volume.
+
+    Args:
+        volume: to plot.
+        axes: matplotlib's, to draw into; a new figure's without.
+        what: `data`, `sigma` or `bias_bound`.
+
+    Returns:
+        The axes.
+
+    Raises:
+        TwinError: the volume has no such values.
     """
     if what in LAYERS:
         values = getattr(volume, what, None)

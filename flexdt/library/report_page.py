@@ -125,6 +125,7 @@ def table(
 def _row(
     tag: str, cells: Sequence[object], sides: Sequence[str], kind: str = ""
 ) -> Markup:
+    """Make a table row of cells with the tag `td` or `th`, each with the class of its side."""
     made = (
         _element(tag, cell_text(c), kind=side)
         for c, side in zip(cells, sides, strict=True)

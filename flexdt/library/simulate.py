@@ -129,13 +129,20 @@ class Truth:
         return self._paths(self.geometry[views])
 
     def _paths(self, cone: ConeVec) -> Float32Array:
+        """Compute path lengths through each part (parts, n, rows, cols) [mm]."""
         out = np.empty((len(self.parts), len(cone), *self.camera.shape), np.float32)
         for i, part in enumerate(self.parts):
             out[i] = project_body(part.body, cone, self.camera.shape)
         return out
 
     def radiographs(self) -> Iterator[Radiograph]:
-        """Simulate the noise-free radiograph of each view."""
+        """Simulate the noise-free radiograph of each view, in batches that fit the memory.
+
+        Rays per pixel and focal spot points are averaged, and scatter is added.
+
+        Yields:
+            One radiograph a view, in order.
+        """
         rows, cols = self.camera.shape
         chain = self.chain
         moments = self.rays**2 * self.spot_points
@@ -370,6 +377,7 @@ def simulate(
         def read(
             number: int, expected: Expected, lit: ExposureSettings = exposure
         ) -> Counts:
+            """Read out an expected image, with the noise of frame `number` unless noise is off."""
             if noise is None:
                 rng = None
             else:
@@ -438,7 +446,11 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:
-    """Return the pixels' edges along u and v [mm], which must be alike in all views."""
+    """Return the pixels' edges along u and v [mm]; equal ones exactly.
+
+    Raises:
+        GeometryError: no views, or edges that differ between views.
+    """
     lengths = np.linalg.norm([cone.u, cone.v], axis=2)
     if not lengths.size:
         raise GeometryError("a geometry without views cannot be simulated", {"asked": 0})
@@ -512,7 +524,13 @@ def _panel(
 
 
 def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
-    """Warn if the flat image, valid for views of one distance, differs between views."""
+    """Yield a warning if the flat image, valid for views of one distance, differs between
+    views.
+
+    Args:
+        shape: (rows, cols).
+        cone: the views.
+    """
     first = flux_of(cone.rows[0], shape)
     worst = max(
         (

@@ -11,7 +11,11 @@ from flexdt.twin.projection.volume import Volume
 
 
 def images_to_xarray(data: ImageSet) -> Any:
-    """Return a data set's line integrals as a DataArray; see `DataSet.to_xarray`."""
+    """Convert a data set's line integrals to a DataArray; see `DataSet.to_xarray`.
+
+    Raises:
+        TwinError: xarray is not installed.
+    """
     xarray = package("xarray", "to_xarray")
     rows = data.geometry.rows
     return xarray.DataArray(

@@ -115,6 +115,12 @@ class Substance:
     density_g_cm3: float
 
     def __post_init__(self) -> None:
+        """Check density and mass fractions, which must add up to 1.
+
+        Raises:
+            LimitError: a value is not allowed.
+            UnknownNameError: an element without tables.
+        """
         if not 0.0 < (density := self.density_g_cm3) <= MAX_DENSITY_G_CM3:
             message = f"{self.name}: density {density:g} g/cm3"
             raise LimitError.instead(
@@ -200,8 +206,15 @@ class Substance:
 
 
 def _mass_at(row: int, energy_keV: float) -> float:
-    """Interpolate mu/rho of an element [cm2/g], log-log from the two nearest bins
-    with no edge between."""
+    """Interpolate mu/rho of an element, log-log from the two nearest bins with no edge between.
+
+    Args:
+        row: of the element in the tables.
+        energy_keV: photon energy.
+
+    Returns:
+        mu/rho [cm2/g].
+    """
     bins = tables().energy_keV
     edges = tables().edges_keV[row]
     total = tables().total[row]

@@ -136,8 +136,16 @@ def without_spot(chain: Chain) -> Chain:
 
 
 def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
-    """Compute `flux_map` of a cone_vec row (12,): the open pixel's share of the charge at
-    1 m, per cm2."""
+    """Compute the open pixels' share of the charge at 1 m, per cm2; see `flux_map`, which
+    caches it.
+
+    Args:
+        view: cone_vec row (12,) [mm].
+        shape: the panel's (rows, cols).
+
+    Returns:
+        (rows, cols).
+    """
     row = np.asarray(view, dtype=np.float64)
     away = row[0:3] - row[3:6]
     u = row[6:9]

@@ -165,6 +165,12 @@ class Detector:
     """Assumed: computed for the scintillator."""
 
     def __post_init__(self) -> None:
+        """Check the figures' ranges, and convert the response to pairs of floats and counts to
+        whole numbers.
+
+        Raises:
+            LimitError: a figure out of its range, or an unknown scintillator.
+        """
         for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
             if value is not None or name not in _OPTIONAL_FIGURES:

@@ -89,7 +89,16 @@ def ideal_response(machine: Machine) -> IdealResponse:
 
 
 def open_beam(model: IdealResponse, settings: ExposureSettings) -> float:
-    """Compute the signal above dark [counts] of a ray that meets nothing."""
+    """Compute the signal above dark of a ray that meets nothing, proportional to voltage, power
+    and time.
+
+    Args:
+        model: signal at its reference settings.
+        settings: voltage [kV], power [W], exposure [ms].
+
+    Returns:
+        Counts; 0 with X-rays off.
+    """
     if not settings.xrays_on:
         return 0.0
     kV, power, exposure = model.reference

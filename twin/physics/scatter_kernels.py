@@ -266,9 +266,19 @@ def coherent_cosine(state, energy, cumulated, root_step):
 
 @kernel
 def incoherent_cosine(state, energy, shell, root_step):
-    """Draw the angle of an incoherent interaction, by rejection from the even
-    distribution: Klein-Nishina, at most 1 here, and S over its greatest value. Half of
-    the trials or more succeed below 250 keV."""
+    """Draw the angle of an incoherent interaction, by rejection from the even distribution:
+    Klein-Nishina, at most 1 here, and S over its greatest value. Half of the trials or more
+    succeed below 250 keV.
+
+    Args:
+        state: of the random stream.
+        energy: of the photon [keV].
+        shell: (e,) S, the incoherent scattering function.
+        root_step: step of its table, in the root of x.
+
+    Returns:
+        The stream's new state, and the cosine.
+    """
     most = shell[len(shell) - 1]
     while True:
         state, number = draw(state)
@@ -343,9 +353,26 @@ def detect(
 ):
     """Send the expected signal of an interaction at p to `fan` of the nodes.
 
-    Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any
-    other. `weight` holds everything but the differential cross-section in units of the
-    attenuation coefficient, the attenuation on the way and the node's solid angle.
+    Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any other.
+
+    Args:
+        amounts, lower, edge: as for `travel`.
+        nodes, normal, per_open: as for `histories`.
+        total, first_keV, step_keV, form, shell, root_step: the cross-sections.
+        response, spread: (e,) signal and variance of a photon, by energy.
+        p: (3,) place of the interaction [mm].
+        d: (3,) direction of the photon before it.
+        energy: of the photon before it [keV].
+        mu: (materials,) attenuations at that energy.
+        m: number of the material.
+        weight: everything but the differential cross-section in units of the attenuation
+            coefficient, the attenuation on the way and the node's solid angle.
+        start: first node.
+        fan: number of nodes.
+        v: (3,) room.
+        paths: (materials,) room.
+        image: (n, 3) added to.
+        channel: of the image, SINGLE or MULTIPLE; the variance goes to NOISE.
     """
     number = len(nodes)
     share = weight * number / fan / mu[m]

@@ -225,6 +225,11 @@ class Tube:
     mono_keV: float | None = None
 
     def __post_init__(self) -> None:
+        """Check voltage, power, spot and energy, and convert the filters' names to `Filter`s.
+
+        Raises:
+            LimitError: a value out of its range, or an unknown filter.
+        """
         low, high = voltages()
         require_within("Tube: kV", self.kV, low, high, "kV")
         require_within("Tube: power_W", self.power_W, 1e-9, 1e6, "W")

@@ -77,7 +77,11 @@ def _found(
     boxes: npt.ArrayLike | None,
     grid: FloatArray | None,
 ) -> Iterator[Finding]:
-    """Yield the findings of all checks that apply; arguments as for `examine`."""
+    """Yield the findings of all checks that apply to an operation.
+
+    Arguments as for `examine`; `geometry` is converted, and `grid` is the box (2, 3) of the
+    volume's lower and upper corner [mm].
+    """
     yield from geometry_findings(geometry, shape)
     if operation is not Operation.PROJECT:
         spans = tuple(span_findings(geometry))

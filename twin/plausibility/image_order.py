@@ -66,8 +66,14 @@ def ordered(names: Sequence[str]) -> Ordered:
 
 
 def _numbered(names: list[str]) -> Ordered | None:
-    """Sorted names that differ by a whole number of fixed width alone, without a gap; else
-    None."""
+    """Check whether sorted names differ by a whole number of fixed width alone, without a gap.
+
+    Args:
+        names: sorted.
+
+    Returns:
+        The names in their order; None if they differ otherwise.
+    """
     if len(names) < 2 or len({*map(len, names)}) != 1:
         return None
     first, last = names[0], names[-1]
@@ -114,7 +120,14 @@ def _is(names: Sequence[str]) -> str:
 
 
 def _keys(names: Sequence[str]) -> dict[str, Key]:
-    """Compute sort keys of names: their text without the numbers, and the numbers."""
+    """Compute sort keys of names: their text without the numbers, and the numbers.
+
+    Hyphens count as signs where only some names have them, points as decimal points where
+    `_decimal` says so.
+
+    Returns:
+        Name -> key.
+    """
     stems = {name: re.sub(r"\.[A-Za-z]\w*$", "", name) for name in names}
     plain = {
         name: _key(stem, signed=False, decimals=False) for name, stem in stems.items()
@@ -144,7 +157,13 @@ def _numbers(key: Key) -> tuple[float, ...]:
 
 
 def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
-    """Split a file's stem into texts and numbers."""
+    """Split a file's stem into texts and numbers, in turns.
+
+    Args:
+        stem: name without its ending.
+        signed: a hyphen before a number is its sign.
+        decimals: a point between digits is a decimal point; otherwise it separates two numbers.
+    """
     parts: list[str | float] = []
     at = 0
     for match in NUMBER.finditer(stem):
@@ -163,7 +182,13 @@ def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
 def _decimal(
     decimal: dict[str, Key], whole: dict[str, Key], stems: dict[str, str]
 ) -> bool:
-    """Return whether points in names are decimal points and not separators of numbers."""
+    """Decide whether points in names are decimal points and not separators of numbers.
+
+    Args:
+        decimal: keys with decimal points, by name.
+        whole: keys without.
+        stems: names without their endings, by name.
+    """
     if len(set(decimal.values())) < len(set(whole.values())):
         return len(_texts(decimal)) < len(_texts(whole))
     parts = [
@@ -186,6 +211,7 @@ def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str,
 
 
 def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
+    """Yield a finding on the first two names with equal numbers, e.g. `7.tif` and `007.tif`."""
     seen: dict[Key, str] = {}
     for name in names:
         key = keys[name]
@@ -196,7 +222,12 @@ def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]
 
 
 def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
-    """Find a number that is missing between others of one step."""
+    """Yield a warning if numbers are missing between others of one step.
+
+    Args:
+        names: in order.
+        keys: their sort keys.
+    """
     if len(names) < 4 or len({_text(keys[name]) for name in names}) != 1:
         return
     table = np.array([_numbers(keys[name]) for name in names], dtype=np.float64)

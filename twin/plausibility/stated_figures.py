@@ -101,9 +101,13 @@ def _worst(own: FloatArray, stated: FloatArray) -> float:
 
 
 def _same_set(own: FloatArray, stated: FloatArray, allowed: float) -> bool:
-    """Return whether the angles are equal in another order.
+    """Check whether angles are equal in another order, each counted from its first, last or
+    least one, and in either sense.
 
-    They are counted from the first or the least of each.
+    Args:
+        own: (n,) angles of the geometry [rad].
+        stated: (n,) stated angles [rad].
+        allowed: largest difference [rad].
     """
     for sense in (1.0, -1.0):
         turned = sense * stated

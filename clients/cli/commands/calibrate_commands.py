@@ -199,7 +199,15 @@ def _given(
 
 
 def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
-    """Load the data sets, each with its own geometry or the one of a file."""
+    """Load the data sets, each with its own geometry or the one of a file.
+
+    Args:
+        folders: of the data sets.
+        geometries: one file for each, or None.
+
+    Raises:
+        typer.BadParameter: another number of geometries.
+    """
     from flexdt.library.datasets.exchange import load_geometry, with_geometry
     from flexdt.library.reading.folders import load_dataset
 
@@ -311,6 +319,14 @@ def _require_answer(twin: Twin) -> None:
 def _push(
     twin: Twin, correction: NamedCorrection, source: str, document: Mapping[str, object]
 ) -> None:
+    """Put a correction in force on the twin, and say so on standard error.
+
+    Args:
+        twin: connects to it.
+        correction: name and offsets.
+        source: name of the data set.
+        document: of the result, which may contain a motion; a twin's correction cannot.
+    """
     with twin() as client:
         push_correction(client, correction, source)
     note(f"in force on the twin: {correction.name}")
@@ -319,7 +335,13 @@ def _push(
 
 
 def push_correction(client: TwinClient, correction: NamedCorrection, source: str) -> None:
-    """Put a correction in force on the twin: the parameters that it changes."""
+    """Put a correction in force on the twin: the parameters that differ from the nominal ones.
+
+    Args:
+        client: of the twin.
+        correction: name, note and offsets.
+        source: name of the data set it is from.
+    """
     from flexdt.twin.geometry.offsets import NOMINAL
 
     nominal = NOMINAL.to_edge()

@@ -300,6 +300,11 @@ def scan_of(
 def _workers(
     scheduler: str | None, slurm: Path | None
 ) -> AbstractContextManager[Executor] | None:
+    """Make the workers that --scheduler or --slurm asks for; None without either.
+
+    Raises:
+        TwinError: flexdt-extensions is not installed.
+    """
     from flexdt.library.extras import extension
 
     if scheduler is None and slurm is None:

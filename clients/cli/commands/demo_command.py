@@ -71,6 +71,7 @@ def demo(
     """
 
     def stay(url: str) -> None:
+        """Print the lab's address, and wait for Ctrl-C."""
         note(f"the lab is at {url}; Ctrl-C ends the demonstration")
         try:
             while True:
@@ -143,7 +144,14 @@ def _drawn_truth() -> Iterator[Path]:
 def _started(
     options: Mapping[str, object], out: Path, tell: Tell, *, viewer: bool
 ) -> Iterator[Servers]:
-    """Start servers on free ports and print their addresses; end them on leaving."""
+    """Start servers on free ports and print their addresses; end them on leaving.
+
+    Args:
+        options: of the servers.
+        out: folder of their log.
+        tell: prints a line.
+        viewer: start a viewer, too.
+    """
     from flexdt.clients.launch.processes import Servers
 
     log = out / "servers.log"
@@ -315,7 +323,13 @@ def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
 
 
 def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
-    """Print the verdict, the files and the next commands."""
+    """Print the verdict, the files and the next commands.
+
+    Args:
+        document: of the demonstration.
+        out: folder of its files.
+        tell: prints a line.
+    """
     if shutil.which(PROGRAM):
         program = PROGRAM
     else:

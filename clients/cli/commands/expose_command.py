@@ -89,6 +89,7 @@ def expose(
 
 
 def _seen(found: Forecast | Measured) -> Answer:
+    """Yield lines on transmission, saturated and starved pixels."""
     seen: Transmission = found.transmission
     yield (
         f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "

@@ -157,6 +157,9 @@ async def _run(
     seconds: float | None,
     beside: tuple[Path, FramesBeside] | None,
 ) -> None:
+    """Follow the scanner for some seconds, or until it ends, with a status line and images from
+    `beside`; raise the session's error.
+    """
     work = asyncio.create_task(session.run(address))
     more = [asyncio.create_task(_status(session))]
     if beside is not None:

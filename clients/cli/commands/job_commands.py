@@ -108,6 +108,11 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     shown = ""
 
     def show(status: JobStatus) -> None:
+        """Update the progress bar, and report why a job is paused.
+
+        Raises:
+            CommandError: the job is paused, and nobody else can resume it.
+        """
         nonlocal shown
         if status.state != "running":
             text = f"{job}: {status.state}"
@@ -157,6 +162,7 @@ def _on_job(does: str, method: str) -> Callable[..., Answer]:
     """
 
     def command(twin: Twin, job: Job = None) -> Answer:
+        """Call the method for a job of the twin; yield its status as a document and as a line."""
         with twin() as client:
             status: JobStatus = getattr(client, method)(job)
         warn(status.warnings)

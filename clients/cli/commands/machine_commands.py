@@ -116,6 +116,7 @@ def fit(
 
 
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
+    """Make the table of axes with limits, speeds and the figures' sources."""
     rows = [
         (
             name,
@@ -129,6 +130,7 @@ def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
 
 
 def _places(machine: Machine) -> str:
+    """Make the table of distances along the beam, at their ends and at home."""
     from flexdt.twin.machine.kinematics import places
 
     rows = [
@@ -139,6 +141,7 @@ def _places(machine: Machine) -> str:
 
 
 def _bodies(machine: Machine) -> str:
+    """Make the table of the machine's bodies."""
     rows = [
         (
             c.name,
@@ -153,6 +156,7 @@ def _bodies(machine: Machine) -> str:
 
 
 def _times(machine: Machine) -> str:
+    """Make the table of times, measured or assumed."""
     timing = machine.timing
     rows = []
     for kind in timing.kinds:

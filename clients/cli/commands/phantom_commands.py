@@ -90,6 +90,9 @@ def _size(text: str) -> tuple[float, float, float]:
 
 
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:
+    """Describe a phantom for `--json`: name, size_mm, beads, bead_radius_mm, description and
+    assumed.
+    """
     return {
         "name": name,
         "size_mm": list(phantom.size_mm),

@@ -51,6 +51,9 @@ def state(twin: Twin) -> Answer:
 
 
 def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
+    """Return the cells of an axis: name, position, target, velocity, limits, unit and what it
+    does.
+    """
     lower, upper = axis.limits
     if axis.moving:
         doing = "moving"
@@ -70,8 +73,12 @@ def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
 
 
 def _facts(state: State) -> list[tuple[str, str]]:
-    """List the facts of a state as label and text: geometry, tube, camera, sample,
-    safety and so on."""
+    """List the facts of a state for its table: geometry, view, tube, camera, sample, safety,
+    clock, correction and controller; image and job if there are any.
+
+    Returns:
+        (label, text) of each.
+    """
     g = state.geometry
     c = state.camera
     t = state.tube

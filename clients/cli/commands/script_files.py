@@ -24,15 +24,12 @@ ScriptFile = Annotated[
 
 
 def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
-    """Read the lines of an executed script, or of one in a recording of `flexdt follow`.
-
-    Its problems are printed to standard error.
+    """Read the lines of an executed script, or of one in a recording of `flexdt follow`; print
+    its problems to standard error.
 
     Args:
         log: file.
         machine: of the script, to read a recording.
-
-    What is worth knowing about them goes to standard error.
 
     Raises:
         CommandError: it is no log, or a line of it does not hold.

@@ -116,6 +116,7 @@ class BeamShade:
     """The planes in a scene."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
+        """Add four hidden images to the scene."""
         plain: Any = {"visible": False, "cast_shadow": False, "receive_shadow": False}
         self._planes: list[Any] = [
             scene.add_image(
@@ -146,6 +147,7 @@ class BeamShade:
             self._draw()
 
     def _draw(self) -> None:
+        """Draw the newest image along the beam, if X-rays are on."""
         if not self._lit or self._newest is None:
             return
         for handle, plane in zip(self._planes, fans(*self._newest), strict=True):

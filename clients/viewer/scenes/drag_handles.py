@@ -47,6 +47,7 @@ class Gizmos:
     """
 
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
+        """Add a handle for each stage; `drag` gets the axes' targets when one is dragged."""
         self._machine, self._drag = machine, drag
         self._positions: dict[str, float] = {}
         self._at: dict[str, tuple[float, ...]] = {}
@@ -92,6 +93,7 @@ class Gizmos:
 
         # Plain functions would run in threads, in any order.
         async def follow(event: Any) -> None:
+            """Follow the phases of a drag: start, move and end."""
             match event.phase:
                 case "start":
                     self._begin(handle)
@@ -137,6 +139,14 @@ class Gizmos:
     def _aim(
         self, targets: dict[str, float], handle: _Handle, quantity: str, change: float
     ) -> None:
+        """Set the target of the motor that changes a quantity, within its limits.
+
+        Args:
+            targets: motor -> target, added to.
+            handle: that is dragged.
+            quantity: of the machine's geometry.
+            change: of it since the drag began [mm, deg].
+        """
         factors = self._machine.geometry.get(quantity, {})
         if len(factors) != 1 or abs(change) < 1e-3:
             return

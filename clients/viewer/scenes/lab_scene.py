@@ -216,6 +216,7 @@ class LabScene:
         )
 
     def _build_bodies(self) -> None:
+        """Add the hull of each collision body, and its safety margin."""
         margin = self.machine.safety_margin_mm
         for name, body in self._bodies.items():
             hull = bare(body.solid)
@@ -254,6 +255,7 @@ class LabScene:
     def _hull(
         self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float
     ) -> Any:
+        """Add a translucent mesh to the scene; returns its handle."""
         vertices, faces = plain(mesh)
         return self._server.scene.add_mesh_simple(
             node,
@@ -322,6 +324,7 @@ class LabScene:
         self._axis.wxyz = quaternion(world.stage.turn)
 
     def _show_panel(self, world: World) -> None:
+        """Put the live image in front of the panel, as large as it."""
         rows, cols = world.shape
         at = (world.detector - GAP_MM * world.normal) * MM
         width = float(np.linalg.norm(world.u)) * cols * MM
@@ -536,6 +539,7 @@ def _axis_points() -> npt.NDArray[np.float32]:
 
 
 def _cross_points() -> npt.NDArray[np.float32]:
+    """Return the four lines (4, 2, 3) of a cross with an open centre [m]."""
     r, g = 7.0 * MM, 1.5 * MM
     return np.array(
         [[[s * g, 0, 0], [s * r, 0, 0]] for s in (-1, 1)]

@@ -82,7 +82,12 @@ def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
 
 
 def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
-    """Make the shape of the panel's image (rows, cols, 3), in front of the panel."""
+    """Make the shape of the panel's image, in front of the panel.
+
+    Args:
+        rgb: (rows, cols, 3); drawn as IMAGE_CELLS.
+        world: place of the panel.
+    """
     import cv2
 
     (cols, rows), (first, right, _, down) = IMAGE_CELLS, world.corners - world.normal
@@ -159,6 +164,7 @@ def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
 
 
 def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
+    """Compute the colours of a shape's triangles in the scene's light, (n, 3)."""
     color = np.broadcast_to(shape.color, (len(shape.corners), 3)).astype(np.float32)
     if not shape.lit:
         return color
@@ -174,8 +180,17 @@ def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
 def _projected(
     corners: FloatArray, camera: Standpoint, width: int, height: int
 ) -> FloatArray:
-    """Project corners (n, 3, 3) to column, row [px] and inverse depth [1/m]; NaN too
-    near the eye."""
+    """Project the corners of triangles onto a picture.
+
+    Args:
+        corners: (n, 3, 3) [m].
+        camera: where it is and looks.
+        width: of the picture [px].
+        height: of the picture [px].
+
+    Returns:
+        (n, 3, 3) column, row [px] and inverse depth [1/m]; NaN too near the eye.
+    """
     eye, up = np.asarray(camera.position), np.asarray(camera.up)
     ahead = np.asarray(camera.look_at) - eye
     ahead = ahead / np.linalg.norm(ahead)

@@ -94,7 +94,15 @@ def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Face
 
 
 def _quads(dense: npt.NDArray[np.bool_], number: npt.NDArray[np.int32]) -> Faces:
-    """Make two triangles around each edge that crosses the surface."""
+    """Make two triangles around each edge that crosses the surface.
+
+    Args:
+        dense: (nz, ny, nx) nodes inside.
+        number: (nz - 1, ny - 1, nx - 1) numbers of the cells' vertices.
+
+    Returns:
+        (m, 3) numbers of vertices.
+    """
     faces = []
     for axis in range(3):
         u, v = (np.eye(3, dtype=int)[(axis + k) % 3] for k in (1, 2))

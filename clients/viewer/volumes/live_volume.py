@@ -192,6 +192,7 @@ def grow(
     held.hold(target.volume().transpose(2, 0, 1), like)
 
     def parts() -> Iterator[Float32Array]:
+        """Yield line integrals, binned, each as soon as its file is there."""
         normalise = None
         for index in indices:
             path = data.frames[index].path
@@ -202,6 +203,9 @@ def grow(
             yield binned_mean(normalise(read_image(path, data.shape)), factor)[None]
 
     def progress(done: float) -> None:
+        """Report the number of images at most every TELL_S, with the surface at longer
+        intervals and at the end.
+        """
         nonlocal told, drawn
         if done < 1.0 and time.monotonic() < told + TELL_S:
             return
@@ -329,6 +333,7 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:
+    """Wait until a file is there; exit if the parent process has ended."""
     while not path.is_file():
         if not alive():
             raise SystemExit(0)
@@ -384,6 +389,9 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 
 
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
+    """Do work, and report an error of any kind as `problem`, so that the page does not wait for
+    ever.
+    """
     try:
         work()
     except (
@@ -407,6 +415,7 @@ def main() -> None:
     held = Held(served.say, about)
 
     def work() -> None:
+        """Reconstruct a data set that is complete, or one that grows."""
         if past:
             reconstruct(held, Path(folder), int(side))
             return

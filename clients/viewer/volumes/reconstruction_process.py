@@ -41,6 +41,7 @@ class LiveReconstruction:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
+        """Prepare reconstructions, whose lines `tell` gets; processes are started when needed."""
         self._tell, self.newest = tell, ""
         self._asked: Wish = ()
         self._task: asyncio.Task[None] | None = None
@@ -144,6 +145,7 @@ class LiveReconstruction:
 
 
 async def _started() -> asyncio.subprocess.Process:
+    """Start a process that reconstructs, with one thread a library, and pipes to it."""
     return await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",

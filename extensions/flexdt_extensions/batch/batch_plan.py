@@ -94,6 +94,7 @@ KINDS: Final = tuple(k for k in _SAMPLERS if k != "fixed")
 
 
 def _number(value: object) -> bool:
+    """Check whether a value is a finite number, not a bool."""
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)
@@ -148,6 +149,11 @@ def parse(value: object) -> Draw:
 
 
 def _numbers(value: object) -> Draw:
+    """Read a number or a distribution of numbers.
+
+    Raises:
+        ValueError: it is none.
+    """
     draw = parse(value)
     if any(isinstance(v, str) for v in draw.values):
         raise ValueError(f"a number is needed, got {draw.to_plain()!r}")
@@ -155,6 +161,11 @@ def _numbers(value: object) -> Draw:
 
 
 def _positive(value: object) -> Draw:
+    """Read a number above 0, or a distribution of such.
+
+    Raises:
+        ValueError: it is none.
+    """
     draw = _numbers(value)
     if draw.lowest <= 0:
         if draw.kind == "normal":
@@ -166,6 +177,11 @@ def _positive(value: object) -> Draw:
 
 
 def _counts(value: object) -> Draw:
+    """Read a whole number above 0, or a choice of such.
+
+    Raises:
+        ValueError: it is none.
+    """
     draw = _positive(value)
     if draw.kind not in ("fixed", "choice", "integers") or any(
         not isinstance(v, int) for v in draw.values
@@ -175,6 +191,11 @@ def _counts(value: object) -> Draw:
 
 
 def _names(value: object) -> Draw:
+    """Read a name, or a choice of names.
+
+    Raises:
+        ValueError: it is none.
+    """
     draw = parse(value)
     if not all(isinstance(v, str) for v in draw.values):
         raise ValueError(
@@ -251,6 +272,11 @@ class PhantomTable(_Table):
 
     @model_validator(mode="after")
     def _one(self) -> PhantomTable:
+        """Check that one of name, cuboid and spheres is given.
+
+        Raises:
+            ValueError: none or several.
+        """
         given = [k for k in ("name", "cuboid", "spheres") if getattr(self, k) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of name, cuboid, spheres; got {given or 'none'}")
@@ -294,6 +320,11 @@ class Camera(_Table):
 
     @model_validator(mode="after")
     def _either(self) -> Camera:
+        """Check that mode and roi are given, or shape and pixel_mm, or neither.
+
+        Raises:
+            ValueError: a mixture.
+        """
         if (self.shape is None) != (self.pixel_mm is None):
             raise ValueError("shape and pixel_mm go together")
         if self.shape is not None and (self.mode is not None or self.roi is not None):
@@ -346,6 +377,11 @@ class Calibrate(_Table):
 
     @model_validator(mode="after")
     def _known(self) -> Calibrate:
+        """Check the names of free parameters, and the priors.
+
+        Raises:
+            ValueError: an unknown name, or priors that do not fit.
+        """
         wrong = [n for n in self.free if n not in NAMES]
         if wrong:
             raise ValueError(

@@ -55,6 +55,16 @@ class Store:
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
+        """Open the results of a batch in a folder, which is made if it is not there, and take
+        up an interrupted one.
+
+        Args:
+            folder: of the results.
+            plan: of the batch.
+
+        Raises:
+            CommandError: the folder holds another batch.
+        """
         self.folder = folder
         self.plan = plan
         self._log_path = folder / "items.jsonl"

@@ -42,6 +42,11 @@ class Augment:
     shift_px: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            LimitError: photons or shift out of their range.
+        """
         try:
             low, high = (1.0, 1.0) if self.photons is None else map(float, self.photons)
         except (TypeError, ValueError):
@@ -154,8 +159,16 @@ class TrainingData:
         return np.asarray(rng.permutation(shards)[rank::ranks])
 
     def shuffled(self, rank: int = 0, ranks: int = 1) -> Iterator[Sample]:
-        """Yield this epoch's samples of a process: shards in `order`, each read once,
-        shuffled inside."""
+        """Yield this epoch's samples of a process: shards in `order`, each read once, shuffled
+        inside.
+
+        Args:
+            rank: number of the process.
+            ranks: number of processes.
+
+        Yields:
+            Samples, augmented, with their index; the same for the same seed and epoch.
+        """
         for shard in self.order(rank, ranks).tolist():
             first = shard * self.shard
             part = {
@@ -170,6 +183,7 @@ class TrainingData:
                 )
 
     def _finish(self, index: int, sample: Sample) -> Sample:
+        """Augment a sample in place, with a generator of its own, and add its index."""
         if self.augment is not None:
             rng = np.random.default_rng((self.seed, self.epoch, index, 1))
             self.augment.apply(sample, rng)

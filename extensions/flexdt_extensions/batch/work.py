@@ -215,6 +215,11 @@ def _camera(
 def _phantom(
     plan: Plan, index: int, rng: np.random.Generator
 ) -> tuple[Phantom, dict[str, Any]]:
+    """Draw an item's phantom as the plan says.
+
+    Returns:
+        The phantom, and the drawn values by name for the manifest.
+    """
     table = plan.phantom
     if table.name is not None:
         name = table.name.sample(rng)
@@ -227,6 +232,7 @@ def _phantom(
 
 
 def _cuboid(table: Cuboid, rng: np.random.Generator) -> tuple[Phantom, dict[str, Any]]:
+    """Draw a block with beads on a spiral; returns it and the drawn values by name."""
     values = {name: getattr(table, name).sample(rng) for name in type(table).model_fields}
     size = tuple(float(values[f"{side}_mm"]) for side in ("width", "breadth", "height"))
     made = bead_phantom(
@@ -283,6 +289,18 @@ def _spheres(
 def _place(
     radius: float, wide: float, high: float, others: list[Any], rng: np.random.Generator
 ) -> tuple[float, float, float] | None:
+    """Draw a place for a ball in a cylinder, clear of other balls.
+
+    Args:
+        radius: of the ball [mm].
+        wide: radius of the cylinder [mm].
+        high: half its height [mm].
+        others: spheres that are there.
+        rng: generator.
+
+    Returns:
+        The centre [mm]; None if none was found in MAX_TRIES.
+    """
     if radius > wide or radius > high:
         return None
     for _ in range(MAX_TRIES):
@@ -445,6 +463,16 @@ def _rng(plan: Plan, item: Item, frame: int) -> np.random.Generator | None:
 
 
 def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
+    """Simulate an item's images by the ideal response, with noise if the plan has it.
+
+    Args:
+        plan: says whether counts or line integrals are made.
+        item: phantom, exposure and detector.
+        cone: true geometry of n views.
+
+    Returns:
+        (n, rows, cols).
+    """
     lines = line_integrals(item.phantom, cone, item.shape)
     if plan.images.values == "line_integrals" and not plan.images.noise:
         return lines

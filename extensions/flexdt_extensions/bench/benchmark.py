@@ -313,8 +313,17 @@ def errors(images: Float32Array, exact: Float32Array | FloatArray) -> tuple[floa
 def exact_images(
     volume: Volume, geometry: ConeVec, shape: tuple[int, int]
 ) -> Float32Array:
-    """Project every ray on its own in double precision (positions and sums), rounded
-    once at the end."""
+    """Project every ray on its own in double precision (positions and sums), rounded once at
+    the end.
+
+    Args:
+        volume: to project.
+        geometry: n views.
+        shape: (rows, cols).
+
+    Returns:
+        (n, rows, cols).
+    """
     from flexdt.measuring import box_of, siddon_kernels, voxel_rays
 
     out = np.zeros((len(geometry), *shape), np.float32)
@@ -329,11 +338,16 @@ def exact_images(
 def sorted_crossings(
     volume: Volume, geometry: ConeVec, shape: tuple[int, int], pixels: FloatArray
 ) -> FloatArray:
-    """Compute the same integrals by another way: all crossings of a ray, sorted, in
-    NumPy.
+    """Compute line integrals by another way: all crossings of a ray, sorted, in NumPy.
 
     Args:
+        volume: to project.
+        geometry: of the views.
+        shape: (rows, cols).
         pixels: (k, 3) view, row, column.
+
+    Returns:
+        (k,) line integrals.
     """
     data = volume.data
     size = np.array(volume.voxel_xyz)
@@ -402,7 +416,13 @@ def timed(
 
 
 def plain(name: str, ms: float, what: str) -> Entry:
-    """Make an entry of one time."""
+    """Make an entry of one time, without errors or peers.
+
+    Args:
+        name: of the case.
+        ms: time [ms].
+        what: description.
+    """
     return {
         "name": name,
         "what": what,

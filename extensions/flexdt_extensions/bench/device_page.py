@@ -90,6 +90,7 @@ def _best(
     from numba import cuda
 
     def now() -> tuple[float, Any]:
+        """Wait for the device; return the host's time [s] and an event of the device's."""
         event = cuda.event()
         event.record()
         cuda.synchronize()
@@ -119,6 +120,16 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
     def line(
         what: str, value: float | None, accepted: float, wanted: float, sign: int = 1
     ) -> None:
+        """Add a target's line: what was measured, and whether that is wanted, accepted, missed
+        or not measured; print it.
+
+        Args:
+            what: name of the target.
+            value: measured; None if it could not be.
+            accepted: limit.
+            wanted: limit.
+            sign: 1 where less is better, -1 where more is.
+        """
         met = "not measured" if value is None else "missed"
         if value is not None and sign * value <= sign * accepted:
             if sign * value <= sign * wanted:

@@ -53,6 +53,12 @@ class Rtk:
         self._pool.shutdown()
 
     def _ask(self, do: Callable[..., _T], *arguments: object) -> _T:
+        """Run a function in RTK's process, and return its result; after an error the process is
+        ended.
+
+        Raises:
+            RuntimeError: with RTK's error.
+        """
         try:
             return self._pool.submit(do, *arguments).result()
         except Exception as error:
@@ -65,6 +71,9 @@ _PREPARED: list[Work] = []
 
 
 def _prepare(build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
+    """Build the work in this process and keep it for `_PREPARED`; the process will end without
+    ITK's own teardown.
+    """
     atexit.register(os._exit, 0)  # past the wrappers' own end
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ITK's wrappers warn while they load

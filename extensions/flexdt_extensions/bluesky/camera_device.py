@@ -122,6 +122,7 @@ class Roll:
     """Where images go: a numbered file each, complete before it is counted."""
 
     def __init__(self) -> None:
+        """Begin without a folder and without images."""
         self.folder: Path | None = None
         self.template = ""
         self.written, self._set_written = soft_signal_r_and_setter(int, 0)
@@ -200,12 +201,14 @@ class _Files(DetectorDataLogic):
     """The images, as a stream of TIFF files."""
 
     def __init__(self, link: LabConnection, where: PathProvider, roll: Roll) -> None:
+        """Take the connection, the provider of paths, and the counters of images."""
         self.link = link
         self.where = where
         self.roll = roll
         self.announcements: Announcements | None = None
 
     async def prepare_unbounded(self, datakey_name: str) -> StreamableDataProvider:
+        """Choose folder and names of the next images; return the provider of their documents."""
         info = self.where(datakey_name)
         self.roll.load(info.directory_path, info.filename)
         shape = (await self.link.fresh()).camera.shape
@@ -312,6 +315,11 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
 
 
 def _edges(text: str) -> tuple[int, int, int, int]:
+    """Read "LEFT TOP RIGHT BOTTOM", also with commas.
+
+    Raises:
+        ValueError: it is of another form.
+    """
     words = text.replace(",", " ").split()
     try:
         left, top, right, bottom = map(int, words)

@@ -118,6 +118,11 @@ class AxisLogic(MovableLogic[float]):
                     return
 
     def _arrived(self, axis: AxisState, target: float, state: State) -> None:
+        """Check that an axis at rest is at its target.
+
+        Raises:
+            RuntimeError: it stopped before, perhaps by the emergency stop.
+        """
         if abs(axis.position - target) > ARRIVAL_TOLERANCE:
             if state.safety.estop:
                 why = " by the emergency stop"
@@ -226,6 +231,11 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
         client = link.client
 
         async def switch(on: bool) -> None:
+            """Switch X-rays, and wait until they are ready or off.
+
+            Raises:
+                RuntimeError: somebody else switched them meanwhile.
+            """
             await client.set_tube(on=on)
             async for state in link.states():
                 if state.tube.on != on:
@@ -276,6 +286,9 @@ class TwinLab(Device, AsyncStageable):
         name: str = "",
         collisions: bool = True,
     ) -> None:
+        """Make the devices of a machine's axes, tube, camera and scans; arguments: see the
+        class.
+        """
         if isinstance(machine, str):
             scanner = builtin_machine(machine)
         else:

@@ -143,6 +143,7 @@ class TwinFlyer(
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
+        """Prepare a device without a scan; arguments: see the class."""
         self._link = link
         self._machine = machine
         self._profile = profile
@@ -360,7 +361,12 @@ class TwinFlyer(
         }
 
     def _settings(self) -> dict[str, tuple[Any, Dtype, str, str | None]]:
-        """Return value, type, NumPy's type and unit by name."""
+        """Return the scan's settings for `read_configuration`: frames, exposure_ms, duration_s,
+        angles_deg and script_sha256.
+
+        Returns:
+            Name -> value, type, NumPy's type and unit.
+        """
         ready = self._ready()
         return {
             "frames": (ready.report.frames, "integer", "<i8", None),
@@ -390,6 +396,7 @@ class TwinFlyer(
         return self.job is not None and self.job.state not in FINAL_STATES
 
     def _scanner(self) -> tuple[Machine, Profile]:
+        """Return machine and profile, those given or those of the twin."""
         server = self._link.client.server
         if self._machine is None:
             machine = builtin_machine(server.machine)
@@ -446,6 +453,7 @@ def _planned(
 
 
 def _refused(report: CheckResult) -> LimitsExceeded:
+    """Make the error on a script with errors: the first five, and the number of the others."""
     errors = [p for p in report.problems if p.severity == "error"]
     lines = [f"line {p.line}: {p.message}" for p in errors[:5]]
     if len(errors) > 5:
@@ -490,6 +498,7 @@ def fly_scan(
     start = {"plan_name": "fly_scan", "detectors": [flyer.name], **(md or {})}
 
     def inner() -> MsgGenerator[None]:
+        """Prepare the scan and carry it out; not replayed after an interruption."""
         prepared = yield from bps.prepare(flyer, scan, wait=True)
         # A replay would begin the scan again, and number images as those before. Without one,
         # the message that was interrupted is lost: what follows asks again where it may have
@@ -497,6 +506,9 @@ def fly_scan(
         yield from bpp.rewindable_wrapper(flight(prepared is not None), False)  # type: ignore[no-untyped-call]
 
     def flight(live: bool) -> MsgGenerator[None]:
+        """Declare the streams, start the scan, and collect its images; `live` is False in a
+        simulator.
+        """
         for device, name in ((flyer, STREAM), (flyer.frames, FRAMES)):
             declared = None
             while declared is None:
@@ -511,6 +523,7 @@ def fly_scan(
         )
 
     def images() -> MsgGenerator[None]:
+        """Collect images until the scan is done, with a checkpoint before each time."""
         ending = yield from bps.complete(flyer)
         done = False
         while not done:

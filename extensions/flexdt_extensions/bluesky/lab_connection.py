@@ -72,6 +72,9 @@ class LabConnection:
         ssl: tls.SSLContext | None = None,
         transport: Transport | None = None,
     ) -> None:
+        """Prepare a connection, which is made when it is first needed; arguments: see the
+        class.
+        """
         if transport is None:
             self.address = f"{host}:{port}"
         else:
@@ -159,6 +162,7 @@ class LabConnection:
                     await self._news.wait()
 
     async def _listen(self) -> None:
+        """Take states of the twin and wake who waits, until the connection is lost."""
         async with self.client.subscribe("state", "job", max_rate_hz=RATE_HZ) as events:
             with contextlib.suppress(ConnectionLost):
                 async for event in events:
@@ -167,6 +171,7 @@ class LabConnection:
                     self._news.set()
 
     def _take(self, state: State) -> None:
+        """Keep a state unless it is older than the one before, and call the watchers."""
         if self.state is not None and state.time < self.state.time:
             return  # an event that is older than the answer to a request
         self.state = state
@@ -226,6 +231,17 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         get: Get[_T] | None = None,
         limits: Callable[[State], tuple[float, float]] | None = None,
     ) -> None:
+        """Make the backend of a signal.
+
+        Args:
+            link: to the twin.
+            path: name in the twin's state.
+            datatype: of the value.
+            put: sets the value; None: read-only.
+            units: of the value.
+            get: reads the value from a state; the member at `path` without.
+            limits: reads its limits from a state.
+        """
         super().__init__(datatype)
         self._link = link
         self._path = path
@@ -305,9 +321,13 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 def _changes(
     get: Get[_T], callback: Callable[[Reading[_T]], None]
 ) -> Callable[[State], None]:
+    """Return a watcher of states that calls `callback` with a reading when the value has
+    changed.
+    """
     last: list[_T] = []
 
     def notify(state: State) -> None:
+        """Call back if the value differs from the last one."""
         value = get(state)
         if not last or last[0] != value:
             last[:] = [value]

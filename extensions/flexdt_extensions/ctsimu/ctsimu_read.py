@@ -100,6 +100,16 @@ class ScenarioReader:
     def __init__(
         self, document: Mapping[str, Any], file: str, beside: Beside | None = None
     ) -> None:
+        """Take a scenario's document, and check its version and number of projections.
+
+        Args:
+            document: content of the file.
+            file: its name, for messages.
+            beside: reads files that it names.
+
+        Raises:
+            ExchangeError: another version, or no such number.
+        """
         self._document = document
         self._file = file
         self._beside = beside
@@ -147,9 +157,16 @@ class ScenarioReader:
         )
 
     def _bins(self, rows: int, cols: int) -> tuple[int, int]:
-        """Read the numbers of pixels to bin along u and v.
+        """Read the numbers of pixels to bin along u and v; 1 without binning.
 
         Pixels that fill no binned pixel are cut off on both sides.
+
+        Args:
+            rows: of the detector.
+            cols: of the detector.
+
+        Raises:
+            ExchangeError: they are no whole numbers within the detector.
         """
         where = "acquisition.pixel_binning"
         binning = self._at("acquisition").get("pixel_binning")
@@ -174,6 +191,14 @@ class ScenarioReader:
         pitch: Sequence[float],
         real: bool,
     ) -> list[Pose]:
+        """Compute source, detector, u, v, and the stage's centre and axes, for each frame [mm].
+
+        Args:
+            parts: source, detector and stage.
+            angle: (n,) of the stage [rad].
+            pitch: pixel edges along u and v [mm].
+            real: with the deviations unknown to reconstruction.
+        """
         still = np.zeros(self._count)
         out: list[Pose] = []
         for i in range(self._count):
@@ -314,6 +339,19 @@ class ScenarioReader:
     def _vector(
         self, value: object, where: str, units: Mapping[Any, float] = NUMBER
     ) -> tuple[str, FloatArray]:
+        """Read a vector of three components, x, y, z or u, v, w or those of the sample.
+
+        Args:
+            value: from the document.
+            where: its path, for messages.
+            units: unit -> factor.
+
+        Returns:
+            The names of its components, and their values (3,).
+
+        Raises:
+            ExchangeError: no such vector, or one with drifts.
+        """
         if isinstance(value, dict):
             for reference in (WORLD, STAGE, _SAMPLE):
                 if set(reference) <= value.keys():
@@ -395,6 +433,11 @@ class ScenarioReader:
         return table
 
     def _value(self, value: object, where: str, units: Mapping[Any, float]) -> float:
+        """Read a number with its unit, converted by `units`.
+
+        Raises:
+            ExchangeError: it is no number, or has another unit.
+        """
         if isinstance(value, dict):
             entry = value
         else:
@@ -405,6 +448,11 @@ class ScenarioReader:
         return float(number) * self._factor(entry.get("unit"), units, where)
 
     def _factor(self, unit: object, units: Mapping[Any, float], where: str) -> float:
+        """Return the factor of a unit; the first of `units` is the default.
+
+        Raises:
+            ExchangeError: another unit.
+        """
         if units is NUMBER:
             return 1.0
         if unit is None:
@@ -418,12 +466,22 @@ class ScenarioReader:
         return self._value(value, ".".join(path), units)
 
     def _size(self, *path: str) -> int:
+        """Read a whole number from 1 to MOST at a path.
+
+        Raises:
+            ExchangeError: it is none.
+        """
         value = self._number(path, NUMBER)
         if not value.is_integer() or not 1 <= value <= MOST:
             raise self._error(".".join(path), f"a whole number from 1 to {MOST}")
         return int(value)
 
     def _at(self, *path: str) -> Mapping[str, Any]:
+        """Return the object at a path of the document.
+
+        Raises:
+            ExchangeError: there is none.
+        """
         found: Any = self._document
         for i, key in enumerate(path):
             if isinstance(found, dict):
@@ -435,6 +493,11 @@ class ScenarioReader:
         return found  # type: ignore[no-any-return]
 
     def _check_version(self) -> None:
+        """Check that the document is a scenario of a version that we read.
+
+        Raises:
+            ExchangeError: it is not.
+        """
         about = self._at("file")
         version = about.get("file_format_version")
         said = version if isinstance(version, dict) else {}
@@ -449,12 +512,14 @@ class ScenarioReader:
             )
 
     def _error(self, where: str, allowed: str) -> ExchangeError:
+        """Make the error on the value at `where`: what it is, and what is allowed."""
         asked = self._asked(where)
         return ExchangeError.instead(
             f"{self._file}: {where} is {asked}", asked, allowed, path=where
         )
 
     def _asked(self, where: str) -> str:
+        """Return the value at a path of the document as JSON, at most 60 characters."""
         found: Any = self._document
         for key in re.findall(r"[^.\[\]]+", where.partition(" ")[0]):
             if isinstance(found, list) and key.isdigit() and int(key) < len(found):
@@ -486,7 +551,7 @@ def place(
     real: bool,
     stage: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute centre (3,) and axes as columns (3, 3) of a part in one frame.
+    """Compute centre and axes of a part in one frame.
 
     In the world, or, for a sample on the stage, in the stage's (u, v, w).
 
@@ -496,6 +561,9 @@ def place(
         frame: number of the frame.
         real: include deviations unknown to reconstruction.
         stage: centre and axes of the stage, for a sample.
+
+    Returns:
+        Centre (3,) [mm], and axes as columns (3, 3).
     """
     center = part.center.copy()
     axes = part.axes
@@ -503,6 +571,7 @@ def place(
         axes = rotation_about(axes[:, 2], float(turn[frame])) @ axes
 
     def seen(reference: str) -> tuple[FloatArray, FloatArray]:
+        """Return origin and axes of a coordinate system, seen from the part's own."""
         if reference == WORLD and part.on_stage and stage is not None:
             return -stage[1].T @ stage[0], stage[1].T
         if reference == WORLD or (reference == STAGE and part.on_stage):
@@ -526,6 +595,9 @@ def place(
 
 
 def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
+    """Return the axes u, v, w as columns (3, 3); None if u and w are not at right angles, or
+    zero.
+    """
     lengths = np.linalg.norm(u), np.linalg.norm(w)
     if min(lengths) == 0.0 or abs(u @ w) > 1e-6 * lengths[0] * lengths[1]:
         return None
@@ -547,7 +619,7 @@ def _interpolated(values: FloatArray, count: int) -> FloatArray:
 
 
 def drifts_of(value: object) -> list[Any]:
-    """List the drifts of a parameter."""
+    """List the drifts of a parameter, also under its older name; empty without any."""
     if isinstance(value, dict):
         found = value.get("drifts")
     else:
@@ -560,6 +632,7 @@ def drifts_of(value: object) -> list[Any]:
 
 
 def _numeric(values: object) -> bool:
+    """Check whether values are a list of finite numbers."""
     return isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
         for v in values

@@ -230,6 +230,7 @@ class _Watched(dict[str, Any]):
 
 
 def _says_something(value: object) -> bool:
+    """Check whether a value holds anything besides comments, zeros and empty texts."""
     if isinstance(value, dict):
         return any(
             _says_something(one) for key, one in value.items() if key not in _WORDS
@@ -298,6 +299,12 @@ class _ScanReader(ScenarioReader):
         return replace(scan, notes=(*geometry.notes, *self._notes, *left))
 
     def _check(self, scan: ScenarioScan) -> None:
+        """Check that a scan with scattering has one spectrum, and samples that rest on the
+        stage.
+
+        Raises:
+            ExchangeError: it has not.
+        """
         varies = len(scan.spectra) > 1
         if scan.scattering and (varies or any(s.on_stage is None for s in scan.samples)):
             raise self._error(
@@ -423,6 +430,7 @@ class _ScanReader(ScenarioReader):
         return self._substances[name]
 
     def _layers(self, *path: str) -> tuple[Filter, ...]:
+        """Read the list of layers at a path, without those of vacuum or no thickness."""
         where = ".".join(path)
         found = [
             self._layer(one, f"{where}[{i}]") for i, one in enumerate(self._list(*path))
@@ -430,7 +438,18 @@ class _ScanReader(ScenarioReader):
         return tuple(layer for layer in found if layer is not None)
 
     def _layer(self, given: object, where: str) -> Filter | None:
-        """Read a thickness of a material; None for vacuum."""
+        """Read a thickness of a material.
+
+        Args:
+            given: object with material_id and thickness.
+            where: its path, for messages.
+
+        Returns:
+            The layer; None for vacuum or no thickness.
+
+        Raises:
+            ExchangeError: another form, or more than 1000 mm.
+        """
         if not isinstance(given, dict):
             raise self._error(where, "an object with material_id and thickness")
         substance = self._material(given.get("material_id"), f"{where}.material_id")
@@ -484,6 +503,11 @@ class _ScanReader(ScenarioReader):
         return fluence, tuple(order[key] for key in keys)
 
     def _check_target(self) -> None:
+        """Check that the target is of tungsten, and note that its angle is not heeded.
+
+        Raises:
+            ExchangeError: another material.
+        """
         made_of = self._material(
             self._given("source", "target", "material_id"), "source.target.material_id"
         )
@@ -652,6 +676,9 @@ class _ScanReader(ScenarioReader):
         return "unsharpness"
 
     def _reference(self, name: str) -> Reference:
+        """Read how dark or flat images are taken: number, averages, and whether they are ideal
+        and correct the projections.
+        """
         at = ("acquisition", name)
         correction = self._flag(*at, "correction")
         number = self._natural(*at, "number", default=0, least=int(correction))
@@ -676,18 +703,33 @@ class _ScanReader(ScenarioReader):
         return found
 
     def _list(self, *path: str) -> list[Any]:
+        """Read the list at a path; empty without one.
+
+        Raises:
+            ExchangeError: something else is there.
+        """
         found = self._given(*path)
         if found is not None and not isinstance(found, list):
             raise self._error(".".join(path), "a list")
         return found or []
 
     def _flag(self, *path: str) -> bool:
+        """Read true or false at a path; False without one.
+
+        Raises:
+            ExchangeError: something else is there.
+        """
         found = self._given(*path)
         if found not in (None, True, False):
             raise self._error(".".join(path), "true or false")
         return bool(found)
 
     def _natural(self, *path: str, default: int = 1, least: int = 1) -> int:
+        """Read a whole number from `least` at a path; `default` without one.
+
+        Raises:
+            ExchangeError: something else is there.
+        """
         found = self._given(*path)
         value = default if found is None else found
         if type(value) is not int or not least <= value <= MOST:
@@ -700,6 +742,11 @@ class _ScanReader(ScenarioReader):
             raise self._error(".".join(path), "null; such files are not read")
 
     def _text(self, given: object, where: str) -> str | None:
+        """Read a text; None without one.
+
+        Raises:
+            ExchangeError: something else, or a text that drifts.
+        """
         if isinstance(given, dict):
             value = given.get("value")
         else:
@@ -764,7 +811,19 @@ class _ScanReader(ScenarioReader):
     def _series(
         self, units: Mapping[Any, float], *path: str, default: float | None = None
     ) -> FloatArray:
-        """Read a positive number for each frame."""
+        """Read a positive number for each frame.
+
+        Args:
+            units: unit -> factor.
+            path: keys of the value.
+            default: for all frames if there is no value.
+
+        Returns:
+            (n,).
+
+        Raises:
+            ExchangeError: no number, or one that is not above 0 in a frame.
+        """
         where = ".".join(path)
         given = self._given(*path)
         if isinstance(given, dict):
@@ -779,6 +838,11 @@ class _ScanReader(ScenarioReader):
         return found
 
     def _tried(self, where: str, make: Callable[..., T], *given: Any) -> T:
+        """Make a value from what the scenario gives; its error names `where`.
+
+        Raises:
+            ExchangeError: `make` raises a TwinError.
+        """
         try:
             return make(*given)
         except TwinError as error:

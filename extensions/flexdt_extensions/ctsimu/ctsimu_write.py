@@ -215,9 +215,15 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
 def _stage_motion(
     angles_deg: FloatArray,
 ) -> tuple[float, float, str, list[dict[str, Any]]]:
-    """Determine the stage's start and stop angle [deg], direction and drifts.
+    """Determine the stage's motion from the angles.
 
     Deviations from equal steps become a drift of a turn about the stage's own axis.
+
+    Args:
+        angles_deg: (n,) of the views.
+
+    Returns:
+        Start and stop angle [deg], direction (CW or CCW), and drifts.
     """
     first = float(angles_deg[0])
     last = float(angles_deg[-1])
@@ -256,6 +262,9 @@ class _Deviations:
     def stage(
         self, motion: list[dict[str, Any]], angles_deg: FloatArray
     ) -> list[dict[str, Any]]:
+        """List the deviations of the stage: its place, its motion's drifts, turns, angle scale,
+        and the object's.
+        """
         scale = [
             _drifting_turn(-amount * angles_deg, known, "angle_scale")
             for known, amount in self._amounts("angle_scale", 1.0)
@@ -264,6 +273,9 @@ class _Deviations:
         return [*moved, *motion, *turned, *scale, *self.of(_OBJECT)]
 
     def _amounts(self, name: str, nominal: float = 0.0) -> list[tuple[bool, float]]:
+        """List known and unknown part of an offset beyond `nominal`: (known, amount), without
+        zeros.
+        """
         known = self._known[name] - nominal
         return [
             (k, a)
@@ -286,6 +298,7 @@ class _Deviations:
 def _deviation(
     kind: str, axis: str, amount: dict[str, Any], known: bool, comment: str
 ) -> dict[str, Any]:
+    """Make a deviation for the scenario's document."""
     return {
         "comment": comment,
         "type": kind,

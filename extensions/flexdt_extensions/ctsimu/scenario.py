@@ -72,6 +72,17 @@ class ScenarioImages:
     def __init__(
         self, path: str | os.PathLike[str], seed: int | None = None, rays: int = 3
     ) -> None:
+        """Read a scenario and the meshes of its samples.
+
+        Args:
+            path: file.
+            seed: of the noise; None: without noise.
+            rays: along each side of a pixel.
+
+        Raises:
+            LimitError: seed or rays out of their range.
+            ExchangeError: no scenario that can be simulated.
+        """
         if not 0 <= (seed or 0) <= 2**63:
             raise LimitError(f"seed is {seed}; allowed: 0 to 2^63", {"asked": seed})
         check_rays(rays)
@@ -87,6 +98,11 @@ class ScenarioImages:
         self._thickest = found
 
     def _beside(self, name: str) -> str:
+        """Read the text of a file that the scenario names.
+
+        Raises:
+            ExchangeError: it cannot be read.
+        """
         try:
             return text_of(self.path.parent / name)
         except (OSError, ValueError) as error:
@@ -95,6 +111,7 @@ class ScenarioImages:
             ) from None
 
     def _mesh(self, sample: MeshSample) -> TriangleMesh:
+        """Read a sample's mesh, centred and scaled to mm."""
         found = read_mesh(self.path.parent / sample.file)
         corners = np.asarray(found.vertices, dtype=np.float64)
         middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
@@ -125,6 +142,17 @@ class ScenarioImages:
         return np.asarray(np.linalg.norm(pixels, axis=2), dtype=np.float32)
 
     def _paths(self, frame: int, ray: int, samples: bool) -> Float32Array:
+        """Compute path lengths through each substance, and the rest through air if there is an
+        environment.
+
+        Args:
+            frame: number of the frame.
+            ray: number of the ray in its pixel.
+            samples: False: the open beam.
+
+        Returns:
+            (substances, rows, cols) [mm].
+        """
         shape = self.scan.shape
         order = {one: i for i, one in enumerate(self._thickest)}
         air = self.scan.environment is not None
@@ -201,6 +229,11 @@ class ScenarioImages:
 
     @cached_property
     def _open(self) -> tuple[Float32Array, Float32Array]:
+        """Energy and variance of the open beam, (rows, cols) each.
+
+        Raises:
+            ExchangeError: nothing reaches the detector.
+        """
         energy, variance = self._collected(0, samples=False)
         if not min(energy.max(), variance.max()) > 0.0:
             raise ExchangeError(
@@ -215,6 +248,7 @@ class ScenarioImages:
         return float(self._grey(self._open[0].max(keepdims=True)).max())
 
     def _grey(self, energy: Float32Array) -> Float32Array:
+        """Convert collected energy to grey values, by the scenario's range, table or line."""
         grey = self.scan.grey
         if grey.imax is not None:
             values = (
@@ -295,6 +329,9 @@ class ScenarioImages:
     def _references(
         self, asked: Reference, lit: bool, first: int
     ) -> Iterator[FloatArray]:
+        """Yield dark (or `lit` flat) images, with the noise of frames `first` on unless they
+        are ideal.
+        """
         energy, variance = (
             self._open if lit else (np.zeros(self.scan.shape, np.float32),) * 2
         )
@@ -451,6 +488,7 @@ class ScenarioImages:
             }
 
         def images(kind: str, asked: Reference) -> dict[str, Any]:
+            """Describe dark or flat images."""
             return {
                 "number": asked.number,
                 "frame_average": asked.averages,

@@ -112,6 +112,12 @@ class _Numbers(pickle.Unpickler):
     """
 
     def find_class(self, module: str, name: str) -> Any:
+        """Find a class of a pickle: those of NumPy's arrays, and a plain namespace for CaTE's
+        own.
+
+        Raises:
+            pickle.UnpicklingError: any other.
+        """
         if module.startswith("cate."):
             return SimpleNamespace
         numbers = {
@@ -134,8 +140,17 @@ def _numbers(file: Path) -> Any:
 def _calibrated(
     seen: Any, frames: Any, start: fx.ConeVec, *free: str
 ) -> tuple[Any, Array]:
-    """Fit the geometry to CaTE's marks; returns the report and the markers' places (k,
-    3) [mm]."""
+    """Fit the geometry to CaTE's marks.
+
+    Args:
+        seen: frame -> marker -> column and row [px].
+        frames: numbers of the frames.
+        start: geometry to start from.
+        free: names of the free offsets.
+
+    Returns:
+        The report, and the markers' places (k, 3) [mm], by name.
+    """
     marks = [
         (k, str(name), float(column), float(row), None)
         for k, frame in enumerate(frames)
@@ -313,11 +328,18 @@ def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVe
 
 
 def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
-    """Compute Grangeat's derivative of the object's integrals over planes (k, 3) through
-    the source.
+    """Compute Grangeat's derivative of the object's integrals over planes through the source.
 
     It is that of the integrals of the image, weighted by cosines, over the planes' lines,
     across those and over the squared cosine of the plane. Pixels are square.
+
+    Args:
+        view: one view.
+        image: (rows, cols) line integrals.
+        normals: (k, 3) of the planes.
+
+    Returns:
+        (k,).
     """
     from scipy.ndimage import map_coordinates
 

@@ -101,6 +101,13 @@ class Lab:
     def __init__(
         self, size_mm: tuple[float, float, float], exposure_s: float = 0.5
     ) -> None:
+        """Make a scanner with a box on the stage, at the height of the beam, and the clock at
+        0.
+
+        Args:
+            size_mm: sides of the box.
+            exposure_s: of one image.
+        """
         self.machine = builtin_machine()
         profile = profile_of(self.machine)
         guard = SceneGuard(build_scene(self.machine, profile, (box(size_mm),)))

@@ -62,6 +62,11 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def __init__(
         self, attempts: int = 5, work_weight: float = 0.5, render_mode: str | None = None
     ) -> None:
+        """Check the settings and make the spaces; see the class.
+
+        Raises:
+            LimitError: a setting outside its range.
+        """
         require_positive(attempts=attempts)
         require_positive(or_zero=True, work_weight=work_weight)
         self.attempts = attempts
@@ -210,6 +215,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return volume, work
 
     def _observe(self) -> Observation:
+        """Return the observation (13,), from 0 to 1: views, photons, attempts left, and the
+        last attempt.
+        """
         low, high = (math.log(p) for p in PHOTONS)
         head = [
             (self._views - VIEWS[0]) / (VIEWS[1] - VIEWS[0]),

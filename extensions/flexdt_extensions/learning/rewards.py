@@ -68,6 +68,7 @@ class InformationTask:
     features = len(SIX)
 
     def __init__(self) -> None:
+        """Begin with the LEGO phantom at nominal offsets, of which only the prior is known."""
         self.phantom = load_phantom("lego")
         self.size_mm = self.phantom.size_mm
         self._model = bead_model(self.phantom)
@@ -179,6 +180,7 @@ class QualityTask:
         self._start(blank(), Scene(()))
 
     def _start(self, truth: Volume, scene: Scene) -> None:
+        """Begin an episode with another object: no images, and a blank volume."""
         self._truth = truth
         self._scene = scene
         self.volume = blank()

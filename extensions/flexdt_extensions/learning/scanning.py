@@ -244,6 +244,9 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.asarray(worth - self.time_weight * seconds)
 
     def _observe(self) -> Observation:
+        """Return the last projection as grey values, or the state as a vector from -1 to 1:
+        angle, place, frames left, time, the task's state and the sectors seen.
+        """
         if self._shows:
             return self._grey()[..., None]
         angle = math.radians(self.lab.position("rot_obj"))
@@ -272,6 +275,9 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.asarray(np.clip(image * (255.0 / 3.0), 0.0, 255.0), dtype=np.uint8)
 
     def _info(self, worth: float, seconds: float) -> dict[str, Any]:
+        """Return the step's figures: worth, frames, seconds, clock_s, dose, collision (False),
+        and those of the task.
+        """
         return {
             **self.task.info(),
             "worth": worth,
@@ -335,7 +341,16 @@ class Episode:
 
 
 def play(env: ScanEnv, policy: Policy, seed: int) -> Episode:
-    """Run one episode from `seed`."""
+    """Run one episode.
+
+    Args:
+        env: environment, which is reset.
+        policy: chooses an action from the environment and the number of the step.
+        seed: of the episode.
+
+    Returns:
+        Rewards, infos and targets of all steps, and whether it ended by a collision.
+    """
     env.reset(seed=seed)
     rewards: list[float] = []
     infos: list[dict[str, Any]] = []

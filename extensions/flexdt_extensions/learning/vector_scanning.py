@@ -49,13 +49,22 @@ class Turntable:
     """
 
     def __init__(self, size_mm: tuple[float, float, float], exposure_s: float) -> None:
+        """Make a scanner at rest, and one that turns, with a box on the stage."""
         self.still = Lab(size_mm, exposure_s)
         self._moved = Lab(size_mm, exposure_s)
         self._ways: dict[tuple[float, float], tuple[Taken, float]] = {}
         self._poses: dict[float, Poses] = {}
 
     def way(self, start: float, target: float) -> tuple[Taken, float]:
-        """Compute the cost of a turn of rot_obj, and its end [deg]."""
+        """Compute the cost of a turn of rot_obj; each turn is computed once.
+
+        Args:
+            start: angle [deg].
+            target: angle, up to whole turns [deg].
+
+        Returns:
+            Time and dose, and the angle at the end [deg].
+        """
         upper = self.still.range_of("rot_obj")[1]
         if abs(start) > upper - 360.0:
             turns = 0.0
@@ -93,6 +102,7 @@ class TurnedLab(Lab):
     moves."""
 
     def __init__(self, table: Turntable) -> None:
+        """Begin at the angle and time of the table's scanner at rest."""
         still = table.still
         self.machine = still.machine
         self.scanner = still.scanner
@@ -235,6 +245,7 @@ class _TurnEnv(ScanEnv):
     """A `ScanEnv` on a common turntable."""
 
     def __init__(self, **words: Any) -> None:
+        """Make an environment, whose images are shared if its task is one of quality."""
         super().__init__(**words)
         if isinstance(self.task, QualityTask):
             table = turntable(self.task.size_mm, self.lab.exposure_s)
@@ -289,6 +300,11 @@ class ScanVectorEnv(SyncVectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **words: Any,
     ) -> None:
+        """Make the environments; arguments: see the class.
+
+        Raises:
+            UnknownNameError: another action than "discrete".
+        """
         action = words.get("action", "angle")
         if action != "discrete":
             what = (

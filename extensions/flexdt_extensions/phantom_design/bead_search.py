@@ -149,7 +149,17 @@ def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
 def _shadows(
     model: BeadModel, planned: PlannedScans, truth: Offsets, rng: np.random.Generator
 ) -> tuple[list[Detections], list[npt.NDArray[np.intp]]]:
-    """Simulate detections in random order, and the bead of each."""
+    """Simulate noisy detections in random order.
+
+    Args:
+        model: the beads.
+        planned: scans to simulate.
+        truth: offsets.
+        rng: generator.
+
+    Returns:
+        Detections of each frame, and the bead of each spot.
+    """
     tracks = _tracks(model, planned, truth)
     radii = spot_radii(model, planned.poses.cone_vec(truth))
     out = []
@@ -404,6 +414,11 @@ def _allowed(
 def _random_set(
     table: SeatTable, rules: _Rules, count: int, rng: np.random.Generator
 ) -> npt.NDArray[np.int64]:
+    """Draw seats for `count` beads that the rules allow together; returns their numbers.
+
+    Raises:
+        TwinError: no seat is left for a bead.
+    """
     chosen = np.zeros(0, dtype=np.int64)
     for _ in range(count):
         free = np.flatnonzero(_allowed(table, rules, chosen))

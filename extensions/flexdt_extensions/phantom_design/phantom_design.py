@@ -327,6 +327,13 @@ def write(
 
 
 def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
+    """Search for the best bead places in a body: seats of its bricks, or a grid in the block.
+
+    Args:
+        body: bricks or block.
+        scans: planned ones.
+        request: number and radius of beads, criterion and so on.
+    """
     radius = request.radius_mm
     where = dict[str, Any]()
     if body.bricks is not None:
@@ -394,8 +401,7 @@ def _spiral(
 
 
 def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
-    """Build the mesh of the STL: bricks and beads, or the block with beads as
-    cavities."""
+    """Build the mesh of the STL: bricks and beads, or the block with beads as cavities."""
     mesh = phantom.mesh()
     if body.bricks is not None:
         return mesh
@@ -581,6 +587,7 @@ def _disc(
 
 
 def _bead(axes: Axes, x: float, y: float, radius: float, number: int) -> None:
+    """Draw a bead as a numbered disc on a cross."""
     reach = 2.2 * radius
     axes.plot([x - reach, x + reach], [y, y], color=LINE, lw=1.0)
     axes.plot([x, x], [y - reach, y + reach], color=LINE, lw=1.0)

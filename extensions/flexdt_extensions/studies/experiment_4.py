@@ -111,8 +111,15 @@ def poses_of(name: str, angle: FloatArray) -> Poses:
 
 
 def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
-    """Read a fit of the logs: the six estimates (`SIX`), rms residual [px],
-    iterations."""
+    """Read a fit of the thesis's logs.
+
+    Args:
+        name: of the scan.
+        used: number of projections.
+
+    Returns:
+        The six estimates (`SIX`), rms residual [px], and iterations.
+    """
     number = scan_names().index(name) + 1
     row = thesis()[f"table_A_{number + 4}_scan_{number}"][str(used)]
     after, iterations = next(
@@ -169,6 +176,7 @@ def authors_fit(
     pairs = bead_pairs(whole)
 
     def residual(x: FloatArray) -> FloatArray:
+        """Compute the residuals at the six values `x`, as the author's code has them."""
         moved = replace(
             poses,
             axis=poses.axis + from_unity(x[:3]) + _turned(x[4], x[5], phi),
@@ -389,7 +397,13 @@ def hidden_phantom(scene: Scene, model: BeadModel, seed: int) -> tuple[Scene, Be
 def moved_beads(
     scene: Scene, model: BeadModel, shift: FloatArray
 ) -> tuple[Scene, BeadModel]:
-    """Move beads (k, 3) off their model; the solids that are beads move too."""
+    """Move beads off their model; the solids that are beads move, too.
+
+    Args:
+        scene: solids of the phantom.
+        model: its k beads.
+        shift: (k, 3) [mm].
+    """
     solids = []
     for solid in scene.solids:
         ball = solid.shape
@@ -533,6 +547,7 @@ def image_runs(
     images = radiographs(really, poses.cone_vec(truth), beam, [seed, int(name[4:])])
 
     def solve(n: int) -> Run:
+        """Calibrate from `n` of the images, spread evenly over the scan."""
         chosen = np.floor(np.linspace(0, frames - 1, n)).astype(np.intp)
         some = ArrayFrames([images[i] for i in chosen], SHAPE)
         result = calibrate(

@@ -54,8 +54,15 @@ def projection_counts() -> tuple[int, ...]:
 
 
 def thesis_row(experiment: str, setting: str) -> Mapping[str, float] | None:
-    """Return MAE, cost reduction and iterations the thesis reports for a setting, or
-    None."""
+    """Return what the thesis reports for a setting.
+
+    Args:
+        experiment: name.
+        setting: name of the row.
+
+    Returns:
+        MAE, cost reduction and iterations by name; None if it reports nothing.
+    """
     table = {
         "beads": "table_6_3_beads",
         "phantoms": "table_6_4_phantoms",
@@ -194,6 +201,7 @@ def tasks(
     scenarios = tuple(thesis()["scenarios"])
 
     def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:
+        """List the units of work of a setting, one for each scenario, all six parameters free."""
         return [
             WorkUnit(
                 experiment,

@@ -70,8 +70,18 @@ def intensities(
     shape: tuple[int, int],
     fine: int = FINE,
 ) -> Float32Array:
-    """Compute the transmitted share of the open beam, (n, rows, cols), integrated over
-    pixels near beads."""
+    """Compute the transmitted share of the open beam, integrated over pixels near beads.
+
+    Args:
+        scene: to render.
+        model: its beads.
+        cone: n views.
+        shape: (rows, cols).
+        fine: rays along each side of these pixels.
+
+    Returns:
+        (n, rows, cols), from 0 to 1.
+    """
     out = np.exp(-project_scene(scene, cone, shape))
     if fine <= 1:
         return out

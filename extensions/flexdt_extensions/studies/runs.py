@@ -129,6 +129,9 @@ def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
     known)."""
 
     def solve(n: int) -> Run:
+        """Fit to the points of `n` projections, noisy ones from a generator of this run, and
+        compare with the truth.
+        """
         parts, truth = geometry_of(task, n)
         poses = Poses.concatenate(parts)
         tracks = poses.cone_vec(truth).project_points(model.beads, SHAPE)
@@ -171,8 +174,16 @@ def run_of(
 ) -> Run:
     """Compare a fit with the truth, and let Algorithm 2 solve the same tracks.
 
-    In the damping experiment the result is that of Algorithm 2, which is studied there,
-    and ours is in `beside`; elsewhere it is the other way round.
+    In the damping experiment the result is that of Algorithm 2, which is studied there, and
+    ours is in `beside`; elsewhere it is the other way round.
+
+    Args:
+        task: experiment and setting.
+        n: number of projections.
+        fit: ours; None if there is none.
+        truth: offsets.
+        problem: tracks for Algorithm 2; None: it is not run.
+        note: why there is no result.
     """
     run = fitted_run(task.setting, task.scenario, n, fit, truth, task.limit, note)
     if problem is None:
@@ -258,7 +269,17 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
 def _algorithm_2(
     task: WorkUnit, n: int, problem: FitProblem, truth: Offsets
 ) -> Run | None:
-    """Solve the same tracks by Algorithm 2; None if beads are unknowns too."""
+    """Solve the same tracks by Algorithm 2.
+
+    Args:
+        task: setting and damping.
+        n: number of projections.
+        problem: the tracks.
+        truth: offsets.
+
+    Returns:
+        The run; None if beads are unknowns too.
+    """
     if problem.layout.bead_column >= 0:
         return None
     result = algorithm_2(problem, task.damping)
@@ -345,7 +366,9 @@ def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
 
 
 def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
-    """Make the JSON of `flexdt study`."""
+    """Make the JSON of `flexdt study`: experiment, fidelity, rows, runs, thesis_source and
+    assumed.
+    """
     return {
         "experiment": experiment,
         "fidelity": fidelity,
@@ -361,8 +384,11 @@ def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, ob
 
 
 def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
-    """Compute the mean MAE over scenarios: settings, numbers of projections,
-    (settings, counts) or nan."""
+    """Compute the mean MAE over scenarios.
+
+    Returns:
+        Settings, numbers of projections, and (settings, counts) means; nan without runs.
+    """
     settings = list(dict.fromkeys(r.setting for r in runs))
     counts = sorted({r.projections for r in runs})
     out = np.full((len(settings), len(counts)), np.nan)

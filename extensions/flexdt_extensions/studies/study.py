@@ -149,7 +149,10 @@ _Found = tuple[Offsets | None, int]
 
 
 def _damped(lam: float) -> Callable[[_Draw], _Found]:
+    """Return a solver: Algorithm 2 with the damping `lam`."""
+
     def solve(draw: _Draw) -> _Found:
+        """Solve a draw; returns offsets and iterations."""
         problem = build_problem(
             draw.tracks, draw.model, draw.poses, free=SIX, shape=SHAPE, start=draw.start
         )
@@ -160,6 +163,7 @@ def _damped(lam: float) -> Callable[[_Draw], _Found]:
 
 
 def _ours(draw: _Draw) -> _Found:
+    """Solve a draw by our fit, the beads' identities known; returns offsets and iterations."""
     fit = estimate_geometry(
         draw.tracks,
         draw.model,
@@ -172,6 +176,9 @@ def _ours(draw: _Draw) -> _Found:
 
 
 def _nameless(draw: _Draw) -> _Found:
+    """Identify a draw's points in random order, and fit to them; offsets are None if they stay
+    ambiguous.
+    """
     # Points in random order, as if detected.
     seen = [
         Detections.of_points(draw.rng.permutation(f), NOISE_PX, 15.0, SHAPE)
@@ -193,6 +200,7 @@ METHODS: Final = tuple(_SOLVERS)
 
 
 def _solve(method: str, draw: _Draw) -> _Found:
+    """Solve a draw by a method; offsets are None if it fails."""
     try:
         return _SOLVERS[method](draw)
     except TwinError:
@@ -343,8 +351,18 @@ def basin_task(cell: Cell) -> list[Run]:
 def _basin(
     spread: Map, say: Tell, fidelity: str, seed: int
 ) -> tuple[list[Run], Document]:
-    """Run all cells: success against the start's error, for Algorithm 2, our fit,
-    unknown identities."""
+    """Run all cells: success against the start's error, for Algorithm 2, our fit, unknown
+    identities.
+
+    Args:
+        spread: maps work over processes.
+        say: prints progress.
+        fidelity: "points" are without noise.
+        seed: of the draws.
+
+    Returns:
+        All runs, and start_mm, start_deg and success_share (method -> table).
+    """
     work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
     runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
     shares = {}

@@ -95,6 +95,7 @@ def study(
 
 
 def _text(value: object) -> str:
+    """Format a cell: "-" for None, three digits for floats."""
     if value is None:
         return "-"
     if isinstance(value, float):

@@ -189,8 +189,9 @@ def real_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def curve_table(curve: Mapping[str, Any]) -> str:
-    """Make a table of one scan against N: logged, simulated as the author fits, with
-    right angles."""
+    """Make a table of one scan against N: logged, simulated as the author fits, with right
+    angles; HTML.
+    """
     names = ("alpha", "dO_z", "tau_x", "tau_z")
     return table(
         [

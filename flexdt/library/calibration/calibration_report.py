@@ -90,7 +90,15 @@ def report(outcome: Outcome[ImageSet]) -> str:
 
 
 def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
-    """Make the tables of parameters, spectrum and correlations of a fit, as HTML parts."""
+    """Make the tables of parameters, spectrum and correlations of a fit.
+
+    Args:
+        fit: of the geometry.
+        document: of the calibration.
+
+    Returns:
+        HTML parts.
+    """
     c = fit.certificate
     rows = [
         [
@@ -160,7 +168,15 @@ def _ellipses(c: Certificate) -> list[str]:
 
 
 def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
-    """Draw trajectories, residuals by frame and detector maps, and tabulate beads, as HTML."""
+    """Draw trajectories, residuals by frame and detector maps, and tabulate beads.
+
+    Args:
+        outcome: its data sets; the first image of each is read.
+        fit: of the geometry.
+
+    Returns:
+        HTML parts.
+    """
     c = fit.certificate
     beads = range(c.used.shape[1])
     frames = np.arange(len(c.used))

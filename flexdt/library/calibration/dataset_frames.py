@@ -37,6 +37,9 @@ class DatasetFrames:
     def __init__(
         self, dataset: ImageSet, seen: Callable[[], object] = lambda: None
     ) -> None:
+        """Take a data set, whose counts are kept if they are few bytes, and a function that is
+        called after each frame.
+        """
         self._dataset, self._seen = dataset, seen
         rows, cols = dataset.shape
         self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
@@ -56,6 +59,7 @@ class DatasetFrames:
         normalise = self._dataset.normalisation
 
         def one(index: int) -> FrameSpots:
+            """Search one frame for spots; a frame that cannot be read is missing."""
             counts = self._counts(index)
             if counts is None:
                 why = self._unreadable.get(index, "")
@@ -79,6 +83,9 @@ class DatasetFrames:
         out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
 
         def one(index: int) -> None:
+            """Fill the windows of one frame with line integrals; none of a frame that cannot be
+            read.
+            """
             counts = self._counts(index)
             if counts is None:
                 return
@@ -108,6 +115,9 @@ class DatasetFrames:
         return counts
 
     def _each(self, work: Callable[[int], _T]) -> list[_T]:
+        """Do work on every frame in threads, in order, and report each frame; returns the
+        results.
+        """
         found = []
         with ThreadPoolExecutor(THREADS) as pool:
             for one in pool.map(work, range(len(self))):

@@ -226,7 +226,18 @@ def _of_table(path: Path, views: int) -> Markers:
 
 
 def _mark(where: str, row: Mark) -> tuple[str, Mark]:
-    """Check and convert the types of a mark; a number becomes the marker's name."""
+    """Check and convert the types of a mark; a number becomes the marker's name.
+
+    Args:
+        where: place in its file, for messages.
+        row: frame, marker, column, row [px] and sigma.
+
+    Returns:
+        `where` and the mark.
+
+    Raises:
+        TwinError: it has another form.
+    """
     try:
         frame, name, column, line, sigma = row
         stated = None if sigma is None else float(sigma)
@@ -533,7 +544,16 @@ def _numbered(names: Sequence[str], name: str) -> int:
 
 
 def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArray:
-    """Return the radii [mm] of balls whose spots have the observed sizes, (k,)."""
+    """Compute the radii of balls whose spots have the observed sizes.
+
+    Args:
+        looks: spots of n frames.
+        index: (n, k) spot of each marker in each frame, -1 without.
+        poses: geometry of the frames.
+
+    Returns:
+        (k,) medians [mm].
+    """
     scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
     return np.array(
         [
@@ -552,7 +572,17 @@ def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArra
 def _described(
     found: Calibration, names: Sequence[str], index: Index
 ) -> list[dict[str, object]]:
-    """Name, position [mm] in the object's frame, frames and residual of each marker."""
+    """List the markers of a calibration.
+
+    Args:
+        found: the calibration.
+        names: of the k markers.
+        index: (n, k) spot of each marker in each frame, -1 without.
+
+    Returns:
+        name, position_mm (in the object's frame), frames and rms_px (None if unknown) of each;
+        empty without a fit.
+    """
     if found.fit is None:
         return []
     rms = found.fit.certificate.rms_per_bead

@@ -23,7 +23,12 @@ MAX_SIDE_DIFFERENCE = 1e-3
 
 
 def squared(data: Images) -> Images:
-    """Return `data`, with rows resampled to the columns' pitch where pixels are not square."""
+    """Resample rows to the columns' pitch where pixels are not square, with a warning in the
+    data set.
+
+    Args:
+        data: a data set; itself is returned if its pixels are square.
+    """
     poses = data.poses
     ratio = float(
         np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1))

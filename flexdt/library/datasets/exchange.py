@@ -136,6 +136,11 @@ def export_dataset(
 
 
 def _content(geometry: ScanGeometry, form: Format, out: Path) -> Content:
+    """Return the content of a geometry's file in a format.
+
+    Raises:
+        ExchangeError: the format needs a data set, or cannot carry the geometry.
+    """
     if form.write is None:
         raise ExchangeError(
             f"a file of format {form.name} is made of a data set: "

@@ -64,6 +64,12 @@ def imported() -> tuple[str, ...]:
 def _export_ctsimu(
     dataset: ImageSet, out: Path, parameters: Offsets | None, real: Offsets | None
 ) -> None:
+    """Write a data set's geometry as a CTSimU scenario; `real` adds the deviations from what is
+    known.
+
+    Raises:
+        TwinError: flexdt-extensions is not installed.
+    """
     from flexdt.library.extras import extension
     from flexdt.runtime.files.whole_files import write_whole
 
@@ -72,6 +78,12 @@ def _export_ctsimu(
 
 
 def _read_ctsimu(path: Path, given: Given) -> ScanGeometry:
+    """Read the geometry of a CTSimU scenario, with the files that it names.
+
+    Raises:
+        TwinError: flexdt-extensions is not installed.
+        ExchangeError: the file is no scenario.
+    """
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.library.extras import extension
 
@@ -86,8 +98,10 @@ def _write_rtk(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_rtk(path: Path, given: Given) -> ScanGeometry:
-    """Read a geometry of RTK; raise ExchangeError if the file is invalid or the pitch
-    unknown.
+    """Read a geometry of RTK, with the pitch and shape of `given`.
+
+    Raises:
+        ExchangeError: the file is invalid, or the pitch unknown.
     """
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.twin.exchange.geometry import ExchangeError
@@ -104,6 +118,7 @@ def _read_rtk(path: Path, given: Given) -> ScanGeometry:
 
 
 def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
+    """Return ASTRA's vectors as text, or as an array for an .npy file."""
     import numpy as np
 
     from flexdt.twin.exchange.number_tables import vectors_text
@@ -116,6 +131,7 @@ def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_astra(path: Path, given: Given) -> ScanGeometry:
+    """Read ASTRA's vectors from text or an .npy file; the shape is that of `given`."""
     from flexdt.library.datasets.geometry_content import arrays_of, text_of
     from flexdt.twin.exchange.geometry import ScanGeometry
     from flexdt.twin.exchange.number_tables import read_vectors_array, read_vectors_text
@@ -134,6 +150,7 @@ def _write_tomosipo(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_tomosipo(path: Path, given: Given) -> ScanGeometry:
+    """Read tomosipo's vectors from an .npz file."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.number_tables import read_tomosipo
 
@@ -156,6 +173,7 @@ def _write_cil(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_cil(path: Path, given: Given) -> ScanGeometry:
+    """Read CIL's arrays from an .npz file."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.cil_arrays import read_cil
 
@@ -169,6 +187,7 @@ def _write_tigre(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_tigre(path: Path, given: Given) -> ScanGeometry:
+    """Read TIGRE's arrays from an .npz file."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.tigre_arrays import read_tigre
 
@@ -182,6 +201,7 @@ def _write_leap(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_leap(path: Path, given: Given) -> ScanGeometry:
+    """Read LEAP's arrays from an .npz file."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.leap_arrays import read_leap
 
@@ -195,6 +215,7 @@ def _write_flexdata(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_flexdata(path: Path, given: Given) -> ScanGeometry:
+    """Read flexdata's text; number of views and shape are those of `given`."""
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.twin.exchange.flexdata import read_flexdata
 
@@ -208,6 +229,7 @@ def _write_csv(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_csv(path: Path, given: Given) -> ScanGeometry:
+    """Read a table of vectors, one view a line."""
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.twin.exchange.number_tables import read_csv
 
@@ -217,6 +239,7 @@ def _read_csv(path: Path, given: Given) -> ScanGeometry:
 def _export_nxtomo(
     dataset: ImageSet, out: Path, parameters: Offsets | None, real: Offsets | None
 ) -> None:
+    """Write a complete data set as NXtomo, with other offsets if `parameters` are given."""
     from flexdt.library.datasets.nxtomo_writing import save_nxtomo
 
     whole = dataset.require_complete()

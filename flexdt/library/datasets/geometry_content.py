@@ -58,8 +58,10 @@ def text_of(path: Path) -> str:
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
-    """Return the arrays of an .npz, or the array of an .npy as `array`; else raise
-    ExchangeError.
+    """Read the arrays of an .npz by name, or the array of an .npy as `array`.
+
+    Raises:
+        ExchangeError: it is no such file.
     """
     try:
         loaded = np.load(path, allow_pickle=False)

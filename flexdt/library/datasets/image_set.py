@@ -484,6 +484,9 @@ class ImageSet:
     def _mean(
         self, files: Sequence[Path], images: npt.NDArray[Any] | None
     ) -> Float32Array | None:
+        """Average reference images, those in memory or those of files, as float32 (rows, cols);
+        None without any.
+        """
         if images is not None:
             return np.asarray(images.mean(axis=0), dtype=np.float32)
         if files:
@@ -654,7 +657,19 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
 def _several(
     what: str, images: npt.ArrayLike | None, shape: tuple[int, int]
 ) -> npt.NDArray[Any] | None:
-    """Return one or several images as (k, rows, cols), None without any."""
+    """Return one or several images as (k, rows, cols).
+
+    Args:
+        what: word for the message.
+        images: (rows, cols) or (k, rows, cols); None for none.
+        shape: the projections' (rows, cols).
+
+    Returns:
+        The images; None without any.
+
+    Raises:
+        DatasetFormatError: images of another shape.
+    """
     if images is None:
         return None
     values = np.asarray(images)

@@ -47,7 +47,12 @@ def save_nxtomo(data: ImageSet, file: File) -> None:
 
 
 def _write(data: ImageSet, out: Any) -> None:
-    """Write a data set into an open HDF5 file: counts, keys, angles, exposure and cone_vec."""
+    """Write a data set into an open HDF5 file: counts, keys, angles, exposure and cone_vec.
+
+    Args:
+        data: with all its images.
+        out: root of the file.
+    """
     geometry = data.geometry
     before = references(data)
     count = len(before) + len(data)
@@ -158,7 +163,9 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
 
 
 def _exposure_of(data: ImageSet) -> tuple[float | None, float | None, float | None]:
-    """Return voltage [kV], power [W] and exposure of one image [ms], None where unknown."""
+    """Return voltage [kV], power [W] and exposure of one image [ms] as the settings or the
+    simulation state them; None where unknown.
+    """
     if data.settings is not None:
         return data.settings.kV, data.settings.power_W, data.settings.exposure_ms
     if data.truth is None:

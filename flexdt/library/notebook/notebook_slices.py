@@ -44,6 +44,9 @@ def window_of(
         values: whose percentiles are taken where no window is given; NaN is left out.
         window: (black, white).
 
+    Returns:
+        (black, white), black the smaller one; (0, 1) if all values are NaN.
+
     Raises:
         TwinError: not two numbers, the first the smaller one.
     """

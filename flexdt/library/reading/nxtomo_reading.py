@@ -113,6 +113,9 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
     lost: list[str] = []
 
     def look(name: str, item: Any) -> None:
+        """Append an HDF5 group with images and keys to `found`, and its links that lead nowhere
+        to `lost`.
+        """
         if "image_key" not in getattr(item, "keys", tuple)():
             return
         for part in ("data", "image_key"):
@@ -143,8 +146,13 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
 def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     """Return the images as an unread dataset of HDF5, and their keys (n,).
 
+    Args:
+        group: with `data` and `image_key`.
+        path: of the file, for messages.
+
     Raises:
-        DatasetFormatError: they do not fit each other, are missing, or exceed the memory.
+        DatasetFormatError: they do not fit each other, are missing, exceed the memory, or claim
+            more than the file holds.
     """
     data = group["data"]
     keys = np.asarray(group["image_key"])
@@ -280,7 +288,17 @@ NEEDED_LENGTHS: Final = ("x_pixel_size", "source distance", "detector distance")
 def _angles(
     file: Any, name: str, projections: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float64] | None:
-    """Read angles of the projections [rad]; None unless the file has one for each image."""
+    """Read angles of the projections from the first place of the file that has one for each
+    image.
+
+    Args:
+        file: open HDF5.
+        name: of the group with the images.
+        projections: (n,) images that are projections.
+
+    Returns:
+        The projections' angles [rad]; None without such a place.
+    """
     entry = file[name.split("/")[0]]
     near = file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
@@ -297,7 +315,16 @@ def _angles(
 
 
 def _length(file: Any, name: str, *members: str) -> float | None:
-    """Read a length [mm] from the first of some places that has it; None without any."""
+    """Read a length from the first of some places that has it.
+
+    Args:
+        file: open HDF5.
+        name: of the group with the images.
+        members: names in the entry, or in the group.
+
+    Returns:
+        [mm]; None without any, or with an unknown unit.
+    """
     entry = file[name.split("/")[0]]
     near = file[name]
     for place in (entry, near):

@@ -109,6 +109,16 @@ class _Streams:
     def images(
         self, names: Sequence[str], code: int, shape: tuple[int, int]
     ) -> npt.NDArray[Any]:
+        """Read images (k, rows, cols) from streams, one each.
+
+        Args:
+            names: of the streams.
+            code: of the type, DataType.
+            shape: (rows, cols).
+
+        Raises:
+            DatasetFormatError: an unknown type, or a stream of another length.
+        """
         if code not in KINDS:
             raise DatasetFormatError(
                 f"DataType is {code}; allowed: {', '.join(map(str, KINDS))}"
@@ -183,7 +193,19 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
 def _reference(
     file: _Streams, code: int, shape: tuple[int, int]
 ) -> npt.NDArray[Any] | None:
-    """Read the images of the open beam (k, rows, cols), None without any."""
+    """Read the images of the open beam.
+
+    Args:
+        file: its streams.
+        code: type of the pixels where the file does not say it for these.
+        shape: (rows, cols).
+
+    Returns:
+        (k, rows, cols); None without any.
+
+    Raises:
+        DatasetFormatError: pixels that are not finite.
+    """
     for folder in REFERENCES:
         names = [
             n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")

@@ -49,6 +49,11 @@ def _bad_pixels(
 ) -> BadPixels | None:
     """Find pixels that differ from their neighbours in all views.
 
+    Args:
+        dataset: with its flat image.
+        cone_vec: of all views.
+        counts: reads an image by its number.
+
     Returns:
         None with few views, no open beam, hardly any turn, or no bad pixels.
     """
@@ -70,6 +75,9 @@ def _bad_pixels(
     keeps = 4 * len(some) * math.prod(dataset.shape) <= MOST_KEPT_BYTES
 
     def images() -> Iterator[Float32Array]:
+        """Yield some line integrals, rows along the axis; kept for the next pass if they fit
+        the memory.
+        """
         yield from kept
         for index in some[len(kept) :].tolist():
             made = dataset.normalisation(counts(index))

@@ -51,6 +51,7 @@ class ImagesOnDisk:
     """
 
     def __init__(self, folder: Path, most_pixels: int) -> None:
+        """Open a temporary file in `folder` for images of at most `most_pixels`."""
         self._folder = folder
         self._most_bytes = 4 * most_pixels
         self._shapes: dict[int, tuple[int, int]] = {}
@@ -96,6 +97,11 @@ class ImagesOnDisk:
         self._file.close()
 
     def _read_into(self, buffer: memoryview) -> int:
+        """Read some bytes into a buffer; returns how many.
+
+        Raises:
+            OSError: the file ends too early.
+        """
         count: int = self._file.readinto(buffer)  # type: ignore[attr-defined]
         if not count:
             raise OSError(5, "the file of kept images ends too early")
@@ -163,6 +169,9 @@ class KeptImages:
         store: ImagesInMemory | ImagesOnDisk,
         told: Callable[[], None],
     ) -> None:
+        """Take the function that reads an image, the store, and a function that is called after
+        each reading.
+        """
         self._read = read
         self._store = store
         self._told = told

@@ -89,6 +89,14 @@ def plan_whole(grid: Grid, again: int, most_pixels: int, memory: int) -> MemoryP
 
 
 def _plan(grid: Grid, kept: int, most_pixels: int, memory: int) -> MemoryPlan:
+    """Plan slabs, and whether kept images are on disk.
+
+    Args:
+        grid: of the volume.
+        kept: number of kept images.
+        most_pixels: of one image.
+        memory: free bytes.
+    """
     need = 4 * kept * most_pixels
     # Fewer slabs are better than images in memory: the file's parts are there as long as nobody
     # else needs the memory.

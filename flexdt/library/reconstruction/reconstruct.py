@@ -251,7 +251,12 @@ def views_of(
 
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
-    """Choose the grid of a requested volume.
+    """Choose the grid of a requested volume; what is not requested is that of the field of
+    view.
+
+    Args:
+        views: to reconstruct.
+        request: voxel size, shape and centre, each may be None.
 
     Raises:
         GeometryError: voxels too large for the field of view.
@@ -632,7 +637,13 @@ def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
 def _task(
     dataset: ImageSet, request: VolumeRequest | None, parameters: Offsets | None
 ) -> ReconstructionTask:
-    """Check a request, and make its task: views, not yet corrected, and grid.
+    """Check a request, and make its task: views without bad pixels, not yet corrected, and
+    grid.
+
+    Args:
+        dataset: its images are read for bad pixels and doubts.
+        request: the defaults without.
+        parameters: offsets instead of the correction's.
 
     Raises:
         TwinError: the request cannot be met.
@@ -853,6 +864,17 @@ def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) 
 
 
 def _require(where: str, need: int, free: int, grid: Grid) -> None:
+    """Check that a volume fits the memory or the disk.
+
+    Args:
+        where: words for the message.
+        need: bytes.
+        free: bytes.
+        grid: of the volume, for the message.
+
+    Raises:
+        LimitError: it does not.
+    """
     if need > free:
         nz, ny, nx = grid.shape
         raise LimitError(
@@ -866,7 +888,17 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
 def _iterative(
     views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress
 ) -> Volume:
-    """Reconstruct by an iterative algorithm, after checking that the memory suffices."""
+    """Reconstruct by an iterative algorithm, after checking that the memory suffices.
+
+    Args:
+        views: to reconstruct.
+        grid: of the volume.
+        request: algorithm and its options.
+        tell: called with the iterations done, and all.
+
+    Raises:
+        LimitError: the memory does not suffice.
+    """
     algorithm = ALGORITHMS[request.algorithm]
     stacks = algorithm.stacks
     grids = algorithm.grids

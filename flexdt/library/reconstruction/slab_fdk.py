@@ -116,7 +116,7 @@ class StandingImages:
         return slice(max(first - MARGIN, 0), min(last + MARGIN, self.shape[0]))
 
     def part(self, rows: slice) -> tuple[ConeVec, tuple[int, int], Truncation | None]:
-        """Return geometry, shape and truncation of some rows."""
+        """Return geometry, (rows, cols) and truncation of some rows."""
         shape = rows.stop - rows.start, self.shape[1]
         if shape == self.shape:
             return self.cone_vec, self.shape, self.truncation
@@ -195,6 +195,14 @@ class Work:
         slabs: Sequence[float],
         tell: Callable[[float, float], None],
     ) -> None:
+        """Count the work of reading images and of adding slabs.
+
+        Args:
+            images: number of images.
+            reading: work of reading all of them.
+            slabs: work of each slab.
+            tell: called with the share done in images, and all images.
+        """
         self._images = images
         self._reading = reading
         self._slabs = slabs
@@ -239,6 +247,7 @@ class Work:
         self._say()
 
     def _say(self) -> None:
+        """Report the share of the work that is done."""
         done = self._reading * (self._read / self._images)
         done += sum(
             work * part for work, part in zip(self._slabs, self._done, strict=True)

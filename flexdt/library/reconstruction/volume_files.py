@@ -97,6 +97,12 @@ def check_name(path: Path) -> VolumeFormat:
 
 
 def _format(path: Path) -> VolumeFormat:
+    """Return the volume format with a file's ending, and check that its package is installed.
+
+    Raises:
+        LimitError: no format has this ending.
+        TwinError: the package is missing.
+    """
     by_ending = {ending: form for form in VOLUME_FORMATS for ending in form.endings}
     form = by_ending.get(ending(path))
     if form is None:
@@ -156,6 +162,7 @@ class MiddleSlices:
     """
 
     def __init__(self, shape: tuple[int, int, int]) -> None:
+        """Allocate the middle slices of a volume (nz, ny, nx)."""
         nz, ny, nx = self._shape = shape
         self._across_z = np.zeros((ny, nx), np.float32)
         self._across_y = np.zeros((nz, nx), np.float32)

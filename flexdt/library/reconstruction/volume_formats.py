@@ -142,6 +142,7 @@ def _headed(
     """Write a header and the values after it."""
 
     def write(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
+        """Write header and voxels; yields the function that takes the slabs."""
         first = header(places)
         with (
             gzip.open(part, "wb", compresslevel=1)
@@ -155,6 +156,8 @@ def _headed(
 
 
 def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
+    """Return a function that writes slabs to a file, float32 with x fastest."""
+
     def write(slab: Float32Array) -> None:
         for block in _blocks(slab):
             file.write(block.data)
@@ -190,6 +193,7 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         first = True
 
         def write(slab: Float32Array) -> None:
+            """Write a slab as pages; the first page gets size and place."""
             nonlocal first
             for layer in chain.from_iterable(_blocks(slab)):
                 tiff.write(
@@ -284,6 +288,7 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         done = 0
 
         def write(slab: Float32Array) -> None:
+            """Write a slab behind the ones before."""
             nonlocal done
             for block in _blocks(slab):
                 values[done : done + len(block)] = block
@@ -310,6 +315,7 @@ def _mapped(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
 
 
 def _read_nrrd(path: Path) -> Stored:
+    """Read voxels, edges and the first voxel's place from an .nrrd file."""
     fields, begin = _header(path, ":", b"\n\n")
     values = _mapped(path, begin, fields["sizes"])
     rows = fields["space directions"].split()
@@ -319,6 +325,7 @@ def _read_nrrd(path: Path) -> Stored:
 
 
 def _read_tiff(path: Path) -> Stored:
+    """Read voxels, edge and centre from a .tif file."""
     import tifffile
 
     with tifffile.TiffFile(path) as file:
@@ -328,6 +335,9 @@ def _read_tiff(path: Path) -> Stored:
 
 
 def _read_mha(path: Path) -> Stored:
+    """Read voxels, edges and the first voxel's place from an .mha file; x and y of the file
+    point the other way.
+    """
     fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
     values = _mapped(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
@@ -342,6 +352,7 @@ def _read_nifti(path: Path) -> Stored:
 
 
 def _read_hdf5(path: Path) -> Stored:
+    """Read voxels, edge and centre from an .h5 file."""
     with _h5py().File(path) as file:
         values = file["volume"]
         about = values.attrs

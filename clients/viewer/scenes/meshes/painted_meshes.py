@@ -42,7 +42,14 @@ class PaintedMesh:
 def bevelled(
     size: Vector, center: Vector, paint: Paint, bevel: float = 2.0
 ) -> PaintedMesh:
-    """Build a box [mm] whose edges are cut, so that they catch the light."""
+    """Build a box whose edges are cut, so that they catch the light.
+
+    Args:
+        size: sides [mm].
+        center: [mm].
+        paint: colour and gloss.
+        bevel: width that is cut off [mm]; less for thin boxes.
+    """
     h = np.asarray(size, dtype=float) / 2.0
     b = min(bevel, 0.35 * float(h.min()))
     corners = np.array(
