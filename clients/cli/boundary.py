@@ -81,7 +81,7 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
             lines = [str(error.strerror)]
             code = REFUSED
         case OSError():
-            where = f"{_asked(error.filename)}: " if error.filename else ""
+            where = f"{_named_file(error.filename)}: " if error.filename else ""
             lines = [f"{where}{error.strerror or _first_line(error)}"]
         case UnicodeDecodeError():
             lines = [f"not valid {error.encoding} text: {error.reason}"]
@@ -143,7 +143,7 @@ def verdict(errors: Iterable[str]) -> int:
     return LIMIT if codes else DONE
 
 
-def _asked(file: object) -> str:
+def _named_file(file: object) -> str:
     """Return the file that the user named, where the error names its temporary file."""
     plain = re.sub(r"\.part$", "", str(file))
     return re.sub(r"(^|.*/)\.([^/]+)\.part\.[^./]+$", r"\1\2", plain)

@@ -199,7 +199,7 @@ class Core:
             if topic in listener.topics:
                 listener.put(params)
 
-    def _ended(self) -> None:
+    def _notify_end(self) -> None:
         """Tell the listeners that the connection has ended."""
         for listener in list(self._listeners):
             listener.connection_lost()
@@ -240,7 +240,7 @@ class Core:
             RpcError: the server refuses the client; the connection is closed.
         """
         await self.transport.open()
-        link = Link(self.transport, self._deliver, self._ended)
+        link = Link(self.transport, self._deliver, self._notify_end)
         try:
             params = hello_params(self.name, self.token)
             answer = await link.request("session.hello", params, self.timeout_s)

@@ -175,10 +175,10 @@ class Gateway:
         self._send(event)  # subscribers see commands as well as replies
         kind = component_type(event.component, self.twin.axes)
         if kind is None:
-            work = self._foreign(event)
+            work = self._await_other_answer(event)
         else:
             work = self._execute(event, kind)
-        self._start(self._guarded(work, event), key)
+        self._start(self._run_guarded(work, event), key)
 
     async def _echo(self) -> None:
         """Send clients the commands of others: over the twin's wire, from the viewer, by a
@@ -206,7 +206,7 @@ class Gateway:
                 self._log_failure("echo")
                 await asyncio.sleep(PAUSE_S)
 
-    async def _guarded(
+    async def _run_guarded(
         self, work: Coroutine[Any, Any, None], event: AcquilaEvent
     ) -> None:
         """Await the work of a command; log an error, and answer with ERR."""
@@ -230,7 +230,7 @@ class Gateway:
         component = own_name(event.component, self.twin.axes)
         self._busy[component] += 1
         progress = CommandProgress()
-        task = asyncio.ensure_future(self._do(event, progress))
+        task = asyncio.ensure_future(self._carry_out(event, progress))
         try:
             while not task.done():
                 await asyncio.wait(
@@ -252,7 +252,7 @@ class Gateway:
         await self._release()  # before the last reply: its receiver may want control
         self._send(end)
 
-    async def _do(self, event: AcquilaEvent, progress: CommandProgress) -> str:
+    async def _carry_out(self, event: AcquilaEvent, progress: CommandProgress) -> str:
         """Carry out a command, after those of its component that came before; returns the
         reply.
         """
@@ -283,7 +283,7 @@ class Gateway:
                 lines.remove(line)
             raise
 
-    async def _foreign(self, event: AcquilaEvent) -> None:
+    async def _await_other_answer(self, event: AcquilaEvent) -> None:
         """Wait for another subscriber to answer a command that is not for the scanner.
 
         Args:

@@ -167,13 +167,15 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
             watch.error is not None
         ):  # it has closed the client, which ends the work in its own ways
             raise watch.error from None
-        told = _told(error, address, distributed.KilledWorker)
+        told = _readable_error(error, address, distributed.KilledWorker)
         if told is None:
             raise
         raise told from None
 
 
-def _told(error: Exception, address: Any, killed: type[Exception]) -> CommandError | None:
+def _readable_error(
+    error: Exception, address: Any, killed: type[Exception]
+) -> CommandError | None:
     """Convert an error of dask's into one for people.
 
     Args:

@@ -71,10 +71,10 @@ def calibrate(
         >>> found = fx.calibrate("my-tiffs", "unknown", **scan)  # doctest: +SKIP
     """
     with long_work.during("calibrating", progress):
-        return _calibrated(data, phantom, geometry, options)
+        return _calibrate(data, phantom, geometry, options)
 
 
-def _calibrated(
+def _calibrate(
     data: Data | Sequence[Data] | None,
     phantom: str | Phantom,
     geometry: ConeVec | str | PathLike[str] | None,
@@ -101,7 +101,9 @@ def _calibrated(
             several = [data]
         else:
             several = list(data)
-        sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]
+        sets = [
+            _open(d) if geometry is None else _with_geometry(d, geometry) for d in several
+        ]
     return calibrate_with(sets, phantom, options)
 
 
@@ -166,7 +168,7 @@ def reconstruct(
         >>> import flexdt as fx
         >>> volume = fx.reconstruct("my-scans/lego", "fdk", voxel=0.2)  # doctest: +SKIP
     """
-    return _opened(data).reconstruct(
+    return _open(data).reconstruct(
         algorithm,
         voxel=voxel,
         shape=shape,
@@ -214,10 +216,10 @@ def align(
         >>> found = fx.align(data)  # doctest: +SKIP
         >>> volume = data.with_correction(found.correction).reconstruct("fdk")  # doctest: +SKIP
     """
-    return _opened(data).align(per_frame=per_frame, progress=progress)
+    return _open(data).align(per_frame=per_frame, progress=progress)
 
 
-def _posed(data: Data, geometry: ConeVec) -> DataSet:
+def _with_geometry(data: Data, geometry: ConeVec) -> DataSet:
     """Return a data set with another nominal geometry, or read a folder of TIFF images
     with it.
     """
@@ -226,7 +228,7 @@ def _posed(data: Data, geometry: ConeVec) -> DataSet:
     return read_tiffs(data, geometry)
 
 
-def _opened(data: Data) -> DataSet:
+def _open(data: Data) -> DataSet:
     if isinstance(data, DataSet):
         return data
     return load_dataset(data)

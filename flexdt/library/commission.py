@@ -228,8 +228,8 @@ def commission(
         raise CommandError(
             f"{where}: no settings text, executed script or radiograph of a scan"
         )
-    machine, text, fit = _fitted(scans, shipped)
-    scans = [_measured(s, machine, ask) for s in scans]
+    machine, text, fit = _fit_machine(scans, shipped)
+    scans = [_with_alignment(s, machine, ask) for s in scans]
     offsets = tells.zero_offsets(scans, machine, d.profile_of(shipped))
     unseen = [f"limits of {n}" for n in machine.axes if fit is None or n not in fit.axes]
     if fit:
@@ -242,7 +242,7 @@ def commission(
     why = f"no executed script tells it, or fewer than {MIN_DURATIONS} commands of one"
     rest = [*offsets.questions, *(Question(what, why, "recorded") for what in unseen)]
     findings = [
-        *_refused(machine, offsets.profile),
+        *_machine_errors(machine, offsets.profile),
         *tells.contradictions(scans, shipped, machine),
         *offsets.findings,
     ]
@@ -250,7 +250,7 @@ def commission(
     return Commissioned(machine, text, fit, scans, offsets, findings, questions)
 
 
-def _refused(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
+def _machine_errors(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
     """Yield the error of `flexdt machine check` for the machine's file, if there is one."""
     try:
         check_home(machine, profile, MACHINE_FILE)
@@ -325,7 +325,7 @@ def _script(
     return scan
 
 
-def _fitted(
+def _fit_machine(
     scans: Sequence[PastScan], shipped: d.Machine
 ) -> tuple[d.Machine, str, Fit | None]:
     """Fit a machine to the texts' signs and rates and to the executed scripts.
@@ -339,7 +339,7 @@ def _fitted(
     """
     turning = shipped.geometry.get("angle", {})
     axes = {
-        n: a if n in turning else _stated(a, n, scans, shipped)
+        n: a if n in turning else _with_rates(a, n, scans, shipped)
         for n, a in shipped.axes.items()
     }
     machine = shipped.model_copy(update={"axes": axes})
@@ -367,7 +367,7 @@ def _fitted(
     return machine, text, fit
 
 
-def _stated(
+def _with_rates(
     axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine
 ) -> d.Axis:
     """Return an axis with the rates of the last settings text, and the sign of most of them.
@@ -401,7 +401,7 @@ def _stated(
     return stated.model_copy(update={"source": source})
 
 
-def _measured(
+def _with_alignment(
     scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]
 ) -> PastScan:
     """Add the poses of a past scan, and its alignment without a phantom.

@@ -373,12 +373,15 @@ def test_the_example_shows_that_nothing_is_lost(folder: Path, tmp_path: Path) ->
 def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> None:
     from typer import BadParameter
 
-    from flexdt.clients.cli.commands.calibrate_commands import _opened
+    from flexdt.clients.cli.commands.calibrate_commands import _load_data_sets
 
     file = tmp_path / "g.json"
     data = load_dataset(folder)
     save_geometry(geometry_of(data, NOMINAL), file)
-    (own,), (imported,) = _opened([folder], None), _opened([folder], [file])
+    (own,), (imported,) = (
+        _load_data_sets([folder], None),
+        _load_data_sets([folder], [file]),
+    )
     assert np.abs(own.cone_vec.rows - imported.cone_vec.rows).max() < 1e-9
     # A correction means the same on top of either, but for alpha: a panel that the profile rolls
     # tells the stage's angle from its rows.
@@ -388,4 +391,4 @@ def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> No
     difference = own.corrected(moved).rows - imported.corrected(moved).rows
     assert np.abs(difference).max() < 1e-9
     with pytest.raises(BadParameter, match="1 geometries for 2"):
-        _opened([folder, folder], [file])
+        _load_data_sets([folder, folder], [file])

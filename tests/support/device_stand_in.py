@@ -117,7 +117,7 @@ def unscale(sums: Any, factor: float, flat: Any) -> None:
 def pytest_configure(config: Any) -> None:
     """Put the stand-ins in place, before any test is imported."""
     gpu.launcher = launcher
-    gpu._probed = lambda: gpu.Availability(True, "a stand-in of a CUDA device")
+    gpu._probe = lambda: gpu.Availability(True, "a stand-in of a CUDA device")
     fdk.OnDevice = Backprojector
     gpu.VIEWS_A_THREAD = MOVED_FROM / cpu.threads()
     for name, work in (("combine", combine), ("fold", fold), ("unscale", unscale)):

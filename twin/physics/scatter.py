@@ -530,7 +530,7 @@ def scan_scatter(
             "no views to simulate scatter for", {"asked": 0, "allowed": "> 0"}
         )
     way = way_of(rows)
-    simulated = _simulated(way, np.radians(wanted.step_deg))
+    simulated = _views_to_simulate(way, np.radians(wanted.step_deg))
     images = tuple(
         scatter_image(thing, rows[i], shape, beam, wanted, i) for i in simulated
     )
@@ -559,7 +559,7 @@ def way_of(rows: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.max(steps, axis=0))])
 
 
-def _simulated(way: FloatArray, step: float) -> Sequence[int]:
+def _views_to_simulate(way: FloatArray, step: float) -> Sequence[int]:
     """Choose the views to simulate: first, last, and so many that no path between two is
     longer than `step`, unless it is a single step from one view to the next."""
     chosen = [0]

@@ -124,30 +124,30 @@ class DeviceArray(NDArrayOperatorsMixin):
         ):
             return NotImplemented
         other = b if isinstance(b, DeviceArray) else float(b)
-        return _combined(UFUNCS[ufunc], a, other, None if out is None else out[0])
+        return _combine(UFUNCS[ufunc], a, other, None if out is None else out[0])
 
     def over(self, other: DeviceArray, least: float) -> DeviceArray:
         """Compute self / other, and 0 where other is at most `least`."""
-        return _combined("RATIO", self, other, least=least)
+        return _combine("RATIO", self, other, least=least)
 
     def copy(self, order: str = "K") -> DeviceArray:
         """Copy the numbers to new memory."""
-        return _combined("ADD", self, 0.0)
+        return _combine("ADD", self, 0.0)
 
     def dot(self, other: DeviceArray) -> float:
         """Sum of the products."""
-        return float(_folded("DOT", self, other).sum())
+        return float(_fold("DOT", self, other).sum())
 
     def sum(self) -> float:
         """Sum all numbers."""
-        return float(_folded("SUM", self, self).sum())
+        return float(_fold("SUM", self, self).sum())
 
     def max(self) -> float:
         """Return the largest number."""
-        return float(_folded("LARGEST", self, self).max())
+        return float(_fold("LARGEST", self, self).max())
 
 
-def _combined(
+def _combine(
     name: str,
     a: DeviceArray,
     b: DeviceArray | float,
@@ -190,7 +190,7 @@ def _combined(
     return found
 
 
-def _folded(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
+def _fold(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
     """Reduce one or two arrays on the device to partial results.
 
     Args:

@@ -127,10 +127,10 @@ def plan_fans(
     )
     facing = ((along > 0) & (along**2 >= FACING**2 * size)).all(axis=1)
     level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
-    parts = [_level(np.flatnonzero(facing & level), shape)]
+    parts = [_plan_level(np.flatnonzero(facing & level), shape)]
     tilted = np.flatnonzero(facing & ~level)
     if len(tilted):
-        parts.append(_tilted(tilted, views[tilted], corners[tilted], counts, shape))
+        parts.append(_plan_tilted(tilted, views[tilted], corners[tilted], counts, shape))
     shift = len(parts[0].lines) * np.array([0, 1, 1])
     done = np.concatenate([part.jobs[:, 0] for part in parts])
     alone = np.ones(len(views), np.bool_)
@@ -144,7 +144,7 @@ def plan_fans(
     )
 
 
-def _level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
+def _plan_level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
     """Plan views with detector columns parallel to z: each column is a fan, in all views.
 
     Args:
@@ -162,7 +162,7 @@ def _level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
     return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, FANS), chosen)
 
 
-def _tilted(
+def _plan_tilted(
     chosen: IntArray,
     views: FloatArray,
     corners: FloatArray,
@@ -189,7 +189,7 @@ def _tilted(
         meeting = -_cross(along[:, None], corners) / _cross(u[:, None], corners)
         slope = _cross(v, middle) / _cross(u, middle)
         rays = np.concatenate([corners, middle[:, None]], axis=1)
-        step = _step(views[:, 0:3], u, rays, counts)
+        step = _fan_columns(views[:, 0:3], u, rays, counts)
         # All boundaries meet where z is seen end on; in rows from there to the middle they
         # spread.
         pole = -_cross(u, first) / _cross(u, v)
@@ -207,7 +207,7 @@ def _tilted(
     u = u[use]
     v = v[use]
     fans = np.maximum(np.ceil((end - begin) / step[use]), 1).astype(np.int64)
-    view, number = _counted(fans + 1)
+    view, number = _expand_counts(fans + 1)
     b = begin[view] + (end - begin)[view] * number / fans[view]
     direction = along[view] + b[:, None] * u[view]
     across = _cross(u[view], direction)
@@ -215,7 +215,7 @@ def _tilted(
         [-_cross(first[view], direction) / across, -_cross(v[view], direction) / across]
     )
     starts = np.concatenate([[0], np.cumsum(fans + 1)[:-1]])
-    of, part = _counted(-(-fans // FANS))
+    of, part = _expand_counts(-(-fans // FANS))
     begins = part * FANS
     ends = np.minimum(begins + FANS, fans[of])
     jobs = np.column_stack([chosen[use[of]], starts[of] + begins, starts[of] + ends])
@@ -230,7 +230,7 @@ def _tilted(
     )
 
 
-def _counted(counts: IntArray) -> tuple[IntArray, IntArray]:
+def _expand_counts(counts: IntArray) -> tuple[IntArray, IntArray]:
     """Expand counts to owners and positions: (2, 3) gives (0, 0, 1, 1, 1) and (0, 1, 0,
     1, 2).
     """
@@ -239,7 +239,7 @@ def _counted(counts: IntArray) -> tuple[IntArray, IntArray]:
     return group, np.arange(len(group)) - starts[group]
 
 
-def _step(
+def _fan_columns(
     source: FloatArray, u: FloatArray, rays: FloatArray, counts: tuple[int, int, int]
 ) -> FloatArray:
     """Compute the columns a fan may span so that its rays stay within SPREAD voxels.
@@ -374,13 +374,13 @@ def _image_widths(
     r = (shape[0] - 1) / 2
     of = views[view]
 
-    def towards(line: IntArray) -> FloatArray:
+    def directions_to(line: IntArray) -> FloatArray:
         c = plan.lines[line, 0] + plan.lines[line, 1] * r
         flat = of[:, 3:5] + c[:, None] * of[:, 6:8] + r * of[:, 9:11]
         return np.asarray(flat / np.linalg.norm(flat, axis=1)[:, None])
 
-    a = towards(first)
-    b = towards(last)
+    a = directions_to(first)
+    b = directions_to(last)
     sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     source = of[:, :2]
     outside = source - np.clip(source, 0.0, np.array(counts[:2], dtype=np.float64))

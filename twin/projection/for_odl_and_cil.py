@@ -82,7 +82,7 @@ def cil_operator(
     from cil.framework import AcquisitionGeometry, ImageGeometry
     from cil.optimisation.operators import LinearOperator
 
-    def filled(
+    def fill_container(
         function: _Map, x: Any, shape: tuple[int, int, int], geometry: Any, out: Any
     ) -> Any:
         """Apply a function to the array of a CIL container, and put the result into `out`, or
@@ -101,11 +101,11 @@ def cil_operator(
 
         def direct(self, x: Any, out: Any = None) -> Any:
             """Project voxels."""
-            return filled(project, x, like.shape, self.range_geometry(), out)
+            return fill_container(project, x, like.shape, self.range_geometry(), out)
 
         def adjoint(self, x: Any, out: Any = None) -> Any:
             """Apply the transpose of `direct`."""
-            return filled(spread, x, image_shape, self.domain_geometry(), out)
+            return fill_container(spread, x, image_shape, self.domain_geometry(), out)
 
     nz, ny, nx = like.shape
     x, y, z = like.voxel_xyz

@@ -76,11 +76,11 @@ def availability() -> Availability:
 
     With NUMBA_DISABLE_CUDA=1 in the environment no device is available.
     """
-    return _failed[0] if _failed else _probed()
+    return _failed[0] if _failed else _probe()
 
 
 @cache
-def _probed() -> Availability:
+def _probe() -> Availability:
     """Look for the driver, import numba's CUDA and project one ray on the device.
 
     Returns:
@@ -116,7 +116,7 @@ def _probed() -> Availability:
 def leave_after_fork() -> None:
     """Leave the device to the parent: a forked child cannot use one that its parent has
     used."""
-    if _probed.cache_info().currsize and _probed().present:
+    if _probe.cache_info().currsize and _probe().present:
         why = "the device belongs to the parent of this forked process; spawn and forkserver work"
         _failed.insert(0, Availability(False, why))
 

@@ -148,13 +148,13 @@ def minimise_tv(
 
     with long_work.during("minimising total variation", progress) as advance:
 
-        def minimised(problem: LinearSystem) -> Minimised:
+        def minimise(problem: LinearSystem) -> Minimised:
             """Minimise for a problem on the processor or on a device, with the regulariser
             where the problem is.
             """
             there = isinstance(problem, DeviceProblem)
             kept = DeviceRegular.of_host(regular, problem.like) if there else regular
-            return _minimised(
+            return _minimise(
                 problem,
                 kept,
                 iterations,
@@ -166,7 +166,7 @@ def minimise_tv(
                 advance,
             )
 
-        return solved(problem, minimised)
+        return solved(problem, minimise)
 
 
 @public
@@ -186,7 +186,7 @@ def tv(*args: Any, **options: Any) -> Volume:
     return minimise_tv(*args, **options).volume
 
 
-def _minimised(
+def _minimise(
     problem: LinearSystem,
     regular: Regular,
     iterations: int,

@@ -16,7 +16,7 @@ import typer
 from flexdt.clients.cli import option_values, options, value_completion
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.command_settings import CalibrateSettings
-from flexdt.clients.cli.commands.data_commands import said
+from flexdt.clients.cli.commands.data_commands import geometry_options
 from flexdt.clients.cli.console import as_json, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import chosen
@@ -94,14 +94,14 @@ def calibrate(
         "per_frame": option_values.names(per_frame),
         "reading": reading,
         "bead_tolerance": bead_tolerance,
-        "priors": "none" if prior == ["none"] else _assigned(prior),
-        "start": _assigned(start),
+        "priors": "none" if prior == ["none"] else _read_assignments(prior),
+        "start": _read_assignments(start),
         "bound": chosen(CalibrateSettings).bound,
         "markers": markers,
         "scale": scale,
         "radius": radius,
     }
-    target = _named(phantom)
+    target = _require_phantom(phantom)
     if per_scan and len(datasets or ()) > 1 and push:
         raise typer.BadParameter(
             "--push: with --per-scan there is no one geometry to push"
@@ -111,8 +111,12 @@ def calibrate(
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
     request_of(target, options)  # what cannot be asked for is said before images are read
-    given = _given(
-        datasets or [], frames, markers, geometry or [], said(None, shape, pixel)
+    given = _load_inputs(
+        datasets or [],
+        frames,
+        markers,
+        geometry or [],
+        geometry_options(None, shape, pixel),
     )
     outcome = calibrate_with(given, target, options)
     document: dict[str, Any] = outcome.document
@@ -135,14 +139,14 @@ def calibrate(
         _push(twin, outcome.correction, outcome.sources, document)
 
 
-def _assigned(given: list[str] | None) -> dict[str, float]:
+def _read_assignments(given: list[str] | None) -> dict[str, float]:
     """Read P=VALUE,... of an option that may be given several times."""
     return option_values.assignments(
         word for one in given or () for word in one.split(",")
     )
 
 
-def _named(phantom: str | None) -> str:
+def _require_phantom(phantom: str | None) -> str:
     """Return the named phantom; none is a usage error that lists those that ship."""
     if phantom is None:
         from flexdt.phantoms import phantom_names
@@ -153,7 +157,7 @@ def _named(phantom: str | None) -> str:
     return phantom
 
 
-def _given(
+def _load_inputs(
     folders: list[Path],
     frames: Path | None,
     markers: Path | None,
@@ -179,7 +183,7 @@ def _given(
     if folders:
         if frames is not None:
             raise typer.BadParameter("--frames and a data set; give one")
-        return _opened(folders, geometries)
+        return _load_data_sets(folders, geometries)
     if len(geometries) != 1 or (frames is None and markers is None):
         raise typer.BadParameter(
             "no data set; allowed: --frames DIR or --markers FILE, and one "
@@ -198,7 +202,7 @@ def _given(
     return [markers_alone(cone, markers.stem)]
 
 
-def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
+def _load_data_sets(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
     """Load the data sets, each with its own geometry or the one of a file.
 
     Args:
@@ -247,7 +251,7 @@ def align(
 
     if push:
         _require_answer(twin)
-    data = _opened([dataset], None if geometry is None else [geometry])[0]
+    data = _load_data_sets([dataset], None if geometry is None else [geometry])[0]
     found = align_dataset(data, per_frame)
     document: dict[str, Any] = found.document
     if out is not None:
@@ -293,7 +297,7 @@ def compare(
 
     if out is not None:
         require_plots()
-    found = compare_folder(dataset, _named(phantom), tolerance)
+    found = compare_folder(dataset, _require_phantom(phantom), tolerance)
     if out is not None:
         write_comparison(found, out)
     document: dict[str, Any] = found.document
@@ -369,7 +373,7 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     rows = [
         (
             f"{name}, scan {k}" if k else name,
-            *_rounded(q, "value", "sigma"),
+            *_round_estimate(q, "value", "sigma"),
             _unit(q["unit"]),
         )
         for k, place in enumerate(document.get("image_space", ()))
@@ -434,7 +438,7 @@ def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return [
         (
             name if p["asked"] else f"({name})",
-            *_rounded(p, "value", "sigma", "images"),
+            *_round_estimate(p, "value", "sigma", "images"),
             _unit(p["unit"]),
         )
         for name, p in document["parameters"].items()
@@ -446,7 +450,7 @@ def write_json(path: Path, document: Mapping[str, object]) -> None:
     write_whole(path, as_json(document) + "\n")
 
 
-def _rounded(estimate: Mapping[str, Any], *names: str) -> Iterator[str]:
+def _round_estimate(estimate: Mapping[str, Any], *names: str) -> Iterator[str]:
     """Format numbers of an estimate to the digits that its sigma leaves."""
     from flexdt.library.calibration.calibrate import digits
 

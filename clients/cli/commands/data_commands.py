@@ -294,7 +294,7 @@ def scan_of(
         data = data.with_correction(
             NamedCorrection("report", "", report.parameters, panel=found)
         )
-    return moved(data, report)
+    return apply_motion(data, report)
 
 
 def _workers(
@@ -364,7 +364,7 @@ def read_report(path: Path) -> Report:
     return Report(path, Offsets.from_edge(content), document)
 
 
-def moved(data: DataSet, report: Report) -> DataSet:
+def apply_motion(data: DataSet, report: Report) -> DataSet:
     """Apply the motion that a report of `flexdt calibrate --per-frame` has for the data
     set.
 
@@ -498,7 +498,7 @@ def import_(
         rows: Count rows down or up; up: v is negated.
         real: Take, of a CTSimU file, what is so, or what reconstruction knows.
     """
-    given = said(like, shape, pixel, views)
+    given = geometry_options(like, shape, pixel, views)
     from dataclasses import replace
 
     from flexdt.library.datasets.exchange import import_geometry, save_geometry
@@ -527,7 +527,7 @@ def import_(
     yield f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm"
 
 
-def said(
+def geometry_options(
     like: Path | None, shape: str | None, pixel: str | None, views: int | None = None
 ) -> Given:
     """Read the options that complete a geometry's file.

@@ -119,13 +119,13 @@ def run_demo(
         compiling = running.enter_context(compile_ahead.start(compile_ahead.ANALYSIS))
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         servers = running.enter_context(
-            _started(options, out, tell, viewer=stay is not None)
+            _running_servers(options, out, tell, viewer=stay is not None)
         )
         with TwinClient(*servers.address) as client:
             document = _main_job(client, compiling.wait, truth, out, tell)
         write_json(out / "demo.json", document)
         write_json(out / CALIBRATION, document["calibration"])
-        _told_the_end(document, out, tell)
+        _print_summary(document, out, tell)
         if stay is not None and servers.viewer_url is not None:
             stay(servers.viewer_url)
     return document
@@ -141,7 +141,7 @@ def _drawn_truth() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _started(
+def _running_servers(
     options: Mapping[str, object], out: Path, tell: Tell, *, viewer: bool
 ) -> Iterator[Servers]:
     """Start servers on free ports and print their addresses; end them on leaving.
@@ -185,11 +185,11 @@ def _main_job(
     Returns:
         The document of `demo.json`.
     """
-    dataset, seconds = _scanned(client, out / "data", tell)
+    dataset, seconds = _scan(client, out / "data", tell)
     with long_work.during("compiling the kernels of calibration and reconstruction"):
         compiled()
     begun = time.monotonic()
-    outcome = _calibrated(dataset, tell)
+    outcome = _calibrate(dataset, tell)
     document: dict[str, Any] = {
         "dataset": str(dataset.folder),
         "frames": len(dataset.frames),
@@ -200,13 +200,15 @@ def _main_job(
     }
     push_correction(client, outcome.correction, outcome.sources)
     tell(f"correction in force on the twin: {outcome.correction.name}")
-    document["inside_95"] = _compared(outcome, truth, tell)
-    document["preview"] = _previewed(dataset, outcome, out / "preview.tif", tell)
-    document["picture"] = str(_pictured(dataset, out / "preview.tif", out / PICTURE))
+    document["inside_95"] = _compare_with_truth(outcome, truth, tell)
+    document["preview"] = _reconstruct_preview(
+        dataset, outcome, out / "preview.tif", tell
+    )
+    document["picture"] = str(_draw_picture(dataset, out / "preview.tif", out / PICTURE))
     return document
 
 
-def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
+def _scan(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
     """Run the example script on the twin and read the data set back with the ordinary
     reader.
 
@@ -251,7 +253,7 @@ def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float
     return dataset, seconds
 
 
-def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
+def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     """Calibrate from the data set alone.
 
     Args:
@@ -279,7 +281,7 @@ def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     return outcome
 
 
-def _previewed(
+def _reconstruct_preview(
     dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
 ) -> dict[str, object]:
     """Reconstruct a small volume with the calibrated geometry."""
@@ -293,7 +295,7 @@ def _previewed(
     return document
 
 
-def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
+def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
     """Draw the first radiograph and the middle layer of a volume side by side, equally
     high.
 
@@ -322,7 +324,7 @@ def _pictured(dataset: DataSet, volume: Path, out: Path) -> Path:
     return out
 
 
-def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
+def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
     """Print the verdict, the files and the next commands.
 
     Args:
@@ -350,7 +352,9 @@ def _told_the_end(document: dict[str, Any], out: Path, tell: Tell) -> None:
     tell(f"  {program} up --data {folder}/data   # the lab in the browser, until Ctrl-C")
 
 
-def _compared(outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell) -> bool:
+def _compare_with_truth(
+    outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell
+) -> bool:
     """Compare the calibration with the hidden truth; a miss is called a miss.
 
     Args:

@@ -65,7 +65,7 @@ def expose(
         warn(data.warnings, dataset)
         measured = of.exposure_of(data)
         yield asdict(measured)
-        yield from _seen(measured)
+        yield from _transmission_lines(measured)
         return
     forecast = of.expose(
         sample,
@@ -85,10 +85,10 @@ def expose(
     )
     warn(forecast.assumed)
     yield asdict(forecast)
-    yield from _told(forecast)
+    yield from _forecast_lines(forecast)
 
 
-def _seen(found: Forecast | Measured) -> Answer:
+def _transmission_lines(found: Forecast | Measured) -> Answer:
     """Yield lines on transmission, saturated and starved pixels."""
     seen: Transmission = found.transmission
     yield (
@@ -102,13 +102,13 @@ def _seen(found: Forecast | Measured) -> Answer:
     yield f"saturated {full}, starved {100 * found.starved:.3g} %"
 
 
-def _told(forecast: Forecast) -> Answer:
+def _forecast_lines(forecast: Forecast) -> Answer:
     """Yield the forecast as text: counts, contrast, dose and the best settings.
 
     Args:
         forecast: of the exposure.
     """
-    yield from _seen(forecast)
+    yield from _transmission_lines(forecast)
     asked = forecast.asked
     seen = "not seen: these pixels are saturated"
     if asked.cnr is not None:

@@ -71,7 +71,7 @@ def follow(
         if STAMP.match(recording) is None:
             raise CommandError(f"{replay}: no message [hh:mm:ss] {{...}}", INVALID)
         session.replay(recording)
-        yield from _told(session, str(replay))
+        yield from _session_lines(session, str(replay))
         return
     beside = None
     if frames is not None:
@@ -105,12 +105,12 @@ def follow(
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
-    yield from _told(session, at)
+    yield from _session_lines(session, at)
     if session.mirror.heard_s is None and not session.mirror.connected:
         raise CommandError(f"{at}: there has been no connection", REFUSED)
 
 
-def _told(session: FollowSession, source: str) -> Answer:
+def _session_lines(session: FollowSession, source: str) -> Answer:
     note(f"{session.mirror.raised} alarms{_unread(session)}")
     unread = {"unread": session.unread, "unread_example": session.unread_example}
     yield {"address": source, **unread, **session.mirror.to_dict(session.clock())}

@@ -61,7 +61,9 @@ def new(
     from flexdt.twin.machine.kinematics import place
     from flexdt.twin.machine.new_machine import Answers, new_machine_text
 
-    base = _asked(f"Most like which of {', '.join(builtin_machines())}", base, USUAL_BASE)
+    base = _ask_or_default(
+        f"Most like which of {', '.join(builtin_machines())}", base, USUAL_BASE
+    )
     base = base or USUAL_BASE
     like = builtin_machine(base)
     panel = like.detector
@@ -69,11 +71,13 @@ def new(
         ":".join(f"{end:g}" for end in dict.fromkeys((at.least, at.most)))
         for at in (place(like, "object_y"), place(like, "detector_y"))
     ]
-    size = _asked("Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}")
-    pitch = _asked("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
-    sod = _asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
-    sdd = _asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
-    kv = _asked(
+    size = _ask_or_default(
+        "Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}"
+    )
+    pitch = _ask_or_default("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
+    sod = _ask_or_default("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
+    sdd = _ask_or_default("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
+    kv = _ask_or_default(
         "Tube, kV: at most, or least:most",
         kv,
         f"{like.tube.min_kV:g}:{like.tube.max_kV:g}",
@@ -117,7 +121,7 @@ def new(
     )
 
 
-def _asked(question: str, given: str | None, usual: str) -> str | None:
+def _ask_or_default(question: str, given: str | None, usual: str) -> str | None:
     """Return the given value, else the answer of a person at a terminal; None for the
     usual one."""
     if given is not None or not sys.stdin.isatty():

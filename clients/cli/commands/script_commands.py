@@ -64,7 +64,7 @@ def new(
     from flexdt.twin.script.compose import compose_script
     from flexdt.twin.script.scan_request import ScanRequest
 
-    own = _own(kind, position=position, tiles=tiles, turns=turns, rise=rise)
+    own = _kind_members(kind, position=position, tiles=tiles, turns=turns, rise=rise)
     scanner = machines.machine(machine)
     offsets = machines.profile(profile, scanner, machine)
     request = ScanRequest(
@@ -105,7 +105,7 @@ def new(
         yield f"{file}: {plan.frames} frames, {size(plan.bytes)}, {duration(plan.duration_s)}"
 
 
-def _own(kind: Kind, **given: Any) -> dict[str, Any]:
+def _kind_members(kind: Kind, **given: Any) -> dict[str, Any]:
     """Collect members of a request that belong to one kind of scan.
 
     Args:

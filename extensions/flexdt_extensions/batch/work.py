@@ -225,13 +225,15 @@ def _phantom(
         name = table.name.sample(rng)
         return load_phantom(name), {"name": name}
     if table.cuboid is not None:
-        return _cuboid(table.cuboid, rng)
+        return _draw_cuboid(table.cuboid, rng)
     assert table.spheres is not None
     parts = np.random.default_rng(seed_of(plan, index, SHAPES))
     return _spheres(table.spheres, rng, parts)
 
 
-def _cuboid(table: Cuboid, rng: np.random.Generator) -> tuple[Phantom, dict[str, Any]]:
+def _draw_cuboid(
+    table: Cuboid, rng: np.random.Generator
+) -> tuple[Phantom, dict[str, Any]]:
     """Draw a block with beads on a spiral; returns it and the drawn values by name."""
     values = {name: getattr(table, name).sample(rng) for name in type(table).model_fields}
     size = tuple(float(values[f"{side}_mm"]) for side in ("width", "breadth", "height"))
@@ -268,7 +270,7 @@ def _spheres(
     for number in range(int(table.count.sample(rng))):
         radius = float(table.radius_mm.sample(parts))
         made_of = material(table.material.sample(parts))
-        center = _place(radius, wide, high, [s.shape for s in solids], parts)
+        center = _draw_place(radius, wide, high, [s.shape for s in solids], parts)
         if center is None:
             raise TwinError(
                 f"sphere {number + 1} of {radius:.3g} mm found no free place in a cylinder of "
@@ -286,7 +288,7 @@ def _spheres(
     return phantom, {"name": phantom.name, "spheres": listed}
 
 
-def _place(
+def _draw_place(
     radius: float, wide: float, high: float, others: list[Any], rng: np.random.Generator
 ) -> tuple[float, float, float] | None:
     """Draw a place for a ball in a cylinder, clear of other balls.
@@ -550,7 +552,7 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         item: drawn.
 
     Returns:
-        No arrays, and the figures of `_judged`.
+        No arrays, and the figures of `_compare_with_truth`.
     """
     model = bead_model(item.phantom)
     free = tuple(plan.calibrate.free)
@@ -568,7 +570,7 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
             priors=known(free, plan.calibrate.priors),
             strain=known_strain(model, given=plan.calibrate.priors, free=free),
         )
-        return {}, _judged(fit, item, free, fit.identifiable, "")
+        return {}, _compare_with_truth(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
     from flexdt_extensions.studies.rendered_runs import Rendering, render
 
@@ -582,10 +584,10 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         [Scan(frames, item.poses)], model, request, scene=item.phantom.scene
     )
     note = "; ".join(f.text for f in result.errors)
-    return {}, _judged(result.fit, item, free, result.identifiable, note)
+    return {}, _compare_with_truth(result.fit, item, free, result.identifiable, note)
 
 
-def _judged(
+def _compare_with_truth(
     fit: FitResult | None,
     item: Item,
     free: tuple[str, ...],

@@ -38,21 +38,21 @@ class Rtk:
 
     def __init__(self, build: Callable[..., Work], *arguments: object) -> None:
         self._pool = ProcessPoolExecutor(1, get_context("spawn"))
-        self._ask(_prepare, build, arguments)
+        self._run_in_process(_prepare, build, arguments)
 
     def run(self) -> float:
         """Do the work; the seconds it took."""
-        return self._ask(_timed)
+        return self._run_in_process(_time_work)
 
     def images(self) -> Float32Array:
         """Get the last result from the process."""
-        return self._ask(_result)
+        return self._run_in_process(_result)
 
     def close(self) -> None:
         """End the process."""
         self._pool.shutdown()
 
-    def _ask(self, do: Callable[..., _T], *arguments: object) -> _T:
+    def _run_in_process(self, do: Callable[..., _T], *arguments: object) -> _T:
         """Run a function in RTK's process, and return its result; after an error the process is
         ended.
 
@@ -80,7 +80,7 @@ def _prepare(build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
         _PREPARED.append(build(*arguments))
 
 
-def _timed() -> float:
+def _time_work() -> float:
     begun = time.perf_counter()
     _PREPARED[0][0]()
     return time.perf_counter() - begun

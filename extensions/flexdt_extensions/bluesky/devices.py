@@ -114,10 +114,10 @@ class AxisLogic(MovableLogic[float]):
             async for state in self.link.states():
                 axis = state.axes[self.axis]
                 if not axis.moving:
-                    self._arrived(axis, new_position, state)
+                    self._check_arrival(axis, new_position, state)
                     return
 
-    def _arrived(self, axis: AxisState, target: float, state: State) -> None:
+    def _check_arrival(self, axis: AxisState, target: float, state: State) -> None:
         """Check that an axis at rest is at its target.
 
         Raises:

@@ -195,8 +195,8 @@ class TwinFlyer(
                 text = script
             report = await self._link.client.check_script(text)
             if not report.ok:
-                raise _refused(report)
-            self._prepared = _planned(value, text, report, machine, profile)
+                raise _script_error(report)
+            self._prepared = _plan_scan(value, text, report, machine, profile)
             self._images = None
             self.job = None
             self._set_written(0)
@@ -405,7 +405,7 @@ class TwinFlyer(
         return machine, self._profile or profile_of(machine, server.profile)
 
 
-def _planned(
+def _plan_scan(
     scan: FlyScan, text: bytes, report: CheckResult, machine: Machine, profile: Profile
 ) -> _Prepared:
     """Plan a script and check that its projections are one numbered series.
@@ -452,7 +452,7 @@ def _planned(
     )
 
 
-def _refused(report: CheckResult) -> LimitsExceeded:
+def _script_error(report: CheckResult) -> LimitsExceeded:
     """Make the error on a script with errors: the first five, and the number of the others."""
     errors = [p for p in report.problems if p.severity == "error"]
     lines = [f"line {p.line}: {p.message}" for p in errors[:5]]

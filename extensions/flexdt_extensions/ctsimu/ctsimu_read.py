@@ -228,9 +228,9 @@ class ScenarioReader:
         return -angles if direction == "CW" else angles
 
     def _part(self, name: str) -> PlacedPart:
-        return self._placed(self._at("geometry", name), f"geometry.{name}", (WORLD,))
+        return self._read_part(self._at("geometry", name), f"geometry.{name}", (WORLD,))
 
-    def _placed(
+    def _read_part(
         self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]
     ) -> PlacedPart:
         """Read source, detector, stage (u, w) or sample (r, t), in one of the `allowed`
@@ -395,7 +395,7 @@ class ScenarioReader:
                 value.get("unit") if isinstance(value, dict) else None
             )
             amounts = np.array(values, dtype=np.float64) * self._factor(unit, units, at)
-            over = _interpolated(amounts, self._count)
+            over = _fit_to_frames(amounts, self._count)
             real = real + over
             if drift.get("known_to_reconstruction") is not False:
                 known = known + over
@@ -513,12 +513,12 @@ class ScenarioReader:
 
     def _error(self, where: str, allowed: str) -> ExchangeError:
         """Make the error on the value at `where`: what it is, and what is allowed."""
-        asked = self._asked(where)
+        asked = self._stated_text(where)
         return ExchangeError.instead(
             f"{self._file}: {where} is {asked}", asked, allowed, path=where
         )
 
-    def _asked(self, where: str) -> str:
+    def _stated_text(self, where: str) -> str:
         """Return the value at a path of the document as JSON, at most 60 characters."""
         found: Any = self._document
         for key in re.findall(r"[^.\[\]]+", where.partition(" ")[0]):
@@ -570,7 +570,7 @@ def place(
     if turn[frame] != 0.0:
         axes = rotation_about(axes[:, 2], float(turn[frame])) @ axes
 
-    def seen(reference: str) -> tuple[FloatArray, FloatArray]:
+    def coordinate_system(reference: str) -> tuple[FloatArray, FloatArray]:
         """Return origin and axes of a coordinate system, seen from the part's own."""
         if reference == WORLD and part.on_stage and stage is not None:
             return -stage[1].T @ stage[0], stage[1].T
@@ -582,11 +582,11 @@ def place(
         if not real and not deviation.known:
             continue
         amount = float(deviation.amount.of(real)[frame])
-        axis = seen(deviation.reference)[1] @ deviation.axis
+        axis = coordinate_system(deviation.reference)[1] @ deviation.axis
         if not deviation.turn:
             center = center + amount * axis
             continue
-        origin, base = seen(deviation.pivot_reference)
+        origin, base = coordinate_system(deviation.pivot_reference)
         pivot = origin + base @ deviation.pivot
         rotation = rotation_about(axis, amount)
         center = pivot + rotation @ (center - pivot)
@@ -607,7 +607,7 @@ def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
     return np.stack([u, v / np.linalg.norm(v), w], axis=1)
 
 
-def _interpolated(values: FloatArray, count: int) -> FloatArray:
+def _fit_to_frames(values: FloatArray, count: int) -> FloatArray:
     """Fit drift values to the frames: the first at the first frame, the last at the
     last."""
     if len(values) == 1 or count == 1:

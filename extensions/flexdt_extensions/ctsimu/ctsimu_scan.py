@@ -349,7 +349,7 @@ class _ScanReader(ScenarioReader):
         if min(scale) <= 0.0:
             raise self._error(f"{where}.scaling_factor", "above 0")
         substance = self._material(given.get("material_id"), f"{where}.material_id")
-        part = self._placed(given["position"], f"{where}.position", (STAGE, WORLD))
+        part = self._read_part(given["position"], f"{where}.position", (STAGE, WORLD))
         still = np.zeros(self._count)
         views = np.empty((self._count, 12))
         there: list[tuple[FloatArray, FloatArray]] = []
@@ -409,7 +409,7 @@ class _ScanReader(ScenarioReader):
                 part.get("mass_fraction"), NUMBER, f"{at}.mass_fraction", 1.0
             )
             if formula.strip() and whole > 0.0:
-                for symbol, x in self._tried(
+                for symbol, x in self._make_value(
                     at, _fractions, "".join(formula.split())
                 ).items():
                     amounts[symbol] = amounts.get(symbol, 0.0) + whole * x
@@ -417,7 +417,9 @@ class _ScanReader(ScenarioReader):
         if density <= 0.0 or not total > 0.0:
             return given["id"], None
         shares = tuple((symbol, x / total) for symbol, x in amounts.items())
-        return given["id"], self._tried(where, Substance, given["id"], shares, density)
+        return given["id"], self._make_value(
+            where, Substance, given["id"], shares, density
+        )
 
     def _material(self, name: object, where: str) -> Substance | None:
         """Return the substance of a material's id; None for vacuum."""
@@ -479,7 +481,8 @@ class _ScanReader(ScenarioReader):
         if any(files):
             keys: list[Any] = [self._text(name, f"{at}.file") for name in files]
             made = {
-                name: self._tabulated(name, f"{at}.file") for name in dict.fromkeys(keys)
+                name: self._read_spectrum(name, f"{at}.file")
+                for name in dict.fromkeys(keys)
             }
             for name in (
                 "voltage",
@@ -492,9 +495,10 @@ class _ScanReader(ScenarioReader):
             behind = (*self._layers("source", "window"), *behind)
             if not single:
                 self._check_target()
-            make = _line if single else _unfiltered
+            make = _line if single else _unfiltered_spectrum
             made = {
-                kV: self._tried("source.voltage", make, kV) for kV in dict.fromkeys(keys)
+                kV: self._make_value("source.voltage", make, kV)
+                for kV in dict.fromkeys(keys)
             }
         fluence = tuple(one.behind(*behind).fluence for one in made.values())
         if not min(one.sum() for one in fluence) > 0.0:
@@ -523,7 +527,7 @@ class _ScanReader(ScenarioReader):
             "type and angles are; source.spectrum.file states another"
         )
 
-    def _tabulated(self, name: object, where: str) -> Spectrum:
+    def _read_spectrum(self, name: object, where: str) -> Spectrum:
         """Read the spectrum of a file into the tables' bins.
 
         Args:
@@ -837,7 +841,7 @@ class _ScanReader(ScenarioReader):
             raise self._error(where, "above 0 in all frames")
         return found
 
-    def _tried(self, where: str, make: Callable[..., T], *given: Any) -> T:
+    def _make_value(self, where: str, make: Callable[..., T], *given: Any) -> T:
         """Make a value from what the scenario gives; its error names `where`.
 
         Raises:
@@ -866,5 +870,5 @@ def _line(energy_keV: float) -> Spectrum:
     return low
 
 
-def _unfiltered(kV: float) -> Spectrum:
+def _unfiltered_spectrum(kV: float) -> Spectrum:
     return tube_spectrum(kV, TubeModel(()))

@@ -89,7 +89,9 @@ class ScenarioImages:
         self.path = Path(path)
         self._seed = seed
         self._rays = rays
-        self.scan = read_scenario(text_of(self.path), str(self.path), self._beside)
+        self.scan = read_scenario(
+            text_of(self.path), str(self.path), self._read_named_file
+        )
         self._meshes = [self._mesh(sample) for sample in self.scan.samples]
         found: dict[Substance, float] = {}
         for sample, mesh in zip(self.scan.samples, self._meshes, strict=True):
@@ -97,7 +99,7 @@ class ScenarioImages:
             found[sample.substance] = found.get(sample.substance, 0.0) + reach
         self._thickest = found
 
-    def _beside(self, name: str) -> str:
+    def _read_named_file(self, name: str) -> str:
         """Read the text of a file that the scenario names.
 
         Raises:
@@ -168,7 +170,7 @@ class ScenarioImages:
             out[-1] = np.maximum(self._distance(frame) - out[:-1].sum(axis=0), 0.0)
         return out
 
-    def _collected(
+    def _collected_energy(
         self, frame: int, samples: bool = True
     ) -> tuple[Float32Array, Float32Array]:
         """Compute the energy in each pixel of one frame, and its variance, before the
@@ -234,7 +236,7 @@ class ScenarioImages:
         Raises:
             ExchangeError: nothing reaches the detector.
         """
-        energy, variance = self._collected(0, samples=False)
+        energy, variance = self._collected_energy(0, samples=False)
         if not min(energy.max(), variance.max()) > 0.0:
             raise ExchangeError(
                 f"{self.path}: nothing of the open beam reaches and stays in the detector; "
@@ -260,7 +262,7 @@ class ScenarioImages:
             values = grey.offset + (grey.factor or 0.0) * KEV_J * energy
         return np.asarray(values, dtype=np.float32)
 
-    def _blurred(self, image: Float32Array) -> Float32Array:
+    def _blur(self, image: Float32Array) -> Float32Array:
         """Apply the detector's blur, a Gaussian or the file's MTF.
 
         Args:
@@ -306,7 +308,7 @@ class ScenarioImages:
             noise: the image's number, for its random numbers; None for no noise.
         """
         grey = self.scan.grey
-        values = self._grey(self._blurred(energy))
+        values = self._grey(self._blur(energy))
         if noise is not None and self._seed is not None:
             if grey.noise is not None:
                 ratio = np.interp(values, grey.noise[:, 0], grey.noise[:, 1])
@@ -373,7 +375,7 @@ class ScenarioImages:
         before: Float32Array | None = None
         first = scan.dark.number + scan.flat.number
         for i in range(len(self)):
-            energy, variance = self._collected(i)
+            energy, variance = self._collected_energy(i)
             if lag > 0.0:
                 # Each frame keeps the part `lag` of the previous one.
                 if before is None:

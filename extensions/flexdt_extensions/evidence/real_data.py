@@ -75,10 +75,10 @@ class Case:
     def told(self, files: list[Path]) -> Iterator[Told]:
         """Compare these files and yield the figures; an error is a figure as well and
         not raised."""
-        return _guarded(lambda: self.compare(files), self.files)
+        return _with_errors(lambda: self.compare(files), self.files)
 
 
-def _guarded(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told]:
+def _with_errors(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told]:
     """Yield the figures of `make`, and an error at its end as one more.
 
     An error out of flexdt is a missed figure. A reader that is not installed, and any
@@ -137,7 +137,7 @@ def _numbers(file: Path) -> Any:
         return _Numbers(stream).load().item()
 
 
-def _calibrated(
+def _fit_to_marks(
     seen: Any, frames: Any, start: fx.ConeVec, *free: str
 ) -> tuple[Any, Array]:
     """Fit the geometry to CaTE's marks.
@@ -208,7 +208,7 @@ def needles(files: list[Path]) -> Iterator[Told]:
         start = fx.ConeVec.circular(
             sod=600, sdd=1098, angles=turn, shape=(1944, 1536), pixel=0.0748
         )
-        document, shapes[scan] = _calibrated(seen, frames, start, "dO_x", "dD_z")
+        document, shapes[scan] = _fit_to_marks(seen, frames, start, "dO_x", "dD_z")
         value, sigma = (document["parameters"]["dD_z"][key] for key in ("value", "sigma"))
         if document["identifiable"]:
             ours = f"{value:.2f} +- {sigma:.2f} mm"
@@ -222,15 +222,15 @@ def needles(files: list[Path]) -> Iterator[Told]:
         )
 
     for file in files:
-        yield from _guarded(partial(of_scan, file), file.name)
+        yield from _with_errors(partial(of_scan, file), file.name)
     for one, other in combinations(shapes, 2):
-        apart, scale = _apart(shapes[one], shapes[other])
+        apart, scale = _distances(shapes[one], shapes[other])
         ours = f"{apart:.3f} mm rms, {100 * (scale - 1):+.2f} % larger"
         near = apart <= APART_MM and abs(scale - 1) <= SCALE
         yield Figure(f"{one} and {other}: markers", "the same", ours, near)
 
 
-def _apart(one: Array, other: Array) -> tuple[float, float]:
+def _distances(one: Array, other: Array) -> tuple[float, float]:
     """Compare two sets of points (k, 3) after the best turn, shift and scale.
 
     Returns:
@@ -271,12 +271,12 @@ def delft(files: list[Path]) -> Iterator[Told]:
         start = fx.ConeVec.circular(
             sod=945, sdd=1215, angles=turn, shape=(1548, 550), pixel=PITCH
         )
-        free, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
+        free, _ = _fit_to_marks(seen, frames, start, "dO_x", "dD_z")
         few = not free["identifiable"]
         sigma = free["parameters"]["dD_z"]["sigma"] or np.inf
         ours = f"{'refused' if few else 'an answer'}, sigma {sigma:.0f} mm"
         yield Figure(f"{k}: SDD", "three views are too few", ours, few)
-        held, places = _calibrated(seen, frames, start, "dO_x")
+        held, places = _fit_to_marks(seen, frames, start, "dO_x")
         rms = held["rms_px"]
         (aside, up) = (held["parameters"][key] for key in ("dO_x", "dD_y"))
         yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
@@ -300,7 +300,7 @@ def delft(files: list[Path]) -> Iterator[Told]:
         flat = (places - places.mean(axis=0)) @ [1215 + 1j * x, 1215j - x, 0]
         found.append((places, flat, here, abs(here - there) / abs(here)))
     for (k, one), (m, other) in combinations(enumerate(found, 1), 2):
-        apart, larger = _apart(one[0], other[0])
+        apart, larger = _distances(one[0], other[0])
         yield Figure(
             f"{k} and {m}: markers", "the same", f"{apart:.3f} mm rms", apart <= 0.2
         )
@@ -452,7 +452,7 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
         yield Figure(f"{name}: correlation", "0.9999", f"{alike:.6f}", alike >= 0.9999)
 
     for file in files:
-        yield from _guarded(partial(of_scan, file), file.name)
+        yield from _with_errors(partial(of_scan, file), file.name)
 
 
 def tooth(files: list[Path]) -> Iterator[Told]:
@@ -470,17 +470,17 @@ def tooth(files: list[Path]) -> Iterator[Told]:
     data = fx.DataSet.from_arrays(counts, far, dark=dark, flat=white)
     why = data.align().alignment.refused.get("axis_column_px", "")
     yield Figure("align", "to be refused", why or "an answer", bool(why))
-    said = _said(lambda: fx.reconstruct(data, voxel=0.02))
+    said = _result_text(lambda: fx.reconstruct(data, voxel=0.02))
     yield Figure("FDK", "to be refused", said, "180 deg" in said)
 
 
 def zeiss(files: list[Path]) -> Iterator[Told]:
     """Check Tomopy's scan of a chip in Zeiss's own format: a parallel beam, too."""
-    said = _said(lambda: fx.open(files[0])).removeprefix(f"{files[0]}: ")
+    said = _result_text(lambda: fx.open(files[0])).removeprefix(f"{files[0]}: ")
     yield Figure("open", "to be refused", said, "a parallel beam" in said)
 
 
-def _said(make: Callable[[], Any]) -> str:
+def _result_text(make: Callable[[], Any]) -> str:
     """Return flexdt's result as text, or its error."""
     try:
         return str(make())

@@ -259,7 +259,7 @@ def random_object(rng: np.random.Generator) -> Phantom:
     body = Ellipsoid(
         (0.0, 0.0, 0.0),
         (rng.uniform(18, 23), rng.uniform(8, 14), rng.uniform(15, 20)),
-        _turned(turn),
+        _turned_axes(turn),
     )
     solids = [Solid(body, "water", water)]
     for _ in range(int(rng.integers(4, 8))):
@@ -269,7 +269,7 @@ def random_object(rng: np.random.Generator) -> Phantom:
         y = along * math.sin(turn) + across * math.cos(turn)
         a, b, c = rng.uniform(2.0, 4.5, 3)
         shape = Ellipsoid(
-            (x, y, rng.uniform(-8, 8)), (a, b, c), _turned(rng.uniform(0, math.pi))
+            (x, y, rng.uniform(-8, 8)), (a, b, c), _turned_axes(rng.uniform(0, math.pi))
         )
         solids.append(Solid(shape, "water", water * rng.choice([-0.8, 1.0, 2.0])))
     return Phantom(
@@ -281,7 +281,7 @@ def random_plates(rng: np.random.Generator) -> Phantom:
     """Draw one or two parallel upright plates, turned by any angle: a few views see
     them edge-on."""
     water = material("water").mu_per_mm
-    axes = _turned(rng.uniform(0.0, math.pi))
+    axes = _turned_axes(rng.uniform(0.0, math.pi))
     count = int(rng.integers(1, 3))
     apart = rng.uniform(12.0, 18.0)
     start = rng.uniform(-4.0, 4.0)
@@ -309,7 +309,7 @@ def quality(volume: Volume, truth: Volume) -> float:
     return 1.0 - float(np.sqrt(np.mean(error**2))) / rms
 
 
-def _turned(angle: float) -> tuple[Vector, Vector, Vector]:
+def _turned_axes(angle: float) -> tuple[Vector, Vector, Vector]:
     c = math.cos(angle)
     s = math.sin(angle)
     return ((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))

@@ -70,14 +70,14 @@ def share_identified(
         shift = rng.normal(0.0, _TRIAL_SHIFT_MM, 3)
         turn = 2.0 * math.pi * (trial + rng.random()) / trials
         truth = Offsets(dO_x=shift[0], dO_y=shift[1], dO_z=shift[2], alpha=turn)
-        shadows, owners = _shadows(model, some, truth, rng)
+        shadows, owners = _simulate_detections(model, some, truth, rng)
         try:
             found = identify(shadows, model, some.poses, search=Search(frames=frames))
         except TwinError:
             continue
         given = np.concatenate(
             [
-                _named(index, owner)
+                _match_owners(index, owner)
                 for index, owner in zip(found.index, owners, strict=True)
             ]
         )
@@ -146,7 +146,7 @@ def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
     return np.where(hidden[..., None], np.nan, pixels)
 
 
-def _shadows(
+def _simulate_detections(
     model: BeadModel, planned: PlannedScans, truth: Offsets, rng: np.random.Generator
 ) -> tuple[list[Detections], list[npt.NDArray[np.intp]]]:
     """Simulate noisy detections in random order.
@@ -176,7 +176,7 @@ def _shadows(
     return out, owners
 
 
-def _named(
+def _match_owners(
     index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]
 ) -> npt.NDArray[np.int64]:
     """Compare each bead's spot with its owner: 1 for its own, 0 for another's, -1
@@ -323,7 +323,7 @@ def design(
     found: dict[tuple[int, ...], float] = {}
     for _ in range(starts):
         chosen = _random_set(table, rules, count, rng)
-        chosen, score = _exchanged(table, rules, chosen, criterion)
+        chosen, score = _exchange_beads(table, rules, chosen, criterion)
         if math.isfinite(score):
             found.setdefault(tuple(sorted(chosen.tolist())), score)
     discarded = 0
@@ -332,7 +332,7 @@ def design(
         beads = places[index]
         if bounds_mm is not None:
             bounds = np.asarray(bounds_mm, dtype=np.float64)
-            beads, index = _polished(
+            beads, index = _polish(
                 beads,
                 index,
                 radius_mm,
@@ -399,7 +399,7 @@ class _Rules:
     unlike: float
 
 
-def _allowed(
+def _allowed_seats(
     table: SeatTable, rules: _Rules, others: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.bool_]:
     """Find the seats that a further bead may take, given `others`: (m,)."""
@@ -421,7 +421,7 @@ def _random_set(
     """
     chosen = np.zeros(0, dtype=np.int64)
     for _ in range(count):
-        free = np.flatnonzero(_allowed(table, rules, chosen))
+        free = np.flatnonzero(_allowed_seats(table, rules, chosen))
         if len(free) == 0:
             raise TwinError(
                 f"{count} beads do not fit: after {len(chosen)} no seat is left that is "
@@ -433,7 +433,7 @@ def _random_set(
     return chosen
 
 
-def _exchanged(
+def _exchange_beads(
     table: SeatTable, rules: _Rules, chosen: npt.NDArray[np.int64], criterion: Criterion
 ) -> tuple[npt.NDArray[np.int64], float]:
     """Replace beads one at a time by the best seat until no exchange helps.
@@ -460,7 +460,7 @@ def _exchanged(
         for k in range(len(chosen)):
             others = np.delete(chosen, k)
             scores = _scores_beside(table, others, criterion)
-            scores[~_allowed(table, rules, others)] = np.inf
+            scores[~_allowed_seats(table, rules, others)] = np.inf
             for seat in np.argsort(scores, kind="stable")[:_TRIED_SEATS]:
                 if not scores[seat] < best * (1.0 - 1e-9):
                     break
@@ -488,7 +488,7 @@ def _scores_beside(
     return score_of(table.felt(information), criterion)
 
 
-def _polished(
+def _polish(
     beads: FloatArray,
     index: npt.NDArray[np.int64],
     radius: float,

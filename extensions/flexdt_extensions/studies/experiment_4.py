@@ -152,7 +152,7 @@ def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArr
     poses = replace(
         poses,
         axis=poses.axis + from_unity(truth[:3]),
-        mount=_turned(truth[4], truth[5], angle),
+        mount=_rotate(truth[4], truth[5], angle),
     )
     return poses.cone_vec().project_points(model.beads, SHAPE)
 
@@ -179,7 +179,7 @@ def authors_fit(
         """Compute the residuals at the six values `x`, as the author's code has them."""
         moved = replace(
             poses,
-            axis=poses.axis + from_unity(x[:3]) + _turned(x[4], x[5], phi),
+            axis=poses.axis + from_unity(x[:3]) + _rotate(x[4], x[5], phi),
             angle=phi + math.radians(x[3]),
         )
         predicted = moved.cone_vec().project_points(model.beads, SHAPE)
@@ -190,7 +190,7 @@ def authors_fit(
     return iterate(residual, np.zeros(6), STEPS, 1e-2)
 
 
-def _turned(x: float, z: float, angle: float | FloatArray) -> FloatArray:
+def _rotate(x: float, z: float, angle: float | FloatArray) -> FloatArray:
     """Rotate Unity's (x, 0, z) from x to z by an angle [rad]; in the world's axes
     (..., 3)."""
     w = (x + 1j * z) * np.exp(1j * np.asarray(angle))
@@ -276,7 +276,7 @@ def real_runs(
     """
     start = author()["real"]["scans"][name]["start_deg"]
     dO_x, dO_y, dO_z, alpha, *mount = truth.values
-    shift = _turned(mount[0], mount[1], math.radians(alpha))
+    shift = _rotate(mount[0], mount[1], math.radians(alpha))
     hidden = Offsets.from_edge(
         {
             "dO_x": dO_x,

@@ -279,7 +279,7 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
         scans = [
             Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
             for g, (frames, poses) in enumerate(
-                zip(_rendered(task, model, scene), everything, strict=True)
+                zip(_render(task, model, scene), everything, strict=True)
             )
         ]
         result = calibrate(
@@ -298,9 +298,7 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     return [attempted(task.setting, task.scenario, n, solve) for n in task.counts]
 
 
-def _rendered(
-    task: WorkUnit, model: BeadModel, scene: Scene
-) -> tuple[RenderedFrames, ...]:
+def _render(task: WorkUnit, model: BeadModel, scene: Scene) -> tuple[RenderedFrames, ...]:
     """Make the radiographs of a task's largest number of projections, or take those of
     the last.
 

@@ -340,14 +340,14 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
                     for n in names
                 },
                 "method": some[0].method,
-                "beside": _beside(some[0].method, beside),
+                "beside": _mean_figures(some[0].method, beside),
                 **{f"thesis_{k}": printed.get(k) for k in COMPARED_FIGURES},
             }
         )
     return out
 
 
-def _beside(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
+def _mean_figures(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
     """Compute means of the other method's figures; empty without any."""
     if not figures:
         return {}

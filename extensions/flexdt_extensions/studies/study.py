@@ -148,7 +148,7 @@ _Found = tuple[Offsets | None, int]
 """Geometry, if any, and iterations."""
 
 
-def _damped(lam: float) -> Callable[[_Draw], _Found]:
+def _algorithm_2_solver(lam: float) -> Callable[[_Draw], _Found]:
     """Return a solver: Algorithm 2 with the damping `lam`."""
 
     def solve(draw: _Draw) -> _Found:
@@ -162,7 +162,7 @@ def _damped(lam: float) -> Callable[[_Draw], _Found]:
     return solve
 
 
-def _ours(draw: _Draw) -> _Found:
+def _solve_by_fit(draw: _Draw) -> _Found:
     """Solve a draw by our fit, the beads' identities known; returns offsets and iterations."""
     fit = estimate_geometry(
         draw.tracks,
@@ -175,7 +175,7 @@ def _ours(draw: _Draw) -> _Found:
     return fit.parameters, fit.iterations
 
 
-def _nameless(draw: _Draw) -> _Found:
+def _solve_unidentified(draw: _Draw) -> _Found:
     """Identify a draw's points in random order, and fit to them; offsets are None if they stay
     ambiguous.
     """
@@ -187,14 +187,14 @@ def _nameless(draw: _Draw) -> _Found:
     found = identify(seen, draw.model, draw.poses, start=draw.start)
     if found.ambiguous:
         return None, 0
-    return _ours(replace(draw, tracks=found.tracks, start=found.parameters))
+    return _solve_by_fit(replace(draw, tracks=found.tracks, start=found.parameters))
 
 
 _SOLVERS: Final[Mapping[str, Callable[[_Draw], _Found]]] = {
-    "GN": _damped(DAMPING["GN"]),
-    "LM_normal": _damped(DAMPING["LM_normal"]),
-    "ours": _ours,
-    "ours, identities unknown": _nameless,
+    "GN": _algorithm_2_solver(DAMPING["GN"]),
+    "LM_normal": _algorithm_2_solver(DAMPING["LM_normal"]),
+    "ours": _solve_by_fit,
+    "ours, identities unknown": _solve_unidentified,
 }
 METHODS: Final = tuple(_SOLVERS)
 
@@ -277,7 +277,7 @@ def run_study(
         spread: Map = map if pool is None else pool.map
         match experiment, fidelity:
             case "basin", _:
-                runs, more = _basin(spread, say, fidelity, seed)
+                runs, more = _run_basin(spread, say, fidelity, seed)
             case "real", "images":
                 runs, more = real_images_runs(spread, say, seed, counts or real.COUNTS)
             case "real", _:
@@ -287,7 +287,7 @@ def run_study(
                     experiment, fidelity, counts=counts, seed=seed, variant=variant
                 )
                 names = [f"{task.setting} {task.scenario}" for task in work]
-                runs = _collected(spread(run_task, work), names, say)
+                runs = _collect_runs(spread(run_task, work), names, say)
                 more = {}
     document = {**summary(experiment, fidelity, runs), "variant": variant, **more}
     if out is not None:
@@ -302,7 +302,7 @@ def _require(problem: str, name: str, allowed: Iterable[str]) -> None:
         raise UnknownNameError.among(f"{problem} {name!r}; allowed", name, allowed)
 
 
-def _collected(
+def _collect_runs(
     results: Iterable[list[Run]], names: Sequence[str], say: Tell
 ) -> list[Run]:
     """Collect the runs of all tasks, with a line of progress for each task."""
@@ -348,7 +348,7 @@ def basin_task(cell: Cell) -> list[Run]:
     return basin_runs(cell, bead_model(load_phantom(cell.phantom)))
 
 
-def _basin(
+def _run_basin(
     spread: Map, say: Tell, fidelity: str, seed: int
 ) -> tuple[list[Run], Document]:
     """Run all cells: success against the start's error, for Algorithm 2, our fit, unknown
@@ -364,7 +364,7 @@ def _basin(
         All runs, and start_mm, start_deg and success_share (method -> table).
     """
     work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
-    runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
+    runs = _collect_runs(spread(basin_task, work), [cell.name for cell in work], say)
     shares = {}
     for method in METHODS:
         good = [
@@ -421,7 +421,7 @@ def _real(
         for group, truth in zip(real.GROUPS, truths, strict=True)
         for name in names[group]
     ]
-    runs = _collected(runs_of(spread(real_task, work)), names, say)
+    runs = _collect_runs(runs_of(spread(real_task, work)), names, say)
     return runs, {
         "assumed": {
             "beads": "those of the LEGO phantom",
@@ -494,5 +494,5 @@ def real_images_runs(
     truth = real.hidden_phantom(phantom.scene, model, seed)[1]
     names = real.scan_names() if scans is None else scans
     work = [(name, found, seed, frames, tuple(counts)) for name in names]
-    runs = _collected(spread(real_images_task, work), names, say)
+    runs = _collect_runs(spread(real_images_task, work), names, say)
     return runs, {"beads_off_truth_mm": real.off_truth(found, truth).tolist()}

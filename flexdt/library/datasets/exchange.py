@@ -189,12 +189,12 @@ def import_geometry(
         shape = known.shape
     else:
         shape = geometry.shape
-    return _examined(
+    return _with_doubts(
         replace(geometry, shape=shape, name=geometry.name or path.stem), path
     )
 
 
-def _examined(geometry: ScanGeometry, path: Path) -> ScanGeometry:
+def _with_doubts(geometry: ScanGeometry, path: Path) -> ScanGeometry:
     """Add the doubts about a file's geometry to its notes.
 
     Raises:
@@ -273,7 +273,7 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
         geometry = ScanGeometry(read_vectors_array(arrays_of(file)["array"], str(file)))
     else:
         geometry = read_geometry_text(text_of(file), str(file))
-    return _examined(geometry, file)
+    return _with_doubts(geometry, file)
 
 
 def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> Images:

@@ -191,7 +191,7 @@ class ImageSet:
             )
         integrals = None
         if flat is not None and values.dtype.kind in "fiu" and not _are_counts(values):
-            values = _normalised(values, dark, flat)
+            values = _normalise(values, dark, flat)
             flat = None
         if values.dtype.kind == "f" and flat is None:
             doubts = settled(integral_findings(some_of(values)), DatasetFormatError, name)
@@ -226,8 +226,8 @@ class ImageSet:
                 f"{len(values)} images and {len(cone)} views; allowed: as many of both",
                 {"asked": len(values), "allowed": len(cone)},
             )
-        darks = _several("dark", dark, shape)
-        flats = _several("flat", flat, shape)
+        darks = _image_stack("dark", dark, shape)
+        flats = _image_stack("flat", flat, shape)
         arrays = Arrays(values, darks, flats, integrals)
         placed = settled(examine(Operation.OPEN, cone, shape), DatasetFormatError, name)
         blank = _blank(values)
@@ -525,7 +525,7 @@ class ImageSet:
         """
         if index is None:
             return self.stack(range(len(self)))
-        image = self._recorded(index)
+        image = self._recorded_integrals(index)
         if self.panel is None:
             return image
         index = range(len(self))[index]
@@ -535,10 +535,10 @@ class ImageSet:
             and before.present
             and before.index == self.frames[index].index - 1
         ):
-            image = self.panel.without_lag(image, self._recorded(index - 1))
+            image = self.panel.without_lag(image, self._recorded_integrals(index - 1))
         return self.panel.undistorted(image)
 
-    def _recorded(self, index: int) -> Float32Array:
+    def _recorded_integrals(self, index: int) -> Float32Array:
         """Return line integrals of one projection as they were recorded or given, (rows,
         cols).
         """
@@ -597,13 +597,13 @@ def _are_counts(values: npt.NDArray[Any]) -> bool:
     return bool(((values >= 0) & (values <= top) & (values == np.rint(values))).all())
 
 
-def _normalised(
+def _normalise(
     values: npt.NDArray[Any], dark: npt.ArrayLike | None, flat: npt.ArrayLike
 ) -> Float32Array:
     """Compute line integrals of images that are no counts, by their dark and flat images."""
     shape = values.shape[1], values.shape[2]
-    darks = _several("dark", dark, shape)
-    flats = _several("flat", flat, shape)
+    darks = _image_stack("dark", dark, shape)
+    flats = _image_stack("flat", flat, shape)
     if flats is None:
         opened = np.zeros(shape)
     else:
@@ -654,7 +654,7 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
     )
 
 
-def _several(
+def _image_stack(
     what: str, images: npt.ArrayLike | None, shape: tuple[int, int]
 ) -> npt.NDArray[Any] | None:
     """Return one or several images as (k, rows, cols).

@@ -85,19 +85,19 @@ def _write(data: ImageSet, out: Any) -> None:
         "distance": abs(float(geometry.source_detector_distance[0])) - to_source,
     }
     for name, value in lengths.items():
-        _measured(detector, name, value, "mm")
-    _measured(source, "distance", -to_source, "mm")
+        _write_quantity(detector, name, value, "mm")
+    _write_quantity(source, "distance", -to_source, "mm")
     detector["field_of_view"] = _field_of_view(axis_column, data.shape[1])
     _write_exposure(data, keys, entry, instrument)
-    _measured(detector, "x_rotation_axis_pixel_position", axis_column, "px")
-    _measured(detector, "y_rotation_axis_pixel_position", axis_row, "px")
+    _write_quantity(detector, "x_rotation_axis_pixel_position", axis_column, "px")
+    _write_quantity(detector, "y_rotation_axis_pixel_position", axis_row, "px")
 
     sample = _group(entry, "sample", "NXsample")
     sample["name"] = (
         data.name if data.document is None else data.document.sample.name or data.name
     )
     turned = np.concatenate([np.full(len(before), angles[0]), angles])
-    _measured(sample, "rotation_angle", turned, "deg")
+    _write_quantity(sample, "rotation_angle", turned, "deg")
 
     shown = _group(entry, "data", "NXdata")
     shown.attrs["signal"] = "data"
@@ -106,7 +106,7 @@ def _write(data: ImageSet, out: Any) -> None:
     shown["rotation_angle"] = sample["rotation_angle"]
 
     own = _group(entry, "flexdt", "NXcollection")
-    _measured(own, "cone_vec", geometry.rows, "mm")
+    _write_quantity(own, "cone_vec", geometry.rows, "mm")
 
 
 def _field_of_view(axis_column: float, columns: int) -> str:
@@ -134,7 +134,7 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
     kV, power_W, exposure_ms = _exposure_of(data)
     count = len(keys)
     if exposure_ms is not None:
-        _measured(
+        _write_quantity(
             instrument["detector"],
             "count_time",
             np.full(count, exposure_ms / 1000.0),
@@ -143,22 +143,22 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
     if kV is None:
         return
     source = instrument["source"]
-    _measured(source, "voltage", kV, "kV")
-    _measured(source, "energy", kV, "keV")
+    _write_quantity(source, "voltage", kV, "kV")
+    _write_quantity(source, "energy", kV, "keV")
     least, most = voltages()
     if least <= kV <= most:
         beam = _group(instrument, "beam", "NXbeam")
-        _measured(beam, "incident_energy", tube_spectrum(kV).mean_keV, "keV")
+        _write_quantity(beam, "incident_energy", tube_spectrum(kV).mean_keV, "keV")
         beam["incident_energy"].attrs["description"] = (
             f"mean of flexdt's spectrum of a tungsten anode at {kV:g} kV"
         )
     if power_W is not None:
         current_A = power_W / kV / 1000.0
-        _measured(source, "power", power_W, "W")
-        _measured(source, "current", current_A, "A")
+        _write_quantity(source, "power", power_W, "W")
+        _write_quantity(source, "current", current_A, "A")
         control = _group(entry, "control", "NXmonitor")
         lit = np.where(np.array(keys) == DARK, 0.0, current_A)
-        _measured(control, "data", lit, "A")
+        _write_quantity(control, "data", lit, "A")
         control["data"].attrs["description"] = "current of the tube; there is no monitor"
 
 
@@ -183,6 +183,6 @@ def _group(parent: Any, name: str, kind: str) -> Any:
     return group
 
 
-def _measured(group: Any, name: str, value: Any, unit: str) -> None:
+def _write_quantity(group: Any, name: str, value: Any, unit: str) -> None:
     group[name] = np.asarray(value, dtype=np.float64)
     group[name].attrs["units"] = unit

@@ -112,7 +112,7 @@ def _require_room_for(
     if not resume:
         said = f"{unfinished(path)}; allowed: resume=True, or an empty folder"
         raise DatasetExistsError(said, {"path": str(path)})
-    if _noted(path) != content:
+    if _read_note(path) != content:
         said = f"{unfinished(path)}, which is another data set than {content['name']!r}"
         raise DatasetExistsError(f"{said}; allowed: an empty folder", {"path": str(path)})
 
@@ -123,14 +123,14 @@ def unfinished(path: Path) -> str:
     Args:
         path: of a folder with the file `UNFINISHED`.
     """
-    noted = _noted(path)
+    noted = _read_note(path)
     tiffs = [entry for entry in path.iterdir() if entry.suffix.lower().startswith(".tif")]
     images = sum(1 for entry in tiffs if not entry.name.startswith(REFERENCES))
     whole = noted.get("projections", "?")
     return f"{path} is half-saved: {images} of {whole} projections of {noted.get('name', '?')!r}"
 
 
-def _noted(path: Path) -> Mapping[str, object]:
+def _read_note(path: Path) -> Mapping[str, object]:
     """Read the content that the folder was to hold; empty where the file is damaged."""
     try:
         noted = json.loads((path / UNFINISHED).read_text(encoding="utf-8"))

@@ -94,7 +94,7 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
     parts = []
     for name, axis, across in AXES:
         places = centers["xyz".index(name)]
-        shown = _some(len(places))
+        shown = _slider_indices(len(places))
         pictures = [
             (f"{name} = {places[i]:.4g} mm", _grey(layer_of(data, axis, i), low, high))
             for i in shown
@@ -124,7 +124,7 @@ def data_page(data: ImageSet) -> NotebookPage:
         data.arrays is not None and data.arrays.flats is not None
     )
     read = data.line_integrals if has_flat else data.counts
-    chosen = [present[i] for i in _some(len(present))]
+    chosen = [present[i] for i in _slider_indices(len(present))]
     images = [np.asarray(read(i), dtype=np.float32) for i in chosen]
     if not images:
         raise TwinError(f"{data.where}: no projections to show", {"path": data.where})
@@ -154,7 +154,7 @@ def geometry_page(cone_vec: ConeVec) -> NotebookPage:
         cone_vec: views in the object's frame; without a detector's shape the panel is a point.
     """
     drawing = _Drawing.of(cone_vec)
-    shown = _some(len(cone_vec))
+    shown = _slider_indices(len(cone_vec))
     pictures = [
         f'<g data-of="view {i} of {len(cone_vec)}"{"" if k == 0 else NOT_DRAWN}>'
         f"{drawing.view(cone_vec, i)}</g>"
@@ -226,7 +226,9 @@ class _Drawing:
         """Draw the parts that all views share: places of the source, and the sample."""
         dots = "".join(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="#d33" opacity=".4"/>'
-            for x, y in (self.point(cone_vec.source[i]) for i in _some(len(cone_vec)))
+            for x, y in (
+                self.point(cone_vec.source[i]) for i in _slider_indices(len(cone_vec))
+            )
         )
         x, y = self.point((0.0, 0.0, 0.0))
         radius = max(2.0, self.radius_mm * DRAWING_PX / self.millimetres)
@@ -260,7 +262,7 @@ class _Drawing:
         )
 
 
-def _some(count: int) -> list[int]:
+def _slider_indices(count: int) -> list[int]:
     """Choose indices, evenly spread, of which a slider shows one."""
     if not count:
         return []

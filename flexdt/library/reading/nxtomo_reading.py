@@ -95,7 +95,7 @@ def _read(
         images[projections], given, dark=several[0], flat=several[1], name=path.stem
     )
     doubts += settled(
-        _stated(file, name, given, projections), DatasetFormatError, path.name
+        _stated_figures(file, name, given, projections), DatasetFormatError, path.name
     )
     return replace(made, warnings=(*made.warnings, *doubts))
 
@@ -344,7 +344,7 @@ def _member(group: Any, name: str) -> Any:
     return None
 
 
-def _stated(
+def _stated_figures(
     file: Any, name: str, geometry: ConeVec, projections: npt.NDArray[np.bool_]
 ) -> Iterator[Finding]:
     """Compare the angles and the pixel that the file states with the geometry.

@@ -70,7 +70,7 @@ class ImagesOnDisk:
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            raise self._placed(error) from None
+            raise self._disk_error(error) from None
         self._shapes[number] = image.shape[0], image.shape[1]
 
     def get(self, number: int, rows: slice = ALL_ROWS) -> Float32Array:
@@ -89,7 +89,7 @@ class ImagesOnDisk:
                 count = self._read_into(left)
                 left = left[count:]
         except OSError as error:
-            raise self._placed(error) from None
+            raise self._disk_error(error) from None
         return out
 
     def close(self) -> None:
@@ -107,7 +107,7 @@ class ImagesOnDisk:
             raise OSError(5, "the file of kept images ends too early")
         return count
 
-    def _placed(self, error: OSError) -> OSError:
+    def _disk_error(self, error: OSError) -> OSError:
         return type(error)(
             error.errno, error.strerror, f"{self._folder} (images kept for a while)"
         )

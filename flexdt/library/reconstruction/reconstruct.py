@@ -409,10 +409,12 @@ def reconstruct_dataset(
     _require_room(out, task.grid)
     slices = MiddleSlices(task.grid.shape)
     if workers is None:
-        views, bias, doubts = _here(task, task.plan(memory), out, slices, tell)
+        views, bias, doubts = _reconstruct_in_process(
+            task, task.plan(memory), out, slices, tell
+        )
     else:
         with workers as pool:
-            views = _corrected(task.views, task.request)
+            views = _apply_corrections(task.views, task.request)
             by_workers = extension("slabs", "a reconstruction by workers")
             doubts = by_workers(views, task.grid, task.request, out, pool, tell)
         bias = _bias(views)
@@ -460,7 +462,7 @@ def _bias(views: ScanFrames) -> Bias | None:
     return bias_of(views.view, views.cone_vec, views.shape, views.truncation)
 
 
-def _here(
+def _reconstruct_in_process(
     task: ReconstructionTask,
     plan: MemoryPlan,
     out: Path,
@@ -486,7 +488,7 @@ def _here(
         _reading_once(task, plan, folder, tell) as (kept, work),
         volume_writer(out, grid) as write,
     ):
-        views = _corrected(replace(task.views, kept=kept), task.request)
+        views = _apply_corrections(replace(task.views, kept=kept), task.request)
         if not task.direct:
             volume = _iterative(views, grid, task.request, tell)
             write(volume.data)
@@ -600,7 +602,7 @@ def reconstruct_volume(
     plan = task.plan(None, slabs=not in_memory)
     _require_room_for_images(folder, plan, 0 if in_memory else grid.bytes)
     with _reading_once(task, plan, folder, tell) as (kept, work):
-        views = _corrected(replace(task.views, kept=kept), task.request)
+        views = _apply_corrections(replace(task.views, kept=kept), task.request)
         for doubt in views.doubts:
             warnings.warn(doubt, stacklevel=2)
         if not fdk:
@@ -711,7 +713,7 @@ def preview(
     )
 
 
-def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
+def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     """Apply the requested corrections: scatter, rings and beam hardening.
 
     Args:
@@ -917,7 +919,7 @@ def _iterative(
             "ignore", PlausibilityWarning
         )  # it is among the views' doubts
         made: Volume = algorithm.load()(
-            _stacked(views),
+            _stack_integrals(views),
             views.cone_vec,
             grid.blank(),
             watch=lambda step: tell(step.iteration, step.of),
@@ -926,7 +928,7 @@ def _iterative(
     return made
 
 
-def _stacked(views: ScanFrames) -> Float32Array:
+def _stack_integrals(views: ScanFrames) -> Float32Array:
     """Stack line integrals of all frames, (n, rows, cols)."""
     stack = np.empty((len(views.indices), *views.shape), np.float32)
     for number, image in enumerate(stack):

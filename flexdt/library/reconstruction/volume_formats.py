@@ -124,19 +124,19 @@ class VolumeFormat:
     packed: bool = False
 
 
-def _renamed(
+def _write_and_rename(
     write: Callable[[Path, VoxelPlaces], Iterator[Sink]],
 ) -> Callable[..., Iterator[Sink]]:
     """Write one file, which then gets its final path."""
 
-    def whole(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
+    def write_whole_file(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
         yield from write(part, places)
         os.replace(part, path)
 
-    return whole
+    return write_whole_file
 
 
-def _headed(
+def _write_headed(
     header: Callable[[VoxelPlaces], bytes], compress: bool = False
 ) -> Callable[..., Iterator[Sink]]:
     """Write a header and the values after it."""
@@ -152,7 +152,7 @@ def _headed(
             file.write(first)
             yield _raw(file)
 
-    return _renamed(write)
+    return _write_and_rename(write)
 
 
 def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
@@ -309,7 +309,7 @@ def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
     return {key.strip(): value.strip() for key, _, value in fields}, len(head) + len(end)
 
 
-def _mapped(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
+def _map_values(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
     nx, ny, nz = map(int, sizes.split())
     return np.memmap(path, "<f4", "r", offset=offset, shape=(nz, ny, nx))
 
@@ -317,7 +317,7 @@ def _mapped(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
 def _read_nrrd(path: Path) -> Stored:
     """Read voxels, edges and the first voxel's place from an .nrrd file."""
     fields, begin = _header(path, ":", b"\n\n")
-    values = _mapped(path, begin, fields["sizes"])
+    values = _map_values(path, begin, fields["sizes"])
     rows = fields["space directions"].split()
     edges = [float(row.strip("()").split(",")[i]) for i, row in enumerate(rows)]
     low = [float(v) for v in fields["space origin"].strip("()").split(",")]
@@ -339,7 +339,7 @@ def _read_mha(path: Path) -> Stored:
     point the other way.
     """
     fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
-    values = _mapped(path, begin, fields["DimSize"])
+    values = _map_values(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
     low = [-x, -y, z]
     return values, [float(edge) for edge in fields["ElementSpacing"].split()], low, True
@@ -382,18 +382,18 @@ def _read_zarr(path: Path) -> Stored:
 
 
 VOLUME_FORMATS: Final = (
-    VolumeFormat((".tif", ".tiff"), _renamed(_write_tiff), _read_tiff),
-    VolumeFormat((".nrrd",), _headed(_nrrd_header), _read_nrrd, oblong=True),
-    VolumeFormat((".mha",), _headed(_mha_header), _read_mha, oblong=True),
+    VolumeFormat((".tif", ".tiff"), _write_and_rename(_write_tiff), _read_tiff),
+    VolumeFormat((".nrrd",), _write_headed(_nrrd_header), _read_nrrd, oblong=True),
+    VolumeFormat((".mha",), _write_headed(_mha_header), _read_mha, oblong=True),
     VolumeFormat(
         (".nii.gz",),
-        _headed(_nifti_header, compress=True),
+        _write_headed(_nifti_header, compress=True),
         _read_nifti,
         _nibabel,
         oblong=True,
         packed=True,
     ),
-    VolumeFormat((".h5",), _renamed(_write_hdf5), _read_hdf5, _h5py),
+    VolumeFormat((".h5",), _write_and_rename(_write_hdf5), _read_hdf5, _h5py),
     VolumeFormat((".zarr",), _write_zarr, _read_zarr, _zarr, packed=True),
 )
 """In the order in which they are listed."""

@@ -102,7 +102,7 @@ def test_a_forked_child_leaves_its_parents_device_alone(
     """A child of a process that has not met the device yet may use it."""
     monkeypatch.setattr(gpu, "_failed", [])
     probed = cache(lambda: gpu.Availability(True, "a device"))
-    monkeypatch.setattr(gpu, "_probed", probed)
+    monkeypatch.setattr(gpu, "_probe", probed)
     if used:
         assert gpu.availability().present
     reading, writing = os.pipe()

@@ -369,7 +369,7 @@ gpu_kernels.BLOCK = gpu_reconstruction_kernels.BLOCK = (4, 2)
 gpu_reconstruction_kernels.THREADS = 8
 
 def again(present):
-    said.clear(); gpu._failed.clear(); gpu._probed.cache_clear()
+    said.clear(); gpu._failed.clear(); gpu._probe.cache_clear()
     assert gpu.availability().present == present, gpu.availability()
 
 def failing(number, error):
@@ -542,7 +542,7 @@ def close(found):
     )
 
 assert not gpu._failed and close(job()) and not same(job()) and not said
-calls.clear(), gpu._probed.cache_clear()
+calls.clear(), gpu._probe.cache_clear()
 job(), there()
 kinds = list(calls)
 assert set(kinds) == {"init", "copy", "memory", "compile", "launch"}, set(kinds)
@@ -561,7 +561,7 @@ for case in range(int(sys.argv[2])):
     places = [k for k, some in enumerate(kinds, 1) if some == kind]
     at, error, once = int(rng.choice(places)), errors[rng.integers(len(errors))], rng.random() < 0.3
     case = (case, at, kind, repr(error), once)
-    said.clear(), gpu._failed.clear(), gpu._probed.cache_clear(), calls.clear()
+    said.clear(), gpu._failed.clear(), gpu._probe.cache_clear(), calls.clear()
     fails = lambda number: error if number == at or (number > at and not once) else None
     found = job()
     assert close(found), case

@@ -318,7 +318,7 @@ def truncation_of(
     # Beyond the near edge of a panel moved to one side the opposite views have the data.
     before, after = columns_beyond(circle, panels, shape[1])
     edges = np.array([before <= 1, after <= 1]) | (not circle.full)
-    found = _fitted(images, panels, shape, edges, helix=bool(circle.rise))
+    found = _fit_truncation(images, panels, shape, edges, helix=bool(circle.rise))
     fan = fan_angles(circle, panels, shape[1])
     near, far = sorted(reach(fan))
     if circle.full or far - near < (far + near) / SAMPLES:
@@ -353,7 +353,7 @@ def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -
     return False
 
 
-def _fitted(
+def _fit_truncation(
     images: Sequence[Float32Array],
     cone_vec: ConeVec,
     shape: tuple[int, int],
