@@ -113,11 +113,15 @@ def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
 
 
 def with_contrast(model: BeadModel, scene: Scene | None) -> BeadModel:
-    """Add the contrast that the phantom's solids give each bead, unless some bead is no ball.
+    """Add the contrast that the phantom's solids give each bead.
 
     Args:
         model: the beads.
         scene: the phantom's solids; None if it has none.
+
+    Returns:
+        The model with contrasts; itself if it has some already, or if a bead is no ball of the
+        scene.
     """
     balls = [
         solid for solid in (scene or Scene(())).solids if isinstance(solid.shape, Sphere)

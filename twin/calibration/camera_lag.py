@@ -56,9 +56,13 @@ def lag_of(
 
     Args:
         images: (n, k, side, side) windows of the plan, line integrals.
-        frames: of the scan, in the order in which they were taken.
+        frames: of the scan, in the order in which they were taken; windows of neighbouring
+            frames are read.
         plan: windows round the beads of each frame.
         usable: (n,) frames that show the beads where the plan has them; None: all.
+
+    Returns:
+        The share of the frame before, and its sigma; an unseen lag if too few places are clear.
     """
     light = np.exp(-images)
     if usable is not None:  # One that shows what the frame before shows is no lag.

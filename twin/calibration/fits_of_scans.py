@@ -42,6 +42,11 @@ def fit_with_loose_priors(
 
     Beads that were freed because of the residuals stay free only if loose priors do not explain
     the residuals as well.
+
+    Args:
+        state: the scans and their measurements.
+        request: free parameters and priors.
+        wide: the last fit, perhaps with freed beads.
     """
     wide_priors = loosened({**request.priors, **priors_of(state.scans, request)})
     loose = replace(request, priors=wide_priors, bound=math.inf)

@@ -195,6 +195,10 @@ def _with_usual_priors(
 ) -> tuple[CalibrationRequest, dict[str, float]]:
     """Give the parameters stated as exact their usual priors.
 
+    Args:
+        state: the scans, which may state priors, too.
+        asked: the caller's request.
+
     Returns:
         The request with those priors, and the values that were exact, edge units.
     """
@@ -237,8 +241,13 @@ def _doubted(
 def _fit_with_fixed(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> FitResult:
-    """Fit from the geometry of another fit, with the fixed parameters of `request` at
-    their values.
+    """Fit from the geometry of another fit, with the fixed parameters of `request` at their
+    values.
+
+    Args:
+        state: the scans and their measurements.
+        request: free and fixed parameters.
+        fit: gives the start of the others.
     """
     fixed = from_printed_reading(request.start, request.reading)
     known = {*request.free, *priors_of(state.scans, request)}

@@ -276,8 +276,15 @@ class _Shadows:
     def picked(
         self, index: npt.NDArray[np.int64], origin: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return tracks [px], covariances and bias of the spots in `index`; nan and 0 for
-        unseen beads.
+        """Return the spots that are assigned to beads.
+
+        Args:
+            index: (n, k) spot of each bead in each frame, -1 without.
+            origin: (n, 2) added to the places [px].
+
+        Returns:
+            Tracks (n, k, 2) [px] and covariances (n, k, 2, 2), nan for unseen beads; bias (n,
+            k), 0 for them.
         """
         seen = index >= 0
         rows, pick = np.arange(len(index))[:, None], np.maximum(index, 0)
@@ -343,12 +350,15 @@ def assign(
 
 
 def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
-    """Change dO_x and dO_y in `x` so that prediction and spots overlap.
+    """Shift dO_x and dO_y in `x` so that prediction and spots overlap most.
 
     Args:
         problem: gives the prediction.
         shadows: the spots.
         x: (c,) column values.
+
+    Returns:
+        The shifted values; `x` itself if it predicts nothing.
     """
     try:
         predicted = _predicted(problem, x)

@@ -85,7 +85,7 @@ def calibrate(
     scene: Scene | None = None,
     detector: SpotFinder | None = None,
 ) -> Calibration:
-    """Calibrate from images.
+    """Calibrate from images: detect, identify, fit, measure again, fit again and diagnose.
 
     Args:
         scans: one or more scans of the same phantom.
@@ -93,8 +93,10 @@ def calibrate(
         request: the parameters to estimate; None is the thesis's six parameters.
         scene: the phantom's solids, so that its body can be subtracted; None is the phantom's
             own if it has one.
-        detector: settings of the detection; None: from the phantom's beads and the
-            geometry.
+        detector: settings of the detection; None: from the phantom's beads and the geometry.
+
+    Returns:
+        Fit and findings; without a fit if an error ended it earlier.
 
     Raises:
         TwinError: a scan has no frames, or the same images as another.

@@ -104,7 +104,9 @@ def _measured(
 
 
 def _judge_confirmation(state: Calibration) -> list[Finding]:
-    """Judge whether the second measurement of every scan finds the spots of the first."""
+    """Judge whether the second measurement of every scan finds the spots of the first; returns
+    an error for each scan where it does not.
+    """
     out = []
     scans = zip(state.scans, state.identifications, state.measured, strict=True)
     for scan, first, second in scans:
@@ -126,7 +128,14 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
 
 
 def _moved_px(state: Calibration, fit: FitResult, plans: Sequence[Windows]) -> float:
-    """Compute the largest distance that a fit moved a bead from its measured place."""
+    """Compute the largest distance that a fit moved a bead from where its window was planned
+    [px].
+
+    Args:
+        state: the scans.
+        fit: the new geometry.
+        plans: windows of each scan.
+    """
     worst = 0.0
     for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
         cone = scan.poses.cone_vec(fit.group_parameters[g])

@@ -155,7 +155,16 @@ def centred(
 def _rays(
     tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return source (n, 3) and unit direction (n, k, 3) of the ray to each spot."""
+    """Compute the ray to each spot.
+
+    Args:
+        tracks: (n, k, 2) column and row [px], nan where unseen.
+        cone: geometry of the n frames.
+        shape: detector (rows, cols).
+
+    Returns:
+        Sources (n, 3) [mm] and unit directions (n, k, 3).
+    """
     off = tracks - (np.array(shape[::-1]) - 1) / 2
     at = (
         cone.detector[:, None]

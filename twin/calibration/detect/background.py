@@ -50,7 +50,8 @@ class Background:
 
 
 def survey(flat: Float32Array, alone: Float32Array) -> Background:
-    """Judge the backgrounds of windows.
+    """Judge the backgrounds of windows: how far they are from smooth ones, whether they bend,
+    and their planes.
 
     Args:
         flat: (m, side, side) line integrals, nan outside the image.

@@ -53,13 +53,15 @@ def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
 def seen_contrasts(
     model: BeadModel, detections: Sequence[Detections], index: npt.NDArray[np.int64]
 ) -> FloatArray:
-    """Estimate the typical contrast of each bead, (k,); of an unseen one from the others'
-    ratio.
+    """Estimate the typical contrast of each bead; of an unseen one from the others' ratio.
 
     Args:
         model: the beads, k.
         detections: of n frames.
         index: (n, k) which spot of a frame is which bead, -1 for none.
+
+    Returns:
+        (k,) medians over the frames; nan if no bead was seen.
     """
     seen = np.full(index.shape, np.nan)
     for frame, (found, numbers) in enumerate(

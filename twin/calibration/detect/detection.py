@@ -354,6 +354,14 @@ def _cut_beads(
     """Fit balls to spots at the edge, with radius and contrast of the kind that fits best.
 
     They are left out where the image has no complete bead to compare with.
+
+    Args:
+        image: (rows, cols) line integrals.
+        spots: rough places and radii [px].
+        found: results of the complete spots, whose kinds are tried.
+
+    Returns:
+        Results of the good fits, one for each place.
     """
     kinds = _kinds(found) if spots else []
     out: list[FloatArray] = []

@@ -138,8 +138,15 @@ def take(
 
 
 def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
-    """Estimate the contrast of each bead, (m,): the median over its complete spots, else
-    the expected one, scaled like the others.
+    """Estimate the contrast of each bead: the median over its complete spots, else the expected
+    one, scaled like the others.
+
+    Args:
+        results: (m, RESULTS) centroids.
+        patches: m windows with expected contrasts.
+
+    Returns:
+        (m,) contrast of each window's bead.
     """
     shape = patches.windows.whole.shape
     seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(
@@ -158,7 +165,15 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
 
 
 def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
-    """Mark usable pixels of some windows: inside the image and free of other beads' spots."""
+    """Mark usable pixels of some windows: inside the image and free of other beads' spots.
+
+    Args:
+        patches: the windows.
+        index: (j,) of those to mark.
+
+    Returns:
+        (j, side, side) uint8, 1 where usable.
+    """
     masks = np.isfinite(patches.flat[index]).astype(np.uint8)
     windows = patches.windows
     k = windows.corner.shape[1]

@@ -113,6 +113,10 @@ def seen_sharpness(
         sample: indices of complete spots.
         cone: geometry of their frames.
         model: the beads.
+
+    Returns:
+        The corrected estimate; `sharp` itself if it is too sharp to matter, or if the
+        correction does not converge.
     """
     if not sharp.seen or sharp.blur < BODY_BLUR_PX:
         return sharp
@@ -243,6 +247,13 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
 def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
     """Find the minimum of a misfit: a hyperbola about the right place, so its square is a
     parabola.
+
+    Args:
+        tried: (n,) trial values.
+        misfit: (n,) their misfits; inf where not tried.
+
+    Returns:
+        The minimum between the trials next to the best one; the best trial itself at an end.
     """
     i = int(np.argmin(misfit))
     near = slice(i - 1, i + 2)

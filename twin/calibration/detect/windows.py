@@ -156,8 +156,15 @@ def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
 
 
 def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
-    """Return the rows and columns that a window shares with its image, in the window and
-    in the image.
+    """Return the part that a window shares with its image.
+
+    Args:
+        windows: of all frames.
+        frame: number of the frame.
+        bead: number of the bead.
+
+    Returns:
+        (rows, columns) as slices of the window, and the same of the image.
     """
     (rows, cols), side = windows.shape, windows.side
     x, y = windows.corner[frame, bead].tolist()
@@ -172,13 +179,15 @@ def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
 def mended(images: Float32Array, windows: Windows) -> Float32Array:
     """Fill dead pixels of the windows from their neighbours.
 
-    A dead pixel is constant over the frames, which noise allows no other pixel, and
-    differs from its neighbours. Parts of more than `WIDEST_DEAD` pixels are left: they
-    may be starved.
+    A dead pixel is constant over the frames, which noise allows no other pixel, and differs
+    from its neighbours. Parts of more than `WIDEST_DEAD` pixels are left: they may be starved.
 
     Args:
         images: (n, k, side, side) line integrals.
         windows: their places.
+
+    Returns:
+        A filled copy; `images` itself without dead pixels.
     """
     side = windows.side
     noise = float(np.median(pixel_noise(images.reshape(-1, side, side), 0, side)))

@@ -488,7 +488,16 @@ def explained_by_causes(
 
 
 def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResult:
-    """Add the differences of the choices to the covariance of a fit."""
+    """Add the differences between likely choices to the covariance of a fit.
+
+    Args:
+        fit: with the causes of `choice`.
+        candidates: all causes, judged.
+        choice: the most likely one.
+
+    Returns:
+        The fit with a wider certificate; itself if the choices agree.
+    """
     spread, own = candidates.left_open(choice)
     factor = [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
     more = (spread - own) * np.outer(factor, factor)

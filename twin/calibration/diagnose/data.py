@@ -77,6 +77,9 @@ def judge_frames(
         scan: gives the name.
         looks: spots and state of each frame.
         sought: sizes of spots.
+
+    Returns:
+        Warnings, and errors where no frame is usable; empty if all show beads.
     """
     out, name = [], scan.name
     n = len(looks)
@@ -131,12 +134,15 @@ def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
 def judge_emptiness(
     scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]], model: BeadModel
 ) -> list[Finding]:
-    """Look for spots of another size where no bead of the expected size was found.
+    """Look for spots of another size in scans where no bead of the expected size was found.
 
     Args:
         scans: the scans.
         looks: spots of each frame of each scan.
         model: the beads.
+
+    Returns:
+        An error for each scan that shows another phantom.
     """
     out = []
     for scan, some in zip(scans, looks, strict=True):
@@ -459,13 +465,15 @@ def _in_motion(
 def _in_parts(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> Finding | None:
-    """Check whether the first or the last frames alone fit the phantom; if both do, name
-    the change.
+    """Check whether the first or the last frames alone fit the phantom.
 
     Args:
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+
+    Returns:
+        An error on frame numbers, or on the change between both ends; None if no part fits.
     """
     n = len(poses)
     ends: dict[str, tuple[slice, Offsets]] = {}
@@ -510,6 +518,9 @@ def _other_turn(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+
+    Returns:
+        An error with the factor; None if no other angle fits.
     """
     turned = poses.angle - poses.angle[0]
     n = int(np.count_nonzero(np.abs(turned) <= FEW_TURNED))
@@ -542,6 +553,9 @@ def _one_by_one(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+
+    Returns:
+        An error on the frames' order or angles; None if most do not fit.
     """
     chosen = np.linspace(0, len(poses) - 1, SAMPLED_FRAMES).astype(int).tolist()
     good = 0

@@ -77,8 +77,8 @@ MOST_FRAMES: Final = 720
 
 
 def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
-    """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a
-    repeated image.
+    """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a repeated
+    image.
 
     Either most of a frame's spots are far from every prediction, or most of its positions had
     to be left out of the fit.
@@ -86,6 +86,9 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     Args:
         fit: to all frames.
         looks: spots and state of each frame of each scan.
+
+    Returns:
+        A finding that lists the frames, or names their numbers; None if all fit.
     """
     detections = [
         nothing(look.detections.shape)
@@ -137,7 +140,9 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
 
 
 def judge_offsets(fit: FitResult) -> Finding | None:
-    """Judge whether the fitted place is within the possible errors of mount and motors."""
+    """Judge whether the fitted place is within the possible errors of mount and motors; an
+    error if not, else None.
+    """
     sod = float(np.median(fit.problem.poses.sod))
     for parameters in fit.group_parameters:
         if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
@@ -152,13 +157,16 @@ def judge_offsets(fit: FitResult) -> Finding | None:
 def judge_first_size(
     found: Identification, looks: Sequence[FrameSpots], radii: FloatArray, allowed: float
 ) -> Finding | None:
-    """Check sizes coarsely from the first measurement.
+    """Judge sizes coarsely from the first measurement.
 
     Args:
         found: the bead of each spot.
         looks: of every frame.
         radii: (n, k) expected radii [px].
-        allowed: deviation that may be blur.
+        allowed: deviation that may be blur, as a share.
+
+    Returns:
+        An error on bead sizes; None if they fit.
     """
     ratios = [
         look.detections.radii_px[j] / radii[f, b]
@@ -179,6 +187,9 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
     Args:
         measured: sizes and blur.
         radius_px: expected radius of the spots.
+
+    Returns:
+        A warning if blur may explain it, else an error; None if the size fits.
     """
     off = abs(measured.size - 1.0)
     blur = measured.blur_px / radius_px
@@ -208,7 +219,9 @@ def _other_size(ratio: float) -> Finding:
 
 
 def judge_body(measured: Sequence[Refined]) -> Finding | None:
-    """Judge whether the phantom's body has its described place and attenuation."""
+    """Judge whether the phantom's body has its described place and attenuation; a warning if
+    not in some scan, else None.
+    """
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):
         return warning(
@@ -358,7 +371,9 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
 
 
 def _explained(better: FitResult, fit: FitResult) -> bool:
-    """Check whether the residuals shrink enough."""
+    """Check whether the residuals shrink enough from `fit` to `better`, without many more spots
+    left out.
+    """
     rms = better.certificate.rms_px
     return (
         better.identifiable
@@ -401,11 +416,15 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
 
 
 def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding | None:
-    """Name the moving parameter, if a motion explains the residuals.
+    """Fit a motion, and name the moving parameter if that explains the residuals.
 
     Args:
         fit: without motion.
         refit: the fit to poses with a motion.
+
+    Returns:
+        A finding with the parameter and how it moves; None if no motion explains them, or it
+        cannot be fitted.
     """
     problem, before = fit.problem, fit.certificate.rms_px
     sizes = np.bincount(problem.group)

@@ -125,7 +125,7 @@ def frame_numbers(
     offsets: Offsets,
     spread_px: float,
 ) -> FrameNumbers | None:
-    """Find the angle that each frame shows; None where the beads do not determine it.
+    """Find the angle that each frame shows.
 
     Args:
         detections: spots of each of the n frames.
@@ -133,6 +133,10 @@ def frame_numbers(
         poses: nominal geometry.
         offsets: geometry that most frames agree with.
         spread_px: distance of spots from the beads' projections.
+
+    Returns:
+        Shift of each frame's number, and the frames that fit; None where the beads do not
+        determine it.
     """
     n = len(poses)
     shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
@@ -161,7 +165,12 @@ def frame_numbers(
 
 
 def _angles(angle: FloatArray, shift: int) -> FloatArray:
-    """Return angles of frames `shift` numbers further on; beyond the ends, the steps go on."""
+    """Return the angles of frames `shift` numbers further on; beyond the ends, the steps go on.
+
+    Args:
+        angle: (n,) [rad].
+        shift: at most MOST_SHIFT either way.
+    """
     n = len(angle)
     first, last = angle[1] - angle[0], angle[-1] - angle[-2]
     beyond = np.arange(1, MOST_SHIFT + 1)

@@ -40,7 +40,8 @@ PARTS: Final[dict[str, FloatArray]] = {
 
 
 def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding]:
-    """Report the causes of a fit as findings.
+    """Report the causes of a fit as findings: certain ones by name, doubtful ones together with
+    their rivals.
 
     Args:
         fit: with the causes as columns.

@@ -562,8 +562,15 @@ def _determined(told: FloatArray, weight: FloatArray) -> float:
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
-    """Compute the part of a sigma from each prior, largest first; those of one source
-    together.
+    """Compute the part of a sigma from each prior; those of one source together.
+
+    Args:
+        names: of the priors.
+        pull: (p,) effect of each on the parameter.
+        sigma: of the parameter.
+
+    Returns:
+        Source -> part, largest first, without those below a tenth of the sigma.
     """
     square: dict[str, float] = {}
     for name, value in zip(names, pull.tolist(), strict=True):
@@ -620,11 +627,18 @@ def _widened(
 
 
 def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
-    """Compute whitened unit errors that follow a bead's place in the pixel grid, (2 n k, 4 k).
+    """Compute whitened unit errors that follow a bead's place in the pixel grid.
 
     An error e(x) with the pixel's period, a sin(2 pi x + theta) with theta unknown, has the
     covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and
     coordinate.
+
+    Args:
+        problem: n frames and k beads.
+        predicted: (n, k, 2) places [px].
+
+    Returns:
+        (2 n k, 4 k).
     """
     n, k = problem.seen.shape
     phase = 2.0 * math.pi * predicted

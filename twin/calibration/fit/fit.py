@@ -143,7 +143,8 @@ def solve(
     x: FloatArray | None = None,
     prior_noise: float = 1.0,
 ) -> Solution:
-    """Minimise the robust reprojection error.
+    """Minimise the robust reprojection error, first with a Huber loss, then without the
+    positions that are far off.
 
     Args:
         problem: the data and columns.
@@ -151,6 +152,9 @@ def solve(
         x: start of the columns; None is the problem's own.
         prior_noise: spread of the whitened residuals, with which the problem's priors are
             weighed.
+
+    Returns:
+        Values, used positions, iterations and whether it converged; nothing is raised.
     """
     how = Solver() if solver is None else solver
     value = np.array(problem.start if x is None else x, dtype=np.float64)
@@ -603,7 +607,12 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
 
 
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
-    """Solve a problem, and weight its priors by the spread of the residuals.
+    """Solve a problem, and weight its priors by the spread of the residuals, in at most four
+    passes.
+
+    Args:
+        problem: data, columns and priors.
+        solver: settings; the default is robust.
 
     Few positions may be explained in two ways: by priors that hold and noise, or by
     priors that are off and hardly any noise. The more likely one is returned.

@@ -330,9 +330,16 @@ class _Mixed:
         self.freedom = max(len(residual) + int((weight > 0).sum()) - g, 1)
 
     def spectrum(self, i: int, pick: tuple[float, float]) -> list[FloatArray]:
-        """Compute the variance of the amplitude of each scan's cosines, by their number
-        of half waves, for deviations that are level at the ends; the first is that of the
-        width.
+        """Compute the variance of the amplitude of each scan's cosines, for deviations that are
+        level at the ends.
+
+        Args:
+            i: number of the parameter.
+            pick: width and smoothness of its motion.
+
+        Returns:
+            For each scan (frames,), by the number of half waves; the first is that of the
+            width.
         """
         width, waves = pick
         one_frame = 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)

@@ -165,10 +165,13 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
 
 
 def cluster_covariance(left: Residuals) -> FloatArray | None:
-    """Compute the covariance (p, p) that allows for errors all beads of a frame share.
+    """Compute the covariance that allows for errors all beads of a frame share.
+
+    Args:
+        left: residuals with their derivatives, covariance and noise.
 
     Returns:
-        None if it is not needed.
+        (p, p); None if beads of a frame do not err together, or for few frames.
     """
     problem, jacobian, residual, frame = (
         left.problem,
@@ -207,16 +210,18 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
 
 
 def turning_errors(left: Residuals) -> FloatArray | None:
-    """Compute the covariance (p, p) to add for errors of a bead that repeat as the object
-    turns.
+    """Compute the covariance to add for errors of a bead that repeat as the object turns.
 
-    Bead positions that are off, a background that pulls centroids, distortion of the
-    detector: each bead's error is then a smooth function of the angle. Its harmonics 0 to
-    3 are sought in every bead's columns and rows. An error found in one bead is assumed
-    in all, and in harmonic 0, most of which the fit hides, as much as in any other.
+    Bead positions that are off, a background that pulls centroids, distortion of the detector:
+    each bead's error is then a smooth function of the angle. Its harmonics 0 to 3 are sought in
+    every bead's columns and rows. An error found in one bead is assumed in all, and in harmonic
+    0, most of which the fit hides, as much as in any other.
+
+    Args:
+        left: residuals with their derivatives, covariance and noise.
 
     Returns:
-        None if there are no such errors.
+        (p, p); None if there are no such errors, or for few frames.
     """
     problem, jacobian, residual, keep = (
         left.problem,

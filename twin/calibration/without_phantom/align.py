@@ -49,7 +49,9 @@ NEEDS_TURN: Final = (
 
 
 def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
-    """Turn the error of a scan that is not identifiable into refusals in the result."""
+    """Wrap a search so that the error of a scan that is not identifiable becomes refusals in
+    its result.
+    """
 
     @wraps(find)
     def found(*args: P.args, **options: P.kwargs) -> Alignment:
@@ -169,6 +171,12 @@ def _motion(
     planes: TurnPlanes, turn: Turn, corrected: Offsets, random: np.random.Generator
 ) -> Motion:
     """Find the shifts of single frames.
+
+    Args:
+        planes: pairs of the turn's frames.
+        turn: its frames.
+        corrected: offsets that are known by then.
+        random: for the image of noise.
 
     Raises:
         NotIdentifiableError: frames are repeated, or the images do not determine shifts.

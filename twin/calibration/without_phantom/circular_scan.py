@@ -97,7 +97,15 @@ class CircularScan:
         return float(shown.project_points(level, self.shape)[0, 0, 1])
 
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
-        """Return the change of the column with each parameter, (k,)."""
+        """Compute the change of the axis' column with each parameter, by differences.
+
+        Args:
+            values: (k,) parameters.
+            scales: (k,) their steps.
+
+        Returns:
+            (k,) [px].
+        """
         steps = np.diag(0.1 * scales)
         return np.array(
             [

@@ -459,7 +459,16 @@ class ConjugateRays:
         )
 
     def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
-        """Read one group of rows between views (n, k) at columns of the panel (k,)."""
+        """Interpolate one group of rows between views and columns.
+
+        Args:
+            group: number of the group.
+            view: (n, k) view numbers, also between two.
+            columns: (k,) or (n, k) columns of the panel [px].
+
+        Returns:
+            (n, k) line integrals.
+        """
         at = np.stack(
             [view % self.views + EDGE_VIEWS, np.broadcast_to(columns, view.shape)]
         )
@@ -471,8 +480,15 @@ class ConjugateRays:
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
-    """Return a ratio of sums over sectors or rows (n,), and its sigma from leaving out each;
-    inf where one has it all."""
+    """Compute a ratio of sums, and its sigma from leaving out each term.
+
+    Args:
+        moved: (n,) terms of the numerator, by sector or row.
+        told: (n,) terms of the denominator.
+
+    Returns:
+        Ratio and sigma; 0 and inf where one term has all of the denominator.
+    """
     count = len(told)
     rest = told.sum() - told
     if not (told.sum() > 0.0 and rest.min() > 0.0):

@@ -43,13 +43,17 @@ class Shifts(NamedTuple):
 def find_shifts(
     pairs: PlanePairs, at: FloatArray, angle: FloatArray, random: np.random.Generator
 ) -> Shifts:
-    """Estimate the shifts of all frames.
+    """Estimate the shifts of all frames, without those that an offset of the object explains.
 
     Args:
         pairs: the frames' pairs.
         at: arguments of their geometry.
         angle: of the stage in each frame, (n,) [rad].
         random: for the image of noise.
+
+    Returns:
+        Shifts right and down [px] with sigmas, and the evidence of each direction; 0 and nan in
+        a direction without evidence.
     """
     n = len(angle)
     modes = np.column_stack([np.ones(n), np.cos(angle), np.sin(angle)])
@@ -115,8 +119,15 @@ class _System:
         return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)
 
     def _slopes(self, sums: Float32Array) -> FloatArray:
-        """Change of the differences with both shifts of the first view, then of the second,
-        (q, 4, k)."""
+        """Compute the change of the differences with both shifts of the first view, then of the
+        second.
+
+        Args:
+            sums: running sums of the images.
+
+        Returns:
+            (q, 4, k).
+        """
         parts = []
         for first in (6, 9):
             ends = []

@@ -50,13 +50,16 @@ def find_gap(
     frames: Sequence[Float32Array],
     closed: Sequence[float] = (),
 ) -> GapFound:
-    """Find the gap between two tiles, if there is one.
+    """Find the gap between two tiles of the panel, if there is one.
 
     Args:
         rays: both ends of rays of a turn.
         values: parameters of the plane of symmetry in the order of `circular_scan.FREE`, (k,).
         frames: line integrals of `tile_gap.averaged_rows`, some of the turn.
         closed: columns of borders next to which the images are filled in.
+
+    Returns:
+        The gap, None without; and the judgement of gaps that stay hidden.
 
     Raises:
         NotIdentifiableError: there are two gaps.
