@@ -174,13 +174,17 @@ class Commissioned(NamedTuple):
 def commission(
     folders: Sequence[Path], traffic: Path | None, read_log: ReadLog
 ) -> Commissioned:
-    """Estimate a machine and its profile from past scans.
+    """Estimate a machine and its profile from past scans: rates and signs from their texts,
+    times from executed scripts, zero offsets from alignments.
 
     Args:
         folders: of scans, as the scanner or a twin writes them.
-        traffic: a recording of `flexdt follow`, or a log; lines that a folder has too
-            count once.
+        traffic: a recording of `flexdt follow`, or a log; lines that a folder has too count
+            once.
         read_log: reads an executed script or a recording.
+
+    Returns:
+        Machine, profile, findings, and questions that a person has to answer.
 
     Raises:
         CommandError: no folder holds anything of a scan, or they are of several scanners.
@@ -267,11 +271,14 @@ def _nothing(question: Question) -> None:
 
 
 def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
-    """Read a scan's settings texts and the names of its images.
+    """Read a scan's settings texts, the names of its images, and the shape of the first one.
 
     Args:
         folder: of the scan.
-        ask: takes each warning as a question.
+        ask: takes each warning, and a text that cannot be read, as a question.
+
+    Returns:
+        The scan with what could be read.
     """
     content = list_folder(folder)
     warnings = list[str]()

@@ -77,7 +77,8 @@ def compare_folder(
     *,
     shown: int = SHOWN_FRAMES,
 ) -> Comparison:
-    """Compare a data set with the twin.
+    """Compare a data set with the twin: calibrate it, and simulate some frames with and without
+    the correction.
 
     Args:
         folder: the data set; TIFFs and the two settings texts are enough.
@@ -86,11 +87,13 @@ def compare_folder(
             coordinate.
         shown: frames of which difference images are made.
 
+    Returns:
+        Residuals before and after correction, and difference images.
+
     Raises:
         DatasetError: no data set.
         NotIdentifiableError: the data do not determine a correction.
-        TwinError: they contradict the phantom or the angles; the message has the
-            findings.
+        TwinError: they contradict the phantom or the angles; the message has the findings.
     """
     begun = time.perf_counter()
     dataset = load_dataset(folder)

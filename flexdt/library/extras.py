@@ -52,7 +52,15 @@ def offered(name: str, group: str) -> Any:
 
 
 def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
-    """Load an entry point of `flexdt-extensions`, which `what` needs.
+    """Load the object of an entry point of `flexdt-extensions`.
+
+    Args:
+        name: of the entry point.
+        what: needs it, for the message.
+        group: of entry points.
+
+    Returns:
+        The object, e.g. a function.
 
     Raises:
         TwinError: the distribution is not installed.

@@ -88,11 +88,15 @@ class Aligned(Generic[Images_co]):
 
 
 def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
-    """Estimate the geometry of a scan without a phantom.
+    """Estimate the geometry of a scan without a phantom, with warnings about the images.
 
     Args:
         data: a data set with a flat image; frames may be missing.
         per_frame: whether shifts of single frames are looked for too.
+
+    Returns:
+        The data set with the correction, the alignment and the report's document; without a
+        correction where the images do not determine the axis.
 
     Raises:
         DatasetError: a frame cannot be read, or there is no flat image.

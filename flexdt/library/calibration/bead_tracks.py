@@ -42,8 +42,15 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
 def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
     """Return measured and predicted bead positions of every frame, (column, row) in pixels.
 
-    `before` is the correction in force during the scan, or the nominal geometry; `after`
-    the fitted one, null where it must not be used. Unseen beads are null.
+    `before` is the correction in force during the scan, or the nominal geometry; `after` the
+    fitted one, null where it must not be used. Unseen beads are null.
+
+    Args:
+        outcome: of a calibration.
+
+    Returns:
+        phantom, and datasets: for each its name and folder, the rms before and after, and its
+        frames; no datasets without a fit.
     """
     result = outcome.calibration
     fit = result.fit

@@ -254,7 +254,7 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
 
 
 def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
-    """Collect marks into a table.
+    """Collect marks into a table, markers in the order of their names.
 
     Args:
         marks: each with its place in the source, for messages.
@@ -304,7 +304,15 @@ def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
 
 
 def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots], Index]:
-    """Markers as spots of each frame, and the number of each marker's spot (-1: unseen)."""
+    """Convert markers to spots of each frame, all complete and of equal contrast.
+
+    Args:
+        markers: k markers in n frames.
+        shape: (rows, cols).
+
+    Returns:
+        The frames' spots, and (n, k) the number of each marker's spot, -1 where unseen.
+    """
     seen = markers.seen
     looks, index = [], np.full(seen.shape, -1, dtype=np.int64)
     for i, row in enumerate(seen):
@@ -453,13 +461,16 @@ def _turning_back(
 ) -> Calibration:
     """Add an error if markers do not move, or fit twice as well with the stage reversed.
 
-    Without perspective both directions would fit, with each marker as far behind the axis
-    as before.
+    Without perspective both directions would fit, with each marker as far behind the axis as
+    before.
 
     Args:
         found: the calibration.
         data: the scan.
         markers: their pixels; None checks nothing.
+
+    Returns:
+        The calibration, with the error as its first finding if there is one.
     """
     if markers is None or found.fit is None:
         return found

@@ -219,8 +219,15 @@ def _known(format: str, allowed: Iterable[str]) -> Format:
 
 
 def _to_write(out: Path, format: str, allowed: Iterable[str]) -> Format:
-    """Return the format of a name, or raise ExchangeError where the file's ending is
-    another.
+    """Return the format of a name.
+
+    Args:
+        out: file to write.
+        format: name.
+        allowed: names of formats.
+
+    Raises:
+        ExchangeError: another name, or the file's ending is not the format's.
     """
     form = _known(format, allowed)
     if out.suffix.lower() not in form.endings:

@@ -600,7 +600,13 @@ def _are_counts(values: npt.NDArray[Any]) -> bool:
 def _normalise(
     values: npt.NDArray[Any], dark: npt.ArrayLike | None, flat: npt.ArrayLike
 ) -> Float32Array:
-    """Compute line integrals of images that are no counts, by their dark and flat images."""
+    """Compute line integrals of images that are no counts.
+
+    Args:
+        values: (n, rows, cols) intensities.
+        dark: (rows, cols) or (k, rows, cols); 0 without.
+        flat: (rows, cols) or (k, rows, cols).
+    """
     shape = values.shape[1], values.shape[2]
     darks = _image_stack("dark", dark, shape)
     flats = _image_stack("flat", flat, shape)

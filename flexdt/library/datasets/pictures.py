@@ -99,9 +99,13 @@ def png(
     marks: npt.NDArray[np.generic] | None = None,
     like: npt.NDArray[Any] | None = None,
 ) -> bytes:
-    """Encode an image, windowed as `like` is or by itself, as PNG; optionally as its negative.
+    """Encode an image as PNG, with percentiles as black and white.
 
-    With marks (see `MARKS`) that are not all zero it is a colour picture.
+    Args:
+        image: (rows, cols).
+        dark_is_dense: encode the negative.
+        marks: (rows, cols), see `MARKS`; unless all are zero the picture is in colour.
+        like: image whose percentiles are taken; `image` itself without.
 
     Raises:
         ValueError: it has no pixels, or is no image.

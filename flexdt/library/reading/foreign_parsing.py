@@ -19,7 +19,7 @@ MAX_REPEATED_CHARACTERS: Final = 200
 
 @contextmanager
 def parsing(path: Path, form: str) -> Iterator[None]:
-    """Turn errors of a parser into the file's error.
+    """Run the body of a `with`, and turn any error of a parser into the file's error.
 
     Args:
         path: the file.

@@ -623,8 +623,12 @@ def reconstruct_volume(
 
 
 def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
-    """Collect slabs in a volume whose values are in a file without a name, deleted with
-    them.
+    """Collect slabs in a volume whose values are in a file without a name, deleted with them.
+
+    Args:
+        slabs: from the lowest up.
+        grid: of the volume.
+        folder: of the file.
     """
     with TemporaryFile(dir=folder) as file:
         data = np.memmap(file, np.float32, "w+", shape=grid.shape)
@@ -714,11 +718,14 @@ def preview(
 
 
 def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
-    """Apply the requested corrections: scatter, rings and beam hardening.
+    """Prepare the requested corrections: scatter, rings and beam hardening.
 
     Args:
-        views: uncorrected frames.
+        views: uncorrected frames; kept images are read once, in order, where the detector lags.
         request: the volume.
+
+    Returns:
+        The frames with what corrects them as they are read.
     """
     panel = views.dataset.panel
     if views.kept is not None and panel is not None and panel.lag:
@@ -755,7 +762,10 @@ def _names(given: str | tuple[str, ...] | None) -> tuple[str, ...]:
 def _without_scatter(
     views: ScanFrames, names: tuple[str, ...], request: VolumeRequest
 ) -> ScanFrames:
-    """Simulate the scatter of an object of these materials, to be subtracted from the views.
+    """Simulate the scatter of an object of these materials in some views, and prepare its
+    subtraction from all.
+
+    A quick volume is reconstructed for the object.
 
     Args:
         views: the frames.

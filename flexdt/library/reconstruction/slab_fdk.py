@@ -98,7 +98,12 @@ class StandingImages:
         return cls(cone_vec, turned, level, (rows, wide), rises, truncation)
 
     def stood(self, image: Float32Array, number: int) -> Float32Array:
-        """Return the image of a view as an upright panel would have recorded it."""
+        """Return the image of a view as an upright panel would have recorded it.
+
+        Args:
+            image: (rows, cols) as recorded.
+            number: of the view.
+        """
         if self.turned:
             image = image.T
         if self.cone_vec is self.recorded:

@@ -38,12 +38,17 @@ NO_PLACE: Final = (
 
 @contextmanager
 def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
-    """Open `path` for a volume on `grid`, and yield the function that takes its slabs;
-    the ending chooses the format.
+    """Open `path` for a volume on `grid`, and yield the function that takes its slabs; the
+    ending chooses the format.
+
+    The file gets its name when all slabs are written; after an error none is left.
+
+    Args:
+        path: of the file.
+        grid: of the volume.
 
     Raises:
-        LimitError: another ending, a missing folder, or voxels that the format does not
-            allow.
+        LimitError: another ending, a missing folder, or voxels that the format does not allow.
         TwinError: the package that writes the format is not installed.
         OSError: the file cannot be written.
     """

@@ -139,7 +139,12 @@ def _write_and_rename(
 def _write_headed(
     header: Callable[[VoxelPlaces], bytes], compress: bool = False
 ) -> Callable[..., Iterator[Sink]]:
-    """Write a header and the values after it."""
+    """Return a writer of a header and the values after it.
+
+    Args:
+        header: makes the header of a volume.
+        compress: by gzip.
+    """
 
     def write(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         """Write header and voxels; yields the function that takes the slabs."""
@@ -211,7 +216,7 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 
 def _nrrd_header(places: VoxelPlaces) -> bytes:
-    """Write NRRD's fields; axes point right, front and up."""
+    """Make NRRD's header; axes point right, front and up."""
     nz, ny, nx = places.shape
     x, y, z = (f"{edge:.9g}" for edge in places.edges_mm)
     lines = (
@@ -230,7 +235,7 @@ def _nrrd_header(places: VoxelPlaces) -> bytes:
 
 
 def _mha_header(places: VoxelPlaces) -> bytes:
-    """Write MetaImage, header and data in one file.
+    """Make MetaImage's header, of a file with header and data.
 
     ITK takes its axes to point left, back and up, so x and y are turned: the place is then that
     of the NRRD and NIfTI files.
@@ -255,7 +260,7 @@ def _mha_header(places: VoxelPlaces) -> bytes:
 
 
 def _nifti_header(places: VoxelPlaces) -> bytes:
-    """Write NIfTI-1's: x to the right, y to the front, z up; data from byte 352 on."""
+    """Make NIfTI-1's header: x to the right, y to the front, z up; data from byte 352 on."""
     nibabel = _nibabel()
     nz, ny, nx = places.shape
     affine = np.diag([*places.edges_mm, 1.0])
