@@ -48,7 +48,9 @@ _heard = 0
 
 
 def leave(*_: object) -> None:
-    """End the process now; printed lines stay."""
+    """End the process at once with a line on standard error and the exit code of an interrupt;
+    printed lines stay.
+    """
     try:
         os.write(2, LINE)
     finally:
@@ -56,7 +58,9 @@ def leave(*_: object) -> None:
 
 
 def _interrupt(number: int, frame: object) -> None:
-    """Handle SIGINT in the main thread."""
+    """Handle SIGINT in the main thread: count it, and raise KeyboardInterrupt; end the process
+    during an import, which must not be interrupted.
+    """
     global _heard
     _heard += 1
     while frame is not None:

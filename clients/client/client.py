@@ -177,7 +177,7 @@ class Core:
                 )
 
     async def close(self) -> None:
-        """End the connection and all subscriptions."""
+        """End all subscriptions and the connection; it is not opened again."""
         self.closed = True
         listeners = list(self._listeners)
         self._listeners.clear()

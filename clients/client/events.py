@@ -238,14 +238,14 @@ class AsyncSubscription:
                 raise TimeoutError(f"no {what} event in {timeout_s:g} s") from None
 
     async def close(self) -> None:
-        """Stop listening; an iteration in another task ends."""
+        """Unsubscribe; an iteration in another task ends."""
         if not self._closed:
             self.end()
             if self._started:
                 await self._cancel(self)
 
     def put(self, params: Mapping[str, object]) -> None:
-        """Take an event (called by the client)."""
+        """Append an event; the oldest one is dropped, and counted, where too many wait."""
         if len(self._events) >= self._max_queue:
             self._events.popleft()
             self.dropped += 1

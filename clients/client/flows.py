@@ -137,7 +137,12 @@ async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> o
 
 
 async def adrive(flow: Flow[_R], call: Callable[[Ask], Awaitable[object]]) -> _R:
-    """Run a flow to its end by `perform`."""
+    """Run a flow to its end, and return its result.
+
+    Args:
+        flow: yields effects, and gets their results or errors.
+        call: sends a request to the server.
+    """
     try:
         effect = next(flow)
         while True:

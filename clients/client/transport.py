@@ -208,7 +208,7 @@ class TcpTransport:
         return messages
 
     def close(self) -> None:
-        """Close the streams."""
+        """Close the connection, if there is one."""
         streams = self._streams
         self._streams = None
         if streams is not None:

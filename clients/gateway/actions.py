@@ -395,7 +395,11 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
 async def abort_script(
     twin: ConnectedTwin, command: AbortScript, progress: CommandProgress
 ) -> str:
-    """Abort the job that this gateway started."""
+    """Abort the job that this gateway started; returns its name.
+
+    Raises:
+        Refusal: none is running.
+    """
     if twin.job is None:
         raise Refusal("no script or sequence of this gateway is running")
     await twin.ask("job.abort", {"job": twin.job})

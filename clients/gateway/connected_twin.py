@@ -127,7 +127,9 @@ class ConnectedTwin:
         return found
 
     async def news(self) -> None:
-        """Wait until something may have changed."""
+        """Wait until something may have changed: an event has come, or some time has passed
+        while something moves.
+        """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LIVELY_S if self.lively else None):
                 await self._news.wait()

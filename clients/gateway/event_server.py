@@ -329,7 +329,7 @@ class Gateway:
             self._busy += Counter()  # without those that are idle
 
     async def _release(self) -> None:
-        """Release control when this was the last running command."""
+        """Release control of the twin if no command of this gateway runs any more."""
         if len(self._running) <= 1 and self.twin.link.connected:
             try:
                 await self.twin.ask("session.control", {"action": "release"})

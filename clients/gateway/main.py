@@ -93,7 +93,9 @@ async def run(options: GatewaySettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the process; returns its exit code."""
+    """Run the gateway with the options of `argv` (default: the command line) until it is ended;
+    returns the exit code.
+    """
     options = parse(GatewaySettings, argv)
     set_up()
     if (missing := lacking("zmq", "pyzmq", "gateway")) is not None:

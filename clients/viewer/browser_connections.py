@@ -88,7 +88,7 @@ class BrowserConnection(ServerConnection):
         return message
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Remove the ended connection from its room."""
+        """Free the place of an ended connection among those that count."""
         self._hold(0)
         self._admission.strangers.leave(self)
         self._admission.answered.leave(self)

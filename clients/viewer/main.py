@@ -144,7 +144,9 @@ def viewer_pages(viewer: Viewer) -> Pages:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the process; returns its exit code."""
+    """Run the viewer with the options of `argv` (default: the command line) until it is ended;
+    returns the exit code.
+    """
     options = parse(ViewerSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     out = sys.stdout

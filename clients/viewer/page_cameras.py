@@ -244,7 +244,7 @@ def _now(client: viser.ClientHandle) -> Standpoint:
 
 
 def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
-    """Set a client's camera."""
+    """Set place, direction and field of view of a client's camera in one message."""
     with client.atomic():
         client.camera.up_direction = camera.up
         client.camera.position = camera.position

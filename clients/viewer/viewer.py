@@ -189,7 +189,7 @@ class Viewer:
         ]
 
     async def stop(self) -> None:
-        """End everything."""
+        """End all tasks, feeds, pages, reconstructions and planners, and viser's server."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -497,7 +497,7 @@ class Viewer:
                 page.show("volume", slices)
 
     def ungrow(self) -> None:
-        """Reconstruct no longer once no page wants it."""
+        """Stop the growing volume and hide its surface, once no page wants it."""
         if not any(page.live for page in self.pages.values()):
             self.grower.stop()
             if self.lab is not None:

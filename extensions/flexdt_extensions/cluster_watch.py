@@ -44,7 +44,12 @@ class ClusterWatch(threading.Thread):
         self.join()
 
     def run(self) -> None:
-        """Look every `EVERY_S`."""
+        """Tend the jobs every `EVERY_S` with the present workers, and print what there is to
+        say.
+
+        A CommandError is kept in `error`, and the client closed, which ends the waiting for
+        results.
+        """
         while not self._over.wait(EVERY_S):
             try:
                 lines = self._tend(self._workers())

@@ -399,7 +399,7 @@ def same_version(made_by: str) -> None:
 
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:
-    """Write the file of a complete store."""
+    """Move a complete store to `out`, or write its volume into a file of another format."""
     if out.suffix.lower() == ".zarr":
         move(store, out)
         return

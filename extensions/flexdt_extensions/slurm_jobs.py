@@ -201,7 +201,9 @@ def lifetime_s(walltime: str) -> int | None:
 
 
 def _outcome(job: str) -> str:
-    """Read from sacct how a job ended."""
+    """Read from sacct how a job ended, e.g. "FAILED, exit code 1:0"; "left the queue" if
+    unknown.
+    """
     said = _run(
         "sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}"
     )

@@ -155,7 +155,11 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
 
 
 def _pyplot() -> Any:
-    """Import matplotlib.pyplot, or raise TwinError."""
+    """Import matplotlib.pyplot.
+
+    Raises:
+        TwinError: it is not installed.
+    """
     require_plots()
     from matplotlib import pyplot
 

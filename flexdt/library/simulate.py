@@ -110,7 +110,7 @@ class Truth:
         )
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
-        """Return the truth of some of the views."""
+        """Select the geometry and scatter of some of the views."""
         if self.scatter is None:
             scatter = None
         else:

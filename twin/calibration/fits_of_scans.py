@@ -58,7 +58,9 @@ def fit_with_loose_priors(
 
 
 def _start(state: Calibration, request: CalibrationRequest) -> list[Offsets]:
-    """Start each scan at the identified values of the free parameters."""
+    """List the offsets from which each scan's fit starts: the request's, with the free
+    parameters at their identified values.
+    """
     out = []
     for found in state.identifications:
         values = {n: getattr(found.parameters, n) for n in SIX if n in request.free}

@@ -90,7 +90,7 @@ def _spots(scan: Scan, looks: Sequence[FrameSpots]) -> list[Detections]:
 def _without(
     looks: Sequence[FrameSpots], frames: Sequence[int]
 ) -> tuple[FrameSpots, ...]:
-    """Mark some frames as unused."""
+    """Mark some frames (by number) as repeated, so that their spots are not used."""
     again = frozenset(frames)
     return tuple(
         replace(look, state=FrameState.REPEATED) if i in again else look

@@ -239,7 +239,15 @@ def _pursue(
 
 
 def _non_negative(columns: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Solve least squares with weights >= 0."""
+    """Solve a least squares problem with weights that are not negative.
+
+    Args:
+        columns: (m, p) what each weight adds.
+        wanted: (m,).
+
+    Returns:
+        (p,) weights.
+    """
     from scipy.optimize import lsq_linear, nnls
 
     try:

@@ -86,7 +86,7 @@ def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
 
 
 def draw_electronics(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
-    """Draw the read noise of `averages` read-outs."""
+    """Draw the read noise of an exposed panel, less by averaging, (rows, cols) [electrons]."""
     sigma = exposed.panel.read_noise(exposed.camera)
     shape = exposed.mean_e.shape
     return np.float32(sigma / np.sqrt(exposed.averages)) * rng.standard_normal(

@@ -101,7 +101,7 @@ class TubeModel:
 
 
 def tube_of(spec: TubeSpec) -> TubeModel:
-    """Make the tube of a machine file."""
+    """Convert the tube of a machine file: its filters and spot."""
     return TubeModel(
         tuple(Filter(Substance.called(f.material), f.thickness_mm) for f in spec.filters),
         spec.spot_mm_per_W,

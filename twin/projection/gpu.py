@@ -139,7 +139,9 @@ def _project_one_ray() -> None:
 
 @contextmanager
 def switched_off() -> Iterator[None]:
-    """Compute on the processor within the context."""
+    """Switch the device off within the context, so that everything is computed on the
+    processor.
+    """
     _failed.insert(0, Availability(False, "switched off"))
     try:
         yield

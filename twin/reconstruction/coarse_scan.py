@@ -210,7 +210,9 @@ class CoarseScan:
 
     @cached_property
     def rim(self) -> npt.NDArray[np.bool_]:
-        """Voxel columns outside some views, (ny, nx) bool."""
+        """Mark the voxel columns that are not seen in all views, and those next to them, (ny,
+        nx) bool.
+        """
         x, y, _ = self.grid.centers()
         away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
         # A voxel and a half. Nodes are at just that distance; rounding shall not decide on

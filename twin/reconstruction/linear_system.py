@@ -341,14 +341,18 @@ class RegionSystem(LinearSystem):
         )
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Return start values; the surroundings begin with zeros."""
+        """Return start values of region and surroundings as one vector: `start` or zeros in the
+        region, zeros around it.
+        """
         x = np.zeros(math.prod(self.like.shape) + self.outside.size, np.float32)
         if start is not None:
             self.grids(x)[0][...] = super().first(start)
         return x
 
     def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
-        """Project region and surroundings; see `LinearSystem`."""
+        """Compute line integrals of region and surroundings together (n, rows, cols); see
+        `LinearSystem`.
+        """
         fine, coarse = self.grids(x)
         geometry = self.geometry[views]
         images = forward(replace(self.like, data=fine), geometry, self.shape)
@@ -357,7 +361,9 @@ class RegionSystem(LinearSystem):
         return images
 
     def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
-        """Apply the adjoint of both; see `LinearSystem`."""
+        """Apply the adjoint to region and surroundings; the result is one vector, overwritten
+        by the next call.
+        """
         fine, coarse = self.grids(self.room)
         geometry = self.geometry[views]
         back(y, geometry, self.like, fine)

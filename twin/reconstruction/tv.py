@@ -367,7 +367,9 @@ class Regular:
         )
 
     def variation(self, x: Any) -> float:
-        """Compute the total variation of x."""
+        """Compute the total variation of voxels (nz, ny, nx): the sum of the lengths of their
+        scaled differences.
+        """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         layers = np.empty(len(x))

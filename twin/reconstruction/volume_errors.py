@@ -95,7 +95,15 @@ def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
 
 
 def _between(values: Float32Array, along: Neighbours) -> Float32Array:
-    """Interpolate along the first axis of two."""
+    """Interpolate linearly along the first of two axes.
+
+    Args:
+        values: (m, k).
+        along: neighbours of n places, from `_neighbours`.
+
+    Returns:
+        (n, k).
+    """
     lower, upper, weight = along
     found: Float32Array = values[lower] * (1.0 - weight)[:, None]
     found += values[upper] * weight[:, None]

@@ -417,7 +417,9 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def motions(document: Mapping[str, Any]) -> Iterator[str]:
-    """Describe the motion during the scans in words."""
+    """Yield a line on each parameter that may move during the scans: by how much, or that no
+    motion was found.
+    """
     for moved in document.get("motion", ()):
         for name, told in moved.items():
             if not told["moves"]:

@@ -284,7 +284,9 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
 def _reconstruct_preview(
     dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
 ) -> dict[str, object]:
-    """Reconstruct a small volume with the calibrated geometry."""
+    """Reconstruct a small volume with the calibrated geometry into the file `out`; returns its
+    report.
+    """
     from flexdt.library.reconstruction.reconstruct import preview
 
     fit = outcome.calibration.fit

@@ -139,7 +139,7 @@ class BeamShade:
         self._draw()
 
     def light(self, on: bool) -> None:
-        """Show the beam or not."""
+        """Show the shaded beam, drawn with the newest image, or hide it."""
         if on != self._lit:
             self._lit = on
             for handle in self._planes:

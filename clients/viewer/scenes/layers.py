@@ -97,7 +97,7 @@ class Shown:
 
     @property
     def told(self) -> dict[str, object]:
-        """For the page."""
+        """Return shown (layer -> bool) and opacity, as the page gets them."""
         return {
             "shown": {layer.name: layer.name in self for layer in LAYERS},
             "opacity": self.opacity,

@@ -90,7 +90,7 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
 
 
 def names_of_image(world: World) -> list[Name]:
-    """Name source, sample and detector."""
+    """List names and places [m] of source, sample and detector."""
     image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
     named = (
         ("X-ray source", world.source),

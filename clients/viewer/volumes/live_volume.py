@@ -157,7 +157,9 @@ class Held:
         self.say()
 
     def hold(self, data: Float32Array, grid: Volume) -> None:
-        """Store a volume for requests."""
+        """Store a volume (nz, ny, nx), from which requests get slices, and its size for their
+        answers.
+        """
         self.grid, self.volumes = grid, {"volume": data}
         self.about |= {
             "size": list(data.shape[::-1]),

@@ -69,7 +69,7 @@ class LiveReconstruction:
         self._task = watched(self._follow(*asked), "a live reconstruction")
 
     def stop(self) -> None:
-        """End the running reconstruction."""
+        """End the running reconstruction, if there is one; the process is killed."""
         if self._task is not None:
             self._task.cancel()
             self._ending = self._task
@@ -77,7 +77,7 @@ class LiveReconstruction:
         self._hang_up()
 
     async def close(self) -> None:
-        """End all there is."""
+        """End the running reconstruction and the spare process, and wait for both."""
         self.stop()
         if self._ending is not None:
             await asyncio.wait([self._ending])

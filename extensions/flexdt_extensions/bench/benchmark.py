@@ -292,7 +292,9 @@ def interleaved(
 
 
 def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
-    """Check whether a contestant has run often enough."""
+    """Check whether a contestant has run often enough: MIN_ROUNDS at least, and then until its
+    time or its rounds are spent.
+    """
     if rounds < MIN_ROUNDS:
         return False
     if spent_s < SHORT_S:

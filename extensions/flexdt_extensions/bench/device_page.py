@@ -380,7 +380,7 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
 
 
 def row(line: Document) -> str:
-    """Format a line of the page's table."""
+    """Format a target's line as a row of the page's Markdown table."""
     if line["measured"] is None:
         value = "-"
     else:

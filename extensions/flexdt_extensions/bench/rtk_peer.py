@@ -171,7 +171,12 @@ def rtk_volume(
 
 
 def rtk_stack(images: Float32Array, rows: FloatArray) -> Any:
-    """Projections as an ITK image, pixel (0, 0) first."""
+    """Convert projections to an ITK image in RTK's axes, pixel (0, 0) first.
+
+    Args:
+        images: (n, rows, cols).
+        rows: (n, 12) cone_vec, whose first one gives the pixels' size.
+    """
     import itk
 
     stack = itk.image_from_array(images)

@@ -92,7 +92,7 @@ def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
 
 
 def noise(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Draw images of random numbers from 0 to 1."""
+    """Draw images (n, rows, cols) of random numbers from 0 to 1; a few are repeated."""
     drawn = np.random.default_rng(0).random(
         (min(NOISE_COUNT, len(scan)), *shape), dtype=np.float32
     )

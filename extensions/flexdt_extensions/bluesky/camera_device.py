@@ -133,7 +133,7 @@ class Roll:
         its end."""
 
     def load(self, folder: PurePath, filename: str) -> None:
-        """Begin a new series."""
+        """Begin a new series of images: make the folder if needed, and number from 0."""
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.template = f"{filename}_{{:06d}}.tif"
@@ -145,7 +145,12 @@ class Roll:
         self._set_written(count)
 
     async def keep(self, image: npt.NDArray[np.generic]) -> None:
-        """Write an image of counts."""
+        """Write an image of counts as the series' next TIFF, and set the signals `mean` and
+        `written`.
+
+        Raises:
+            RuntimeError: no series has begun.
+        """
         if self.folder is None:
             raise RuntimeError("the camera was triggered before it was prepared")
         file = self.folder / self.template.format(self.count)

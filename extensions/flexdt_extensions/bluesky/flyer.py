@@ -161,7 +161,7 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Connect; forget an earlier scan."""
+        """Connect to the twin, and forget an earlier scan."""
         await self._link.connect()
         self._prepared = None
         self._images = None
@@ -203,7 +203,7 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Start the scan: submit its job."""
+        """Start the scan: submit its job, and announce the images of its data set."""
         ready = self._ready()
         client = self._link.client
         scan = ready.scan
@@ -281,7 +281,7 @@ class TwinFlyer(
             await self._link.client.resume_job(self._job())
 
     async def stop(self, success: bool = True) -> None:
-        """Abort a scan that has not ended."""
+        """Abort the scan's job if it has not ended."""
         async with self._submitting:
             if self._running():
                 self.job = await self._link.client.job_status(self._job())

@@ -106,7 +106,7 @@ class LabConnection:
             atexit.register(self._end_at_exit)
 
     async def close(self) -> None:
-        """End the connection."""
+        """End the connection, and the task that reads it."""
         atexit.unregister(self._end_at_exit)
         if self._pump is not None:
             self._pump.cancel()
@@ -309,7 +309,9 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
     get_setpoint = get_value
 
     def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
-        """Subscribe a callback to changes."""
+        """Call `callback` with each changed reading from now on, in place of the one before;
+        None ends that.
+        """
         if self._end is not None:
             self._end()
         if callback is None:

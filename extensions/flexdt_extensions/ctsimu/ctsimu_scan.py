@@ -216,7 +216,7 @@ class _Watched(dict[str, Any]):
         return super().__getitem__(key)
 
     def unseen(self, where: str = "") -> Iterator[str]:
-        """Yield the places of values that were not read."""
+        """Yield the paths of values that nobody has read, comments and empty ones left out."""
         for key, value in self.items():
             at = f"{where}.{key}".lstrip(".")
             if key not in self.seen and key not in _WORDS and _says_something(value):
@@ -799,7 +799,17 @@ class _ScanReader(ScenarioReader):
     def _plain(
         self, given: object, units: Mapping[Any, float], where: str, default: D
     ) -> float | D:
-        """Read a number that does not drift."""
+        """Read a number that does not drift.
+
+        Args:
+            given: value or object from the document.
+            units: unit -> factor.
+            where: its path, for messages.
+            default: returned if there is no value.
+
+        Raises:
+            ExchangeError: no number, or one that drifts.
+        """
         if given is None or (isinstance(given, dict) and given.get("value") is None):
             if drifts_of(given):
                 raise self._error(where, "a value where there are drifts")

@@ -123,7 +123,7 @@ class ScenarioImages:
 
     @cached_property
     def _beams(self) -> list[EffectiveBeam]:
-        """Of each spectrum."""
+        """Effective beam of each spectrum, through all substances up to the thickest path."""
         substances = list(self._thickest)
         thick = list(self._thickest.values())
         if self.scan.environment is not None:

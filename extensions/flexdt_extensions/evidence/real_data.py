@@ -98,7 +98,7 @@ def _with_errors(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told
 
 
 def _modules(error: BaseException) -> Iterator[str]:
-    """Names of the modules that an error came through."""
+    """Yield the names of the modules that an error came through."""
     at = error.__traceback__
     while at is not None:
         yield str(at.tb_frame.f_globals.get("__name__"))

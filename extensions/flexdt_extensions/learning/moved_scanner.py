@@ -139,7 +139,15 @@ class Lab:
         return self.scanner.positions(self.now)[axis]
 
     def take(self, targets: dict[str, float]) -> Taken:
-        """Move (rotations the shorter way), wait for rest, expose."""
+        """Move the motors (rotations the shorter way), wait for rest, and expose; clock and
+        dose go on.
+
+        Args:
+            targets: axis -> [mm, deg].
+
+        Returns:
+            Time and dose; after a collision that of the halt alone, without an image.
+        """
         start = self.now
         try:
             self.scanner.move(targets, self.now, shortest=True)

@@ -170,7 +170,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return self._observe(), reward, self._left <= 0, False, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """Render the middle slice of the last attempt."""
+        """Render the middle slice of the last attempt, uint8 (rows, cols, 3); None without a
+        render mode.
+        """
         if self.render_mode is None:
             return None
         middle = self._volume.data[GRID // 2]

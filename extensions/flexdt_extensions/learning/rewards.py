@@ -76,7 +76,9 @@ class InformationTask:
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """Draw offsets of a few millimetres and degrees; only the prior is known."""
+        """Draw new offsets of a few millimetres and degrees, and forget what was measured: only
+        the prior is known.
+        """
         shift = rng.normal(0.0, 2.0, 3)
         tau = rng.normal(0.0, 1.0, 2)
         self._truth = Offsets.from_edge(

@@ -255,8 +255,14 @@ def _rows(problem: FitProblem) -> FloatArray:
 
 
 def inverse(information: FloatArray) -> FloatArray:
-    """Compute covariances (..., p, p) in units of tolerances; infinite diagonal where
-    not determined."""
+    """Invert information matrices.
+
+    Args:
+        information: (..., p, p) in units of tolerances.
+
+    Returns:
+        Covariances (..., p, p); infinite diagonal where not determined.
+    """
     values, vectors = np.linalg.eigh(information)
     lost = values <= 1e-12 * np.maximum(values[..., -1:], 1e-300)
     safe = np.where(lost, np.inf, values)

@@ -241,7 +241,7 @@ def run_design(
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """Compare the design with the spiral in a sentence."""
+    """Compare the design's score with that of the thesis's spiral in a sentence."""
     name = document["spiral"]["name"]
     gain = document["gain"]
     if gain is None:

@@ -123,7 +123,7 @@ class RenderedFrames:
         return list(self.looks)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut out windows of line integrals; see `Frames`."""
+        """Cut windows (n, k, side, side) of line integrals out of the images; see `Frames`."""
         n, k = plan.corner.shape[:2]
         out = np.empty((n, k, plan.side, plan.side), dtype=np.float32)
         for i in range(n):
@@ -146,7 +146,7 @@ class RenderedFrames:
         return full
 
     def take(self, frames: Sequence[int]) -> RenderedFrames:
-        """Select some of the frames."""
+        """Return some of the frames, by number, as frames of their own."""
         return RenderedFrames(
             tuple(self.kept[i] for i in frames),
             tuple(self.corner[i] for i in frames),

@@ -79,7 +79,7 @@ class Cell:
 
 
 def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
-    """List the cells of the grid of start errors."""
+    """List the cells of the grid of start errors, each a shift [mm] and an angle [deg]."""
     return [
         Cell(mm, deg, 10, "normal-5", seed, noise_px)
         for mm in START_MM

@@ -48,7 +48,11 @@ class Given:
 
 
 def text_of(path: Path) -> str:
-    """Return a file's UTF-8 text, or raise ExchangeError."""
+    """Read a file's UTF-8 text.
+
+    Raises:
+        ExchangeError: it is too long, or no UTF-8.
+    """
     if path.stat().st_size > MAX_BYTES:
         raise ExchangeError(f"{path}: {path.stat().st_size} bytes; allowed: {MAX_BYTES}")
     try:

@@ -129,7 +129,11 @@ class _Streams:
         return out
 
     def lengths(self, name: str, count: int) -> FloatArray:
-        """Read lengths (count,) of `ImageInfo`, without their signs."""
+        """Read lengths (count,) of a stream of `ImageInfo`, without their signs.
+
+        Raises:
+            DatasetFormatError: one of them is 0 or not finite.
+        """
         found = abs(
             self.values(f"ImageInfo/{name}", "<f4", count, hint=GEOMETRY_HINT).astype(
                 np.float64

@@ -105,7 +105,16 @@ def _bends(
 
 
 def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
-    """Compute means of blocks, (m, count^2)."""
+    """Compute means of blocks of BLOCK_PX x BLOCK_PX pixels.
+
+    Args:
+        windows: (m, side, side).
+        edge: first used row and column.
+        count: blocks along a side.
+
+    Returns:
+        (m, count^2); nan for blocks with nan.
+    """
     inner = windows[:, edge : edge + count * BLOCK_PX, edge : edge + count * BLOCK_PX]
     part = inner.reshape(len(windows), count, BLOCK_PX, count * BLOCK_PX).sum(axis=2)
     summed = part.reshape(len(windows), count, count, BLOCK_PX).sum(axis=3)

@@ -564,7 +564,7 @@ def with_pick(choice: Choice, i: int, pick: float) -> Choice:
 
 
 def _total(evidence: Sequence[float]) -> float:
-    """Compute the logarithm of the sum of probabilities."""
+    """Compute the logarithm of a sum of probabilities from their logarithms; -inf without any."""
     if not evidence:
         return -math.inf
     top = max(evidence)

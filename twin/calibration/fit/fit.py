@@ -227,7 +227,9 @@ def _levenberg(
     huber = math.inf
 
     def at(x: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        """Cost, norms and normal equations, priors included."""
+        """Evaluate cost, norms of the residuals, and Hessian and gradient with the priors in
+        them.
+        """
         cost, _, norms, _, hess, grad = p.evaluate(x, use, 1, huber)
         off = x - p.prior_mean
         hess.flat[:: len(x) + 1] += weight

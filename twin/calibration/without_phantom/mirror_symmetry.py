@@ -351,7 +351,15 @@ class _MirrorPairs:
         return np.asarray(self.own[which] - read_spline(self.level.soft[which], image))
 
     def score(self, values: FloatArray) -> FloatArray:
-        """Evaluate the estimating equation."""
+        """Evaluate the estimating equation at some parameters: the difference of mirrored pairs
+        along its slopes, less what noise adds.
+
+        Args:
+            values: (p,) parameters.
+
+        Returns:
+            (p,), 0 at the solution.
+        """
         image = self.level._mirrored(values, self.at)
         rest = self.own[0] - read_spline(self.level.soft[0], image)
         both = 3.0 * self.level.sigma**2  # of the two smoothings
@@ -375,7 +383,9 @@ class _MirrorPairs:
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
     def asymmetry(self) -> float:
-        """Compute the asymmetry of `Symmetry`."""
+        """Compute how much mirrored pairs differ beyond noise, as a share of the images'
+        structure.
+        """
         rest, noise = self._power()
         own = self.own[0] - np.average(self.own[0], weights=self.w)
         structure = max(float(np.average(own * own, weights=self.w)), 1e-30)

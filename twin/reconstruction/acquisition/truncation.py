@@ -115,7 +115,7 @@ class Prism:
         return np.array([*self.centre, first, low, second, self.attenuation])
 
     def rim(self) -> FloatArray:
-        """Compute (72, 3) points around it [mm]."""
+        """Compute 72 points on the prism's outline at z = 0, (72, 3) [mm]."""
         turn = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         disc = np.stack([np.cos(turn), np.sin(turn)])
         return np.pad(

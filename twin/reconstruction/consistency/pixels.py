@@ -185,7 +185,9 @@ class _Usual:
         self._largest: list[Float32Array] = []
 
     def add(self, square: Float32Array) -> None:
-        """Add one image of squares, (rows, cols)."""
+        """Add one image of squares (rows, cols) to the sum, and keep the largest values of each
+        pixel apart.
+        """
         self.count += 1
         self._total = square.copy() if self._total is None else self._total + square
         if self.count % VIEWS_AN_OUTLIER == 0:

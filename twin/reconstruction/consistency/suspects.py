@@ -111,7 +111,9 @@ def moved(cone_vec: ConeVec, along: float, down: float = 0.0) -> ConeVec:
 
 
 def _orders(scan: CoarseScan) -> Iterator[Suspect]:
-    """Yield scans whose images belong to other angles."""
+    """Yield scans whose images belong to other angles: in another order, or over half or twice
+    the span.
+    """
     angle = scan.circle.angle
     count = len(angle)
     for kind, order, figure in _permutations(angle):

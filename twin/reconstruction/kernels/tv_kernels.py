@@ -22,7 +22,9 @@ SOURCES = sources(compiling)
 
 @inline
 def differences(x, k, j, i, scale):
-    """Scaled differences of voxel (k, j, i) to the next along z, y and x."""
+    """Compute the scaled differences of voxel (k, j, i) to the next along z, y and x, a tuple
+    of three; 0 at the end of an axis.
+    """
     nz, ny, nx = x.shape
     here = x[k, j, i]
     dz = scale[0] * (x[k + 1, j, i] - here) if k + 1 < nz else np.float32(0)

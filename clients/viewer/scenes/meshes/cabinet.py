@@ -64,7 +64,9 @@ class Room(NamedTuple):
 
 
 def room_of(machine: Machine) -> Room:
-    """Compute the room that a machine needs."""
+    """Compute the room that a machine needs: its corners [mm], its scale over the drawn one,
+    and the floor's height.
+    """
     low, high = reach_of(machine)
     across, tall = (high - low)[:2].max(), (high - low)[2]
     scale = float(min(across / DRAWN_FOR_MM[0], tall / DRAWN_FOR_MM[1]))

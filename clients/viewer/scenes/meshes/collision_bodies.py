@@ -16,7 +16,7 @@ the axes too."""
 
 
 def bare(solid: ConvexSolid) -> trimesh.Trimesh:
-    """Build a convex solid [mm]."""
+    """Build the mesh of a convex solid, without margin [mm]."""
     if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height
         return cylinder(*size, solid.center, STEEL).mesh

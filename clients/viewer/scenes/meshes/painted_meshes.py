@@ -71,7 +71,16 @@ def cylinder(
     axis: str = "z",
     sections: int = 48,
 ) -> PaintedMesh:
-    """Build a cylinder [mm] along z (or y)."""
+    """Build a cylinder.
+
+    Args:
+        diameter: [mm].
+        height: along its axis [mm].
+        center: [mm].
+        paint: colour and gloss.
+        axis: "z" or "y".
+        sections: sides of the mesh.
+    """
     mesh = trimesh.creation.cylinder(
         radius=diameter / 2, height=height, sections=sections
     )
