@@ -9,6 +9,7 @@ cheap.
 from __future__ import annotations
 
 import os
+import sys
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import islice
@@ -402,7 +403,7 @@ def _run(argv: Sequence[str]) -> int:
     except (
         BrokenPipeError
     ):  # a closed pipe at the help page; `say` handles that of results
-        hush()
+        hush(sys.stdout)
         return DONE
     except Exception as error:
         if os.environ.get("FLEXDT_TRACEBACK"):

@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from flexdt.twin import long_work
 
@@ -54,9 +54,9 @@ def printable() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def hush() -> None:
-    """Drop further output: its reader has ended (`flexdt ... | head`)."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def hush(stream: TextIO) -> None:
+    """Drop further output of a stream: its reader has ended (`flexdt ... | head`)."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def say(text: str = "", end: str = "\n") -> None:
@@ -64,12 +64,15 @@ def say(text: str = "", end: str = "\n") -> None:
     try:
         print(text, end=end, flush=True)
     except BrokenPipeError:
-        hush()
+        hush(sys.stdout)
 
 
 def note(text: str) -> None:
     """Write a line of progress or a warning to standard error."""
-    print(text, file=sys.stderr, flush=True)
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        hush(sys.stderr)
 
 
 def warn(texts: Iterable[str], about: object = None) -> None:

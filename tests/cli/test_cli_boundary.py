@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -172,6 +173,34 @@ def test_a_reader_that_leaves_changes_neither_the_exit_code_nor_says_anything(
         assert process.stderr is not None
         assert process.stderr.read() == b""
     assert process.returncode == 0
+
+
+def test_a_reader_of_both_streams_that_leaves_keeps_the_exit_code(
+    tmp_path: Path,
+) -> None:
+    script = tmp_path / "s.txt"
+    script.write_text("tube\tset kVv\t80\t\tACK\t\t\r\n" * 6000)
+    with subprocess.Popen(
+        [sys.executable, "-m", "flexdt.clients.cli", "check", str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    ) as process:
+        assert process.stdout is not None
+        assert b"s.txt:1:" in process.stdout.readline()
+        process.stdout.close()
+    assert process.returncode == 1
+
+
+def test_a_binary_file_is_one_problem(tmp_path: Path) -> None:
+    rng = random.Random(5)
+    for head in (b"NRRD0005\ntype: float\n\n", b"", b"tube\tset kV\t80\t\tACK\t\t\r\n"):
+        file = tmp_path / "volume.nrrd"
+        file.write_bytes(head + rng.randbytes(50_000))
+        with flexdt("check", str(file)) as process:
+            told = process.communicate()[1].decode().splitlines()
+        assert process.returncode == 1
+        assert [line for line in told if "binary data" in line] == told[:1]
+        assert len(told) <= 2
 
 
 def test_what_the_terminal_cannot_write_is_escaped(tmp_path: Path) -> None:

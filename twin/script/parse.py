@@ -26,6 +26,15 @@ from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
 from flexdt.twin.script.problems import ScriptError, ScriptProblem, in_order
 from flexdt.twin.signatures import PathLike
 
+BINARY_HEAD_BYTES: Final = 64 << 10
+"""Length of a file's beginning that shows whether it is text [bytes]."""
+MIN_BINARY_BYTES: Final = 1024
+"""Least length of a file that may be called binary [bytes]; of a shorter one each line is
+reported."""
+MAX_CONTROL_SHARE: Final = 0.05
+"""Largest share of control characters in a text."""
+CONTROL_BYTES: Final = bytes(k for k in range(32) if k not in b"\t\n\r")
+"""Control characters that separate neither columns nor lines."""
 LIGHT_BYTES: Final = 8 << 10
 """Longest script, or list of poses, that any thread may plan [bytes]."""
 _MANY_IMAGES = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
@@ -100,6 +109,21 @@ def is_utf16(data: str | bytes) -> bool:
     return head[:2] in (b"\xff\xfe", b"\xfe\xff") or (
         len(head) >= 4 and not (any(head[0::2]) and any(head[1::2]))
     )
+
+
+def is_binary(data: str | bytes) -> bool:
+    """Return whether a file is an image, an archive or the like: of its beginning, more than
+    `MAX_CONTROL_SHARE` are control characters.
+
+    The binary argument of one `set sample info` in a script of some lines is far less.
+    """
+    head = data[:BINARY_HEAD_BYTES]
+    if isinstance(head, str):
+        head = head.encode("utf-8", "surrogatepass")
+    if len(head) < MIN_BINARY_BYTES:
+        return False
+    controls = len(head) - len(head.translate(None, CONTROL_BYTES))
+    return controls > MAX_CONTROL_SHARE * len(head)
 
 
 def is_log(text: str | bytes) -> bool:
@@ -274,8 +298,8 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
         text: text or bytes of a script.
 
     Returns:
-        The script of the lines that could be read, and all problems. A log or UTF-16 text
-        gives an empty script and one error.
+        The script of the lines that could be read, and all problems. A log, UTF-16 text
+        or a binary file gives an empty script and one error.
 
     Example:
         >>> script, problems = read_script("camera\tset exposure\tlong\t\tACK\t\t\r\n")
@@ -285,6 +309,9 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     text = content(text)
     if is_utf16(text):
         what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
+        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
+    if is_binary(text):
+        what = "the file holds binary data; allowed: the text of a scan script"
         return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
     problems: list[ScriptProblem] = []
     if is_log(text):
