@@ -5,6 +5,7 @@ Images are written as TIFF bytes by `tiff_bytes`.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import re
@@ -43,6 +44,9 @@ MAX_IMAGE_BYTES: Final = 1 << 29
 BLANK_SAMPLE_BYTES: Final = 4096
 """Bytes in the middle of an image's file that are examined first for other values than 0."""
 _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
+
+# What tifffile logs of a damaged file is in our error; it reaches whoever sets up logging.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True)
@@ -319,10 +323,12 @@ def read_values(
         raise ds.DatasetFormatError(
             f"cannot read {path}: {error}", {"path": str(path)}
         ) from None
-    except (
-        Exception
-    ) as error:  # A third party's parser on a damaged file: anything may come.
+    except ValueError as error:  # TiffFileError is one
         message = f"{path} is not a readable TIFF image: {error}"
+        raise ds.DatasetFormatError(message, {"path": str(path)}) from None
+    except Exception:  # a third party's parser raises anything on a damaged file
+        size = path.stat().st_size
+        message = f"{path} is not a readable TIFF image: its {size} bytes are cut off or damaged"
         raise ds.DatasetFormatError(message, {"path": str(path)}) from None
     if shape is not None and image.shape != shape:
         raise ds.DatasetFormatError(

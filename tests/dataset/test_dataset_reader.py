@@ -219,11 +219,12 @@ def image(shape: tuple[int, ...], dtype: str = "uint16") -> bytes:
         (b"II*\0\x08\0\0\0", "not a readable TIFF|allowed: uint16"),
         (b"\x80\x04cposix\nsystem\n.", "not a readable TIFF"),
         (image((24, 30))[:-100], "not a readable TIFF|cannot read"),
+        (b"II*\0", "its 4 bytes are cut off or damaged"),
         (image((24, 31)), "has 31 x 24 pixels, the data set has 30 x 24"),
         (image((24, 30), "float32"), "float32"),
         (image((24, 30, 3)), r"shape \(24, 30, 3\)"),
     ],
-    ids=range(7),
+    ids=range(8),
 )
 def test_damaged_images_are_named(written: Written, content: bytes, message: str) -> None:
     folder = written()
@@ -231,6 +232,9 @@ def test_damaged_images_are_named(written: Written, content: bytes, message: str
     d = load_dataset(folder)
     with pytest.raises(DatasetFormatError, match=message) as caught:
         d.counts(2)
+    assert not any(
+        raw in caught.value.message for raw in ("index out", "list ", "unpack")
+    )
     assert str(folder / "scan_000002.tif") in caught.value.message
     assert caught.value.data["path"] == str(folder / "scan_000002.tif")
 
