@@ -240,6 +240,8 @@ class PutResult(f.Result):
     received: int
     total: int
     complete: bool
+    warnings: list[str] = Field(default_factory=list)
+    """doubts about the volume, such as grey values in the place of attenuation"""
 
 
 class VolumeList(f.Result):
@@ -263,6 +265,8 @@ class Array(f.Result):
     shape: list[int]
     parts: int | None = None
     data: Buffer | None = None
+    warnings: list[str] = Field(default_factory=list)
+    """doubts about a geometry and what it projects, such as metres for mm"""
 
 
 class Cancelled(f.Result):

@@ -126,6 +126,8 @@ class DatasetResult(Result):
     clearance_of: str = ""
     """what the clearances are of"""
     script: str | None = None
+    warnings: list[str] = Field(default_factory=list)
+    """contradictions of its files and its geometry"""
 
 
 class DatasetFrameResult(ImageValue):

@@ -29,6 +29,8 @@ from flexdt.server.projector.compute import (
     views_a_block,
 )
 from flexdt.server.projector.job_context import SPARE_BYTES, Context, JobClient
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.plausibility import Operation, examine, settled
 from flexdt.twin.projection import TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
 
@@ -89,11 +91,12 @@ async def volume_put(
     what = p.grid or p.mesh
     assert what is not None
     assert p.data is not None
+    doubts: list[str] = []
     received, complete_body = context.store.chunk(client, p.name, what, p.start, p.data)
     complete = complete_body is not None
     if complete_body is not None:
         ready = complete_body
-        volume = await context.run(client, id, lambda: _prepared(ready()))
+        volume = await context.run(client, id, lambda: _prepared(ready(), doubts))
         assert isinstance(volume, Volume | TriangleMesh)
         context.store.put(p.name, volume, evictable=p.evictable)
     return {
@@ -101,6 +104,7 @@ async def volume_put(
         "received": received,
         "total": what.nbytes,
         "complete": complete,
+        **_warnings(doubts),
     }
 
 
@@ -165,13 +169,18 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 
     Raises:
         RpcError: no such volume, or a view that is too large.
+        GeometryError: a geometry that no scanner has.
     """
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
     if 4 * view > MAX_VIEW_BYTES:
         raise too_large("a view", 4 * view, MAX_VIEW_BYTES)
     # All rows at once, before any is computed: blocks would count from their own first row.
-    rows = as_cone_vec(p.cone_vec).rows
+    views = as_cone_vec(p.cone_vec)
+    rows = views.rows
+    boxes = volume.boxes if isinstance(volume, Volume) else None
+    found = examine(Operation.PROJECT, views, p.detector, boxes=boxes)
+    told = _warnings(settled(found, GeometryError))
     block = views_a_block(p.detector)
     if p.key is not None:
         context.supersede(client, p.key)
@@ -179,14 +188,15 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
     parts = 0
     done = 0
     for step in projection_steps(volume, rows, p.detector, block):
-        views = await job.run(context.compute, step)
-        assert isinstance(views, np.ndarray)
-        context.views += len(views)
-        if len(views) == len(rows) and views.nbytes + SPARE_BYTES <= MAX_FRAME:
-            return image.encode(views)
-        parts += await context.send_parts(client, id, views, done * view)
-        done += len(views)
-    return {"dtype": "float32", "shape": [len(rows), *p.detector], "parts": parts}
+        images = await job.run(context.compute, step)
+        assert isinstance(images, np.ndarray)
+        context.views += len(images)
+        if len(images) == len(rows) and images.nbytes + SPARE_BYTES <= MAX_FRAME:
+            return {**image.encode(images), **told}
+        parts += await context.send_parts(client, id, images, done * view)
+        done += len(images)
+    shape = [len(rows), *p.detector]
+    return {"dtype": "float32", "shape": shape, "parts": parts, **told}
 
 
 async def backproject(
@@ -284,15 +294,27 @@ def _accumulator(
     return held
 
 
-def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
-    """Check that a volume is finite, and make its projection layout.
+def _warnings(doubts: list[str]) -> dict[str, list[str]]:
+    """Return the result's part with warnings, empty without any."""
+    return {"warnings": doubts} if doubts else {}
+
+
+def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | TriangleMesh:
+    """Check a volume's values, and make its projection layout.
+
+    Args:
+        volume: complete.
+        doubts: gets warnings about its values.
 
     Raises:
         RpcError: numbers that are not finite.
+        GeometryError: values that are no attenuation.
     """
     if isinstance(volume, Volume):
         if not np.isfinite(volume.data).all():
             raise invalid_params("the volume holds numbers that are not finite")
+        found = examine(Operation.PROJECT, None, volume=volume.data)
+        doubts += settled(found, GeometryError)
         _ = volume.layout  # made now, so that the first projection does not wait for it
     return volume
 

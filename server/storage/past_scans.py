@@ -42,8 +42,10 @@ from flexdt.twin.dataset.flexdt_json import (
 )
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.plausibility import Operation, Severity, examine
 
 WORKERS: Final = 2
 """Number of worker processes."""
@@ -571,8 +573,30 @@ def _get(
         },
         same_machine=_same(scan, around),
         script=_script(folder) if asked.script else None,
+        warnings=_doubts(scan, info.shape),
         **(_measured(scan, tuple(at)) if asked.measure else {}),
     )
+
+
+def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:
+    """List contradictions of a data set's files and its geometry.
+
+    Args:
+        scan: the data set.
+        shape: of its projections, (rows, cols).
+    """
+    if scan.texts is not None:
+        root = scan.folder.path.parent
+        return [str(from_root(doubt, root)) for doubt in scan.texts.warnings]
+    rows = [one.cone_vec for one in scan.images if one.kind == "projection"]
+    known = [row for row in rows if row is not None]
+    if not known:
+        return []
+    try:
+        found = examine(Operation.OPEN, ConeVec(np.array(known)), shape)
+    except TwinError as error:
+        return [str(error)]
+    return [one.said for one in found if one.severity > Severity.NOTE]
 
 
 def _same(scan: _Scan, around: TwinContext) -> bool:

@@ -40,7 +40,7 @@ class Operation(Enum):
 
 def examine(
     operation: Operation,
-    geometry: ConeVec,
+    geometry: ConeVec | None,
     shape: tuple[int, int] | None = None,
     *,
     images: Any = None,
@@ -52,7 +52,7 @@ def examine(
 
     Args:
         operation: operation to be done.
-        geometry: of the views.
+        geometry: of the views, or None of data without any.
         shape: detector (rows, cols), or None where it is not known.
         images: line integrals (n, rows, cols).
         volume: values of voxels [1/mm].
@@ -65,33 +65,26 @@ def examine(
         >>> [one.kind for one in examine(Operation.OPEN, scan, (76, 96))]
         ['angles in radians']
     """
-    return tuple(_found(operation, geometry, shape, images, volume, boxes, grid))
+    values = tuple(_values(images, volume))
+    if geometry is None:
+        return values
+    return (*_found(operation, geometry, shape, boxes, grid), *values)
 
 
 def _found(
     operation: Operation,
     geometry: ConeVec,
     shape: tuple[int, int] | None,
-    images: Any,
-    volume: npt.NDArray[Any] | None,
     boxes: npt.ArrayLike | None,
     grid: FloatArray | None,
 ) -> Iterator[Finding]:
-    """Yield the findings of all checks that apply to an operation.
-
-    Arguments as for `examine`; `geometry` is converted, and `grid` is the box (2, 3) of the
-    volume's lower and upper corner [mm].
-    """
+    """Yield the findings of all checks of a geometry; arguments as for `examine`."""
     yield from geometry_findings(geometry, shape)
     if operation is not Operation.PROJECT:
         spans = tuple(span_findings(geometry))
         yield from spans
         if operation is Operation.ITERATE and not spans:
             yield from arc_findings(geometry)
-    if images is not None and len(images):
-        yield from integral_findings(some_of(images))
-    if volume is not None:
-        yield from volume_findings(volume)
     if boxes is not None and shape is not None:
         exposed = operation is Operation.SIMULATE
         yield from placement_findings(geometry, shape, boxes, exposed=exposed)
@@ -100,6 +93,14 @@ def _found(
         yield from grid_findings(geometry, shape, grid[0], grid[1], layers=layers)
     if grid is not None and operation is Operation.FDK:
         yield from inclination_findings(geometry, grid.mean(axis=0))
+
+
+def _values(images: Any, volume: npt.NDArray[Any] | None) -> Iterator[Finding]:
+    """Yield the findings of all checks of values; arguments as for `examine`."""
+    if images is not None and len(images):
+        yield from integral_findings(some_of(images))
+    if volume is not None:
+        yield from volume_findings(volume)
 
 
 def some_of(images: Any) -> npt.NDArray[Any]:

@@ -90,7 +90,8 @@ export type DatasetResult = {
   kinds: Array<"dark" | "flat" | "projection">; present: Array<boolean>;
   times_s: Array<number> | null; positions: Record<string, Array<number | null>>;
   same_machine: boolean; counts: Array<number | null> | null;
-  clearance_mm: Array<number | null> | null; clearance_of: string; script: string | null
+  clearance_mm: Array<number | null> | null; clearance_of: string; script: string | null;
+  warnings: Array<string>
 };
 export type Datasets = { search?: string; start?: number };
 export type Empty = Record<string, never>;
