@@ -43,7 +43,7 @@ VIEWS: Final = 180
 """Largest number of views: enough for the nodes and a panel moved aside."""
 COMPARED_VIEWS: Final = 2.0
 """Views per column, about, of a scan whose images are compared with its volume."""
-COMPARED_ROWS: Final = 16
+COMPARED_ROWS: Final = 6
 """Least rows of that scan, if the panel has so many."""
 PARALLEL_SOURCE_RADII: Final = 50.0
 """Distance of the source for parallel rays, in radii of the scan."""

@@ -3,8 +3,7 @@
 A coarse volume is projected again and compared with the images. How large the residual is where
 both are right depends on object and trajectory; the volume, projected and reconstructed a
 second time, shows it. Other explanations are tried, each with a coarse reconstruction of its
-own: the opposite rotation always, the others where the residual is larger than that of the
-second reconstruction. A geometry is believed if it fits better than every explanation whose
+own. A geometry is believed if it fits better than every explanation whose
 volume would differ. All of it is done with few views and rows.
 """
 
@@ -120,11 +119,11 @@ class Comparison:
         self._trial = trial
         self._unfit = trial.whole and trial.even and trial.excess > MAX_MISFIT
         self._tried: list[Tried] = []
-        if not trial.telling.any():
+        doubtful = trial.excess >= MIN_DOUBTFUL_MISFIT
+        if not trial.telling.any() or not (doubtful or trial.whole):
             return
-        self._tried.append(trial.opposite())
-        if trial.excess >= 1.0:
-            self._tried += trial.others(far=self._unfit)
+        others = trial.others(far=self._unfit, mirrored=doubtful)
+        self._tried = [trial.opposite(), *others]
 
     def contradiction(self) -> Contradiction | None:
         """Find the error of the scan's geometry; None if there is none."""
@@ -148,13 +147,12 @@ class Comparison:
             claimed: largest relative error that is claimed of nine of ten uniform regions.
         """
         trial = self._trial
-        most = EQUAL_MISFIT_RATIO * trial.excess
         rivals = [
             one
             for one in self._tried
             if one.evidence < MIN_EVIDENCE_SIGMAS
             and one.change > claimed
-            and trial.excess_of(one) <= most
+            and trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
         ]
         if not trial.whole or not rivals:
             return None

@@ -48,6 +48,8 @@ UPSIDE_DOWN: Final = frozenset({"rows", "turned"})
 """Explanations whose volume is upside down."""
 TURNED: Final = frozenset({"direction", "columns", "turned"})
 """Explanations whose volume is turned about the axis."""
+MIRRORED: Final = frozenset({"columns", "rows", "turned"})
+"""Explanations by mirrored images."""
 TURN_STEPS: Final = 180
 """Angles of a turn in which a mirrored object is compared."""
 
@@ -60,6 +62,7 @@ class Tried:
         suspect: the explanation.
         shown: its images, and its volume's; None where FDK cannot use its geometry.
         score: its misfit over that of the stated geometry.
+        residual: the same with noise, from which the evidence is.
         evidence: by how many standard errors the stated geometry fits better.
         change: what nine of ten uniform nodes of the volume change by at most, relative
             to their values.
@@ -68,6 +71,7 @@ class Tried:
     suspect: Suspect
     shown: Reprojection | None
     score: float = np.inf
+    residual: float = np.inf
     evidence: float = np.inf
     change: float = 0.0
 
@@ -101,14 +105,17 @@ class Trial:
         """Try the rotation the other way."""
         return self._tried(reversed_turn(self.scan))
 
-    def others(self, *, far: bool) -> list[Tried]:
+    def others(self, *, far: bool, mirrored: bool = True) -> list[Tried]:
         """Try all explanations but the opposite rotation.
 
         Args:
             far: panels far aside, too, as for images that do not fit.
+            mirrored: images mirrored or turned, too; a panel in the middle sees the
+                opposite rotation so.
         """
         listed = suspects(self.scan, whole=self.whole and self.even)
-        return [*self._beside(far), *map(self._tried, listed)]
+        chosen = [one for one in listed if mirrored or one.kind not in MIRRORED]
+        return [*self._beside(far), *map(self._tried, chosen)]
 
     def excess_of(self, one: Tried) -> float:
         """Compute an explanation's misfit over that of its volume's second
@@ -117,6 +124,16 @@ class Trial:
         if one.shown is None:
             return np.inf
         return self._excess(one.shown, self._expected(one.shown, one.suspect.cone_vec))
+
+    def fits_as_well(self, one: Tried, ratio: float) -> bool:
+        """Return whether an explanation leaves at most `ratio` times the residual, each
+        geometry measured by its volume's second reconstruction.
+        """
+        if one.shown is None:
+            return False
+        expected = self._expected(one.shown, one.suspect.cone_vec) / self.expected
+        usual = float(np.exp(np.log(expected[self.telling]).mean()))
+        return one.residual <= ratio * usual
 
     def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
         """Compute the misfit of a volume's second reconstruction, infinite without one,
@@ -143,7 +160,9 @@ class Trial:
         each = 0.5 * np.log(residuals).mean(axis=0)
         spread = max(float(each.std(ddof=1)), np.finfo(np.float32).tiny)
         evidence = float(each.mean()) * np.sqrt(len(each)) / spread
-        return Tried(suspect, shown, score, evidence, self._change(suspect, shown))
+        residual = float(np.exp(each.mean()))
+        change = self._change(suspect, shown)
+        return Tried(suspect, shown, score, residual, evidence, change)
 
     def _change(self, suspect: Suspect, shown: Reprojection) -> float:
         """Compute the largest relative change of nine of ten uniform nodes.
@@ -190,7 +209,7 @@ class Trial:
         if len(known) > 3 or score(side) < 1.0:
             for _ in range(2):
                 score(_lowest(known))
-        for at in (-PROBE_COLUMNS, PROBE_COLUMNS):
+        for at in (-PROBE_COLUMNS, PROBE_COLUMNS) if self.whole else ():
             for _ in range(MAX_PROBE_STEPS):
                 score(at)
                 if at in tried and tried[at].evidence >= MIN_EVIDENCE_SIGMAS:
