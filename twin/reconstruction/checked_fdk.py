@@ -101,17 +101,21 @@ def fdk(
     box = as_volume(like).boxes[0]
     found = examine(Operation.FDK, geometry, shape, images=values, grid=box)
     sentences = settled(found, GeometryError)
-    with long_work.during("reconstructing by FDK", progress) as advance:
-        volume, doubts = checked_fdk(
-            values.__getitem__,
-            parts,
-            geometry,
-            shape,
-            like,
-            window,
-            advance,
-            errors=errors,
-        )
+    try:
+        with long_work.during("reconstructing by FDK", progress) as advance:
+            volume, doubts = checked_fdk(
+                values.__getitem__,
+                parts,
+                geometry,
+                shape,
+                like,
+                window,
+                advance,
+                errors=errors,
+            )
+    except GeometryError as error:
+        message = "; ".join([error.message, *sentences])
+        raise GeometryError(message, error.data) from None
     for sentence in sentences:
         warnings.warn(sentence, PlausibilityWarning, stacklevel=3)
     for doubt in doubts:
