@@ -382,6 +382,7 @@ class Viewer:
                 "type": "state",
                 "state": without_bytes(raw),
                 "framing": framing,
+                "across_mm": self.look.across_mm,
                 "cone_vec": world.cone_vec.rows[0].tolist(),
                 "near": near,
                 "at": time.time(),

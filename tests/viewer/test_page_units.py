@@ -5,17 +5,10 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-from pathlib import Path
 
 import pytest
 
 from tests.viewer.test_page_source import BUILT, WEB, node
-
-COLUMNS = 100
-LONG_STILL = {"calibrate", "film", "keys", "measure", "path", "raycast", "scene", "shared",
-              "slices", "timeline", "viewer.d", "views", "volume", "welcome"}  # fmt: skip
-"""Modules with longer lines: those that draw, and tables of types. Take out what becomes
-short."""
 
 
 def test_what_the_page_computes() -> None:
@@ -37,16 +30,6 @@ def test_what_the_page_computes() -> None:
     passed = re.search(r"pass (\d+)", done.stdout)
     assert passed is not None
     assert int(passed[1]) >= 10, done.stdout
-
-
-def test_lines_of_the_pages_modules_are_short() -> None:
-    sources = [path for path in WEB.glob("*.ts") if path.name != "wire.d.ts"]
-    long = {path.name.removesuffix(".ts") for path in sources if widest(path) > COLUMNS}
-    assert long <= LONG_STILL, sorted(long - LONG_STILL)
-
-
-def widest(path: Path) -> int:
-    return max(map(len, path.read_text("utf-8").splitlines()))
 
 
 def test_every_pure_module_is_what_the_tests_import() -> None:

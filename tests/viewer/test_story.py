@@ -25,7 +25,7 @@ def test_five_steps_lead_from_a_wrong_geometry_to_a_sharp_volume(
     """The twin of this test hides no misalignment: what is found is the nominal geometry."""
     twin.control("force")
     twin.set_camera(**USUAL)
-    twin.set_sample("gear")
+    twin.set_sample("square")
     twin.control("release")
     page = open_page(size=(1366, 768), tab="calibrate")
     page.click("#story summary")
@@ -38,13 +38,13 @@ def test_five_steps_lead_from_a_wrong_geometry_to_a_sharp_volume(
     begun = time.monotonic()
     for button in ("bend", "scan", "fit", "apply", "again"):
         if button == "again":  # chosen for "Scan it", which is not the story's
-            page.select_option("#scan-it-sample", "gear")
+            page.select_option("#scan-it-sample", "square")
         page.locator(f"#story-{button}.primary:enabled").click(timeout=PATIENCE_MS)
         if button == "bend":
             page.wait_for_function(
                 "flexdt.store.state.correction?.parameters.dO_x === 0.6"
             )
-            assert twin.state().sample.name == "lego"
+            assert twin.state().sample.name == "gear"
     page.locator("#story-says", has_text="Sharp again").wait_for(timeout=PATIENCE_MS)
     print(f"\n{time.monotonic() - begun:.0f} s; load average {os.getloadavg()[0]:.1f}")
     before, after = map(
@@ -55,7 +55,7 @@ def test_five_steps_lead_from_a_wrong_geometry_to_a_sharp_volume(
     assert correction is not None
     assert abs(correction.parameters.get("dO_x", 0.0)) < 0.05
     assert abs(correction.parameters.get("det_roll", 0.0)) < 0.1
-    assert twin.state().sample.name == "lego"
+    assert twin.state().sample.name == "gear"
     page.close()
     twin.control("force")
     twin.revert_calibration()

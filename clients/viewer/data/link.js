@@ -8,6 +8,7 @@ export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array
 export const store = {
     state: null,
     framing: null,
+    across_mm: null,
     near: null,
     hello: null,
     session: null,
@@ -134,6 +135,7 @@ const handlers = {
         Object.assign(store, {
             state: m.state,
             framing: m.framing,
+            across_mm: m.across_mm,
             near: m.near,
             coneVec: m.cone_vec,
         });

@@ -1,7 +1,7 @@
 import { bar, codeOf, drawBar, extent } from "./slices.js";
 const BRICK = 8;
 const SLOW_MS = 90;
-const ROOM = 1.75; // rays see so many times the box's longest side
+export const ROOM = 1.75; // rays see so many times the box's longest side
 const VERTEX = "#version 300 es\nin vec2 a; out vec2 at; void main() { at = a; gl_Position = vec4(a, 0., 1.); }";
 // Bricks whose greatest value is too low are left out: those are most of the rays' way. `near`
 // is where a ray enters the box, on a cut face as grey values. Steps are of a voxel; a surface

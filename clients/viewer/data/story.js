@@ -1,14 +1,19 @@
 // Misalign: the thesis as a story in five steps. The scanner is told a wrong geometry, a
-// scan shows what that does to a volume, the bead phantom tells the right one, and a second
-// scan is sharp again. Images are the same with a part that is displaced and with a
-// reconstruction that believes it displaced: so nothing has to be bent.
+// scan of a gear shows what that does to a volume, a short scan of the bead phantom tells the
+// right one, and a second scan of the gear is sharp again. Images are the same with a part that
+// is displaced and with a reconstruction that believes it displaced: so nothing is bent.
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { isUnfinished } from "./job_words.js";
-import { scanIt } from "./scan_it.js";
+import { scanIt, turnOf } from "./scan_it.js";
+// What is scanned, and the phantom whose beads tell the geometry.
+const OBJECT = "gear";
 const PHANTOM = "lego";
+// Views of the phantom's turn: beads are found in each.
+const PHANTOM_VIEWS = 45;
+const NOT_BEGUN = "The scan did not begin: the note says why.";
 // What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt
 // from their height.
 const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
@@ -23,10 +28,10 @@ const STEPS = [
     [
         "story-bend",
         "1  Misalign",
-        "Choose how wrong the geometry is; the bead phantom goes onto the stage.",
+        "Choose how wrong the geometry is; a printed gear goes onto the stage.",
     ],
     ["story-scan", "2  Scan it", "One turn, reconstructed with the wrong geometry."],
-    ["story-fit", "3  Calibrate", "The phantom's beads tell where axis, panel and source are."],
+    ["story-fit", "3  Calibrate", "A bead phantom turns once: its beads tell the geometry."],
     ["story-apply", "4  Apply", "What was found comes into force."],
     [
         "story-again",
@@ -37,6 +42,7 @@ const STEPS = [
 let step = 0;
 let job = null;
 let dataset = null;
+let phantomJob = null;
 let found = null;
 let waiting = false;
 const rms = [];
@@ -87,7 +93,7 @@ async function bend() {
     rms.length = 0;
     setText($("#story-found"), "");
     const wrong = { parameters: chosen(), source: null, comment: COMMENT };
-    if (!(await command("sample.set", { name: PHANTOM }, "The sample stays")))
+    if (!(await command("sample.set", { name: OBJECT }, "The sample stays")))
         return;
     if (!(await command("calibration.apply", wrong, "Not applied")))
         return;
@@ -97,16 +103,21 @@ async function scan() {
     waiting = true;
     show("Scanning; the volume grows in the scene.");
     dataset = null;
-    job = await scanIt(PHANTOM);
+    job = await scanIt(OBJECT);
     if (!job)
-        failed("The scan did not begin: the note says why.");
+        failed(NOT_BEGUN);
 }
+// Scans the phantom; its beads are looked for once its images are there.
 async function fit() {
-    if (!dataset)
-        return;
     waiting = true;
+    show("The bead phantom is on the stage, and turns once.");
+    phantomJob = await turnOf(PHANTOM, PHANTOM_VIEWS);
+    if (!phantomJob)
+        failed(NOT_BEGUN);
+}
+async function look(scanned) {
     show("Finding beads in all images …");
-    const asked = { datasets: [dataset], phantom: PHANTOM, free: FREE };
+    const asked = { datasets: [scanned], phantom: PHANTOM, free: FREE };
     const report = await call("calibration.fit", asked).catch((error) => words(error));
     if (typeof report === "string") {
         failed(report);
@@ -117,33 +128,47 @@ async function fit() {
         failed(`Nothing is applied: ${report.verdict}`);
         return;
     }
-    found = correction;
-    const { parameters } = report;
+    if (!(await command("sample.set", { name: OBJECT }, "The sample stays"))) {
+        failed("The phantom is still on the stage.");
+        return;
+    }
+    found = { correction, source: scanned };
+    tell(report.parameters);
+    next();
+}
+// What was found beside what was told.
+function tell(parameters) {
     const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => {
         const one = parameters[name];
         const seen = one
             ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}`
             : "not estimated: back to nominal";
-        return el("div", {}, `${what}: told ${fixed(slider(name).valueAsNumber, 2)} ${unit}, ${seen}`);
+        const told = fixed(slider(name).valueAsNumber, 2);
+        return el("div", {}, `${what}: told ${told} ${unit}, ${seen}`);
     });
     $("#story-found").replaceChildren(...rows);
-    next();
 }
 async function use() {
-    if (!found || !dataset)
+    if (!found)
         return;
-    if (await apply(found, dataset, "after a story"))
+    if (await apply(found.correction, found.source, "after a story"))
         next();
 }
 on("job", (told) => {
-    if (!waiting || told.job !== job)
+    if (!waiting || (told.job !== job && told.job !== phantomJob))
         return;
-    if (told.state === "done") {
+    if (isUnfinished(told))
+        failed(`The scan is ${told.state}.`);
+    if (told.state !== "done")
+        return;
+    if (told.job === phantomJob) {
+        phantomJob = null;
+        void look(folder(told));
+    }
+    else {
+        job = null;
         dataset = folder(told);
         show("Reconstructing, and comparing with the truth …");
-    }
-    else if (isUnfinished(told)) {
-        failed(`The scan is ${told.state}.`);
     }
 });
 on("volume", (volume) => {
@@ -156,6 +181,7 @@ on("volume", (volume) => {
     }
     if (!volume.compared)
         return;
+    dataset = null;
     rms.push(Object.values(volume.compared)[0].rms);
     next();
     if (step === 2)

@@ -5,14 +5,18 @@ import { along, curve, histogram } from "./plots.js";
 import { $, $button, $canvas, $input, $select, clicks, el, fixed, keep, setText, slid, words, } from "./dom.js";
 import { call, on, store } from "./link.js";
 import { folder } from "./data.js";
+import { reach } from "./filled.js";
 import { extent, index, slices, valueOf } from "./slices.js";
-import { raycast } from "./raycast.js";
+import { raycast, ROOM } from "./raycast.js";
 import { shared } from "./shared.js";
 import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
 const KEY = "flexdt-volume";
 const STARTING = "starting; dark, flat and a first image are needed";
 const EXACT_MS = 60;
+// Largest first zoom of a volume in three dimensions, and the room about its object.
+const NEAREST = 4;
+const MARGIN = 1.1;
 const SHOWN = {
     volume: "volume",
     sigma: "noise (standard deviation)",
@@ -282,10 +286,20 @@ function show(block) {
     put();
     if (!same && !block.own)
         surface();
+    if (first && past)
+        closer(block);
     if (first && reveal) {
         reveal = false;
         $("#volume-card").scrollIntoView({ block: "start" });
     }
+}
+// A past scan's volume opens as near as its object allows.
+function closer(block) {
+    const far = solid && reach(block, solid.level);
+    if (!solid || !far)
+        return;
+    solid.zoom = Math.max(1, Math.min(NEAREST, ROOM / 2 / far / MARGIN));
+    solid.draw();
 }
 shown.addEventListener("change", () => void want());
 // Ends of the window and the surface's value, in parts of the block's range about its window.

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, cast
 
 import numpy as np
@@ -39,6 +40,8 @@ OTHER_COLOR: Final = (214, 170, 90)
 MAX_LOOKS: Final = 8
 MAX_FACES: Final = 200_000
 DEFAULT_MATERIAL: Final = "abs"
+HAND_MM: Final = 50.0
+"""Radius of the ball that is looked at on an empty stage."""
 Key = tuple[str | None, str | None, str | None]
 Ask = Callable[[str, Mapping[str, Any]], Awaitable[object]]
 
@@ -76,11 +79,23 @@ class SampleLook:
     beads: FloatArray
     exact: bool = True
 
-    @property
+    @cached_property
     def radius_mm(self) -> float:
         """Of the ball about the sample's origin that holds it; of a hand for an empty stage."""
-        far = [float(np.linalg.norm(skin.vertices, axis=1).max()) for skin in self.skins]
-        return max(far) / MM if far else 50.0
+        far = self._reach(3)
+        return HAND_MM if far is None else far
+
+    @cached_property
+    def across_mm(self) -> float | None:
+        """Diameter of the cylinder about the sample's z axis that holds it; None for an
+        empty stage."""
+        far = self._reach(2)
+        return None if far is None else 2.0 * far
+
+    def _reach(self, axes: int) -> float | None:
+        """Compute the greatest distance from the origin along the first axes [mm]."""
+        far = [np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins]
+        return float(max(far)) / MM if far else None
 
 
 NOTHING = SampleLook((), np.zeros((0, 3)))

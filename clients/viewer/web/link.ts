@@ -36,6 +36,7 @@ export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array
 export const store = {
   state: null as State | null,
   framing: null as Framing | null,
+  across_mm: null as number | null,
   near: null as Near | null,
   hello: null as HelloResult | null,
   session: null as string | null,
@@ -175,6 +176,7 @@ const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
     Object.assign(store, {
       state: m.state,
       framing: m.framing,
+      across_mm: m.across_mm,
       near: m.near,
       coneVec: m.cone_vec,
     });

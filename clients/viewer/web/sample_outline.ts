@@ -5,32 +5,42 @@ import type { CameraState, GeometryState, SampleState } from "./viewer.js";
 const HALF_PX = 0.5;
 type Interval = readonly [from: number, to: number];
 
-// What the picture lacks, for people; nothing where the sample is inside.
+// Diameter [mm] of the cylinder that holds a sample, about an upright axis through its origin:
+// of its shape, where that is known and stands upright, else of its box; null where nobody has
+// said its size.
+export function across({ size_mm: size, offset }: SampleState, shape_mm: number | null) {
+  if (!size) return null;
+  if (offset.rx || offset.ry) return Math.hypot(...size);
+  return Math.min(Math.hypot(size[0], size[1]), shape_mm ?? Infinity);
+}
+// What the picture lacks, for people; nothing where the sample is inside. `shape_mm` is the
+// diameter of the cylinder about the sample's z axis that holds it, where that is known.
 export function outline(
   sample: SampleState,
   g: GeometryState,
   camera: CameraState,
   sampleHeight_mm: number,
+  shape_mm: number | null = null,
 ): string[] {
   const size = sample.size_mm;
+  const width = across(sample, shape_mm);
   const axis = g.axis_column_px;
-  if (!size || axis === null || !Number.isFinite(axis)) return [];
+  if (!size || width === null || axis === null || !Number.isFinite(axis)) return [];
   const o = sample.offset;
   const upright = !o.rx && !o.ry;
-  const half = upright ? 0.5 * Math.hypot(size[0], size[1]) : 0.5 * Math.hypot(...size);
-  const radius = half + Math.hypot(o.x, o.y);
+  const radius = 0.5 * width + Math.hypot(o.x, o.y);
   if (radius >= g.SOD_mm) return ["the sample reaches the source"];
   const reach = (radius * g.SDD_mm) / Math.sqrt(g.SOD_mm ** 2 - radius ** 2) / camera.pixel_mm;
-  const across: Interval = [axis - reach, axis + reach];
-  const height = upright ? size[2] : 2 * half;
+  const sideways: Interval = [axis - reach, axis + reach];
+  const height = upright ? size[2] : width;
   const nearest = g.SDD_mm / (g.SOD_mm - radius) / camera.pixel_mm;
   const raised = ((o.z + sampleHeight_mm) * g.magnification) / camera.pixel_mm;
   const middle = g.piercing_point_px[1] - raised;
   const along: Interval = [middle - (height / 2) * nearest, middle + (height / 2) * nearest];
   const [rows, cols] = camera.shape;
-  if (outside(across, cols) || outside(along, rows)) return ["Sample is outside the image"];
+  if (outside(sideways, cols) || outside(along, rows)) return ["Sample is outside the image"];
   const cut: string[] = [];
-  if (beyond(across, cols)) cut.push("truncated sideways over a full turn");
+  if (beyond(sideways, cols)) cut.push("truncated sideways over a full turn");
   if (beyond(along, rows)) cut.push("truncated at top or bottom");
   return cut.length ? [`Sample ${cut.join(", ")}`] : [];
 }

@@ -5,6 +5,8 @@ import { $, $button, $select, clicks, el, setText } from "./dom.js";
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
 import { isUnfinished } from "./job_words.js";
+import { across } from "./sample_outline.js";
+import { nearSample } from "./views.js";
 import { reconstruct, watch } from "./volume.js";
 import type { Answers, State } from "./viewer.js";
 
@@ -15,6 +17,9 @@ const EXPOSURE_MS = 100;
 const SHOWN_VOXELS = 256;
 // Part of the image, in width and height, that the sample takes.
 const FILL = 0.8;
+// How often, and after which time, the page looks for a sample that was just put there.
+const SHOWN_TRIES = 20;
+const SHOWN_AGAIN_MS = 100;
 // Change of the voxel size below which the stage stays where it is.
 const SAME = 0.12;
 const sample = $select("#scan-it-sample");
@@ -23,12 +28,25 @@ const note = $("#scan-it-note");
 let mine: string | null = null;
 // From the press of the button until the volume stands beside its truth.
 let busy = false;
+// Until the first image: then the stage stands where it turns, and the camera goes there.
+let far = false;
 
+// Whether the page's own state is of a sample: only then does it know what is across it.
+const isShown = (some: State["sample"]) =>
+  some.name === store.state?.sample.name && some.revision === store.state.sample.revision;
 // Size of what turns, across and upright, in mm; null where nobody has said it.
-function turning({
-  sample: { size_mm: size },
-}: State): [across: number, upright: number] | null {
-  return size ? [Math.hypot(size[0], size[1]), size[2]] : null;
+function turning({ sample: some }: State): [across: number, upright: number] | null {
+  const { x, y, rx, ry } = some.offset;
+  const width = across(some, isShown(some) ? store.across_mm : null);
+  if (!some.size_mm || width === null) return null;
+  return [width + 2 * Math.hypot(x, y), rx || ry ? width : some.size_mm[2]];
+}
+// The state of the twin, once the page's own is of the same sample or has had time for it.
+async function current(): Promise<State | null> {
+  const state = await call("state.get").catch(() => null);
+  for (let wait = 0; state && !isShown(state.sample) && wait < SHOWN_TRIES; wait++)
+    await new Promise((again) => setTimeout(again, SHOWN_AGAIN_MS));
+  return state;
 }
 // The voxel size [um] at which the sample fills the image.
 export function filling(state: State): number | null {
@@ -44,39 +62,53 @@ export function viewsFor(state: State, voxel_um: number): number {
   const wanted = size ? Math.ceil((Math.PI / 2) * (size[0] / shown_mm)) : MOST_VIEWS;
   return Math.min(MOST_VIEWS, Math.max(LEAST_VIEWS, wanted)) | 1;
 }
-// A script for it: nearer or farther where that is possible, else where the stage stands.
-async function script(state: State): Promise<Answers["viewer.compose"] | null> {
+// A script for it: nearer or farther where that is possible, else where the stage stands; with
+// as many views as follow from the sample, unless they are given.
+async function script(
+  state: State,
+  views: number | null,
+): Promise<Answers["viewer.compose"] | null> {
   const now_um = 1000 * (state.geometry.voxel_size_mm ?? 0.1);
   const wanted_um = filling(state);
   const near = wanted_um !== null && Math.abs(wanted_um / now_um - 1) > SAME ? wanted_um : null;
   for (const voxel_um of near === null ? [null] : [near, null]) {
-    const frames = viewsFor(state, voxel_um ?? now_um);
+    const frames = views ?? viewsFor(state, voxel_um ?? now_um);
     const asked = { kind: "fly" as const, frames, exposure_ms: EXPOSURE_MS };
     const more = voxel_um === null ? {} : { voxel_um };
     const made = await call("viewer.compose", { ...asked, ...more }).catch(() => null);
     const found = made && (await call("script.check", { text: made.text }).catch(() => null));
     if (found?.ok) return made;
   }
-  const least = { kind: "fly" as const, frames: LEAST_VIEWS, exposure_ms: EXPOSURE_MS };
+  const frames = views ?? LEAST_VIEWS;
+  const least = { kind: "fly" as const, frames, exposure_ms: EXPOSURE_MS };
   return command("viewer.compose", least, "No scan");
 }
-// Begins a scan of a sample, of the chosen one unless another is named; its job, or null.
+// Puts a sample on the stage, unless it stands there, and begins one turn of it that fills the
+// image; its job, or null.
+export async function turnOf(
+  named: string,
+  views: number | null = null,
+): Promise<string | null> {
+  const other = named && named !== store.state?.sample.name;
+  if (other && !(await command("sample.set", { name: named }, "The sample stays"))) return null;
+  const state = await current();
+  const made = state && (await script(state, views));
+  const asked = made && { text: made.text, speed_up: "max" as const };
+  const job = asked && (await command("script.submit", asked, "No scan"));
+  return job?.job ?? null;
+}
+// Begins a scan of a sample, of the chosen one unless another is named, whose volume grows and
+// then stands beside its truth; its job, or null.
 export async function scanIt(named: string = sample.value): Promise<string | null> {
   go.disabled = true;
   try {
-    const other = named && named !== store.state?.sample.name;
-    if (other && !(await command("sample.set", { name: named }, "The sample stays")))
-      return null;
-    const state = await call("state.get").catch(() => null);
-    const made = state && (await script(state));
-    const asked = made && { text: made.text, speed_up: "max" as const };
-    const job = asked && (await command("script.submit", asked, "No scan"));
-    if (!job) return null;
-    mine = job.job;
+    mine = await turnOf(named);
+    if (!mine) return null;
     busy = true;
+    far = true;
     watch();
-    emit("note", "good", "Scan it", `${named || "the sample"}: ${job.job} has begun`);
-    return job.job;
+    emit("note", "good", "Scan it", `${named || "the sample"}: ${mine} has begun`);
+    return mine;
   } finally {
     go.disabled = false;
   }
@@ -104,6 +136,10 @@ on("job", (job) => {
     mine = null;
     reconstruct(folder(job), true);
     return;
+  }
+  if (far && job.frames_done > 0) {
+    far = false;
+    nearSample();
   }
   setText(note, `${job.frames_done} of ${job.frames_total} images`);
   if (isUnfinished(job)) {

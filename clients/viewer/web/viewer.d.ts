@@ -145,7 +145,15 @@ interface Failure {
 // Messages by their type.
 export interface Messages {
   answer: { id: number; result: unknown; error?: Failure };
-  state: { state: State; framing: Framing; near: Near; cone_vec: number[]; at: number };
+  state: {
+    state: State;
+    framing: Framing;
+    // Diameter of the cylinder about its z axis that holds the sample.
+    across_mm: number | null;
+    near: Near;
+    cone_vec: number[];
+    at: number;
+  };
   link: {
     connected: boolean;
     problem: string | null;

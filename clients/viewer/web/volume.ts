@@ -19,8 +19,9 @@ import {
 import { call, on, store } from "./link.js";
 import type { Block, Figures, Live, Name, Pair, Vector, VolumeMessage } from "./viewer.js";
 import { folder } from "./data.js";
+import { reach } from "./filled.js";
 import { extent, index, slices, valueOf } from "./slices.js";
-import { raycast } from "./raycast.js";
+import { raycast, ROOM } from "./raycast.js";
 import { shared } from "./shared.js";
 import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
@@ -28,6 +29,9 @@ import { otsu } from "./otsu.js";
 const KEY = "flexdt-volume";
 const STARTING = "starting; dark, flat and a first image are needed";
 const EXACT_MS = 60;
+// Largest first zoom of a volume in three dimensions, and the room about its object.
+const NEAREST = 4;
+const MARGIN = 1.1;
 const SHOWN: Record<Name, string> = {
   volume: "volume",
   sigma: "noise (standard deviation)",
@@ -286,10 +290,18 @@ function show(block: Block) {
   if (!block.own) solid?.show(block);
   put();
   if (!same && !block.own) surface();
+  if (first && past) closer(block);
   if (first && reveal) {
     reveal = false;
     $("#volume-card").scrollIntoView({ block: "start" });
   }
+}
+// A past scan's volume opens as near as its object allows.
+function closer(block: Block) {
+  const far = solid && reach(block, solid.level);
+  if (!solid || !far) return;
+  solid.zoom = Math.max(1, Math.min(NEAREST, ROOM / 2 / far / MARGIN));
+  solid.draw();
 }
 shown.addEventListener("change", () => void want());
 

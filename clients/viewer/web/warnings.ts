@@ -76,7 +76,8 @@ function ofScan({ job }: State): Warning[] {
 
 let last = "";
 function draw(s: State) {
-  const outside = outline(s.sample, s.geometry, s.camera, store.framing?.sample_height_mm ?? 0);
+  const height_mm = store.framing?.sample_height_mm ?? 0;
+  const outside = outline(s.sample, s.geometry, s.camera, height_mm, store.across_mm);
   const cut = outside.map((words): Warning => ["", words]);
   const list = [...ofMachine(s), ...cut, ...ofImage(s), ...ofScan(s)];
   const key = JSON.stringify(list);

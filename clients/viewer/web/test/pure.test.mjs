@@ -6,7 +6,7 @@ import * as fp from "../../data/fingerprint.js";
 import * as job from "../../data/job_words.js";
 import * as meshes from "../../data/mesh_extent.js";
 import * as names from "../../data/names.js";
-import { outline } from "../../data/sample_outline.js";
+import { across, outline } from "../../data/sample_outline.js";
 import * as signals from "../../data/signals.js";
 
 let seed = 20261127;
@@ -173,6 +173,29 @@ test("a sample is inside, cut or outside as the rays to its corners say", () => 
     }
   }
   for (const count of Object.values(seen)) assert.ok(count > 4, JSON.stringify(seen));
+});
+
+test("a sample's shape, where it is known, decides how wide it turns, and never widens it", () => {
+  const offset = { x: 0, y: 0, z: 0, rx: 0, ry: 0, rz: 0 };
+  for (let k = 0; k < 100; k++) {
+    const size_mm = [1, 2, 3].map(() => 1 + 50 * random());
+    const box = Math.hypot(size_mm[0], size_mm[1]);
+    const shape = box * 1.5 * random();
+    const sample = { size_mm, offset };
+    assert.equal(across(sample, null), box);
+    assert.equal(across(sample, shape), Math.min(box, shape));
+    const tilted = { size_mm, offset: { ...offset, rx: 5 } };
+    assert.equal(across(tilted, shape), Math.hypot(...size_mm));
+  }
+  // A wheel whose box's corners turn outside the image, and its rim within it.
+  const size_mm = [40, 40, 30];
+  const g = {
+    SOD_mm: 380, SDD_mm: 1000, magnification: 2.63, axis_column_px: 477.5,
+    piercing_point_px: [477.5, 379.5],
+  };
+  const camera = { pixel_mm: 0.1496, shape: [760, 956] };
+  assert.match(outline({ size_mm, offset }, g, camera, 0).join(), /sideways/);
+  assert.deepEqual(outline({ size_mm, offset }, g, camera, 0, 40), []);
 });
 
 test("a scan's end names who asked and what stands elsewhere", () => {
