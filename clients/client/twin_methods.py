@@ -28,6 +28,7 @@ from flexdt.protocol.methods import image_messages as images
 from flexdt.protocol.methods import job_messages as scans
 from flexdt.protocol.methods import scanner_messages as scanner
 from flexdt.protocol.methods import session_messages as session
+from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.twin import long_work
 from flexdt.twin.long_work import Progress
 
@@ -1121,6 +1122,17 @@ def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
 
 
 def _script(script: str | bytes) -> dict[str, object]:
+    """Make the parameters of a script from its text or bytes.
+
+    Raises:
+        RpcError: -32602, the name of a file in place of its text.
+    """
+    if isinstance(script, str) and script.split() == [script]:
+        what = f"{script!r} is one word and no script"
+        cure = f"the text; of a file Path({script!r}).read_bytes()"
+        raise invalid_params(
+            f"{what}; allowed: {cure}", [{"path": "text", "message": what}]
+        )
     if isinstance(script, str):
         return {"text": script}
     return {"data_base64": base64.b64encode(script).decode("ascii")}

@@ -130,6 +130,6 @@ def _steps(report: CheckReport) -> list[str]:
         )
         for s in report.plan.steps
     ]
-    head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "effect")
-    texts = ("of it commands", "effect")
+    head = ("line", "start [s]", "takes [s]", "90 % within [s]", "assumed [s]", "effect")
+    texts = ("assumed [s]", "effect")
     return [heading("Steps", level=2), table(head, rows, text=texts)]

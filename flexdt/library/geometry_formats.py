@@ -89,7 +89,7 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
 
 def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
     """Convert type `cone` to rows (n, 12) of our circle, with v upwards."""
-    warn_of(radian_findings(geometry["ProjectionAngles"]), GeometryError, stacklevel=5)
+    warn_of(radian_findings(geometry["ProjectionAngles"]), GeometryError)
     circle = ConeVec.circular(
         sod=float(geometry["DistanceOriginSource"]),
         sdd=float(geometry["DistanceOriginSource"])

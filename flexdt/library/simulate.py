@@ -8,7 +8,6 @@ from motors. Views are computed a few at a time, so memory holds the counts and 
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -30,6 +29,7 @@ from flexdt.phantoms.channels import (
 )
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin import long_work
+from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -397,7 +397,7 @@ def simulate(
     made = replace(made, full_scale=panel.full_scale)
     told = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
     for doubt in told:
-        warnings.warn(doubt, stacklevel=3)
+        warn_caller(doubt)
     return replace(made, warnings=(*truth.assumed, *told))
 
 

@@ -43,7 +43,7 @@ def test_the_text_says_what_is_assumed(
     assert "nothing moves ver_tube, ver_det, tra_tube, tra_det, mag_det" in captured.err
     rows = captured.out.splitlines()
     assert rows[0].split("  ")[0] == "line"
-    column = rows[0].index("of it commands")
+    column = rows[0].index("assumed [s]")
     document = json_of(path, capsys)
     # Each step's assumed part is its own, as in the document.
     told = [

@@ -79,6 +79,7 @@ def test_a_folder_with_one_scan_of_another_program_is_opened(tmp_path: Path) -> 
     for file in tmp_path.glob("*.xtekct"):
         file.unlink()
     with pytest.raises(
-        DatasetError, match=r"of 3 other TIFFs: fx\.read_tiffs\(FOLDER, geometry\)"
+        DatasetError,
+        match=r"but 3 other TIFFs, which fx\.read_tiffs\(FOLDER, geometry\) reads",
     ):
         fx.open(tmp_path)

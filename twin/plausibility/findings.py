@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.errors import TwinError
 
 
@@ -86,18 +86,15 @@ class PlausibilityWarning(UserWarning):
 def warn_of(
     findings: Iterable[Finding],
     error: type[TwinError] = TwinError,
-    *,
-    stacklevel: int = 3,
 ) -> None:
     """Raise an error for refusals as `settled` does, and warn about the other findings.
 
     Args:
         findings: of one entry point.
         error: type of error to raise.
-        stacklevel: of the entry point's caller, seen from the entry point.
     """
     for doubt in settled(findings, error):
-        warnings.warn(doubt, PlausibilityWarning, stacklevel=stacklevel + 1)
+        warn_caller(doubt, PlausibilityWarning)
 
 
 def settled(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy.typing as npt
 
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import PLAIN
+from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -117,9 +117,9 @@ def fdk(
         message = "; ".join([error.message, *sentences])
         raise GeometryError(message, error.data) from None
     for sentence in sentences:
-        warnings.warn(sentence, PlausibilityWarning, stacklevel=3)
+        warn_caller(sentence, PlausibilityWarning)
     for doubt in doubts:
-        warnings.warn(doubt, stacklevel=3)
+        warn_caller(doubt)
     return volume
 
 

@@ -146,7 +146,7 @@ class LinearSystem:
         else:
             given = None
         found = examine(Operation.ITERATE, geometry, system.shape, images=given, grid=box)
-        warn_of(found, GeometryError, stacklevel=4)
+        warn_of(found, GeometryError)
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
             said = "images on a device, with hardening or surroundings"
             raise GeometryError.instead(said, "device", "images of the host")

@@ -35,6 +35,8 @@ MAX_CONTROL_SHARE: Final = 0.05
 """Largest share of control characters in a text."""
 CONTROL_BYTES: Final = bytes(k for k in range(32) if k not in b"\t\n\r")
 """Control characters that separate neither columns nor lines."""
+FEW_PROBLEMS: Final = 20
+"""Number of problems that are listed of a text without any command."""
 LIGHT_BYTES: Final = 8 << 10
 """Longest script, or list of poses, that any thread may plan [bytes]."""
 _MANY_IMAGES = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
@@ -327,6 +329,13 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
         command = read_row(row, problems)
         if command is not None:
             commands.append(command)
+    if not commands and len(problems) > FEW_PROBLEMS:
+        what = (
+            f"no line is a command of a scan script; {FEW_PROBLEMS} of {len(problems)} "
+            "problems are listed"
+        )
+        found = [*in_order(problems)[:FEW_PROBLEMS]]
+        problems = [ScriptProblem("error", "syntax", 0, 1, what), *found]
     if not commands and not problems:
         problems.append(
             ScriptProblem("error", "syntax", 0, 1, "the script holds no command")

@@ -140,7 +140,14 @@ def show(report: CheckReport, file: str) -> Answer:
         for s in report.plan.steps
     ]
     if steps:
-        head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
+        head = (
+            "line",
+            "start [s]",
+            "takes [s]",
+            "90 % within [s]",
+            "assumed [s]",
+            "what",
+        )
         yield table(steps, head) + "\n"
     yield table([(f"{label}:", value) for label, value in summary(report)])
     yield f"{file}: {'ok' if report.ok else 'not ok'}"

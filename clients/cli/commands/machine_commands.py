@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from flexdt.clients.cli import value_completion
 from flexdt.clients.cli.commands.script_files import read_log_file, tell
 from flexdt.clients.cli.console import table
 from flexdt.clients.cli.options import Answer, argument, option
@@ -18,7 +19,12 @@ if TYPE_CHECKING:
 COMMENTS: Final = "as the file's comments say"
 """Source of a value whose source is no value of the file."""
 NameOrFile = Annotated[
-    str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")
+    str,
+    typer.Argument(
+        metavar="NAME or FILE",
+        help="Shipped, or TOML.",
+        autocompletion=value_completion.machine_names,
+    ),
 ]
 
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, Literal, NoReturn
 
 import typer
 
+from flexdt.clients.cli import value_completion
 from flexdt.clients.cli.settings_file import TABLES, settings_of
 from flexdt.runtime.process_settings import UpSettings
 from flexdt.runtime.settings import has_parameters, parameters, words
@@ -26,6 +27,12 @@ MODULES: Final = {
     "gateway": "flexdt.clients.gateway.main",
 }
 """Process -> module of its program."""
+COMPLETED: Final = {
+    "machine": value_completion.machine_names,
+    "profile": value_completion.profile_names,
+    "sample": value_completion.sample_names,
+}
+"""Option of `up` -> function that gives the values that a shell completes."""
 Only = Annotated[
     Literal["twin", "projector", "viewer", "gateway"] | None,
     typer.Option(
@@ -49,6 +56,9 @@ def _public() -> list[inspect.Parameter]:
     file can set it."""
     public = {f.name for f in fields(UpSettings) if f.metadata["public"]}
     own = [p for name, p in parameters(UpSettings).items() if name in public]
+    for p in own:
+        [declared] = p.annotation.__metadata__
+        declared.autocompletion = COMPLETED.get(p.name)
     return [p if p.default is False else p.replace(default=None) for p in own]
 
 

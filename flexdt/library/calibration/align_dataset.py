@@ -44,11 +44,18 @@ class Aligned(Generic[Images_co]):
     dataset: Images_co
 
     def __repr__(self) -> str:
+        return f"<Alignment of {self.dataset.name!r}: {self.verdict}>"
+
+    @property
+    def verdict(self) -> str:
+        """What was found, with its standard deviations, or why nothing can be told."""
         told = [
             f"{name} {e.value:.6g} +- {e.sigma:.2g} {e.unit}"
             for name, e in self.alignment.parameters.items()
         ]
-        return f"<Alignment of {self.dataset.name!r}: {', '.join(told) or 'not identifiable'}>"
+        if told:
+            return ", ".join(told)
+        return f"not identifiable: {self.alignment.refused['axis_column_px']}"
 
     @property
     def identifiable(self) -> bool:

@@ -275,7 +275,7 @@ class ImageSet:
         facts = {
             "projections": f"{len(self)} of {rows} x {cols} pixels",
             "complete": "yes" if self.complete else "no",
-            "dark, flat images": f"{len(self.darks)}, {len(self.flats)}",
+            "dark, flat images": ", ".join(map(str, self._reference_counts())),
             **{f"warning {i}": text for i, text in enumerate(self.warnings, 1)},
         }
         picture = ""
@@ -283,6 +283,19 @@ class ImageSet:
             first = self.present[0]
             picture = thumbnail(self.counts(first), f"projection {first}")
         return facts_table(f"DataSet {self.name}", facts) + picture
+
+    def _reference_counts(self) -> tuple[int, int]:
+        """Count the dark and the flat images, of files or in memory."""
+        kept = (
+            (None, None)
+            if self.arrays is None
+            else (self.arrays.darks, self.arrays.flats)
+        )
+        dark, flat = (
+            len(files) if images is None else len(images)
+            for files, images in zip((self.darks, self.flats), kept, strict=True)
+        )
+        return dark, flat
 
     @overload
     def __getitem__(self, index: int) -> Float32Array: ...
@@ -475,7 +488,8 @@ class ImageSet:
         flat = self._mean(self.flats, None if self.arrays is None else self.arrays.flats)
         if flat is None:
             raise DatasetMissingError(
-                f"{self.where}: no flat field (io000000.tif); without one there are no line "
+                f"{self.where}: no flat field (io000000.tif, or the images that `flat` of "
+                "fx.read_tiffs and from_arrays names); without one there are no line "
                 "integrals",
                 {"path": self.where, "missing": ["io000000.tif"]},
             )

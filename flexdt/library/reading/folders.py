@@ -307,7 +307,7 @@ def _other_scan(content: Folder) -> str:
             return f"; it holds a scan of {form.name}: fx.open({str(content.path / named[0])!r})"
     images = sorted(n for n in content.names if n.lower().endswith((".tif", ".tiff")))
     if images:
-        return f"; of {len(images)} other TIFFs: fx.read_tiffs(FOLDER, geometry)"
+        return f", but {len(images)} other TIFFs, which fx.read_tiffs(FOLDER, geometry) reads"
     return ""
 
 

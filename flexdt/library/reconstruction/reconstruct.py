@@ -51,6 +51,7 @@ from flexdt.library.reconstruction.volume_files import (
 from flexdt.runtime.files.directory import free_memory_bytes, memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
+from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import (
     GeometryError,
@@ -604,7 +605,7 @@ def reconstruct_volume(
     with _reading_once(task, plan, folder, tell) as (kept, work):
         views = _apply_corrections(replace(task.views, kept=kept), task.request)
         for doubt in views.doubts:
-            warnings.warn(doubt, stacklevel=2)
+            warn_caller(doubt)
         if not fdk:
             return _iterative(views, grid, task.request, tell)
         bias = _bias(views) if errors else None
@@ -618,7 +619,7 @@ def reconstruct_volume(
         volume = with_errors(volume, bias=bias)
         doubts = [*bias_warnings(bias, volume), *doubts]
     for doubt in doubts:
-        warnings.warn(doubt, stacklevel=2)
+        warn_caller(doubt)
     return volume
 
 
