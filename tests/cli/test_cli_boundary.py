@@ -179,14 +179,15 @@ def test_a_reader_of_both_streams_that_leaves_keeps_the_exit_code(
     tmp_path: Path,
 ) -> None:
     script = tmp_path / "s.txt"
-    script.write_text("tube\tset kVv\t80\t\tACK\t\t\r\n" * 6000)
+    right, wrong = ("tube\tset kV\t80\t\tACK\t\t\r\n", "tube\tset kVv\t80\t\tACK\t\t\r\n")
+    script.write_text(right + 6000 * wrong)
     with subprocess.Popen(
         [sys.executable, "-m", "flexdt.clients.cli", "check", str(script)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     ) as process:
         assert process.stdout is not None
-        assert b"s.txt:1:" in process.stdout.readline()
+        assert b"s.txt:2:" in process.stdout.readline()
         process.stdout.close()
     assert process.returncode == 1
 
