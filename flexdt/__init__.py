@@ -54,9 +54,9 @@ def _told(
     what: str, progress: _long_work.Progress = None
 ) -> _typing.ContextManager[_long_work.Advance]:
     # Here, because logging and threads take a third of the import of flexdt.
-    from flexdt.runtime.progress_lines import told
+    from flexdt.runtime.progress_lines import shown_work
 
-    return told(what, progress)
+    return shown_work(what, progress)
 
 
 _long_work.during = _told

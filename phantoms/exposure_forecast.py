@@ -258,7 +258,7 @@ def expose(
     }
     camera = changed_camera(spec, spec.camera, change)
     lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
-    wish = ScanRequest(
+    request = ScanRequest(
         kind or "step",
         sod,
         sdd,
@@ -274,7 +274,7 @@ def expose(
     seconds = images * averages * camera.exposure_ms / 1e3
     total = images * 2 * _pixels(camera)
     if kind is not None:
-        plan = _plan_of(wish, scanner, profile, start)
+        plan = _plan_of(request, scanner, profile, start)
         images = plan.frames
         seconds = plan.duration_s
         total = plan.bytes

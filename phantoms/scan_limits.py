@@ -59,7 +59,7 @@ def check_distances(
     Raises:
         LimitError: names the value and the allowed ones.
     """
-    wish = ScanRequest(
+    request = ScanRequest(
         "step",
         sod_mm,
         sdd_mm,
@@ -70,7 +70,7 @@ def check_distances(
         kV=exposure.kV,
         power_W=exposure.power_W,
     )
-    compose_script(wish, machine, profile_of(machine))
+    compose_script(request, machine, profile_of(machine))
 
 
 def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> None:

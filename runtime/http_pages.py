@@ -41,18 +41,18 @@ from flexdt.runtime.access import (
 from flexdt.runtime.log import dropped, log
 from flexdt.runtime.process import BACKLOG, ServerLoop, durations
 from flexdt.runtime.process_settings import ServerSettings
-from flexdt.runtime.waiting_room import Room, neighbourhood
+from flexdt.runtime.waiting_room import WaitingList, neighbourhood
 
 MAX_SILENCE_S: Final = 5.0
 """Time after which a silent client is disconnected [s]."""
 MAX_HELD_S: Final = 60.0
 """Time after which an event loop that makes no page counts as failed (503) [s]."""
-STRANGERS: Final = 64
+MAX_UNADMITTED: Final = 64
 """Largest number of connections that wait for the end of their request.
 
 Where one address opens 167 a second, each of them still has 0.4 s for it.
 """
-ANSWERED: Final = 16
+MAX_ANSWERED: Final = 16
 """Largest number of requests that are answered at a time."""
 ADMIT: Final = "flexdt.admit"
 """Key of a request's environment: function to call before it is answered."""
@@ -150,8 +150,8 @@ class _Server(ThreadingWSGIServer):
     request_queue_size = BACKLOG
 
     def __init__(self, *given: Any, **more: Any) -> None:
-        self._strangers = Room[_Visitor](STRANGERS)
-        self._answered = Room[_Visitor](ANSWERED)
+        self._strangers = WaitingList[_Visitor](MAX_UNADMITTED)
+        self._answered = WaitingList[_Visitor](MAX_ANSWERED)
         self._here: dict[object, _Visitor] = {}
         self._lock = Lock()
         super().__init__(*given, **more)

@@ -1,7 +1,7 @@
 """Show work that takes seconds: a bar on terminals and in notebooks, lines of the log
 elsewhere.
 
-`told` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends
+`shown_work` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends
 within `SILENT_S` shows nothing. Work within other work of the same thread lends it its name
 only: there is one bar. Where a program handles the records of the logger `flexdt`, it gets
 lines, not a bar; a level above WARNING of the logger `flexdt.progress` silences both.
@@ -109,7 +109,7 @@ class _Work:
                 self.shown.close()
 
 
-class _Teller:
+class _ProgressThread:
     """Shows all work of this process from one thread, which starts with the first."""
 
     def __init__(self) -> None:
@@ -197,7 +197,7 @@ class _Threads(threading.local):
         self.works: list[_Entered] = []
 
 
-_teller = _Teller()
+_progress_thread = _ProgressThread()
 _threads = _Threads()
 _last: dict[str, tuple[float, float]] = {}
 """Word of `FOLLOWED` -> when the first of those that follow each other began and the last
@@ -206,8 +206,8 @@ ended: one kernel compiles after another."""
 
 def _forget() -> None:
     """Begin anew in a forked process, where no thread but one lives."""
-    global _teller, _threads
-    _teller = _Teller()
+    global _progress_thread, _threads
+    _progress_thread = _ProgressThread()
     _threads = _Threads()
 
 
@@ -215,7 +215,7 @@ os.register_at_fork(after_in_child=_forget)
 
 
 @contextmanager
-def told(what: str, progress: Progress = None) -> Iterator[Advance]:
+def shown_work(what: str, progress: Progress = None) -> Iterator[Advance]:
     """Show the work that goes on inside the context, from when it takes seconds.
 
     Args:
@@ -236,15 +236,18 @@ def told(what: str, progress: Progress = None) -> Iterator[Advance]:
     elif works and works[-1].what == what:
         yield works[-1].advance
     elif works or progress is False:
-        with _entered(works, _Entered(what, ignore)), _lent(works[0].work, what):
+        with _entered(works, _Entered(what, ignore)), _renamed(works[0].work, what):
             yield ignore
     else:
-        with _shown(what) as work, _entered(works, _Entered(what, work.advance, work)):
+        with (
+            _show_until_end(what) as work,
+            _entered(works, _Entered(what, work.advance, work)),
+        ):
             yield work.advance
 
 
 @contextmanager
-def _shown(what: str) -> Iterator[_Work]:
+def _show_until_end(what: str) -> Iterator[_Work]:
     """Show a work until the context ends, and log the time it took.
 
     Work of the same kind shortly after is shown as one that goes on.
@@ -261,11 +264,11 @@ def _shown(what: str) -> Iterator[_Work]:
     if now > ended + SILENT_S:
         begun = now
     work = _Work(what, begun, max(now, begun + SILENT_S))
-    _teller.add(work)
+    _progress_thread.add(work)
     try:
         yield work
     finally:
-        _teller.remove(work)
+        _progress_thread.remove(work)
         work.end()
         _last[kind] = begun, time.monotonic()
         LOG.info("flexdt: %s took %.2f s", what, time.monotonic() - now)
@@ -282,7 +285,7 @@ def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
 
 
 @contextmanager
-def _lent(outer: _Work | None, what: str) -> Iterator[None]:
+def _renamed(outer: _Work | None, what: str) -> Iterator[None]:
     """Show a work under the name of one within it until the context ends; None shows
     nothing.
     """

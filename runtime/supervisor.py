@@ -97,7 +97,7 @@ class Ends:
         return min(FIRST_PAUSE_S * 2.0 ** min(self.row - 2, 60), LONGEST_PAUSE_S)
 
     @property
-    def told(self) -> bool:
+    def reported(self) -> bool:
         """Whether the last end is reported."""
         return self.row <= MAX_SINGLE_REPORTS or self.row & (self.row - 1) == 0
 
@@ -147,7 +147,7 @@ class Supervisor:
         try:
             starts = [_Start(service) for service in self.services]
             for start in starts:
-                keepers.append(asyncio.create_task(self._keep(start)))
+                keepers.append(asyncio.create_task(self._keep_alive(start)))
                 await _unless_one_ends(start.bound, keepers)
             for start in starts:
                 await _unless_one_ends(start.ready, keepers)
@@ -158,7 +158,7 @@ class Supervisor:
                 keeper.cancel()
             await asyncio.gather(*keepers, return_exceptions=True)
 
-    async def _keep(self, start: _Start) -> None:
+    async def _keep_alive(self, start: _Start) -> None:
         """Start a service whenever it ends, after a growing pause, and note each end;
         ends only by cancellation.
 
@@ -176,7 +176,7 @@ class Supervisor:
             begun = None
             try:
                 process = await self._spawn(service)
-                await self._ready(process, start)
+                await self._wait_until_ready(process, start)
                 begun = clock()
                 start.ready.set()
                 how = _how(await _drained(process))
@@ -187,9 +187,9 @@ class Supervisor:
                     ) from None
                 how = f"{end}, while starting"
             first = False
-            self._bury(service)
+            self._forget(service)
             pause = ends.after(0.0 if begun is None else clock() - begun)
-            if ends.told:
+            if ends.reported:
                 times = ""
                 if ends.row > MAX_SINGLE_REPORTS:
                     times = f" for the {ends.row}th time in a row"
@@ -225,7 +225,7 @@ class Supervisor:
         self._running[service.name] = process
         return process
 
-    async def _ready(self, process: Process, start: _Start) -> None:
+    async def _wait_until_ready(self, process: Process, start: _Start) -> None:
         """Wait until a service is ready; report the wait and the progress.
 
         Args:
@@ -237,7 +237,7 @@ class Supervisor:
         """
         clock = asyncio.get_running_loop().time
         service = start.service
-        ready = asyncio.create_task(self._lines(process, start))
+        ready = asyncio.create_task(self._read_addresses(process, start))
         end = asyncio.create_task(_ended(process))
         used_s = session_seconds(process.pid)
         since = clock()
@@ -270,7 +270,7 @@ class Supervisor:
                 task.cancel()
             await asyncio.gather(ready, end, return_exceptions=True)
 
-    async def _lines(self, process: Process, start: _Start) -> None:
+    async def _read_addresses(self, process: Process, start: _Start) -> None:
         """Read a service's output up to `ready`: record the address of `bound` and
         `ready` lines, skip others.
 
@@ -298,7 +298,7 @@ class Supervisor:
                     if "ready" in message:
                         return
 
-    def _bury(self, service: Service) -> None:
+    def _forget(self, service: Service) -> None:
         """Kill the rest of a service's session: its children may hold its port or its files."""
         process = self._running.pop(service.name, None)
         if process is not None:
@@ -320,7 +320,7 @@ class Supervisor:
                     with contextlib.suppress(ProcessLookupError):
                         process.kill()
                     await _ended(process)
-            self._bury(service)
+            self._forget(service)
 
 
 class _Ended(Exception):

@@ -1,6 +1,6 @@
 """Connections without a place, at every port: which of too many stay.
 
-A connection waits in a `Room` until it has shown the token, if its port has one, or a
+A connection waits in a `WaitingList` until it has shown the token, if its port has one, or a
 request that is served: the token, or without one a request that is served. A newcomer
 always gets in, so that it can identify itself; it displaces one of the address that has
 most there.
@@ -12,14 +12,14 @@ import ipaddress
 from collections import Counter
 from typing import Final, Generic, Protocol, TypeVar
 
-WAITING: Final = 512
+MAX_WAITING: Final = 512
 """Largest number of connections of a port that wait.
 
 Where one address opens 167 a second, each of them still has 3 s to identify itself.
 """
 
 
-class Guest(Protocol):
+class PendingConnection(Protocol):
     """A connection that may be in a room."""
 
     address: str
@@ -29,10 +29,10 @@ class Guest(Protocol):
         """Close the connection: a newer one needs the room."""
 
 
-_G = TypeVar("_G", bound=Guest)
+_G = TypeVar("_G", bound=PendingConnection)
 
 
-class Room(Generic[_G]):
+class WaitingList(Generic[_G]):
     """Connections without a place, in the order in which they came.
 
     Where it is full, the oldest connection of the address that has most goes. A newcomer

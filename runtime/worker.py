@@ -44,12 +44,12 @@ def receive_parts(channel: socket.socket) -> list[bytes]:
         EOFError: the other end is gone.
         TimeoutError: of the socket.
     """
-    (count,) = struct.unpack("<I", _exactly(channel, 4))
-    sizes = struct.unpack(f"<{count}Q", _exactly(channel, 8 * count))
-    return [bytes(_exactly(channel, size)) for size in sizes]
+    (count,) = struct.unpack("<I", _receive_exactly(channel, 4))
+    sizes = struct.unpack(f"<{count}Q", _receive_exactly(channel, 8 * count))
+    return [bytes(_receive_exactly(channel, size)) for size in sizes]
 
 
-def _exactly(channel: socket.socket, size: int) -> bytearray:
+def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
     """Read `size` bytes from a socket; raise EOFError if the other end is gone."""
     data = bytearray(size)
     view = memoryview(data)

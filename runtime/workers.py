@@ -109,7 +109,7 @@ class Worker:
                 _label(work), f"more than {seconds:g}", seconds, "s"
             ) from None
         except (OSError, EOFError, ValueError):
-            raise self._died(work, seconds) from None
+            raise self._end_error(work, seconds) from None
         finally:
             if not sound:
                 self.kill()
@@ -151,7 +151,7 @@ class Worker:
                 if worked > seconds or time.monotonic() - since > seconds:
                     raise TimeoutError
 
-    def _died(self, work: Work, seconds: float) -> RpcError:
+    def _end_error(self, work: Work, seconds: float) -> RpcError:
         """Kill the process and make the error -32008 for its end; returned, not raised."""
         self.kill()
         return RpcError(

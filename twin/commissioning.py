@@ -36,17 +36,17 @@ YEAR_S: Final = 365.25 * 86400.0
 FOR_A_LINE: Final = 3
 """Dates that a drift needs, and rows beyond the unknowns that outvote a scan: with two there is
 nothing to check one by."""
-FAR_OFF: Final = 4.0
+MAX_SIGMAS: Final = 4.0
 """Sigmas from which on a scan contradicts the others, and is left out where enough remain."""
-TOLD: Final = 0.5
+MAX_PRIOR_SHARE: Final = 0.5
 """Share of its prior's width below which scans tell det_tan themselves."""
-DRIFT: Final = 0.25
+DRIFT_PRIOR_PER_YEAR: Final = 0.25
 """Prior of a drift [mm or deg a year]: from one published profile of the FleX-ray to the next
 det_tan changes by 0.23 mm rms and the roll by 0.15 deg."""
-AGREE: Final = 1e-4
+RELATIVE_TOLERANCE: Final = 1e-4
 """By what part statements of one quantity may differ: texts carry six decimals, cameras round
 their exposures. Motors and offsets may differ by `rebuild.MATCH_MM`."""
-ALIKE: Final = 3
+MIN_SHARED_LIMITS: Final = 3
 """Motors whose limits are a shipped machine's, from which on an executed script is of it."""
 OFFSETS: Final = ("det_tan", "src_ort", "axs_tan", "c_obj", "c_det", "det_roll_deg")
 TELLS: Final = {
@@ -237,7 +237,9 @@ def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
         if x.motor is not None and isinstance(x.command, c.MotorCommand):
             limits[x.command.component] = x.motor.lower, x.motor.upper
     found = max(known, key=lambda machine: _shared(limits, machine), default=None)
-    if found is not None and _shared(limits, found) >= max(ALIKE, len(limits) / 2):
+    if found is not None and _shared(limits, found) >= max(
+        MIN_SHARED_LIMITS, len(limits) / 2
+    ):
         return Scanner(found.name, serial, "the motors' limits in its executed script")
     return Scanner(serial=serial)
 
@@ -247,7 +249,9 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
     own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
         axis is not None
-        and bool(np.allclose(limits[name], (axis.lower, axis.upper), AGREE, 0.0))
+        and bool(
+            np.allclose(limits[name], (axis.lower, axis.upper), RELATIVE_TOLERANCE, 0.0)
+        )
         for name, axis in own.items()
     )
 
@@ -295,12 +299,12 @@ def contradictions(
     every = [
         (f"{name} in {scan.name}", value, who, name)
         for scan in scans
-        for name, value, who in _within(scan, fitted)
+        for name, value, who in _own_statements(scan, fitted)
     ]
     every += [
         (name, value, scan.name, name)
         for scan in scans
-        for name, value in _alike(scan, fitted)
+        for name, value in _common_statements(scan, fitted)
     ]
     known = {about for about, *_ in every}
     every += [
@@ -317,7 +321,7 @@ def contradictions(
         if name in lengths:
             slack = (0.0, rebuild.MATCH_MM)
         else:
-            slack = (AGREE, 0.0)
+            slack = (RELATIVE_TOLERANCE, 0.0)
         told = said.setdefault(about, [])
         names = next((n for other, n in told if _agree(value, other, slack)), None)
         if names is None:
@@ -339,7 +343,7 @@ def contradictions(
             )
 
 
-def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
+def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
     """Yield (name, value, who) of what a scan's own parts state of the same thing.
 
     Args:
@@ -383,7 +387,7 @@ def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
                 yield name, told[name], who
 
 
-def _alike(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
+def _common_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
     """Yield (name, value) of what should be alike in all scans: scanner, pixel, rates,
     limits, offsets.
 
@@ -494,7 +498,7 @@ def zero_offsets(
             more = slope if drifts and i == 0 else {}
             lines[name] = Line(value, widths[i], scans=len(told), **more)
         for scan, pull in zip(told, pulls.tolist(), strict=True):
-            if abs(pull) > FAR_OFF:
+            if abs(pull) > MAX_SIGMAS:
                 text = f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
                 findings.append(Finding(names[0], text))
         return at, covariance
@@ -510,7 +514,9 @@ def zero_offsets(
         rolls = [p["det_roll"] for p in found]
         sides = np.vstack([np.column_stack([np.ones(len(told)), years]), [0.0, 1.0]])
         rest = [*(r.value - base.det_roll_deg for r in rolls), 0.0]
-        fitted(sides, rest, [*(r.sigma for r in rolls), DRIFT], "det_roll_deg")
+        fitted(
+            sides, rest, [*(r.sigma for r in rolls), DRIFT_PRIOR_PER_YEAR], "det_roll_deg"
+        )
         seen = np.array(
             [_axis(machine, s, base, r.value) for s, r in zip(told, rolls, strict=True)]
         )
@@ -521,7 +527,7 @@ def zero_offsets(
             0.0,
             0.0,
         ]
-        sigmas = [*(m.sigma for m in measured), DRIFT, width]
+        sigmas = [*(m.sigma for m in measured), DRIFT_PRIOR_PER_YEAR, width]
         known = np.vstack([sides, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         at, covariance = fitted(known, rest, sigmas, "axs_tan", "det_tan")
         spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, covariance, sides))
@@ -549,7 +555,7 @@ def zero_offsets(
         for n, by in TELLS.items()
         if not lines[n].scans
     ]
-    if (lines["det_tan"].sigma or math.inf) > TOLD * width:
+    if (lines["det_tan"].sigma or math.inf) > MAX_PRIOR_SHARE * width:
         why = "no scans of different magnification tell the axis"
         questions.append(Question("det_tan apart from axs_tan", why, "magnified"))
     if not drifts:
@@ -594,7 +600,7 @@ def _fit(
     """Fit by weighted least squares of rows, of which the first `scans` belong to a scan
     each.
 
-    The scan that contradicts the others most is left out while it does so by `FAR_OFF`
+    The scan that contradicts the others most is left out while it does so by `MAX_SIGMAS`
     sigmas and enough remain.
 
     Args:
@@ -617,7 +623,7 @@ def _fit(
         pulls = (rest / spread)[:scans]
         freedom = int(kept.sum()) - a.shape[1]
         far = np.where(kept[:scans], np.abs(pulls), 0.0)
-        if freedom < FOR_A_LINE or far.max() <= FAR_OFF:
+        if freedom < FOR_A_LINE or far.max() <= MAX_SIGMAS:
             return (
                 at,
                 max(1.0, float(rest[kept] @ rest[kept]) / max(freedom, 1)) * inverse,

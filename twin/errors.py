@@ -138,7 +138,7 @@ class SafetyError(TwinError):
     """Refused because of the safety state (E-stop in force, move aborted)."""
 
 
-MEANT: Final = "did you mean"
+SUGGESTION: Final = "did you mean"
 """Words before the proposal of a name."""
 LONGEST_NAME: Final = 80
 """Characters of a name that is compared with others."""
@@ -177,12 +177,12 @@ class UnknownNameError(TwinError):
         if (
             isinstance(asked, str)
             and isinstance(allowed, Sequence)
-            and MEANT not in message
+            and SUGGESTION not in message
         ):
             near = nearest_name(
                 asked, [name for name in allowed if isinstance(name, str)]
             )
-            message += "" if near is None else f"; {MEANT} {near!r}?"
+            message += "" if near is None else f"; {SUGGESTION} {near!r}?"
         super().__init__(message, facts)
 
     @classmethod

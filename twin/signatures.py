@@ -36,9 +36,9 @@ Thing = TypeVar("Thing", bound=Callable[..., Any])
 NAMES: Final = (("voxel", "voxel_mm"), ("center", "center_mm"), ("geometry", "cone_vec"))
 """Names of one thing (docs/conventions.md): where a signature has one, the other is
 deprecated."""
-SHOWN: Final = 60
+MAX_SHOWN_CHARS: Final = 60
 """Characters of a value that a message repeats."""
-LOOKED_AT: Final = 100
+MAX_CHECKED_MEMBERS: Final = 100
 """Members of a list that are compared with the annotation: mistakes stand at the beginning."""
 
 
@@ -245,7 +245,7 @@ class Known:
             bound = self.signature.bind(*given, **named).arguments
         except TypeError as error:
             raise ArgumentError.instead(
-                f"{where}: {error}", [*map(_shown, given), *named], self._names()
+                f"{where}: {error}", [*map(_value_words, given), *named], self._names()
             ) from None
         for name, value in bound.items():
             kind = self.kinds.get(name)
@@ -347,7 +347,7 @@ class Known:
         more = ""
         if told:
             more = f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})"
-        said = f"{where}: {label} is {_shown(value)}"
+        said = f"{where}: {label} is {_value_words(value)}"
         return ArgumentError.instead(
             said, repr(value)[:100], words + more + hint, argument=label
         )
@@ -380,7 +380,9 @@ def kind_of(annotation: Any) -> Kind | None:
     plain = origin not in (Annotated, Literal, Callable)
     inner = [kind_of(part) for part in parts if plain and part is not ...]
     if origin is Annotated:  # a value, which its owner also makes of its JSON
-        return Kind((_named(parts[0]),), lambda v: isinstance(v, (parts[0], Mapping)))
+        return Kind(
+            (_type_words(parts[0]),), lambda v: isinstance(v, (parts[0], Mapping))
+        )
     if origin in (typing.Union, types.UnionType):
         kinds = [kind for kind in inner if kind is not None]
         words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))
@@ -421,8 +423,8 @@ def kind_of(annotation: Any) -> Kind | None:
             for n, m in vars(wanted).items()
             if inspect.isfunction(m) and n != "__init__"
         ]
-        return Kind((_named(wanted),), lambda v: all(hasattr(v, n) for n in methods))
-    return Kind((_named(wanted),), lambda v: isinstance(v, wanted))
+        return Kind((_type_words(wanted),), lambda v: all(hasattr(v, n) for n in methods))
+    return Kind((_type_words(wanted),), lambda v: isinstance(v, wanted))
 
 
 def _is_number(value: Any) -> bool:
@@ -482,12 +484,12 @@ def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False)
         and len(value) == len(kinds)
         and all(
             kind is None or kind.holds(one)
-            for kind, one in zip(kinds[:LOOKED_AT], value, strict=False)
+            for kind, one in zip(kinds[:MAX_CHECKED_MEMBERS], value, strict=False)
         )
     )
 
 
-def _named(kind: type) -> str:
+def _type_words(kind: type) -> str:
     """Return a type's name with its article, such as "an int"; "a path" for path-like
     objects.
     """
@@ -497,7 +499,7 @@ def _named(kind: type) -> str:
     return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
 
-def _shown(value: object) -> str:
+def _value_words(value: object) -> str:
     """Format a value for a message: a short one itself, an array's shape, or the name of
     its type.
     """
@@ -506,9 +508,9 @@ def _shown(value: object) -> str:
         return f"an array of shape {tuple(shape)}"
     text = repr(value)
     plain = isinstance(value, Real | str | bytes | list | tuple | Mapping | None)
-    if plain and len(text) <= SHOWN:
+    if plain and len(text) <= MAX_SHOWN_CHARS:
         return text
-    return _named(type(value))
+    return _type_words(type(value))
 
 
 PLAIN: Final = {

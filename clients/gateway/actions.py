@@ -271,7 +271,7 @@ def rate_setting(what: Rate, digits: int) -> Action:
         if machine is not None and machine.has(axis):
             found = rate(machine, axis, what, value)
             shares = machine.moves(axis)
-            if found.told and found.is_clamped(machine):
+            if found.messages and found.is_clamped(machine):
                 value = min(
                     found.motors[motor] / abs(share) for motor, share in shares.items()
                 )

@@ -16,7 +16,7 @@ from websockets.asyncio.server import ServerConnection
 
 from flexdt.runtime import waiting_room
 from flexdt.runtime.process import tune
-from flexdt.runtime.waiting_room import Room, neighbourhood
+from flexdt.runtime.waiting_room import WaitingList, neighbourhood
 
 ANSWERED: Final = 64
 """Largest number of requests with the token in service at a time, in addition to pages
@@ -32,8 +32,8 @@ class Admission:
     """Who is connected without a place, and the bytes that all connections hold."""
 
     def __init__(self) -> None:
-        self.strangers = Room[BrowserConnection](waiting_room.WAITING)
-        self.answered = Room[BrowserConnection](ANSWERED)
+        self.strangers = WaitingList[BrowserConnection](waiting_room.MAX_WAITING)
+        self.answered = WaitingList[BrowserConnection](ANSWERED)
         self.held = 0
 
     def connection(self, *given: Any, **more: Any) -> BrowserConnection:

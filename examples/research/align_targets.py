@@ -502,13 +502,13 @@ def main() -> None:
                 rng = np.random.default_rng([o.seed, k, sorted(OBJECTS).index(name)])
                 hidden, solids = drawn(rng, plain), OBJECTS[name](rng)
                 lines, hidden, keep, ramp = spoilt(kind, hidden, solids, rng)
-                for photons, told_of in runs.items():
+                for photons, limit_messages in runs.items():
                     data = measured(lines, hidden, photons, rng, keep, ramp)
                     begun = time.perf_counter()
                     found = data.align()
                     took = time.perf_counter() - begun
                     told = errors(found, hidden) if found.identifiable else {}
-                    told_of.append((told, took))
+                    limit_messages.append((told, took))
                     if o.json:
                         why = (
                             None if told else found.document["refused"]["axis_column_px"]
@@ -517,10 +517,10 @@ def main() -> None:
                                 "errors": told, "refused": why, "warnings": found.warnings,
                                 "seconds": round(took, 2)}  # fmt: skip
                         print(json.dumps(line), flush=True)
-            for photons, told_of in runs.items():
+            for photons, limit_messages in runs.items():
                 if not o.json:
                     print(
-                        _line(f"{name} {photons:g} {kind}", told_of, o.binning),
+                        _line(f"{name} {photons:g} {kind}", limit_messages, o.binning),
                         flush=True,
                     )
 

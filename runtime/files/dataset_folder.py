@@ -527,15 +527,15 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
     )
 
 
-def free_name(root: Directory, wish: str) -> str:
-    """Find the first of `wish`, `wish-2`, `wish-3`... that `root` does not have.
+def free_name(root: Directory, wanted: str) -> str:
+    """Find the first of `wanted`, `wanted-2`, `wanted-3`... that `root` does not have.
 
     Raises:
-        DatasetNameError: `wish` is not plain.
+        DatasetNameError: `wanted` is not plain.
     """
-    plain_name(wish, "data set")
+    plain_name(wanted, "data set")
     candidates: Iterable[str] = (
-        wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000)
+        wanted if n == 1 else f"{wanted}-{n}" for n in range(1, 1_000_000)
     )
     return next(n for n in candidates if root.stat(n) is None)
 

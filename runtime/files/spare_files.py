@@ -16,12 +16,12 @@ from typing import Final
 from flexdt.runtime.files.directory import Directory, writing
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 
-SIZE: Final = 256 << 10
+SPARE_BYTES: Final = 256 << 10
 """Size of a spare file [bytes]; longer documents need room on the disk."""
-COUNT: Final = 8
+SPARE_FILES: Final = 8
 """Number of spare files."""
 PREFIX: Final = ".reserve-"
-NAMES: Final = tuple(f"{PREFIX}{i}" for i in range(COUNT))
+NAMES: Final = tuple(f"{PREFIX}{i}" for i in range(SPARE_FILES))
 
 
 class SpareFiles:
@@ -45,9 +45,11 @@ class SpareFiles:
         try:
             self._folder.keep(name, data)
         except DiskFullError:
-            if len(data) > SIZE or not self._keep_in_spare(name, data.ljust(SIZE)):
+            if len(data) > SPARE_BYTES or not self._keep_in_spare(
+                name, data.ljust(SPARE_BYTES)
+            ):
                 raise
-        if len(self._there) < COUNT:
+        if len(self._there) < SPARE_FILES:
             self._refill()
 
     def _keep_in_spare(self, name: str, data: bytes) -> bool:
@@ -87,7 +89,7 @@ class SpareFiles:
         """Make a spare file of a document of that size that is about to be replaced."""
         about = self._folder.stat(name)
         free = [spare for spare in NAMES if spare not in self._there]
-        if about is None or about.st_size != SIZE:
+        if about is None or about.st_size != SPARE_BYTES:
             return
         for spare in free:
             with suppress(OSError):
@@ -98,7 +100,7 @@ class SpareFiles:
     def _usable(self, name: str) -> bool:
         """Return whether a spare file exists, of full size and with no other name."""
         about = self._folder.stat(name)
-        return about is not None and (about.st_size, about.st_nlink) == (SIZE, 1)
+        return about is not None and (about.st_size, about.st_nlink) == (SPARE_BYTES, 1)
 
     def _refill(self) -> None:
         """Make the missing spare files, as far as there is room."""
@@ -107,7 +109,7 @@ class SpareFiles:
                 continue
             try:
                 if not self._usable(name):
-                    self._folder.allocate(name, SIZE)
+                    self._folder.allocate(name, SPARE_BYTES)
             except OSError:  # no room yet, or none for us
                 return
             self._there.add(name)

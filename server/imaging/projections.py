@@ -146,7 +146,7 @@ class Projector(Protocol):
 
 
 @dataclass(eq=False)
-class _Apart:
+class _DividedSample:
     """A sample divided into its pieces.
 
     Attributes:
@@ -192,7 +192,7 @@ class Imaging:
     room: Callable[[], Awaitable[int | None]] | None = None
 
     def __post_init__(self) -> None:
-        self._known: dict[_Key, _Apart] = {}
+        self._divided: dict[_Key, _DividedSample] = {}
         """Divided samples, the least recently used first."""
         self._versions: dict[str, list[str]] = {}
         self._scatterer: tuple[Phantom, Object] | None = None
@@ -225,7 +225,7 @@ class Imaging:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
         cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
-        async with self._sent(sample, "part") as apart:
+        async with self._on_projector(sample, "part") as apart:
             factors = [factor for _, factor in apart.found]
             if factors == [1.0]:
                 return await self.projector.project(apart.names[0], cone, camera.shape)
@@ -269,7 +269,7 @@ class Imaging:
                 np.empty((0, len(cone), *camera.shape), dtype=np.float32),
                 cone.rows,
             )
-        async with self._sent(sample, "material") as apart:
+        async with self._on_projector(sample, "material") as apart:
             out = np.empty((len(apart.names), len(cone), *camera.shape), dtype=np.float32)
             for i, name in enumerate(apart.names):
                 out[i] = await self.projector.project(name, cone, camera.shape)
@@ -301,7 +301,7 @@ class Imaging:
         views, *grid = cone.shape
         if not sample.name:
             return (), np.empty((0, views, *grid), dtype=np.float32)
-        async with self._sent(sample, "material") as apart:
+        async with self._on_projector(sample, "material") as apart:
             out = await self._along(apart, sample.offset.to_sample(cone))
             return apart.found, out
 
@@ -310,12 +310,12 @@ class Imaging:
         views, *grid = cone.shape
         if not sample.name:
             return np.zeros((views, *grid), dtype=np.float32)
-        async with self._sent(sample, "part") as apart:
+        async with self._on_projector(sample, "part") as apart:
             parts = await self._along(apart, sample.offset.to_sample(cone))
             factors = np.array([factor for _, factor in apart.found], dtype=np.float32)
             return np.asarray(np.tensordot(factors, parts, axes=1), dtype=np.float32)
 
-    async def _along(self, apart: _Apart, cone: ConeVec) -> Float32Array:
+    async def _along(self, apart: _DividedSample, cone: ConeVec) -> Float32Array:
         """Project each piece of a sample, float32 (pieces, n, rows, cols)."""
         views, *grid = cone.shape
         out = np.empty((len(apart.names), views, *grid), dtype=np.float32)
@@ -325,7 +325,7 @@ class Imaging:
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """Sample the materials of `sample` on a grid of about so many voxels, once."""
-        async with self._sent(sample, "material") as apart:
+        async with self._on_projector(sample, "material") as apart:
             phantom = apart.phantom
             if self._scatterer is None or self._scatterer[0] is not phantom:
                 size = phantom.size_mm
@@ -348,11 +348,11 @@ class Imaging:
         if not sample.name:
             return
         async with self._sending:
-            apart = await self._taken_apart(sample, pieces)
+            apart = await self._divide(sample, pieces)
         mine = (_name(sample), pieces)
         if self.memory_limit is not None:
             others = sum(
-                self._known[key].nbytes for key in self._pinned_keys() if key != mine
+                self._divided[key].nbytes for key in self._pinned_keys() if key != mine
             )
             left = self.memory_limit - others
             if apart.nbytes > left:
@@ -378,7 +378,9 @@ class Imaging:
         return error
 
     @asynccontextmanager
-    async def _sent(self, sample: Sample, pieces: Pieces) -> AsyncIterator[_Apart]:
+    async def _on_projector(
+        self, sample: Sample, pieces: Pieces
+    ) -> AsyncIterator[_DividedSample]:
         """Divide a sample, send it to the projector where it is new, and keep it there
         within the context.
 
@@ -393,11 +395,11 @@ class Imaging:
             The pieces, with their names on the projector.
         """
         async with self._sending:
-            apart = await self._taken_apart(sample, pieces)
+            apart = await self._divide(sample, pieces)
             apart.users += 1
             try:
                 if not apart.names:
-                    await self._send(apart, _name(sample), pieces)
+                    await self._send_bodies(apart, _name(sample), pieces)
                 await self._forget_old()
             except BaseException:
                 apart.users -= 1
@@ -407,17 +409,17 @@ class Imaging:
         finally:
             apart.users -= 1
 
-    async def _taken_apart(self, sample: Sample, pieces: Pieces) -> _Apart:
+    async def _divide(self, sample: Sample, pieces: Pieces) -> _DividedSample:
         """Divide the sample as it is now, in a thread, or reuse its pieces; with
         `_sending` held.
 
         Args:
             sample: on the stage, or of a scan.
-            pieces: "part" or "material", as in `_sent`.
+            pieces: "part" or "material", as in `_on_projector`.
         """
         key = (_name(sample), pieces)
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
-        apart = self._known.pop(key, None)
+        apart = self._divided.pop(key, None)
         if apart is None or apart.phantom is not phantom:
             if pieces == "part":
                 found: Any = await asyncio.to_thread(attenuating, phantom)
@@ -425,22 +427,24 @@ class Imaging:
             else:
                 found = await asyncio.to_thread(channels, phantom)
                 bodies = [channel.body for channel in found]
-            apart = _Apart(phantom, found, bodies)
-        self._known[key] = apart
+            apart = _DividedSample(phantom, found, bodies)
+        self._divided[key] = apart
         return apart
 
-    async def _send(self, apart: _Apart, name: str, pieces: Pieces) -> None:
+    async def _send_bodies(
+        self, apart: _DividedSample, name: str, pieces: Pieces
+    ) -> None:
         """Send the pieces of a sample and record their names."""
         single = pieces == "part" and len(apart.bodies) == 1
         apart.names = [
-            await self._put(name if single else f"{name}, {pieces} {i}", body)
+            await self._ensure_sent(name if single else f"{name}, {pieces} {i}", body)
             for i, body in enumerate(apart.bodies)
         ]
 
     def _pinned_keys(self) -> set[_Key]:
         """List the keys of samples that stay in memory."""
         names = {_name(sample) for sample in self.pinned()}
-        return {key for key in self._known if key[0] in names}
+        return {key for key in self._divided if key[0] in names}
 
     async def _forget_old(self) -> None:
         """Drop the least recently used samples beyond the limits, here and on the
@@ -451,20 +455,20 @@ class Imaging:
             limit_bytes = math.inf
         else:
             limit_bytes = self.memory_limit
-        used = sum(apart.nbytes for apart in self._known.values())
-        newest = next(reversed(self._known))
-        for key, apart in list(self._known.items()):
-            if used <= limit_bytes and len(self._known) <= MAX_SAMPLES:
+        used = sum(apart.nbytes for apart in self._divided.values())
+        newest = next(reversed(self._divided))
+        for key, apart in list(self._divided.items()):
+            if used <= limit_bytes and len(self._divided) <= MAX_SAMPLES:
                 return
             if key in stays or key == newest or apart.users:
                 continue
             used -= apart.nbytes
-            del self._known[key]
+            del self._divided[key]
             for name in {named.rpartition(" #")[0] for named in apart.names}:
                 await self._remove(name, 0)
                 del self._versions[name]
 
-    async def _put(self, name: str, body: Body) -> str:
+    async def _ensure_sent(self, name: str, body: Body) -> str:
         """Ensure that the projector has the present version of a body; old versions are
         removed.
 

@@ -103,7 +103,7 @@ class ProjectorPool:
         """Store a body, and send it to one projector, which shows that it fits;
         errors as the client's."""
         self._values[name] = body
-        await self._deal(name, None, (0, 0))
+        await self._request(name, None, (0, 0))
 
     async def remove(self, name: str) -> None:
         """Have all projectors remove it; those that do not answer lose it when they restart."""
@@ -116,11 +116,11 @@ class ProjectorPool:
     ) -> Float32Array:
         """Compute line integrals, float32 (n, rows, cols);
         errors as `ProjectorClient.project`."""
-        images = await self._deal(name, cone_vec, shape)
+        images = await self._request(name, cone_vec, shape)
         assert images is not None
         return images
 
-    async def _deal(
+    async def _request(
         self, name: str, views: ConeVec | None, shape: tuple[int, int]
     ) -> Float32Array | None:
         """Request images of a free projector, and of another one if it is late; take the
@@ -155,11 +155,11 @@ class ProjectorPool:
                 wanted = not running or now >= late
                 member = None
                 if wanted:
-                    member = self._free(members | refused, now)
+                    member = self._free_member(members | refused, now)
                 if member is not None:
                     members.add(member)
                     asking = self._ask(member, name, value, views, shape)
-                    running[self._begin(member, asking)] = member
+                    running[self._start_request(member, asking)] = member
                     late = (
                         now
                         + LATE_S
@@ -192,7 +192,7 @@ class ProjectorPool:
             for task in running:
                 task.cancel()
 
-    def _free(self, asked: set[_Member], now: float) -> _Member | None:
+    def _free_member(self, asked: set[_Member], now: float) -> _Member | None:
         """Choose the next projector: of the free ones that with least to do,
         then the fastest."""
         limit = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
@@ -203,7 +203,7 @@ class ProjectorPool:
         )
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
-    def _begin(
+    def _start_request(
         self, member: _Member, asking: Coroutine[Any, Any, Float32Array | None]
     ) -> asyncio.Task[Float32Array | None]:
         """Start a request in a task that counts as open until it ends, and then wakes a

@@ -66,10 +66,10 @@ class ProjectorWatch:
         """Ask one projector repeatedly, while somebody wants to know."""
         while True:
             if self.asks():
-                await self._look(client)
+                await self._check(client)
             await asyncio.sleep(self.every_s)
 
-    async def _look(self, client: Watched) -> None:
+    async def _check(self, client: Watched) -> None:
         """Ask one projector for its health, and report silence, a failure, or that it
         answers.
 
@@ -81,21 +81,21 @@ class ProjectorWatch:
         answer = asyncio.ensure_future(client.health())
         try:
             if not (await asyncio.wait([answer], timeout=self.silent_s))[0]:
-                self._found(
+                self._report(
                     client,
                     f"the projector at {client.host}:{client.port} does not answer",
                 )
             await answer
         except ProjectorUnavailable as error:
-            self._found(client, str(error))
+            self._report(client, str(error))
         except RpcError:  # an answer, too
-            self._found(client, None)
+            self._report(client, None)
         else:
-            self._found(client, None)
+            self._report(client, None)
         finally:
             answer.cancel()
 
-    def _found(self, client: Watched, problem: str | None) -> None:
+    def _report(self, client: Watched, problem: str | None) -> None:
         """Record the problem of one projector; call `changed` if the overall one changes."""
         self._problems[client] = problem
         known = [self._problems.get(each) for each in self.clients]

@@ -28,10 +28,10 @@ class LoopTurns:
         self._lanes[lane].setdefault(who, deque()).append(turn)
         if not self._due:
             self._due = True
-            loop.call_soon(self._give)
+            loop.call_soon(self._give_turn)
         await turn
 
-    def _give(self) -> None:
+    def _give_turn(self) -> None:
         """Give the first waiting connection of the most urgent lane its turn; reschedule
         if others wait.
         """
@@ -46,5 +46,5 @@ class LoopTurns:
                     turn.set_result(None)
                     if any(self._lanes):
                         self._due = True
-                        asyncio.get_running_loop().call_soon(self._give)
+                        asyncio.get_running_loop().call_soon(self._give_turn)
                     return

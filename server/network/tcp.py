@@ -12,7 +12,7 @@ first.
 
 A client takes one of `max_clients` places when it has shown the token, or with its first
 request where there is none. Until then, and while all places are taken, it is in a
-`Room`: there it may call hello, and urgent methods once it has shown the token where
+`WaitingList`: there it may call hello, and urgent methods once it has shown the token where
 there is one, but nothing else.
 """
 
@@ -47,7 +47,7 @@ from flexdt.runtime import waiting_room
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
-from flexdt.runtime.waiting_room import Room, neighbourhood
+from flexdt.runtime.waiting_room import WaitingList, neighbourhood
 from flexdt.server.network import admission, batches, deadlines, loop_turns, outbox
 from flexdt.server.network import shell_parts as parts
 
@@ -88,13 +88,13 @@ class TcpServer(ListeningServer):
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.waiting = Room[_Link](waiting_room.WAITING)
-        self.reserved = Room[_Link](RESERVED_PLACES)
+        self.waiting = WaitingList[_Link](waiting_room.MAX_WAITING)
+        self.reserved = WaitingList[_Link](RESERVED_PLACES)
         self.lines = Sparing()
         self.turns = loop_turns.LoopTurns()
         self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
-        self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
-        self._look_due = False
+        self._unexamined: dict[_Link, None] = {}  # in the order in which they came
+        self._examination_due = False
         self.opened = 0
 
     def connection(self) -> _Link:
@@ -104,27 +104,27 @@ class TcpServer(ListeningServer):
     def look_soon(self, link: _Link) -> None:
         """Schedule a search for urgent requests of a connection, in turns that no
         flood can fill."""
-        self._to_look_at[link] = None
-        if not self._look_due:
-            self._look_due = True
-            asyncio.get_running_loop().call_soon(self._look)
+        self._unexamined[link] = None
+        if not self._examination_due:
+            self._examination_due = True
+            asyncio.get_running_loop().call_soon(self._start_urgent)
 
-    def _look(self) -> None:
+    def _start_urgent(self) -> None:
         """Let waiting connections start their urgent requests, for up to `LOOK_S`;
         reschedule the rest.
         """
         until = time.perf_counter() + LOOK_S
         try:
-            while self._to_look_at:
-                link = next(iter(self._to_look_at))
-                del self._to_look_at[link]
+            while self._unexamined:
+                link = next(iter(self._unexamined))
+                del self._unexamined[link]
                 link.overtake()  # may want another look
                 if time.perf_counter() > until:
                     break
         finally:
-            self._look_due = bool(self._to_look_at)
-            if self._look_due:
-                asyncio.get_running_loop().call_soon(self._look)
+            self._examination_due = bool(self._unexamined)
+            if self._examination_due:
+                asyncio.get_running_loop().call_soon(self._start_urgent)
 
     async def close(self) -> None:
         """Stop listening, end every connection, wait until all are gone."""
@@ -236,13 +236,13 @@ class _Link(asyncio.BufferedProtocol):
         self.address = neighbourhood(str(peer[0]))
         self.server.waiting.enter(self)
         if self.let_in:
-            self._open()
+            self._admit()
         else:
             self.deadlines.start("hello", self.limits.hello_timeout_s)
-        self.worker = self.loop.create_task(self._work())
+        self.worker = self.loop.create_task(self._serve_messages())
         self.worker.add_done_callback(self._crashed)
 
-    def _seat(self) -> bool:
+    def _take_place(self) -> bool:
         """Give the connection a place if one is free, else a reserved one, for urgent
         requests alone.
 
@@ -436,7 +436,7 @@ class _Link(asyncio.BufferedProtocol):
 
     # -- requests ----------------------------------------------------------------------------
 
-    def _open(self) -> None:
+    def _admit(self) -> None:
         """Admit the connection and open the application's session; abort if that fails."""
         self.let_in = True
         self.loop.call_soon(self.overtake)  # earlier messages were not examined
@@ -476,7 +476,7 @@ class _Link(asyncio.BufferedProtocol):
         """Return whether a message is not ordinary."""
         return self._lane(message) != loop_turns.ORDINARY
 
-    async def _work(self) -> None:
+    async def _serve_messages(self) -> None:
         """Serve the connection's messages in order, one in each turn; close after its
         stream has ended.
 
@@ -499,7 +499,7 @@ class _Link(asyncio.BufferedProtocol):
                     await split.urgent_done.wait()
                     await self._answer_batch(split.batch, waits=False)
                 elif raw is not None:
-                    await self._serve(await self._decoded(raw))
+                    await self._serve(await self._decode(raw))
             if self.ended:
                 self._answer_the_end()
                 # Urgent requests are served beside this loop; they are answered as well.
@@ -518,7 +518,7 @@ class _Link(asyncio.BufferedProtocol):
         except ProtocolError as error:
             self.out.reply(m.Failure(None, errors.parse_error(str(error))))
 
-    async def _decoded(
+    async def _decode(
         self, raw: bytes
     ) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
         """Decode a message, a large one in another process; errors become `Malformed`,
@@ -575,17 +575,17 @@ class _Link(asyncio.BufferedProtocol):
     async def _begin(self, split: batches.Split) -> None:
         """Serve a batch's urgent items; the others follow when the batch's turn comes."""
         try:
-            await self._items(split.batch, waits=True, urgent_alone=True)
+            await self._serve_items(split.batch, waits=True, urgent_alone=True)
         finally:
             split.urgent_done.set()
 
     async def _answer_batch(self, batch: batches.Batch, *, waits: bool) -> None:
         """Serve the items of a batch and send the answers together."""
-        await self._items(batch, waits=waits)
+        await self._serve_items(batch, waits=waits)
         if bodies := batch.bodies():
             await self._send(self.wire.batch(bodies))
 
-    async def _items(
+    async def _serve_items(
         self, batch: batches.Batch, *, waits: bool, urgent_alone: bool = False
     ) -> None:
         """Serve the remaining items of a batch, each in a turn of its own, and keep their
@@ -661,7 +661,7 @@ class _Link(asyncio.BufferedProtocol):
             self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
 
     async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
-        """Serve a call by `_try`, and count and log it under a trace of its own.
+        """Serve a call by `_handle`, and count and log it under a trace of its own.
 
         Args:
             id: of the request; None for a notification.
@@ -671,7 +671,7 @@ class _Link(asyncio.BufferedProtocol):
         self.served += 1
         trace = f"{self.number}.{self.served}"
         return await parts.answered(
-            self._try(id, name, given, trace),
+            self._handle(id, name, given, trace),
             name,
             trace=trace,
             client=self.name,
@@ -679,7 +679,7 @@ class _Link(asyncio.BufferedProtocol):
             observe=self.server.observe,
         )
 
-    async def _try(
+    async def _handle(
         self, id: m.Id, name: str, given: Given, trace: str
     ) -> m.Response | m.Failure:
         """Check token, rate, place and parameters of a call, and have the session handle
@@ -702,7 +702,7 @@ class _Link(asyncio.BufferedProtocol):
             method = find(name, self.server.methods)
             if not method.urgent:
                 self._check_rate()
-            seated = self.let_in and self._seat()
+            seated = self.let_in and self._take_place()
             if not (seated or method.urgent or name == HELLO):
                 raise self._no_place()
             if isinstance(given, RpcError):
@@ -730,8 +730,8 @@ class _Link(asyncio.BufferedProtocol):
         await self.token_check.check(hello.token, self.name)
         require_compatible(hello.protocol)  # before the session opens
         if not self.let_in:
-            self._open()
-            self._seat()
+            self._admit()
+            self._take_place()
 
     def _check_rate(self) -> None:
         """Count a request against the client's rate `requests_per_s`, if it has one.

@@ -4,7 +4,7 @@ Work is computed in turns (see `compute`) and results are sent as they are made.
 methods are in `projector_methods`.
 
 A client takes one of `max_clients` places when it has shown the token, or with its first
-request where there is none. Until then it waits in a `Room`; without the token, small
+request where there is none. Until then it waits in a `WaitingList`; without the token, small
 messages are taken from it, one at a time and few in all.
 
 On its health and metrics pages volumes are counted but not named, since names may reveal
@@ -33,7 +33,7 @@ from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
 from flexdt.runtime.log import current, log
 from flexdt.runtime.process import ListeningServer
-from flexdt.runtime.waiting_room import Room
+from flexdt.runtime.waiting_room import WaitingList
 from flexdt.server.network.shell_parts import Observe, answered, unobserved
 from flexdt.server.projector.compute import ComputeThread
 from flexdt.server.projector.job_context import Context, JobClient
@@ -62,7 +62,7 @@ class ProjectorServer(ListeningServer):
     observe: Observe
 
     def __post_init__(self) -> None:
-        self.waiting = Room[JobClient](waiting_room.WAITING)
+        self.waiting = WaitingList[JobClient](waiting_room.MAX_WAITING)
         self.seated: set[JobClient] = set()
 
     async def close(self) -> None:
@@ -206,7 +206,7 @@ class ProjectorServer(ListeningServer):
     ) -> m.Response | m.Failure:
         """Serve a call, and count and log it."""
         return await answered(
-            self._try(client, id, name, given),
+            self._handle(client, id, name, given),
             name,
             trace=str(id),
             client=client.link.peer,
@@ -214,7 +214,7 @@ class ProjectorServer(ListeningServer):
             observe=self.observe,
         )
 
-    async def _try(
+    async def _handle(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
         """Check token, parameters and place of a call, and answer it.

@@ -62,9 +62,9 @@ class Acquisition:
     ensure_same: Callable[[], None] = lambda: None
     _recent: dict[int, Radiograph] = field(default_factory=dict, init=False)
     """Index -> image that later frames may need."""
-    _trapped: dict[int, Float32Array] = field(default_factory=dict, init=False)
+    _charges: dict[int, Float32Array] = field(default_factory=dict, init=False)
     """Frame index -> charge in the panel's traps at its start."""
-    _trapping: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
+    _charge_lock: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
         """Project, expose and store a batch of frames, and show the last one.
@@ -81,16 +81,16 @@ class Acquisition:
             Exception: as `ensure_same`; nothing was stored.
         """
         if batch[0].xrays_on:
-            images = await self._take(batch)
+            images = await self._radiographs(batch)
         else:
             images = [self.radiography.dark(batch[0].camera)] * len(batch)
-        before = [await self._before(frame) for frame in batch]
-        trapped = [await self._traps(frame) for frame in batch]
+        before = [await self._earlier_images(frame) for frame in batch]
+        trapped = [await self._trapped_charge(frame) for frame in batch]
         await asyncio.to_thread(self._store, batch, images, before, trapped)
         if self.shown is not None and batch[-1].xrays_on:
             self.shown(batch[-1], images[-1])
 
-    async def _take(self, batch: Sequence[Exposure]) -> list[Radiograph]:
+    async def _radiographs(self, batch: Sequence[Exposure]) -> list[Radiograph]:
         """Project a batch of frames; remember the last `KEPT_IMAGES` where the panel has
         lag or traps.
 
@@ -112,7 +112,7 @@ class Acquisition:
                 del self._recent[next(iter(self._recent))]
         return images
 
-    async def _before(self, frame: Exposure) -> Before:
+    async def _earlier_images(self, frame: Exposure) -> Before:
         """Collect the earlier frames whose afterglow is still on the panel.
 
         Missing ones are projected again, so that a frame does not depend on which were
@@ -139,10 +139,10 @@ class Acquisition:
         """Return the image of a frame with X-rays on; it is projected again if not kept."""
         image = self._recent.get(frame.index)
         if image is None:
-            return (await self._take([frame]))[0]
+            return (await self._radiographs([frame]))[0]
         return image
 
-    async def _traps(self, frame: Exposure) -> Float32Array | None:
+    async def _trapped_charge(self, frame: Exposure) -> Float32Array | None:
         """Compute the charge in the panel's traps at a frame's start, from the first
         frame on.
 
@@ -158,9 +158,9 @@ class Acquisition:
         """
         if not self.radiography.traps:
             return None
-        async with self._trapping:
-            at = max((i for i in self._trapped if i <= frame.index), default=0)
-            charge = self._trapped.get(
+        async with self._charge_lock:
+            at = max((i for i in self._charges if i <= frame.index), default=0)
+            charge = self._charges.get(
                 at, np.zeros(self.plan.exposures[at].camera.shape, "f4")
             )
             for index in range(at, frame.index):
@@ -179,8 +179,8 @@ class Acquisition:
                         settings_of(now),
                         max(gap, 0.0),
                     )
-                self._trapped[index + 1] = charge
-                self._trapped.pop(index + 1 - KEPT_IMAGES, None)
+                self._charges[index + 1] = charge
+                self._charges.pop(index + 1 - KEPT_IMAGES, None)
             return charge
 
     async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:

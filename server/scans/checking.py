@@ -3,7 +3,7 @@ process.
 
 The answer to a check comes back encoded, a plan in pieces that are each unpickled in a
 moment, so that the loop's interpreter is never held for long. The limits of one check are
-`SECONDS` and `MEMORY_BYTES`; a larger one is refused with the limit.
+`MAX_CHECK_S` and `MEMORY_BYTES`; a larger one is refused with the limit.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from flexdt.twin.script.problems import in_order
 
 MAX_PARALLEL_CHECKS: Final = 2
 """Largest number of checks in worker processes at a time; others wait."""
-SECONDS: Final = float(CHECK_LIMITS["seconds"])
+MAX_CHECK_S: Final = float(CHECK_LIMITS["seconds"])
 MEMORY_BYTES: Final = int(CHECK_LIMITS["memory_bytes"])
 MAX_PROBLEMS: Final = 1000
 """Largest number of problems listed by an error or a job's warnings; others are
@@ -72,14 +72,14 @@ class CheckInput:
     """A scan to be checked, and the conditions of the check.
 
     Attributes:
-        wish: script or poses.
+        source: script or poses.
         machine, profile, start: the scanner before.
         size: of the sample the beam sees.
         pieces, parameters: bodies of the sample, and the applied correction.
         physics: model of images, for the counts of the open beam.
     """
 
-    wish: ScanSource
+    source: ScanSource
     machine: Machine
     profile: Profile
     start: StartState
@@ -91,10 +91,10 @@ class CheckInput:
     @property
     def light(self) -> bool:
         """True if the check is too short to pay for another process."""
-        script = self.wish.script
-        if self.wish.poses is None:
+        script = self.source.script
+        if self.source.poses is None:
             return is_light(script)
-        return len(self.wish.poses.text) <= LIGHT_BYTES
+        return len(self.source.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None, swept: bool = True) -> CheckReport:
         """Parse, plan and check the scan, collisions included where the machine has
@@ -110,14 +110,16 @@ class CheckInput:
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
         """
-        wish = self.wish
+        source = self.source
         machine = self.machine
         sweep: dry_run.CollisionCheck | None = None
         if swept and machine.components:
-            sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
-        if wish.poses is None:
+            sweep = _refusing_large(
+                collision_check(self.pieces, self.parameters), bytes_at_most
+            )
+        if source.poses is None:
             return dry_run.check_script(
-                wish.script,
+                source.script,
                 machine,
                 self.profile,
                 start=self.start,
@@ -126,13 +128,13 @@ class CheckInput:
                 physics=self.physics,
             )
         plan = plan_poses(
-            wish.poses.decoded(),
+            source.poses.decoded(),
             machine,
             self.profile,
-            wish.exposure_ms,
+            source.exposure_ms,
             start=self.start,
             sample=self.size,
-            flat=wish.flat,
+            flat=source.flat,
             route=self.free_moves if sweep else None,
         )
         return dry_run.check_plan(plan, (), sweep, physics=self.physics)
@@ -154,13 +156,13 @@ class Checked:
     """Result of a successful check: the plan with its certificate.
 
     Attributes:
-        matter: the checked input. Nothing else enters a plan, so a scan with an equal
+        check_input: the checked input. Nothing else enters a plan, so a scan with an equal
             input has this plan and needs no other check.
         plan: of the scan.
         warnings: in words.
     """
 
-    matter: CheckInput
+    check_input: CheckInput
     plan: ScanPlan
     warnings: list[str]
 
@@ -174,41 +176,41 @@ class Checks:
 
     def __init__(self, apart: bool = True) -> None:
         self._apart = apart
-        self._workers = Workers(MAX_PARALLEL_CHECKS, MEMORY_BYTES, SECONDS)
+        self._workers = Workers(MAX_PARALLEL_CHECKS, MEMORY_BYTES, MAX_CHECK_S)
         self._last: Checked | None = None
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
         self._turn = asyncio.Semaphore(MAX_PARALLEL_CHECKS)
 
     async def report(
-        self, matter: CheckInput, codec: Codec, seen: SampleForecast | None = None
+        self, check_input: CheckInput, codec: Codec, seen: SampleForecast | None = None
     ) -> Sequence[bytes]:
         """Compute the dry-run report, encoded in portions.
 
         Args:
-            matter: the scan and its conditions.
+            check_input: the scan and its conditions.
             codec: of the answer.
             seen: the pixels behind the sample on the stage.
 
         Raises:
             RpcError: -32008, it is larger than an answer may be or takes too long.
         """
-        if self._here(matter):
-            return await self._threaded(lambda: _encoded(matter, codec, seen))
-        return await self._workers.ask(_encoded, _bare(matter), codec, seen)
+        if self._runs_here(check_input):
+            return await self._threaded(lambda: _encoded(check_input, codec, seen))
+        return await self._workers.ask(_encoded, _bare(check_input), codec, seen)
 
-    async def probes(self, matter: CheckInput) -> tuple[SampleProbe, ...]:
+    async def probes(self, check_input: CheckInput) -> tuple[SampleProbe, ...]:
         """Choose rays of a scan's projections from which its counts are predicted.
 
         Raises:
             RpcError: -32008, planning takes too long.
         """
-        if self._here(matter):
-            return await self._threaded(lambda: probes_of(matter))
-        [packed] = await self._workers.ask(packed_probes, _bare(matter))
+        if self._runs_here(check_input):
+            return await self._threaded(lambda: probes_of(check_input))
+        [packed] = await self._workers.ask(packed_probes, _bare(check_input))
         found: tuple[SampleProbe, ...] = pickle.loads(packed)
         return found
 
-    async def sound(self, matter: CheckInput) -> Checked:
+    async def runnable(self, check_input: CheckInput) -> Checked:
         """Parse, plan and sweep a scan, here or in a worker process, and return it if it
         may run.
 
@@ -217,7 +219,7 @@ class Checks:
         checked then.
 
         Args:
-            matter: the scan, with everything that its check depends on.
+            check_input: the scan, with everything that its check depends on.
 
         Returns:
             The plan and its warnings.
@@ -228,24 +230,26 @@ class Checks:
         """
         last = self._last
         self._last = None
-        if last is not None and last.matter == matter:
+        if last is not None and last.check_input == check_input:
             return last
-        if self._here(matter):
-            plan, warnings = await self._threaded(lambda: planned(matter))
+        if self._runs_here(check_input):
+            plan, warnings = await self._threaded(lambda: planned(check_input))
         else:
-            said, *parts = await self._workers.ask(in_pieces, _bare(matter))
+            said, *parts = await self._workers.ask(in_pieces, _bare(check_input))
             warnings = json.loads(said)
-            plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
+            plan = await asyncio.to_thread(
+                _rebuilt_plan, parts, check_input.machine, check_input.profile
+            )
             if isinstance(
                 asyncio.get_running_loop(), ServerLoop
             ):  # a process of one twin
                 gc.freeze()  # a million objects that are no garbage, see `announce`
-        self._last = Checked(matter, plan, warnings)
+        self._last = Checked(check_input, plan, warnings)
         return self._last
 
-    def _here(self, matter: CheckInput) -> bool:
+    def _runs_here(self, check_input: CheckInput) -> bool:
         """Return whether to check in a thread: light scans, while no process is free."""
-        return not self._apart or (matter.light and not self._workers.ready)
+        return not self._apart or (check_input.light and not self._workers.ready)
 
     async def _threaded(self, do: Callable[[], _T]) -> _T:
         async with self._turn:
@@ -256,54 +260,55 @@ class Checks:
         self._workers.close()
 
 
-def planned(matter: CheckInput) -> tuple[ScanPlan, list[str]]:
+def planned(check_input: CheckInput) -> tuple[ScanPlan, list[str]]:
     """Return the plan of a scan and its warnings in words; blocks.
 
     Raises:
         RpcError: -32005 or -32002, it may not run.
     """
-    report = matter.report()
-    require_sound(report)
+    report = check_input.report()
+    require_runnable(report)
     warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
     left = len(report.warnings) - MAX_PROBLEMS
     return report.plan, [*warnings, f"and {left} more"] if left > 0 else warnings
 
 
-def in_pieces(matter: CheckInput) -> list[bytes]:
+def in_pieces(check_input: CheckInput) -> list[bytes]:
     """Check in the worker: returns the warnings as JSON, then the plan in pieces."""
-    plan, warnings = planned(matter)
-    return [json.dumps(warnings).encode(), *_pieces_of(plan)]
+    plan, warnings = planned(check_input)
+    return [json.dumps(warnings).encode(), *_pickled_pieces(plan)]
 
 
-def _bare(matter: CheckInput) -> CheckInput:
+def _bare(check_input: CheckInput) -> CheckInput:
     """Return the input without the listing of poses, which only people read."""
-    wish = matter.wish
-    if wish.poses is None:
-        return matter
+    source = check_input.source
+    if source.poses is None:
+        return check_input
     return replace(
-        matter, wish=replace(wish, script=b"", poses=PoseList(wish.poses.text, b""))
+        check_input,
+        source=replace(source, script=b"", poses=PoseList(source.poses.text, b"")),
     )
 
 
-def probes_of(matter: CheckInput) -> tuple[SampleProbe, ...]:
+def probes_of(check_input: CheckInput) -> tuple[SampleProbe, ...]:
     """Choose the rays of a scan's projections; none of a scan with errors. Blocks."""
-    report = matter.report(swept=False)
+    report = check_input.report(swept=False)
     return () if report.errors else sample_probes(report.plan)
 
 
-def packed_probes(matter: CheckInput) -> list[bytes]:
+def packed_probes(check_input: CheckInput) -> list[bytes]:
     """Choose the rays of a scan's projections in a worker process, pickled."""
-    return [pickle.dumps(probes_of(matter))]
+    return [pickle.dumps(probes_of(check_input))]
 
 
 def _encoded(
-    matter: CheckInput, codec: Codec, seen: SampleForecast | None
+    check_input: CheckInput, codec: Codec, seen: SampleForecast | None
 ) -> list[bytes]:
     """Compute a dry-run report and encode it in pieces of `ANSWER_PIECE` bytes; runs in a
     worker.
 
     Args:
-        matter: the scan to be checked.
+        check_input: the scan to be checked.
         codec: of the connection that asked.
         seen: the prediction behind the sample, whose problems join the report; None without.
 
@@ -311,7 +316,7 @@ def _encoded(
         RpcError: -32008, the report is larger than an answer may be.
     """
     most = MAX_ANSWER[codec]
-    found = matter.report(most)
+    found = check_input.report(most)
     if seen is not None and not found.errors:
         more = sample_problems(seen, found.problems)
         found = replace(found, problems=in_order((*found.problems, *more)))
@@ -325,7 +330,9 @@ def _encoded(
     return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]
 
 
-def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.CollisionCheck:
+def _refusing_large(
+    sweep: dry_run.CollisionCheck, most: int | None
+) -> dry_run.CollisionCheck:
     """Wrap a sweep so that it refuses plans whose report would be too large.
 
     Args:
@@ -347,7 +354,7 @@ def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.Collisi
     return bounded
 
 
-def require_sound(report: CheckReport) -> None:
+def require_runnable(report: CheckReport) -> None:
     """Raise an error with the report's problems unless the plan may run.
 
     Args:
@@ -400,7 +407,7 @@ def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:
 # A plan in pieces ---------------------------------------------------------------------------------
 
 
-def _pieces_of(plan: ScanPlan) -> list[bytes]:
+def _pickled_pieces(plan: ScanPlan) -> list[bytes]:
     """Pickle a plan, without machine and profile, in pieces small enough to be read at
     once.
 
@@ -431,12 +438,12 @@ def _pieces_of(plan: ScanPlan) -> list[bytes]:
     return [pickle.dumps(short), *map(pickle.dumps, pieces)]
 
 
-def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
-    """Rebuild the plan that `_pieces_of` pickled; in a thread, so that others run between
+def _rebuilt_plan(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
+    """Rebuild the plan that `_pickled_pieces` pickled; in a thread, so that others run between
     pieces.
 
     Args:
-        pieces: of `_pieces_of`, all and in order.
+        pieces: of `_pickled_pieces`, all and in order.
         machine, profile: of the plan, which its pieces lack.
     """
     with _no_collection():

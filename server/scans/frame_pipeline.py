@@ -41,13 +41,15 @@ class FramePipeline(Generic[T]):
         self._waiting: deque[T] = deque()
         self._busy = 0
         self._changed = asyncio.Condition()
-        self._go = asyncio.Event()
-        self._go.set()
+        self._retry_allowed = asyncio.Event()
+        self._retry_allowed.set()
         self._tasks: list[asyncio.Task[None]] = []
 
     def open(self) -> None:
         """Start the workers; before that, frames only wait."""
-        self._tasks = [asyncio.create_task(self._work()) for _ in range(self.workers)]
+        self._tasks = [
+            asyncio.create_task(self._process_batches()) for _ in range(self.workers)
+        ]
 
     @property
     def full(self) -> bool:
@@ -73,7 +75,7 @@ class FramePipeline(Generic[T]):
 
     def retry(self) -> None:
         """Let the workers that failed try their batches again."""
-        self._go.set()
+        self._retry_allowed.set()
 
     async def close(self) -> None:
         """Stop the workers; frames that are not made are dropped."""
@@ -81,22 +83,22 @@ class FramePipeline(Generic[T]):
             worker.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    async def _work(self) -> None:
+    async def _process_batches(self) -> None:
         """Take batches of waiting frames and produce each until it succeeds; ends only by
         cancellation.
         """
         while True:
             async with self._changed:
                 await self._changed.wait_for(lambda: bool(self._waiting))
-                batch = self._take()
+                batch = self._next_batch()
                 self._busy += 1
                 self._changed.notify_all()
-            await self._until_made(batch)
+            await self._produce_until_done(batch)
             async with self._changed:
                 self._busy -= 1
                 self._changed.notify_all()
 
-    def _take(self) -> list[T]:
+    def _next_batch(self) -> list[T]:
         """Remove the next batch from the queue: consecutive frames of one kind, at most
         `batch`.
         """
@@ -110,7 +112,7 @@ class FramePipeline(Generic[T]):
             batch.append(self._waiting.popleft())
         return batch
 
-    async def _until_made(self, batch: Sequence[T]) -> None:
+    async def _produce_until_done(self, batch: Sequence[T]) -> None:
         """Produce a batch; after a failure call `failed`, wait for `retry`, and try
         again.
         """
@@ -118,8 +120,8 @@ class FramePipeline(Generic[T]):
             try:
                 await self.produce(batch)
             except Exception as error:
-                self._go.clear()
+                self._retry_allowed.clear()
                 self.failed(error)
-                await self._go.wait()
+                await self._retry_allowed.wait()
             else:
                 return

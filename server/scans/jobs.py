@@ -24,7 +24,7 @@ from flexdt.runtime.log import log, traced
 from flexdt.runtime.wire_errors import explain, is_user_error
 from flexdt.server.scans.job_retries import Retry, transient
 from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner
-from flexdt.server.scans.scan_job import ENDED, Job, JobInputs, Prepare, recalled
+from flexdt.server.scans.scan_job import ENDED_PHASES, Job, JobInputs, Prepare, recalled
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.job_files import JobMemory, number_of
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -84,7 +84,7 @@ class Jobs:
         self._preparing = False
         """True while the current job is being opened: its checked conditions must not
         change."""
-        self._by_hand = False
+        self._manual = False
         """True if only `resume` continues the current job, whatever stopped it."""
         self._interrupted: Exception | None = None
         """Last stop from outside since the current job's turn."""
@@ -165,15 +165,15 @@ class Jobs:
 
         If the command fails before anything has moved, the automatic resume is restored.
         """
-        by_hand = self._by_hand
+        by_hand = self._manual
         programmes = self._scanner.programmes
-        self._by_hand = True
+        self._manual = True
         try:
             yield
         except Exception:
             if self._scanner.programmes == programmes:
-                self._by_hand = by_hand
-                self._go_on_later()
+                self._manual = by_hand
+                self._schedule_resume()
             else:
                 self.retry.cancel()
             raise
@@ -182,12 +182,12 @@ class Jobs:
     def uses(self, folder: str) -> bool:
         """Return whether a job that has not ended writes into `folder`."""
         return any(
-            j.folder == folder and j.phase not in ENDED for j in self._all.values()
+            j.folder == folder and j.phase not in ENDED_PHASES for j in self._all.values()
         )
 
     def showing(self, sample: str) -> Job | None:
         """Return a job that has not ended and uses the sample of that name, or None."""
-        unended = (j for j in self._all.values() if j.phase not in ENDED)
+        unended = (j for j in self._all.values() if j.phase not in ENDED_PHASES)
         return next(
             (j for j in unended if j.sample is not None and j.sample.name == sample), None
         )
@@ -199,7 +199,7 @@ class Jobs:
 
     def samples(self) -> list[Sample]:
         """List the samples of jobs that have not ended."""
-        unended = (j for j in self._all.values() if j.phase not in ENDED)
+        unended = (j for j in self._all.values() if j.phase not in ENDED_PHASES)
         return [j.sample for j in unended if j.sample is not None]
 
     def status(self, job: Job) -> JobStatus:
@@ -217,7 +217,7 @@ class Jobs:
             frames_total=job.frames_total,
             elapsed_s=job.elapsed_s,
             remaining_s=0.0
-            if job.phase in ENDED
+            if job.phase in ENDED_PHASES
             else max(0.0, job.duration_s - job.elapsed_s),
             time=self._clock.now(),
             speed_up=self._clock.speed_up if job.speed_up is None else job.speed_up,
@@ -227,7 +227,7 @@ class Jobs:
             warnings=job.warnings,
             step=None if step is None else step.index,
             line=None if step is None else step.line,
-            what="" if p is None or job.phase in ENDED else p.what,
+            what="" if p is None or job.phase in ENDED_PHASES else p.what,
             ended_by=job.ended_by,
             start=job.start,
         )
@@ -264,8 +264,8 @@ class Jobs:
         if waiting >= self.max_waiting:
             data = {"asked": waiting + 1, "allowed": self.max_waiting}
             raise busy(f"{waiting} jobs wait already", data)
-        if job is not None and job.phase not in ENDED:
-            raise self._cannot("resume", job, ENDED)
+        if job is not None and job.phase not in ENDED_PHASES:
+            raise self._phase_error("resume", job, ENDED_PHASES)
         return replace(
             job or Job(f"job-{self._count + 1}", name, folder),
             prepare=prepare,
@@ -307,7 +307,7 @@ class Jobs:
         """Let a paused job go on; nothing to do for one that runs."""
         runner = self._runner(job, "resume", ("running", "paused"))
         self.retry.cancel()
-        self._by_hand = False
+        self._manual = False
         runner.resume()
 
     def step(self, job: Job) -> None:
@@ -326,7 +326,7 @@ class Jobs:
             reason: for the data set.
             by: connection of the request.
         """
-        if job.phase in ENDED:
+        if job.phase in ENDED_PHASES:
             return
         job.ended_by = job.ended_by or by
         if job.runner is not None:
@@ -352,7 +352,7 @@ class Jobs:
 
     def _take_over(self) -> None:
         self.retry.cancel()
-        self._by_hand = True
+        self._manual = True
 
     # Remembering and forgetting -----------------------------------------------------------------
 
@@ -374,7 +374,7 @@ class Jobs:
         """Select the jobs of an earlier server that are not forgotten at once, oldest
         first.
         """
-        ended = [job.id for job in jobs if job.phase in ENDED]
+        ended = [job.id for job in jobs if job.phase in ENDED_PHASES]
         forgotten = set(ended[: max(0, len(ended) - self._max_ended)])
         return [job for job in jobs if job.id not in forgotten]
 
@@ -397,7 +397,7 @@ class Jobs:
         left = []
         for memory in jobs:
             job = self._all[memory.id] = recalled(memory, root, self._today())
-            if memory.phase not in ENDED:
+            if memory.phase not in ENDED_PHASES:
                 left.append(job)
             if job.memory() != memory:
                 self._changed.add(job.id)
@@ -416,10 +416,10 @@ class Jobs:
             RpcError: -32003, it has not ended.
         """
         if job is None:
-            return self._older(self._today() - min_age)
+            return self._ended_before(self._today() - min_age)
         found = self.get(job)
-        if found.phase not in ENDED or found is self.current:
-            raise self._cannot("forget", found, ENDED)
+        if found.phase not in ENDED_PHASES or found is self.current:
+            raise self._phase_error("forget", found, ENDED_PHASES)
         return [found]
 
     def forget(self, jobs: Iterable[Job]) -> None:
@@ -432,17 +432,19 @@ class Jobs:
     def _forget_old(self) -> None:
         """Forget the ended jobs beyond those that are kept, and those that are too old."""
         ended = [
-            j for j in self._all.values() if j.phase in ENDED and j is not self.current
+            j
+            for j in self._all.values()
+            if j.phase in ENDED_PHASES and j is not self.current
         ]
         self.forget(ended[: max(0, len(ended) - self._max_ended)])
-        self.forget(self._older(self._today() - self._max_age))
+        self.forget(self._ended_before(self._today() - self._max_age))
 
-    def _older(self, than: datetime) -> list[Job]:
+    def _ended_before(self, than: datetime) -> list[Job]:
         """List the jobs, except the current one, that ended before a moment."""
         return [
             job
             for job in self._all.values()
-            if job.phase in ENDED
+            if job.phase in ENDED_PHASES
             and job is not self.current
             and (job.ended or than) <= than
         ]
@@ -475,7 +477,7 @@ class Jobs:
             except (
                 Exception
             ) as error:  # whatever it is, it is this job's, and the next one runs
-                phase = self._failed(job, error)
+                phase = self._store_failure(job, error)
             finally:
                 job.phase = phase
                 job.ended = self._today()
@@ -501,7 +503,7 @@ class Jobs:
             The job's last phase: done, aborted or failed.
         """
         self._interrupted = None
-        self._by_hand = False
+        self._manual = False
         try:
             await self._clock.at_rest(
                 self._scanner.rest_time
@@ -512,13 +514,13 @@ class Jobs:
                 job.start = self._scanner.final_positions()
             scan = await job.prepare()
         except Exception as error:
-            return self._failed(job, error)
+            return self._store_failure(job, error)
         finally:
             self._preparing = False
         job.frames_total = scan.plan.frames
         job.duration_s = scan.plan.duration_s
         try:
-            runner = await self._runner_of(job, scan)
+            runner = await self._make_runner(job, scan)
             if job.phase != "queued":  # aborted while it was being prepared
                 raise JobAborted(job.aborted_for)
             job.runner = runner
@@ -533,20 +535,20 @@ class Jobs:
         except JobAborted as ended:
             if job.runner is not None:
                 self._scanner.set_tube(on=False, now=self._clock.now())
-            await asyncio.to_thread(self._mark, job, scan, str(ended))
+            await asyncio.to_thread(self._mark_incomplete, job, scan, str(ended))
             return "aborted"
         except asyncio.CancelledError:
             # The loop is being closed: nothing can be awaited any more.
-            self._mark(job, scan, "the server was stopped")
+            self._mark_incomplete(job, scan, "the server was stopped")
             raise
         except Exception as error:
-            await asyncio.to_thread(self._mark, job, scan, str(error))
-            return self._failed(job, error)
+            await asyncio.to_thread(self._mark_incomplete, job, scan, str(error))
+            return self._store_failure(job, error)
         finally:
             scan.store.close()
         return "done"
 
-    async def _runner_of(self, job: Job, scan: JobInputs) -> ScanRunner:
+    async def _make_runner(self, job: Job, scan: JobInputs) -> ScanRunner:
         """Create the runner of a job in a thread, as it sorts the events of a long plan.
 
         Args:
@@ -562,7 +564,7 @@ class Jobs:
                 self._clock,
                 _logged(scan.produce, job.id),
                 done=scan.store.present,
-                notify=lambda: self._progress(job),
+                notify=lambda: self._copy_progress(job),
                 projectors=self._projectors,
             )
         finally:
@@ -571,7 +573,7 @@ class Jobs:
     def _stopped(self) -> Exception | None:
         return self._interrupted  # a call: it may change while others run
 
-    def _mark(self, job: Job, scan: JobInputs, reason: str) -> None:
+    def _mark_incomplete(self, job: Job, scan: JobInputs, reason: str) -> None:
         """Mark the data set of a job as incomplete, with the reason and the time reached;
         log a failure.
         """
@@ -585,7 +587,7 @@ class Jobs:
         ) as error:  # the disk may be full: the data set says incomplete anyway
             log("data set not marked", logging.ERROR, job=job.id, reason=str(error))
 
-    def _failed(self, job: Job, error: Exception) -> JobPhase:
+    def _store_failure(self, job: Job, error: Exception) -> JobPhase:
         """Store an error in its job, log it unless a user caused it, and return the phase
         "failed".
         """
@@ -600,10 +602,10 @@ class Jobs:
 
     def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:
         if job.runner is None or job.phase not in phases:
-            raise self._cannot(what, job, phases)
+            raise self._phase_error(what, job, phases)
         return job.runner
 
-    def _cannot(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
+    def _phase_error(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
         """Make the error -32003 for a command that a job's phase does not allow;
         returned, not raised.
 
@@ -617,7 +619,7 @@ class Jobs:
             {"asked": what, "state": job.phase, "allowed": list(phases)},
         )
 
-    def _progress(self, job: Job) -> None:
+    def _copy_progress(self, job: Job) -> None:
         """Copy the runner's progress and error into the job, count frames, and publish if
         due.
 
@@ -639,25 +641,25 @@ class Jobs:
             self.frames_made += p.frames_done - job.frames_seen
             job.frames_seen = p.frames_done
             self.retry.progressed()
-        self._go_on_later()
+        self._schedule_resume()
         now = asyncio.get_running_loop().time()
         if important or now - job.published_at >= PUBLISH_INTERVAL_S:
             job.published_at = now
             self._tell(job)
 
-    def _go_on_later(self) -> None:
+    def _schedule_resume(self) -> None:
         """Schedule a retry after a pause by a full disk or a projector, unless a user
         took over.
         """
         job = self.current
-        if job is None or job.runner is None or self._by_hand:
+        if job is None or job.runner is None or self._manual:
             return
         p = job.runner.progress
         if p.phase == "paused" and p.error is not None and transient(p.error):
             self.retry.schedule(p.error, lambda: self._try_again(job))
 
     def _try_again(self, job: Job) -> None:
-        if job.phase == "paused" and job.runner is not None and not self._by_hand:
+        if job.phase == "paused" and job.runner is not None and not self._manual:
             job.runner.resume()
 
 

@@ -25,11 +25,11 @@ from flexdt.twin.scanner.state import TubeSettings
 from flexdt.twin.script import Exposure, PlanStep, ScanPlan
 from flexdt.twin.script import commands as c
 
-BATCH = 4
-WORKERS = 2
+MAX_BATCH_FRAMES = 4
+WORKERS_PER_PROJECTOR = 2
 MAX_SWEEPS = 3
 """Sweeps of the rest of a plan before a run gives up because others move the scanner."""
-ROOM = 16
+WAITING_FRAMES_PER_PROJECTOR = 16
 Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
 Phase = Literal["running", "paused", "done"]
 
@@ -146,11 +146,11 @@ class ScanRunner:
         since."""
         self._end: Exception = JobAborted()
         """Exception raised when the run must end."""
-        self._stepping = False
+        self._single_step = False
         self._steps = 0
         """Number of requested steps."""
-        self._kept: _Settings | None = None
-        self._moves = False
+        self._saved_settings: _Settings | None = None
+        self._started_motors = False
         """True if the run has started motors since the last resume."""
         self._signal = asyncio.Event()
         self._waiting: asyncio.Future[None] | None = None
@@ -158,9 +158,9 @@ class ScanRunner:
             self._make,
             self._not_made,
             kind=lambda e: (e.camera, e.xrays_on),
-            batch=BATCH,
-            workers=WORKERS * self.projectors,
-            room=ROOM * self.projectors,
+            batch=MAX_BATCH_FRAMES,
+            workers=WORKERS_PER_PROJECTOR * self.projectors,
+            room=WAITING_FRAMES_PER_PROJECTOR * self.projectors,
         )
 
     # Control ------------------------------------------------------------------------------------
@@ -173,27 +173,27 @@ class ScanRunner:
             error: reason, shown in `progress`; None if a user requested the pause.
         """
         if error is not None:
-            self._set(error=error)
-        if self._kept is None:
-            self._kept = _Settings.of(self.scanner)
+            self._set_progress(error=error)
+        if self._saved_settings is None:
+            self._saved_settings = _Settings.of(self.scanner)
         # The run stops before any further command: the motors may be at rest by now.
         self._pause = True
         self._stop_due = True
-        self._stepping = False
+        self._single_step = False
         self._wake()
 
     def resume(self) -> None:
         """Return to the pose of the pause and continue; later errors count as new."""
-        self._pause = self._stepping = False
-        self._set(error=None)
+        self._pause = self._single_step = False
+        self._set_progress(error=None)
         self._wake()
 
     def step(self) -> None:
         """Run one frame, or one command that takes none, and pause again."""
         self._pause = False
-        self._stepping = True
+        self._single_step = True
         self._steps += 1
-        self._set(error=None)
+        self._set_progress(error=None)
         self._wake()
 
     def abort(self, reason: str | None = None) -> None:
@@ -211,7 +211,7 @@ class ScanRunner:
     @property
     def stepping(self) -> bool:
         """True while a requested step has not ended."""
-        return self._stepping
+        return self._single_step
 
     @property
     def idle(self) -> bool:
@@ -237,23 +237,23 @@ class ScanRunner:
             await self._begin()
             for moment, event in self._events:
                 if isinstance(event, PlanStep) and moment < first:
-                    await self._take_effect(event)
+                    await self._apply_step(event)
             await self._rejoin_or_pause(first)
             for moment, event in self._events:
                 match event:
                     case PlanStep() if moment < first:
                         continue
                     case PlanStep():
-                        await self._until(moment)
-                        await self._take_effect(event)
+                        await self._wait_until(moment)
+                        await self._apply_step(event)
                         length = 0.0
                         if event.index not in self._quick:
                             length = event.holds_s
                     case Exposure():
-                        await self._until(moment)
+                        await self._wait_until(moment)
                         # A frame that a pause falls into is discarded: the run goes back before
                         # it and exposes it completely, at the speed of the scan.
-                        await self._until(
+                        await self._wait_until(
                             moment + event.duration_s, exposing_since=moment
                         )
                         steps = self._steps
@@ -263,12 +263,12 @@ class ScanRunner:
                         length = 0.0
                         if steps == self._steps:
                             length = event.duration_s
-                if self._stepping and length > 0.0:
-                    await self._until(moment + length)
+                if self._single_step and length > 0.0:
+                    await self._wait_until(moment + length)
                     self.pause()
-            await self._until(self.plan.duration_s)
+            await self._wait_until(self.plan.duration_s)
             await self._drain()
-            self._set(phase="done", tau=self.plan.duration_s, what="")
+            self._set_progress(phase="done", tau=self.plan.duration_s, what="")
         except Exception:
             self.scanner.stop(self.clock.now())
             raise
@@ -297,16 +297,16 @@ class ScanRunner:
     async def _make(self, batch: Sequence[Exposure]) -> None:
         await self.produce(batch)
         made = sum(e.kind == "projection" for e in batch)
-        self._set(frames_done=self.progress.frames_done + made)
+        self._set_progress(frames_done=self.progress.frames_done + made)
 
-    async def _take_effect(self, step: PlanStep) -> None:
+    async def _apply_step(self, step: PlanStep) -> None:
         """Apply a command of the plan and show it in `progress`; after an error pause,
         and try again on resume.
 
         Raises:
             Exception: the run is to end (`JobAborted`).
         """
-        self._set(step=step, what=step.what)
+        self._set_progress(step=step, what=step.what)
         while True:
             try:
                 apply_command(self.scanner, step.command, self.clock.now())
@@ -314,11 +314,13 @@ class ScanRunner:
                 TwinError
             ) as error:  # an E-stop refuses X-rays on: wait for reset and resume
                 self.pause(error)
-                await self._obey(self.progress.tau)
+                await self._obey_requests(self.progress.tau)
             else:
                 return
 
-    async def _until(self, moment: float, exposing_since: float | None = None) -> None:
+    async def _wait_until(
+        self, moment: float, exposing_since: float | None = None
+    ) -> None:
         """Wait until plan time `moment`, obeying pause and abort; set the progress to it.
 
         Args:
@@ -330,17 +332,19 @@ class ScanRunner:
             Exception: the run is to end (`JobAborted`).
         """
         while True:
-            if self._told():
+            if self._has_request():
                 reached = max(
                     self.progress.tau, min(self.clock.now() - self.origin, moment)
                 )
-                await self._obey(reached if exposing_since is None else exposing_since)
+                await self._obey_requests(
+                    reached if exposing_since is None else exposing_since
+                )
                 continue
             until = self.origin + moment
             if self.clock.now() >= until:
                 break
             await self._sleep(until)
-        self._set(tau=moment)
+        self._set_progress(tau=moment)
 
     async def _sleep(self, until: float) -> None:
         self._waiting = self.clock.at(until)
@@ -352,7 +356,7 @@ class ScanRunner:
         if self._waiting is not None and not self._waiting.done():
             self._waiting.set_result(None)
 
-    async def _obey(self, tau: float) -> None:
+    async def _obey_requests(self, tau: float) -> None:
         """Obey requests: raise if the run is to end; else stop, wait for `resume`, and
         rejoin the plan.
 
@@ -367,20 +371,20 @@ class ScanRunner:
         """
         if self._abort:
             raise self._end
-        if not self._told():
+        if not self._has_request():
             return
         self._stop()
         while True:
-            await self._until_told(tau)
-            self._moves = False
+            await self._wait_for_request(tau)
+            self._started_motors = False
             try:
-                if self._kept is not None:
-                    self._kept.restore(self.scanner)
+                if self._saved_settings is not None:
+                    self._saved_settings.restore(self.scanner)
                 await self._rejoin(tau)
             except TwinError as error:
                 self.pause(error)
-            if not self._told():
-                self._kept = None
+            if not self._has_request():
+                self._saved_settings = None
                 self._pipeline.retry()
                 return
             self._stop()
@@ -389,22 +393,22 @@ class ScanRunner:
         """Stop the run's motion; motion by hand during a run that cannot continue is not
         stopped.
         """
-        if self._moves:
+        if self._started_motors:
             self.scanner.stop(self.clock.now())
 
     async def _begin(self) -> None:
         """Wait where a stop came before the run has begun: nothing is set before it may go
         on."""
-        while self._told():
-            await self._until_told(0.0)
-            self._set(phase="running", error=None)
-        self._kept = None
+        while self._has_request():
+            await self._wait_for_request(0.0)
+            self._set_progress(phase="running", error=None)
+        self._saved_settings = None
 
-    async def _until_told(self, tau: float) -> None:
+    async def _wait_for_request(self, tau: float) -> None:
         """Pause until resume, step or abort."""
         self._stop_due = False
         if self._pause:
-            self._set(phase="paused", tau=tau)
+            self._set_progress(phase="paused", tau=tau)
         while self._pause and not self._abort:
             self._signal.clear()
             await self._signal.wait()
@@ -413,13 +417,13 @@ class ScanRunner:
 
     async def _rejoin_or_pause(self, tau: float) -> None:
         """Move to the plan's beginning; an obstacle pauses the run."""
-        if not self._told():
+        if not self._has_request():
             try:
                 await self._rejoin(tau)
             except TwinError as error:
                 self.pause(error)
-        if self._told():
-            await self._obey(tau)
+        if self._has_request():
+            await self._obey_requests(tau)
 
     async def _rejoin(self, tau: float) -> None:
         """Move to the plan's pose at `tau` and start the swept motion from there; ends
@@ -441,24 +445,24 @@ class ScanRunner:
             programme = await asyncio.to_thread(way.programme)
             prepared = self.scanner.prepared(programme, self.clock.now(), way.start)
             certificate = await asyncio.to_thread(prepared.certified)
-            if self._told():
+            if self._has_request():
                 return
             now = self.clock.now()
             if not self.scanner.holds(certificate):
                 continue
             if certificate.contact is not None:
                 break
-            self._set(phase="running", error=None)
+            self._set_progress(phase="running", error=None)
             await self._return_to(way.start)
-            if self._told():
+            if self._has_request():
                 return
             now = self.clock.now()
             if self.scanner.may_follow(certificate, now):
                 break
         self.scanner.follow(certificate, now)
-        self._moves = True
+        self._started_motors = True
         self.origin = now + way.run_up_s - tau
-        self._set(tau=tau)
+        self._set_progress(tau=tau)
 
     async def _return_to(self, start: Mapping[str, float]) -> None:
         """Move the motors to where a programme begins and wait for rest; ends early on a
@@ -473,14 +477,14 @@ class ScanRunner:
         now = self.clock.now()
         if self.scanner.positions(now) == start and not self.scanner.moving(now):
             return
-        self._set(what="returning to the pose of the scan")
-        self._moves = True
+        self._set_progress(what="returning to the pose of the scan")
+        self._started_motors = True
         self.scanner.move(start, now)
         rest = self.scanner.rest_time(now)
-        while self.clock.now() < rest and not self._told():
+        while self.clock.now() < rest and not self._has_request():
             await self._sleep(rest)
 
-    def _told(self) -> bool:
+    def _has_request(self) -> bool:
         # A call: all three may change while others run.
         return self._pause or self._stop_due or self._abort
 
@@ -491,15 +495,17 @@ class ScanRunner:
         if not self._pipeline.full:
             await self._pipeline.put(frame)
             return
-        await self._held(self._pipeline.put(frame), frame.start_s + frame.duration_s)
+        await self._await_clock_held(
+            self._pipeline.put(frame), frame.start_s + frame.duration_s
+        )
 
     async def _drain(self) -> None:
         """Wait for the last frames."""
-        self._set(what="finishing the last frames")
+        self._set_progress(what="finishing the last frames")
         while not self._pipeline.idle:
-            await self._held(self._pipeline.drained(), self.plan.duration_s)
+            await self._await_clock_held(self._pipeline.drained(), self.plan.duration_s)
 
-    async def _held(self, work: Awaitable[None], moment: float) -> None:
+    async def _await_clock_held(self, work: Awaitable[None], moment: float) -> None:
         """Await `work` with the clock held, obeying pause and abort meanwhile.
 
         Args:
@@ -512,8 +518,8 @@ class ScanRunner:
         task = asyncio.ensure_future(work)
         try:
             while not task.done():
-                if self._told():
-                    await self._obey(moment)
+                if self._has_request():
+                    await self._obey_requests(moment)
                 self._signal.clear()
                 signal = asyncio.ensure_future(self._signal.wait())
                 with self.clock.held():
@@ -525,7 +531,7 @@ class ScanRunner:
         finally:
             task.cancel()
 
-    def _set(self, **changes: object) -> None:
+    def _set_progress(self, **changes: object) -> None:
         """Change fields of `progress`, and notify if any value is another one."""
         new = replace(self.progress, **changes)  # type: ignore[arg-type]
         if new != self.progress:

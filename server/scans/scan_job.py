@@ -20,7 +20,7 @@ from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan
 
-ENDED: tuple[JobPhase, ...] = get_args(EndedPhase)
+ENDED_PHASES: tuple[JobPhase, ...] = get_args(EndedPhase)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
     last = Progress("done", memory.elapsed_s, memory.frames_done)
     job = Job(folder=str(folder.path), last=last, **known)
     job.ended = job.ended or now
-    if job.phase in ENDED:
+    if job.phase in ENDED_PHASES:
         return job
     if is_complete(folder):  # it was killed between the last file and telling of it
         job.phase = "done"

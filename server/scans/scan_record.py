@@ -1,6 +1,6 @@
 """A scan's request and start conditions, kept in DATA/jobs so that it can be resumed.
 
-One JSON file a data set that is not complete: the wish (script byte for byte, or poses), the
+One JSON file a data set that is not complete: the source (script byte for byte, or poses), the
 scanner's state at the start, sample, seed, pace. With it any later server makes exactly the
 missing images.
 
@@ -130,13 +130,13 @@ class JobRecord:
     """The data kept with a data set.
 
     Attributes:
-        wish: the requested scan.
+        source: the requested scan.
         begin: conditions at its start.
         speed_up: the job's; None for the clock's.
         operator: the program that submitted it.
     """
 
-    wish: ScanSource
+    source: ScanSource
     begin: StartConditions
     speed_up: SpeedUp | None = None
     operator: str = ""
@@ -159,15 +159,17 @@ class JobRecord:
             root: data directory.
             name: of the data set.
         """
-        wish = self.wish
+        source = self.source
         document = {
             "schema": SCHEMA,
             **asdict(self.begin),
             "wish": {
-                "script": base64.b64encode(wish.script).decode("ascii"),
-                "poses": None if wish.poses is None else wish.poses.text.decode("ascii"),
-                "exposure_ms": wish.exposure_ms,
-                "flat": wish.flat,
+                "script": base64.b64encode(source.script).decode("ascii"),
+                "poses": None
+                if source.poses is None
+                else source.poses.text.decode("ascii"),
+                "exposure_ms": source.exposure_ms,
+                "flat": source.flat,
             },
             "speed_up": self.speed_up,
             "operator": self.operator,
@@ -225,20 +227,20 @@ class JobRecord:
         if document["schema"] != SCHEMA:
             raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")
         begin = BEGINNING.validate_python(document)
-        wish = document["wish"]
+        source = document["wish"]
         speed_up = document["speed_up"]
-        poses = wish["poses"]
+        poses = source["poses"]
         if isinstance(poses, list):  # as servers before wrote it
             poses = json.dumps(poses)
         return cls(
             ScanSource(
-                base64.b64decode(wish["script"], validate=True),
+                base64.b64decode(source["script"], validate=True),
                 None if poses is None else PoseList(poses.encode("ascii"), b""),
-                _EXPOSURE.validate_python(wish["exposure_ms"]),
+                _EXPOSURE.validate_python(source["exposure_ms"]),
                 begin.moments,
                 begin.seed,
                 _FLAT.validate_python(
-                    wish.get("flat", False)
+                    source.get("flat", False)
                 ),  # servers before took none
             ),
             begin,

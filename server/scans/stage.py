@@ -37,11 +37,11 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample, StagePlacement
 from flexdt.twin.script.planning.plan_values import SampleSize
 
-KEPT = 8
+MAX_CACHED_SCENES = 8
 MAX_BYTES: Final = 64 << 20
-HEADER = 84
+STL_HEADER_BYTES = 84
 """Size of binary STL before the faces [bytes]."""
-FACE = 50
+STL_FACE_BYTES = 50
 """Size of each face of binary STL [bytes]."""
 _Content = tuple[Sample, str | None]
 """A sample and the revision of its upload: another file may get the same name."""
@@ -62,7 +62,9 @@ class Stage:
         self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = (
             OrderedDict()
         )
-        self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
+        self._convex_pieces_of: OrderedDict[_Content, tuple[Polytope, ...]] = (
+            OrderedDict()
+        )
 
     def phantom(self, sample: Sample) -> Phantom | None:
         """Load the phantom of a sample; None for an empty stage.
@@ -86,7 +88,7 @@ class Stage:
         """Compute convex pieces that contain the sample, object frame [mm]; may take a
         second.
 
-        The pieces of the last `KEPT` samples are remembered.
+        The pieces of the last `MAX_CACHED_SCENES` samples are remembered.
 
         Args:
             sample: on the stage.
@@ -96,23 +98,23 @@ class Stage:
             The pieces; empty for an empty stage.
         """
         before = self._content(sample, upload)
-        pieces = self._pieces.get(before)
+        pieces = self._convex_pieces_of.get(before)
         if pieces is None:
             if upload is None:
                 phantom = self.phantom(sample)
             else:
                 phantom = upload.standing
             if phantom is not None:
-                pieces = _pieces(phantom, sample.offset)
+                pieces = _convex_pieces_of(phantom, sample.offset)
             else:
                 pieces = ()
             # The revision is known once an upload has been read.
             now = self._content(sample, upload)
             if before[1] not in (None, now[1]):
                 return pieces  # another file came under the name meanwhile
-            self._pieces[now] = pieces
-            while len(self._pieces) > KEPT:
-                self._pieces.popitem(last=False)
+            self._convex_pieces_of[now] = pieces
+            while len(self._convex_pieces_of) > MAX_CACHED_SCENES:
+                self._convex_pieces_of.popitem(last=False)
         return pieces
 
     def size(self, sample: Sample) -> SampleSize | None:
@@ -130,7 +132,7 @@ class Stage:
         parameters: Offsets = NOMINAL,
         upload: ReceivedSample | None = None,
     ) -> CollisionScene | None:
-        """Build the scene of bodies that may collide; the last `KEPT` scenes are
+        """Build the scene of bodies that may collide; the last `MAX_CACHED_SCENES` scenes are
         remembered.
 
         Args:
@@ -149,7 +151,7 @@ class Stage:
         if scene is None:
             scene = build_scene(self._machine, self._profile, pieces, parameters)
             self._scenes[key] = scene
-            while len(self._scenes) > KEPT:
+            while len(self._scenes) > MAX_CACHED_SCENES:
                 self._scenes.popitem(last=False)
         return scene
 
@@ -176,7 +178,7 @@ class Stage:
         return sample, upload.shown if upload else self.revision(sample)
 
 
-def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
+def _convex_pieces_of(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
     """Divide a phantom, placed as `offset` says, into convex pieces, object frame [mm]."""
     return convex_pieces(
         phantom.mesh(around=True),
@@ -216,7 +218,7 @@ class Shapes:
         if (kept := self.known(name, revision)) is not None:
             return kept
         mesh: Any = phantom.mesh()
-        size = HEADER + FACE * len(mesh.faces)
+        size = STL_HEADER_BYTES + STL_FACE_BYTES * len(mesh.faces)
         if size > self._limit:
             raise too_large("the sample's mesh", size, self._limit)
         self._kept = Shape(name, revision, mesh.export(file_type="stl"))
@@ -270,7 +272,7 @@ class ObstacleMoves:
             SafetyError: another command came meanwhile; nothing moves.
         """
         commands = self._commands
-        way = await self._plan(targets, relative=relative, shortest=shortest)
+        way = await self._find_way(targets, relative=relative, shortest=shortest)
         if commands != self._commands:
             raise SafetyError(
                 "another command came while the way was being planned; nothing moves",
@@ -278,7 +280,7 @@ class ObstacleMoves:
             )
         return way
 
-    async def _plan(
+    async def _find_way(
         self, targets: Mapping[str, float], *, relative: bool, shortest: bool
     ) -> Way:
         """Resolve targets and find moves to them that touch nothing; the search runs in a
@@ -307,12 +309,12 @@ class ObstacleMoves:
             self.stage.scene, scanner.sample, scanner.parameters
         )
         if scene is None:
-            return self._way(start, [goal])
+            return self._timed_way(start, [goal])
         found, contact = await asyncio.to_thread(
             free_moves, scene, scanner.machine, start, goal, scanner.paces
         )
         if found is not None and len(found) <= 1:
-            return self._way(start, found)
+            return self._timed_way(start, found)
         if contact is None:
             pair = ("?", "?")
         else:
@@ -331,16 +333,16 @@ class ObstacleMoves:
             )
         order = "; then ".join(_text(leg) for leg in found)
         warning = f"{' and '.join(pair)} would collide on the direct way; going {order}"
-        return self._way(start, found, warning)
+        return self._timed_way(start, found, warning)
 
     def go(self, way: Way) -> asyncio.Task[None]:
         """Set off; the task is done when the last leg has ended, or fails where one cannot
         go."""
         self.cancel()
-        self._task = asyncio.create_task(self._legs(way))
+        self._task = asyncio.create_task(self._follow_legs(way))
         return self._task
 
-    async def _legs(self, way: Way) -> None:
+    async def _follow_legs(self, way: Way) -> None:
         """Move along the legs of a way one by one, each after the motors' rest; call
         `changed` at each start.
 
@@ -363,7 +365,7 @@ class ObstacleMoves:
             self.changed()
         await clock.at_rest(scanner.rest_time)
 
-    def _way(
+    def _timed_way(
         self,
         start: Mapping[str, float],
         legs: Sequence[Mapping[str, float]],
@@ -389,7 +391,7 @@ class ObstacleMoves:
         return Way(tuple(legs), seconds, warnings)
 
 
-async def finished(task: asyncio.Task[None]) -> list[str]:
+async def wait_for_way(task: asyncio.Task[None]) -> list[str]:
     """Wait for the end of the task that moves along a way.
 
     Returns:

@@ -63,7 +63,7 @@ class Submissions:
         scanner, jobs, stage: see their modules.
         radiography: how images are made.
         root: the data directory.
-        keeper: writes a job down before it is in the queue.
+        state_store: writes a job down before it is in the queue.
         job_files: where it is written.
         now: the date.
         shown: called with images for watchers.
@@ -78,7 +78,7 @@ class Submissions:
     radiography: Radiography
     stage: Stage
     root: Directory
-    keeper: StateStore
+    state_store: StateStore
     job_files: JobFiles
     now: Callable[[], datetime]
     shown: FrameListener
@@ -89,7 +89,7 @@ class Submissions:
     _numbered: tuple[str, int] = field(default=("", 1), init=False)
     """Day, and number of the last scan named on it."""
 
-    async def check(self, wish: ScanSource, codec: Codec) -> Encoded:
+    async def check(self, source: ScanSource, codec: Codec) -> Encoded:
         """Compute the dry-run report from the scanner's present state; nothing moves.
 
         Raises:
@@ -97,17 +97,17 @@ class Submissions:
                 answer.
         """
         sample = self.scanner.sample
-        matter = await self._matter(wish, self.start(), sample)
-        seen = await self._sample_seen(matter, sample)
-        return Encoded(tuple(await self.checks.report(matter, codec, seen)))
+        check_input = await self._check_input(source, self.start(), sample)
+        seen = await self._sample_seen(check_input, sample)
+        return Encoded(tuple(await self.checks.report(check_input, codec, seen)))
 
     async def _sample_seen(
-        self, matter: CheckInput, sample: Sample
+        self, check_input: CheckInput, sample: Sample
     ) -> SampleForecast | None:
         """Predict the pixels behind the sample on the stage; None without a sample."""
         if not sample.name:
             return None
-        probes = await self.checks.probes(matter)
+        probes = await self.checks.probes(check_input)
         return await forecast_sample(self.radiography, sample, probes)
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class Submissions:
 
     async def submit(
         self,
-        wish: ScanSource,
+        source: ScanSource,
         name: str | None,
         speed_up: SpeedUp | None,
         operator: str = "",
@@ -127,7 +127,7 @@ class Submissions:
         A name of an interrupted data set resumes that scan with its start conditions.
 
         Args:
-            wish: script or poses.
+            source: script or poses.
             name: of the data set; None chooses a free one, date and number.
             speed_up: of the twin's clock during the job; None keeps the present one.
             operator: for the data set.
@@ -143,19 +143,19 @@ class Submissions:
         """
         resumed = None
         if name is not None:
-            resumed = self._resumable(name, wish)
+            resumed = self._resumable(name, source)
         if resumed is not None:
             begin = resumed
         else:
-            if wish.seed is None:
+            if source.seed is None:
                 seed = self.seed()
             else:
-                seed = wish.seed
+                seed = source.seed
             begin = StartConditions(
                 self.start(),
                 self.scanner.sample,
                 seed,
-                wish.moments,
+                source.moments,
                 self.radiography.physics,
                 self.radiography.scatter,
             )
@@ -163,13 +163,13 @@ class Submissions:
             chosen = name
         else:
             chosen = self._free_name()
-        sidecar = JobRecord(wish, begin, speed_up, operator)
-        plan, prepare, warnings = await self._ready(
-            sidecar, chosen, resumed is not None, ensure_allowed
+        job_record = JobRecord(source, begin, speed_up, operator)
+        plan, prepare, warnings = await self._check_and_prepare(
+            job_record, chosen, resumed is not None, ensure_allowed
         )
         folder = str(self.root.path / chosen)
-        return await self._queued(
-            sidecar,
+        return await self._enqueue(
+            job_record,
             chosen,
             ensure_allowed,
             lambda: self.jobs.draft(
@@ -194,19 +194,21 @@ class Submissions:
         if self.jobs.uses(job.folder):
             raise refused("a job is writing it")
         try:
-            sidecar = await asyncio.to_thread(JobRecord.read, self.root, name)
+            job_record = await asyncio.to_thread(JobRecord.read, self.root, name)
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise refused(
                 f"what it started from is not known any more ({error})"
             ) from None
         begun = self.root.stat(name) is not None
         if begun:
-            begin = self._resumable(name, sidecar.wish)
+            begin = self._resumable(name, job_record.source)
             assert begin is not None
-            sidecar = replace(sidecar, begin=begin)
-        plan, prepare, warnings = await self._ready(sidecar, name, begun, ensure_allowed)
-        await self._queued(
-            sidecar,
+            job_record = replace(job_record, begin=begin)
+        plan, prepare, warnings = await self._check_and_prepare(
+            job_record, name, begun, ensure_allowed
+        )
+        await self._enqueue(
+            job_record,
             name,
             ensure_allowed,
             lambda: self.jobs.draft(
@@ -214,16 +216,16 @@ class Submissions:
                 job.folder,
                 plan,
                 prepare,
-                sidecar.speed_up,
+                job_record.speed_up,
                 warnings,
                 job,
-                sidecar.begin.sample,
+                job_record.begin.sample,
             ),
         )
 
-    async def _queued(
+    async def _enqueue(
         self,
-        asked: JobRecord,
+        job_record: JobRecord,
         name: str,
         ensure_allowed: Callable[[], None],
         make: Callable[[], Job],
@@ -232,7 +234,7 @@ class Submissions:
         queue.
 
         Args:
-            asked: record of the scan.
+            job_record: record of the scan.
             name: of the data set.
             ensure_allowed: raises if the requester has lost control.
             make: drafts the job.
@@ -249,7 +251,7 @@ class Submissions:
             return memory.model_copy(update={"jobs_made": made})
 
         def files(changes: Changes) -> None:
-            asked.keep(changes, self.root, name)
+            job_record.keep(changes, self.root, name)
             self.job_files.put(changes, drafts[0].memory())
 
         def take() -> Job:
@@ -259,11 +261,11 @@ class Submissions:
                 raise name_conflict(name, "a job is writing it")
             return self.jobs.enqueue(draft)
 
-        return await self.keeper.keep(take, after, files)
+        return await self.state_store.keep(take, after, files)
 
-    async def _ready(
+    async def _check_and_prepare(
         self,
-        asked: JobRecord,
+        job_record: JobRecord,
         name: str,
         resume: bool,
         ensure_allowed: Callable[[], None],
@@ -272,7 +274,7 @@ class Submissions:
         prepare its start.
 
         Args:
-            asked: record of the scan.
+            job_record: record of the scan.
             name: of the data set.
             resume: whether the data set exists and is continued.
             ensure_allowed: raises if the requester has lost control.
@@ -284,9 +286,9 @@ class Submissions:
         Raises:
             RpcError: as `submit`.
         """
-        begin = asked.begin
-        checked = await self.checks.sound(
-            await self._matter(asked.wish, begin.start, begin.sample)
+        begin = job_record.begin
+        checked = await self.checks.runnable(
+            await self._check_input(job_record.source, begin.start, begin.sample)
         )
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
@@ -298,7 +300,7 @@ class Submissions:
             warnings.insert(
                 0, f"taking up the data set {name}, of which {there} images exist"
             )
-            shown = asked.begin.sample
+            shown = job_record.begin.sample
             stands = self.scanner.sample
             if shown != stands:
                 a, b = shown.name or "nothing", stands.name or "nothing"
@@ -309,40 +311,42 @@ class Submissions:
 
         async def prepare() -> JobInputs:
             """Check the scan again at its turn, and open its data set."""
-            begun = asked
+            begun = job_record
             if (
                 not resume
             ):  # others may have moved since, and put something else on the stage
                 begin = replace(
-                    asked.begin, start=self.start(), sample=self.scanner.sample
+                    job_record.begin, start=self.start(), sample=self.scanner.sample
                 )
-                begun = replace(asked, begin=begin)
+                begun = replace(job_record, begin=begin)
                 self.jobs.shows(begin.sample)
             # The sample's file and the correction may be others by now; then it is checked
             # again.
-            final = await self.checks.sound(
-                await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
+            final = await self.checks.runnable(
+                await self._check_input(
+                    begun.source, begun.begin.start, begun.begin.sample
+                )
             )
             self._ensure_same(begun.begin)
             shows = begun.begin.revision or self.stage.revision(begun.begin.sample)
             begun = replace(begun, begin=replace(begun.begin, revision=shows))
-            same = final is checked and begun.begin.sample == asked.begin.sample
+            same = final is checked and begun.begin.sample == job_record.begin.sample
             counts = predicted
             if not same:
                 counts = await predict_counts(self.radiography, begun.begin, final.plan)
             return await asyncio.to_thread(
-                self._open, begun, final.plan, name, resume, counts.exposures
+                self._open_dataset, begun, final.plan, name, resume, counts.exposures
             )
 
         return checked.plan, prepare, warnings
 
-    async def _matter(
-        self, wish: ScanSource, start: StartState, shown: Sample
+    async def _check_input(
+        self, source: ScanSource, start: StartState, shown: Sample
     ) -> CheckInput:
         """Collect the input of a scan's check; shapes are computed in a thread.
 
         Args:
-            wish: script or poses.
+            source: script or poses.
             start: scanner before the scan.
             shown: sample through which the beam passes; collisions are those of the
                 sample on the stage.
@@ -361,7 +365,7 @@ class Submissions:
             machine = scanner.machine
             profile = scanner.profile
             return CheckInput(
-                wish,
+                source,
                 machine,
                 profile,
                 start,
@@ -386,9 +390,9 @@ class Submissions:
             xrays_on=s.tube.on,
         )
 
-    def _open(
+    def _open_dataset(
         self,
-        asked: JobRecord,
+        job_record: JobRecord,
         plan: ScanPlan,
         name: str,
         resume: bool,
@@ -398,7 +402,7 @@ class Submissions:
         thread.
 
         Args:
-            asked: record of the scan.
+            job_record: record of the scan.
             plan: checked at the job's turn.
             name: of the data set.
             resume: whether the data set exists and is continued.
@@ -412,7 +416,7 @@ class Submissions:
             DatasetWriteError, GeometryError: the folder cannot be written; the geometry
                 is not usable.
         """
-        begin = asked.begin
+        begin = job_record.begin
         radiography = replace(
             self.radiography, physics=begin.physics, scatter=begin.scatter
         )
@@ -429,7 +433,7 @@ class Submissions:
             ),
             noise=noise,
             correction=self.scanner.correction,
-            operator=asked.operator,
+            operator=job_record.operator,
             version=self.version,
             predicted=predicted,
         )
@@ -437,8 +441,10 @@ class Submissions:
             pixel = block.camera.pixels_mm(plan.machine.detector.pixels)
             check_cone_vec(record.cone_vec([block]), pixel)
         # First the conditions of a resume, then the folder: killed in between, nothing is lost.
-        asked.write(self.root, name)
-        writer = DatasetWriter(self.root, record, script=asked.wish.script, resume=resume)
+        job_record.write(self.root, name)
+        writer = DatasetWriter(
+            self.root, record, script=job_record.source.script, resume=resume
+        )
         acquisition = Acquisition(
             plan,
             radiography,
@@ -468,12 +474,12 @@ class Submissions:
                 {"asked": now, "allowed": begin.revision, "sample": name},
             )
 
-    def _resumable(self, name: str, wish: ScanSource) -> StartConditions | None:
+    def _resumable(self, name: str, source: ScanSource) -> StartConditions | None:
         """Read the start conditions of the interrupted data set called `name`.
 
         Args:
             name: of the data set.
-            wish: scan that is to continue it.
+            source: scan that is to continue it.
 
         Returns:
             The conditions under which it began; None if there is no such data set.
@@ -520,7 +526,7 @@ class Submissions:
             raise refused("that data set is complete")
         asked, known = (
             (w.script, w.poses, w.exposure_ms if w.poses is not None else None)
-            for w in (wish, kept.wish)
+            for w in (source, kept.source)
         )
         if asked != known:
             raise refused("its script is another one")

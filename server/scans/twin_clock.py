@@ -69,7 +69,7 @@ class TwinClock:
         self._speed_up = check_speed_up(speed_up)
         self._base = 0.0
         self._base_wall = wall()
-        self._holds = 0
+        self._hold_count = 0
         self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []
         self._order = itertools.count()
         self._timer: asyncio.Handle | None = None
@@ -89,7 +89,7 @@ class TwinClock:
         checked = check_speed_up(speed_up)
         self._rebase()
         self._speed_up = checked
-        self._arm()
+        self._set_timer()
 
     def now(self) -> float:
         """Return the twin time [s]."""
@@ -120,7 +120,7 @@ class TwinClock:
             future.set_result(None)
             return future
         heapq.heappush(self._waiting, (moment, next(self._order), future))
-        self._arm()
+        self._set_timer()
         return future
 
     async def sleep_until(self, moment: float) -> None:
@@ -137,18 +137,18 @@ class TwinClock:
     def held(self) -> Iterator[None]:
         """Stop the time within the context; contexts nest."""
         self._rebase()
-        self._holds += 1
-        self._arm()
+        self._hold_count += 1
+        self._set_timer()
         try:
             yield
         finally:
             self._rebase()
-            self._holds -= 1
-            self._arm()
+            self._hold_count -= 1
+            self._set_timer()
 
     def _time(self) -> float:
         """Compute the twin's time now [s]; from `LATE_S` on it runs at real time at most."""
-        if self._holds or self._speed_up == "max":
+        if self._hold_count or self._speed_up == "max":
             return self._base
         passed = self._wall() - self._base_wall
         quick = min(passed, max(0.0, LATE_S - self._base) / self._speed_up)
@@ -167,7 +167,7 @@ class TwinClock:
         while len(self._samples) > 2 and wall - self._samples[1][0] > WINDOW_S:
             self._samples.popleft()
 
-    def _arm(self) -> None:
+    def _set_timer(self) -> None:
         """Schedule the wake-up of the first future that waits, in place of the one
         scheduled before.
         """
@@ -176,11 +176,11 @@ class TwinClock:
             self._timer = None
         while self._waiting and self._waiting[0][2].done():
             heapq.heappop(self._waiting)
-        if self._holds or not self._waiting:
+        if self._hold_count or not self._waiting:
             return
         loop = asyncio.get_running_loop()
         if self._speed_up == "max":
-            self._timer = loop.call_soon(self._jump, WAKE_ROUNDS)
+            self._timer = loop.call_soon(self._jump_to_next, WAKE_ROUNDS)
         else:
             now = self._time()
             if now < LATE_S:
@@ -188,9 +188,9 @@ class TwinClock:
             else:
                 pace = min(1.0, self._speed_up)
             wait = max(0.0, self._waiting[0][0] - now) / pace
-            self._timer = loop.call_later(min(wait, 3600.0), self._ring)
+            self._timer = loop.call_later(min(wait, 3600.0), self._wake_due)
 
-    def _jump(self, patience: int) -> None:
+    def _jump_to_next(self, patience: int) -> None:
         """Set the time to the first awaited moment, and wake its task alone; for speed
         "max".
 
@@ -199,7 +199,9 @@ class TwinClock:
                 may still ask for earlier moments.
         """
         if patience > 0:
-            self._timer = asyncio.get_running_loop().call_soon(self._jump, patience - 1)
+            self._timer = asyncio.get_running_loop().call_soon(
+                self._jump_to_next, patience - 1
+            )
             return
         self._timer = None
         while self._waiting:
@@ -208,9 +210,9 @@ class TwinClock:
                 self._base = max(self._base, moment)
                 future.set_result(None)
                 break
-        self._arm()
+        self._set_timer()
 
-    def _ring(self) -> None:
+    def _wake_due(self) -> None:
         """Wake the tasks that are due while time flows, and schedule the next wake-up."""
         self._timer = None
         now = self._time()
@@ -223,4 +225,4 @@ class TwinClock:
                     self._base = moment
                     self._base_wall = self._wall()
                 future.set_result(None)
-        self._arm()
+        self._set_timer()

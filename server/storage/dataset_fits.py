@@ -52,7 +52,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     if asked.markers is not None:
         marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]
     found = calibrate(
-        [_there(root, name) for name in asked.datasets],
+        [_dataset_path(root, name) for name in asked.datasets],
         phantom,
         free=asked.free,
         priors=asked.priors,
@@ -86,11 +86,11 @@ def align(
     """Align a data set; blocks. Raises as `fit`."""
     from flexdt.library.analysis import align as align_data_set
 
-    found = align_data_set(_there(root, asked.name), per_frame=asked.per_frame)
+    found = align_data_set(_dataset_path(root, asked.name), per_frame=asked.per_frame)
     return p.CalibrationAlignResult.model_validate(from_root(found.document, root.path))
 
 
-def _there(root: Directory, name: str) -> Path:
+def _dataset_path(root: Directory, name: str) -> Path:
     """Return the folder of a data set, or raise DatasetMissingError."""
     if not root.is_directory(plain_name(name, "data set")):
         raise DatasetMissingError(

@@ -73,7 +73,7 @@ class DatasetWriter:
             file: block.camera.shape for block in record.blocks for file in block.files
         }
         try:
-            self._present = self._begin(resume)
+            self._present = self._prepare_folder(resume)
             self._check_room()
             if script is not None:
                 self._files.put(SCRIPT, script)
@@ -142,17 +142,17 @@ class DatasetWriter:
                 f"{summary(missing)}",
                 {"path": str(self.folder), "missing": list(missing[:100])},
             )
-        self._end(True, "", duration_s)
+        self._write_end(True, "", duration_s)
 
     def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
         """Write into all texts that and why the scan did not finish."""
-        self._end(False, reason, duration_s)
+        self._write_end(False, reason, duration_s)
 
     def close(self) -> None:
         """Close the folder; the data set stays as it is marked."""
         self._files.close()
 
-    def _begin(self, resume: bool) -> set[str]:
+    def _prepare_folder(self, resume: bool) -> set[str]:
         """Check that the folder is empty or holds this scan, and remove unfinished files
         from it.
 
@@ -177,9 +177,9 @@ class DatasetWriter:
             self._check_same()
         self._files.sweep()
         found = names & set(self.record.files)
-        return {name for name in found if self._whole(name)}
+        return {name for name in found if self._is_complete_image(name)}
 
-    def _whole(self, name: str) -> bool:
+    def _is_complete_image(self, name: str) -> bool:
         """Return whether the file holds an image of the right format (only its
         header is read)."""
         try:
@@ -247,7 +247,7 @@ class DatasetWriter:
                 {"path": str(self.folder), "bytes": need, "free": free},
             )
 
-    def _end(self, complete: bool, reason: str, duration_s: float | None) -> None:
+    def _write_end(self, complete: bool, reason: str, duration_s: float | None) -> None:
         """Write the texts with the end of the scan, after the images are safe on the
         disk.
 

@@ -117,7 +117,7 @@ def remember(
     )
 
 
-def as_of(
+def with_scanner_state(
     memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
 ) -> Memory:
     """Replace the settings, sample and correction of the document by those of `scanner`.

@@ -47,10 +47,10 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.plausibility import Operation, Severity, examine
 
-WORKERS: Final = 2
+MAX_WORKERS: Final = 2
 """Number of worker processes."""
 MEMORY_BYTES: Final = 3 << 30
-SECONDS: Final = 30.0
+MAX_WORK_S: Final = 30.0
 MAX_SETS: Final = 2000
 """Largest number of folders that are listed, the newest first; older ones are counted."""
 LIST_S: Final = 4.0
@@ -91,7 +91,7 @@ class PastScans:
         self._root = root
         self._machine = machine.model_dump(mode="json", by_alias=True)
         self._profile = profile.model_dump(mode="json")
-        self._workers = Workers(WORKERS, MEMORY_BYTES, SECONDS)
+        self._workers = Workers(MAX_WORKERS, MEMORY_BYTES, MAX_WORK_S)
         self._fitters = Workers(
             1, dataset_fits.MAX_MEMORY_BYTES, dataset_fits.MAX_SECONDS
         )
@@ -111,10 +111,10 @@ class PastScans:
         Returns:
             The encoded answer.
         """
-        around = TwinContext(running, self._machine, self._profile)
+        context = TwinContext(running, self._machine, self._profile)
         slow = isinstance(params, CalibrationFit | CalibrationAlign)
         workers = self._fitters if slow else self._workers
-        return Encoded(tuple(await workers.ask(work, self._root, params, around, codec)))
+        return Encoded(tuple(await workers.ask(work, self._root, params, context, codec)))
 
     def close(self) -> None:
         """End the processes."""
@@ -122,7 +122,7 @@ class PastScans:
         self._fitters.close()
 
 
-def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[bytes]:
+def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[bytes]:
     """Answer a request in the worker; return the encoded answer.
 
     Raises:
@@ -131,7 +131,7 @@ def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[b
     try:
         directory = Directory(root)
         with directory, files.confined(directory):
-            result = _ANSWERS[type(asked)](directory, asked, around, codec)
+            result = _ANSWERS[type(asked)](directory, asked, context, codec)
     except OSError as error:  # it has gone meanwhile, or the disk fails
         name = getattr(asked, "name", "the data directory")
         raise ds.DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
@@ -386,7 +386,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 
 
 def _list(
-    root: Directory, asked: p.DatasetList, around: TwinContext, codec: Codec
+    root: Directory, asked: p.DatasetList, context: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
     """Answer dataset.list: the data sets that match the search, newest first, within the
     time limit.
@@ -397,7 +397,7 @@ def _list(
     Args:
         root: data directory.
         asked: search, range and thumbnails.
-        around: jobs and machine of the twin.
+        context: jobs and machine of the twin.
         codec: of the connection, not used.
     """
     folders = []
@@ -424,14 +424,14 @@ def _list(
         try:
             path, key = _place(root, name)
             late = key not in _INFOS and time.monotonic() > until
-            info = None if late else _INFOS.get(key, lambda: _listed(path, modified))  # noqa: B023
+            info = None if late else _INFOS.get(key, lambda: _list_row(path, modified))  # noqa: B023
         except ds.DatasetError:
             continue  # it has gone meanwhile, or is no data set
         if info is None:
             info = p.DatasetInfo(name=name, modified=modified, problem="not read yet")
         elif info == "":
             continue
-        info = _as_it_runs(info, around)
+        info = _as_it_runs(info, context)
         texts = (
             info.name,
             info.state,
@@ -455,15 +455,15 @@ def _list(
     )
 
 
-def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
+def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
     """Set the state of a data set that is being written."""
-    running = info.name == around.running
+    running = info.name == context.running
     if running:
         return info.model_copy(update={"state": "running", "reason": ""})
     return info
 
 
-def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
+def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
     """Read and summarise a data set; a damaged one has its problem in the summary.
 
     Args:
@@ -534,14 +534,14 @@ def _with_thumbnail(
 
 
 def _get(
-    root: Directory, asked: p.DatasetGet, around: TwinContext, codec: Codec
+    root: Directory, asked: p.DatasetGet, context: TwinContext, codec: Codec
 ) -> p.DatasetResult:
     """Answer dataset.get: settings, poses over time, and the other requested parts.
 
     Args:
         root: data directory.
         asked: name and parts.
-        around: jobs and machine of the twin.
+        context: jobs and machine of the twin.
         codec: of the connection, not used.
 
     Raises:
@@ -552,7 +552,7 @@ def _get(
     images = scan.images
     about = root.stat(asked.name)
     info = _info(folder.path, 0.0 if about is None else about.st_mtime, scan)
-    info = _as_it_runs(info, around)
+    info = _as_it_runs(info, context)
     last = len(images) - 1
     at = np.unique(
         np.linspace(0, last, min(asked.points, last + 1)).round().astype(int)
@@ -571,10 +571,10 @@ def _get(
         positions={
             name: [frame.positions.get(name) for frame in chosen] for name in motors
         },
-        same_machine=_same(scan, around),
+        same_machine=_same_machine(scan, context),
         script=_script(folder) if asked.script else None,
         warnings=_doubts(scan, info.shape),
-        **(_measured(scan, tuple(at)) if asked.measure else {}),
+        **(_measure(scan, tuple(at)) if asked.measure else {}),
     )
 
 
@@ -599,7 +599,7 @@ def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:
     return [one.said for one in found if one.severity > Severity.NOTE]
 
 
-def _same(scan: _Scan, around: TwinContext) -> bool:
+def _same_machine(scan: _Scan, context: TwinContext) -> bool:
     """Return whether the twin has the machine and the profile that a data set states."""
     document = scan.document
     texts = scan.texts
@@ -613,8 +613,8 @@ def _same(scan: _Scan, around: TwinContext) -> bool:
         machine = texts.machine.model_dump(mode="json", by_alias=True)
         profile = texts.profile.model_dump(mode="json")
     parts = ("axes", "geometry", "fixed", "components", "detector")
-    own = around.machine
-    return profile == around.profile and all(own.get(k) == machine.get(k) for k in parts)
+    own = context.machine
+    return profile == context.profile and all(own.get(k) == machine.get(k) for k in parts)
 
 
 def _script(folder: files.Folder) -> str:
@@ -634,7 +634,7 @@ def _script(folder: files.Folder) -> str:
         return file.read().decode("utf-8", "replace")
 
 
-def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
+def _measure(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
     """Compute mean counts and clearances of images; late ones come with the next request.
 
     Args:
@@ -649,7 +649,7 @@ def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
     counts: list[float | None] = []
     for i in at:
         try:
-            path = scan.folder.path / _there(scan.folder, scan.images[i].file)
+            path = scan.folder.path / _existing_file(scan.folder, scan.images[i].file)
             counts.append(None if time.monotonic() > until else _mean(path, scan.key))
         except ds.DatasetError:
             counts.append(None)
@@ -696,7 +696,7 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
         pieces = (
             UprightCylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),
         )
-        what = "the machine and the cylinder around the sample"
+        what = "the machine and the cylinder context the sample"
     correction = document.correction_in_force()
     offsets = NOMINAL
     if correction is not None:
@@ -711,14 +711,14 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
 
 
 def _frame(
-    root: Directory, asked: p.DatasetFrame, around: TwinContext, codec: Codec
+    root: Directory, asked: p.DatasetFrame, context: TwinContext, codec: Codec
 ) -> p.DatasetFrameResult:
     """Answer dataset.frame: one image, normalised and binned as requested.
 
     Args:
         root: data directory.
         asked: image, kind and binning.
-        around: jobs and machine of the twin.
+        context: jobs and machine of the twin.
         codec: of the connection, which limits the size.
 
     Raises:
@@ -738,7 +738,7 @@ def _frame(
     shape = None
     if document and isinstance(frame, FrameEntry):
         shape = document.shape_of(frame)
-    counts = files.read_image(folder.path / _there(folder, frame.file), shape)
+    counts = files.read_image(folder.path / _existing_file(folder, frame.file), shape)
     if asked.binning > min(counts.shape):
         raise LimitError(
             f"binning {asked.binning} leaves nothing of {counts.shape} pixels"
@@ -750,7 +750,7 @@ def _frame(
                 f"{frame.file} is a {frame.kind} image: it has no line integrals"
             )
         rows, cols = counts.shape
-        pixels = _normal(scan, (rows, cols))(counts)
+        pixels = _line_integrals_of(scan, (rows, cols))(counts)
     small = binned_mean(pixels.astype(np.float32), asked.binning)
     if asked.kind == "counts":
         small = np.rint(small).astype(np.uint16)
@@ -784,7 +784,7 @@ def _frame(
     )
 
 
-def _there(folder: files.Folder, file: str) -> str:
+def _existing_file(folder: files.Folder, file: str) -> str:
     """Check that a file exists, and return its name.
 
     Raises:
@@ -798,7 +798,7 @@ def _there(folder: files.Folder, file: str) -> str:
 
 
 @lru_cache(4)
-def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
+def _line_integrals_of(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
     """Make the conversion of a data set's counts to line integrals; the last four are
     cached.
 

@@ -29,7 +29,7 @@ from flexdt.server.storage.mesh_workers import mesh_apart, scene_apart
 from flexdt.server.storage.sample_uploads import MAX_UPLOAD_BYTES, Incoming, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
 
-KEPT = 8
+MAX_CACHED_PHANTOMS = 8
 """Number of parsed samples that are cached; meshes may be large."""
 DEFAULT_MATERIAL = "abs"
 EMPTY = "empty"
@@ -181,7 +181,7 @@ class SampleStore:
             self._revisions[key[0]] = revision
         for old in [k for k in self._loaded if k not in (self.standing(), key)]:
             used = sum(map(_bytes_of, self._loaded.values()))
-            if len(self._loaded) <= KEPT and used <= self._memory_limit:
+            if len(self._loaded) <= MAX_CACHED_PHANTOMS and used <= self._memory_limit:
                 break
             del self._loaded[old]
 
@@ -345,11 +345,11 @@ class SampleStore:
             except UnknownNameError:
                 problem = f"no sample called {name!r}; there are"
                 raise UnknownNameError.among(problem, name, self.names) from None
-        raw = self._bytes(head)
+        raw = self._read_bytes(head)
         phantom = _parse(head, raw, head.material if material is None else material)
         return phantom, _revision(head, raw)
 
-    def _bytes(self, head: UploadHead) -> bytes:
+    def _read_bytes(self, head: UploadHead) -> bytes:
         """Read the bytes of an upload and compare them with its size and revision.
 
         A damaged upload is removed from the list and its files are set aside.

@@ -61,7 +61,7 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
 from flexdt.twin.script import Exposure
 
-LOG_KEPT = 50
+MAX_KEPT_LOG_ENTRIES = 50
 """Number of entries of the topic `log` that a late subscriber gets."""
 MAX_FAILURES = 5
 """Number of failures within `FAILURE_WINDOW_S` after which a service is not restarted."""
@@ -109,7 +109,7 @@ class ControlLease:
             self.holder = who
         self.heard(who)
         if self.holder != who:
-            raise self._taken(what)
+            raise self._control_error(what)
 
     def ensure_allowed(self, who: str, what: str) -> None:
         """Check after a wait that `who` may still move: no other client has taken
@@ -119,7 +119,7 @@ class ControlLease:
             RpcError: -32003, another client is the controller.
         """
         if self.holder not in (None, who):
-            raise self._taken(what)
+            raise self._control_error(what)
 
     def release(self, who: str) -> None:
         """Give control back; nothing happens if `who` does not hold it."""
@@ -135,7 +135,7 @@ class ControlLease:
         self.heard(who)
         return loser
 
-    def _taken(self, what: str) -> RpcError:
+    def _control_error(self, what: str) -> RpcError:
         """Make the error -32003 that names the controller; returned, not raised."""
         return busy(
             f"{what}: {self.holder} is the controller; session.control with action force takes "
@@ -203,7 +203,7 @@ class TwinServer:
         )  # numbers of a server before this one release nothing here
         self.hub = Hub(
             self.clock.now,
-            {"log": LOG_KEPT},
+            {"log": MAX_KEPT_LOG_ENTRIES},
             self.limits.max_subscriptions,
             self.limits.max_views,
         )
@@ -270,10 +270,10 @@ class TwinServer:
         )
         self.job_files = JobFiles(root)
         self.job_files.settle()
-        self.keeper = kept.StateStore(
+        self.state_store = kept.StateStore(
             root, self._memory, self.job_files, self.jobs.changed
         )
-        self.keeper.noticed = self._noticed_disk
+        self.state_store.noticed = self._noticed_disk
         self._unfiled: list[JobMemory] = []
         """Jobs that an earlier server kept in its state and that have no files."""
         self._recalled = False
@@ -283,7 +283,7 @@ class TwinServer:
             self.radiography,
             self.stage,
             root,
-            self.keeper,
+            self.state_store,
             self.job_files,
             now=lambda: datetime.now(UTC),
             shown=self._scan_image,
@@ -327,11 +327,11 @@ class TwinServer:
             self.jobs.work,
             self.live.run,
             lambda: self.feed.run(self._settled),
-            lambda: self.keeper.run(self._moving),
+            lambda: self.state_store.run(self._moving),
         ]
         if self.projector_watch is not None:
             work.append(self.projector_watch.run)
-        self._tasks = [asyncio.create_task(self._guarded(w)) for w in work]
+        self._tasks = [asyncio.create_task(self._run_service(w)) for w in work]
 
     async def stop(self) -> None:
         """End all services and workers, and write the state as that of a server that
@@ -348,7 +348,7 @@ class TwinServer:
         self.past_scans.close()
         self.predictors.close()
         if self._tasks:
-            self.keeper.end()
+            self.state_store.end()
 
     def recall(self) -> Sample | None:
         """Restore scanner and jobs of the previous server, before `start`; log a warning
@@ -375,7 +375,7 @@ class TwinServer:
             )
         if sample is None:
             return None
-        return self._readable(sample)
+        return self._readable_sample(sample)
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
         """Restore the jobs of earlier servers, and write files for those that have none.
@@ -399,7 +399,7 @@ class TwinServer:
             DatasetWriteError
         ):  # tried again with each change; until then the state has them
             self._unfiled = unfiled
-            self.keeper.owe(unfiled)
+            self.state_store.owe(unfiled)
         known = sorted([*jobs, *unfiled], key=lambda job: number_of(job.id))
         return self.jobs.recall(known, memory.jobs_made, self.directory)
 
@@ -424,7 +424,7 @@ class TwinServer:
                 reason=str(error),
             )
 
-    def _readable(self, sample: Sample) -> Sample:
+    def _readable_sample(self, sample: Sample) -> Sample:
         """Return the stored sample, or the empty stage if the sample cannot be read."""
         head = self.samples.head(sample.name)
         if head is not None and head.kind == "voxels":
@@ -441,7 +441,7 @@ class TwinServer:
             return Sample()
         return sample
 
-    async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def _run_service(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run a service; after an exception log it and restart the service.
 
         A service that fails repeatedly ends the process, which its supervisor restarts:
@@ -469,7 +469,7 @@ class TwinServer:
         """
         snapshot = self.scanner.state(self.clock.now())
         job = self.jobs.current
-        problem = self.keeper.problem
+        problem = self.state_store.problem
         watch = self.projector_watch
         return w.State(
             time=snapshot.time,
@@ -539,7 +539,7 @@ class TwinServer:
         """Notify watchers of a command."""
         self.feed.changed()
         self.live.changed()
-        self.keeper.changed()
+        self.state_store.changed()
         for end in self._awaited:  # a stop brings the end forward: look again
             if not end.done():
                 end.set_result(None)
@@ -551,7 +551,7 @@ class TwinServer:
     def _settled(self) -> None:
         """Request a live image and the saving of the state after motion has ended."""
         self.live.changed()
-        self.keeper.changed()
+        self.state_store.changed()
 
     def _moving(self) -> bool:
         now = self.clock.now()
@@ -564,7 +564,9 @@ class TwinServer:
             ended: whether the server ends now.
         """
         history = self.corrections.in_state(self.corrections.history)
-        self._unfiled = [job for job in self._unfiled if self.keeper.is_unwritten(job.id)]
+        self._unfiled = [
+            job for job in self._unfiled if self.state_store.is_unwritten(job.id)
+        ]
         return kept.remember(
             self.scanner,
             self.clock.now(),

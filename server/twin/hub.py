@@ -27,14 +27,14 @@ EVENTS_A_TURN = 4
 
 
 @dataclass(frozen=True)
-class ImageWish:
+class ImageRequest:
     """A subscriber's view of images: kind, and the mean over binning x binning pixels."""
 
     kind: Literal["line_integral", "counts"] = "line_integral"
     binning: int = 1
 
 
-Render = Callable[[ImageWish], object]
+Render = Callable[[ImageRequest], object]
 """Computes an event's data for one view; called at most once a view."""
 
 
@@ -54,9 +54,9 @@ class _Event:
         self.time = time
         self._data = data
         self.slot = None if slot is None else f"{topic}:{slot}"
-        self._made: dict[ImageWish, Prepared] = {}
+        self._made: dict[ImageRequest, Prepared] = {}
 
-    def prepared(self, view: ImageWish) -> Prepared:
+    def prepared(self, view: ImageRequest) -> Prepared:
         """Encode the event for a view; each view is encoded once."""
         if view not in self._made:
             if callable(self._data):
@@ -71,7 +71,7 @@ class _Event:
 class _Subscription:
     """One listener's subscription to a topic."""
 
-    view: ImageWish
+    view: ImageRequest
     min_interval_s: float
     next_at: float = 0.0
     timer: asyncio.TimerHandle | None = None
@@ -103,10 +103,10 @@ class Hub:
         self._kept: dict[TopicName, deque[_Event]] = {
             topic: deque(maxlen=count) for topic, count in (kept or {}).items()
         }
-        self._told: dict[tuple[Peer, TopicName], int] = {}
+        self._last_sent: dict[tuple[Peer, TopicName], int] = {}
         self._seq: dict[TopicName, int] = {}
         self._listeners: dict[TopicName, dict[Peer, _Subscription]] = {}
-        self._due: deque[tuple[Peer, _Subscription, _Event]] = deque()
+        self._due_events: deque[tuple[Peer, _Subscription, _Event]] = deque()
         self._room = EVENTS_A_TURN
         self._refilling = False
 
@@ -115,7 +115,7 @@ class Hub:
         listener: Peer,
         topics: Iterable[TopicName],
         max_rate_hz: float | None = None,
-        view: ImageWish | None = None,
+        view: ImageRequest | None = None,
     ) -> None:
         """Subscribe `listener` to `topics`, and send it the kept events that it has not
         had.
@@ -136,19 +136,19 @@ class Hub:
         if max_rate_hz is not None:
             interval = 1.0 / max_rate_hz
         topics = set(topics)
-        view = view or ImageWish()
+        view = view or ImageRequest()
         self._require_room(listener, topics, view)
         for topic in sorted(topics):
             self.unsubscribe(listener, [topic])
             subscription = _Subscription(view, interval)
             self._listeners.setdefault(topic, {})[listener] = subscription
-            told = self._told.get((listener, topic), -1)
+            told = self._last_sent.get((listener, topic), -1)
             for earlier in self._kept.get(topic, ()):
                 if earlier.seq > told:
                     self._deliver(listener, subscription, earlier)
 
     def _require_room(
-        self, listener: Peer, topics: set[TopicName], view: ImageWish
+        self, listener: Peer, topics: set[TopicName], view: ImageRequest
     ) -> None:
         """Check that a listener's subscriptions and view stay within the limits of the
         hub.
@@ -183,7 +183,7 @@ class Hub:
         """Forget a connection."""
         self.unsubscribe(listener, list(self._listeners))
         for topic in self._kept:
-            self._told.pop((listener, topic), None)
+            self._last_sent.pop((listener, topic), None)
 
     def wanted(self, topic: TopicName) -> bool:
         """Return whether a topic has subscribers, so that nothing is computed in vain."""
@@ -193,7 +193,7 @@ class Hub:
         """Return the number of events of `topic` so far."""
         return self._seq.get(topic, 0)
 
-    def views(self, topic: TopicName) -> set[ImageWish]:
+    def views(self, topic: TopicName) -> set[ImageRequest]:
         """Return the views that subscribers of `topic` want."""
         return {s.view for s in self._listeners.get(topic, {}).values()}
 
@@ -273,19 +273,19 @@ class Hub:
 
     def _deliver(self, listener: Peer, subscription: _Subscription, new: _Event) -> None:
         """Post an event at once, or in order if many are due."""
-        self._due.append((listener, subscription, new))
+        self._due_events.append((listener, subscription, new))
         self._drain()
 
     def _drain(self) -> None:
         """Post as many due events as one turn of the loop allows, and schedule the next
         turn.
         """
-        while self._due and self._room:
-            listener, subscription, new = self._due.popleft()
+        while self._due_events and self._room:
+            listener, subscription, new = self._due_events.popleft()
             if self._listeners.get(new.topic, {}).get(listener) is subscription:
                 listener.post(new.prepared(subscription.view), new.slot)
                 if new.topic in self._kept:
-                    self._told[listener, new.topic] = new.seq
+                    self._last_sent[listener, new.topic] = new.seq
                 self._room -= 1
         if not self._refilling:
             self._refilling = True
@@ -295,5 +295,5 @@ class Hub:
         """Allow the events of a new turn, and post those that are due."""
         self._room = EVENTS_A_TURN
         self._refilling = False
-        if self._due:
+        if self._due_events:
             self._drain()

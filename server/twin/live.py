@@ -23,7 +23,7 @@ from flexdt.runtime.log import log
 from flexdt.server.imaging.projections import TrueGeometry
 from flexdt.server.imaging.radiography import Radiography, flags_of
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.server.twin.hub import Hub, ImageWish
+from flexdt.server.twin.hub import Hub, ImageRequest
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -116,7 +116,7 @@ def image_of(
     radiograph: Radiograph,
     cone: ConeVec,
     shot: Shot,
-    view: ImageWish,
+    view: ImageRequest,
     radiography: Radiography,
     rng: np.random.Generator | None,
 ) -> Projection:
@@ -283,7 +283,7 @@ class LiveView:
         count = self._count
         views = self.hub.views("projection")
 
-        def make(view: ImageWish) -> object:
+        def make(view: ImageRequest) -> object:
             rng = np.random.default_rng([count])
             return image_of(radiograph, cone, shot, view, self.radiography, rng)
 
@@ -298,9 +298,9 @@ class LiveView:
         """Publish a scan's image to the subscribers; the newest one replaces older ones."""
         self._made = (radiograph, cone, shot)
         if self._showing is None or self._showing.done():
-            self._showing = asyncio.create_task(self._show_made())
+            self._showing = asyncio.create_task(self._publish_newest())
 
-    async def _show_made(self) -> None:
+    async def _publish_newest(self) -> None:
         """Publish the newest image that was handed over, until there is none."""
         while self._made is not None:
             made = self._made
@@ -353,9 +353,9 @@ class StateFeed:
             if moved:
                 self._publish()  # the end may have come between the last one and the check
                 settled()
-            await self._warmed_up(settled)
+            await self._wait_until_warm(settled)
 
-    async def _warmed_up(self, settled: Callable[[], None]) -> None:
+    async def _wait_until_warm(self, settled: Callable[[], None]) -> None:
         """Wait until X-rays are ready and publish the state then, if nothing else changes
         before.
 

@@ -24,14 +24,14 @@ from flexdt.server.scans.scan_record import PoseList
 MAX_PARAMS: Final = 1 << 20
 """Largest size of a call's parameters, except for methods marked `bulky` [bytes]."""
 MEMORY_BYTES: Final = 3 << 30
-SECONDS: Final = 60.0
+MAX_READ_S: Final = 60.0
 
 
 class Reader:
     """Reads messages in a worker; `close` must be called at the end."""
 
     def __init__(self) -> None:
-        self._workers = Workers(1, MEMORY_BYTES, SECONDS)
+        self._workers = Workers(1, MEMORY_BYTES, MAX_READ_S)
 
     async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
         """Decode the message of `raw`, or those of a batch.
@@ -74,11 +74,11 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
         name = ""
         if isinstance(item, m.Request | m.Notification):
             name = item.method
-        parts += [name.encode() if name in METHODS else b"", _frozen(item)]
+        parts += [name.encode() if name in METHODS else b"", _pickled_call(item)]
     return parts
 
 
-def _frozen(message: m.Single) -> bytes:
+def _pickled_call(message: m.Single) -> bytes:
     """Pickle a message as a call with validated parameters; errors, and too large ones,
     are pickled in place of parameters.
     """

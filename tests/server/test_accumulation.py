@@ -282,7 +282,7 @@ def test_ended_jobs_are_kept_by_count_and_by_age(tmp_path: Path) -> None:
             [j["job"] for j in (await c.call("job.list"))["jobs"]] == [job] == ["job-5"]
         )
         await lab.ended(c, job)
-        await lab.twin.keeper.flush()
+        await lab.twin.state_store.flush()
         files = {f.name for f in (lab.root / "jobs" / "status").iterdir()}
         assert files == {"job-5.json"}
         assert not list((lab.root / "jobs").glob("*.json")), (

@@ -53,9 +53,9 @@ def test_a_change_that_comes_before_its_writing_is_found(
     """The test's own test: change, then store, as it was once."""
     keep = StateStore.keep
 
-    async def hasty(keeper, take, after=None, files=None):  # type: ignore[no-untyped-def]
+    async def hasty(state_store, take, after=None, files=None):  # type: ignore[no-untyped-def]
         done = take()
-        return await keep(keeper, lambda: done, after, files)
+        return await keep(state_store, lambda: done, after, files)
 
     monkeypatch.setattr(StateStore, "keep", hasty)
     before, undisturbed = right["settings"]

@@ -13,7 +13,7 @@ from full_disk_histories import run_history, settings
 from in_process import Lab, run, script
 from simulation import Fault, Simulation
 
-from flexdt.runtime.files.spare_files import COUNT, SIZE
+from flexdt.runtime.files.spare_files import SPARE_BYTES, SPARE_FILES
 
 FULL = Fault(at=0, error=errno.ENOSPC, lasting=True)
 BROKEN = Fault(at=0, error=errno.EIO, lasting=True)
@@ -35,10 +35,10 @@ def test_a_full_disk_takes_changes_without_end(tmp_path: Path) -> None:
         client = sim.client()
         sim.call(client, "tube.set", kV=50.0)
         sim.disk.set(FULL)
-        for kV in range(40, 40 + 3 * COUNT):
+        for kV in range(40, 40 + 3 * SPARE_FILES):
             sim.call(client, "tube.set", kV=float(kV))
         document = (sim.data / "state.json").read_bytes()
-        assert len(document) == SIZE
+        assert len(document) == SPARE_BYTES
         assert json.loads(document)["scene"]["tube"]["kV"] == kV
         sim.kill()
         sim.start()  # a twin starts on a full disk, too
@@ -46,10 +46,10 @@ def test_a_full_disk_takes_changes_without_end(tmp_path: Path) -> None:
         assert sim.call(client, "state.get")["tube"]["kV"] == kV
         sim.disk.set(None)
         sim.call(client, "tube.set", kV=41.0)
-        assert (sim.data / "state.json").stat().st_size < SIZE
+        assert (sim.data / "state.json").stat().st_size < SPARE_BYTES
         sim.call(client, "tube.set", kV=42.0)
         sizes = [f.stat().st_size for f in sim.data.glob(".reserve-*")]
-        assert sizes == [SIZE] * COUNT, "room is kept again"
+        assert sizes == [SPARE_BYTES] * SPARE_FILES, "room is kept again"
 
 
 def test_an_estop_that_no_disk_takes_is_said(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_a_data_directory_that_was_removed_is_the_disk_s_fault(tmp_path: Path) -
             assert str(root) not in error.message
         assert settings(await c.call("state.get")) == before
         assert (await c.call("safety.estop"))["safety"]["estop"]
-        await lab.until(lambda: lab.twin.keeper.problem is not None, "it is noticed")
+        await lab.until(lambda: lab.twin.state_store.problem is not None, "it is noticed")
         assert "state.json" in (await c.call("state.get"))["unsaved"]
 
     root.mkdir()

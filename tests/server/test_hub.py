@@ -12,7 +12,7 @@ import pytest
 
 from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
 from flexdt.server.twin.core import ControlLease
-from flexdt.server.twin.hub import Hub, ImageWish
+from flexdt.server.twin.hub import Hub, ImageRequest
 from flexdt.testing.in_process import SimulatedLoop
 
 
@@ -60,8 +60,8 @@ def test_subscriptions_and_views_have_a_limit_and_a_refusal_changes_nothing() ->
     async def main() -> None:
         hub = Hub(lambda: 0.0, most=3, most_views=2)
         a, b, c = Ear(), Ear(), Ear()
-        hub.subscribe(a, ["state", "projection"], view=ImageWish("counts", 2))
-        again = ImageWish("counts", 4)  # instead, not besides
+        hub.subscribe(a, ["state", "projection"], view=ImageRequest("counts", 2))
+        again = ImageRequest("counts", 4)  # instead, not besides
         hub.subscribe(a, ["state", "projection"], view=again)
         with pytest.raises(RpcError, match="4 subscriptions") as refused:
             hub.subscribe(b, ["state", "job"])
@@ -73,11 +73,11 @@ def test_subscriptions_and_views_have_a_limit_and_a_refusal_changes_nothing() ->
             hub.subscribe(c, ["log"])
         hub.unsubscribe(a, ["state"])
         with pytest.raises(RpcError, match="3 different views") as refused:
-            hub.subscribe(c, ["projection"], view=ImageWish("counts", 8))
+            hub.subscribe(c, ["projection"], view=ImageRequest("counts", 8))
         assert refused.value.data == {"asked": 3, "allowed": 2}
-        hub.subscribe(c, ["projection"], view=ImageWish("counts", 4))
+        hub.subscribe(c, ["projection"], view=ImageRequest("counts", 4))
         hub.drop(b)
-        hub.subscribe(c, ["projection"], view=ImageWish("counts", 8))
+        hub.subscribe(c, ["projection"], view=ImageRequest("counts", 8))
         hub.publish("projection", lambda view: view.binning)
         assert (a.values, b.values, c.values) == ([4], [], [8])
 
@@ -118,11 +118,11 @@ def test_each_view_is_rendered_once_however_many_listen() -> None:
         ears = [Ear() for _ in range(6)]
         for i, ear in enumerate(ears):
             hub.subscribe(
-                ear, ["projection"], view=ImageWish("counts", 2) if i % 2 else ImageWish()
+                ear, ["projection"], view=ImageRequest("counts", 2) if i % 2 else ImageRequest()
             )
-        made: list[ImageWish] = []
+        made: list[ImageRequest] = []
 
-        def render(view: ImageWish) -> object:
+        def render(view: ImageRequest) -> object:
             made.append(view)
             return view.kind
 

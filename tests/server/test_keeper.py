@@ -44,7 +44,7 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
 
     first = Late.model_construct(**dict(make(False)))
     root = Directory(tmp_path)
-    keeper = StateStore(
+    state_store = StateStore(
         root, lambda last: make(True) if last else first, JobFiles(root), dict
     )
     written: list[str] = []
@@ -57,13 +57,13 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
     monkeypatch.setattr(Directory, "keep", put)
 
     async def body() -> None:
-        work = asyncio.create_task(keeper.run(lambda: False))
-        keeper.changed()
+        work = asyncio.create_task(state_store.run(lambda: False))
+        state_store.changed()
         await asyncio.to_thread(made.wait, 30.0)
         work.cancel()  # its thread goes on
         await asyncio.gather(work, return_exceptions=True)
         threading.Timer(0.2, ended.set).start()
-        await asyncio.to_thread(keeper.end)
+        await asyncio.to_thread(state_store.end)
 
     asyncio.run(body())
     assert json.loads((tmp_path / FILE).read_text())["ended"] is True

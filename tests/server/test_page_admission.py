@@ -75,8 +75,8 @@ def test_peers_that_hold_connections_keep_nobody_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Neither silent ones, nor halves of requests, nor requests without the token."""
-    monkeypatch.setattr(http_pages, "STRANGERS", 8)
-    monkeypatch.setattr(http_pages, "ANSWERED", 2)
+    monkeypatch.setattr(http_pages, "MAX_UNADMITTED", 8)
+    monkeypatch.setattr(http_pages, "MAX_ANSWERED", 2)
     token = tmp_path / "token"
     token.write_text(TOKEN)
     honest = (

@@ -529,7 +529,7 @@ def test_work_that_takes_too_long_is_ended_and_the_next_is_done(
             with pytest.raises(RpcError) as refused:
                 await scans.ask(DatasetList(), "", Codec.JSON)
             assert refused.value.code == -32008
-            scans._workers.seconds = past_scans.SECONDS * 10
+            scans._workers.seconds = past_scans.MAX_WORK_S * 10
             answer = await scans.ask(DatasetList(), "", Codec.JSON)
             return str(json.loads(b"".join(answer.pieces))["datasets"][0]["name"])
         finally:

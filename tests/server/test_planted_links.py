@@ -40,7 +40,7 @@ from flexdt.twin.errors import TwinError
 SECRET = "nobody is to see this"
 DATED = re.compile(r"\d{4}-\d\d-\d\dT\d{6} ")
 NUMBERED = re.compile(r"(?<=\.part-)\d+-\d+-\d+$")
-ENDED = ("done", "failed", "aborted", "incomplete", "paused")
+ENDED_PHASES = ("done", "failed", "aborted", "incomplete", "paused")
 FRAMES = 3
 PATHS = {
     "open",
@@ -127,7 +127,7 @@ class Life:
     def ended(self, name: str) -> None:
         for _ in range(400):
             jobs = [j for j in self.ask("job.list")["jobs"] if j["name"] == name]
-            if not jobs or jobs[0]["state"] in ENDED:
+            if not jobs or jobs[0]["state"] in ENDED_PHASES:
                 return
             self.sim.advance(0.05)
         raise AssertionError(jobs)

@@ -30,7 +30,7 @@ async def user(server: ProjectorServer, token: str | None = TOKEN) -> ProjectorL
 def test_users_are_served_whatever_other_peers_do(
     seed: int, token: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(waiting_room, "WAITING", 12)
+    monkeypatch.setattr(waiting_room, "MAX_WAITING", 12)
     rng = random.Random(seed)
 
     async def main() -> None:

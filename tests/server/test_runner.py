@@ -299,7 +299,7 @@ def test_each_step_runs_something_where_the_pause_met_a_frame_that_waited_for_ro
         go = asyncio.Event()
         lab.before = lambda batch: go.wait()
         task = asyncio.create_task(lab.runner.run())
-        await lab.until(lambda: lab.clock._holds > 0)
+        await lab.until(lambda: lab.clock._hold_count > 0)
         lab.runner.pause()
         await lab.until(lambda: lab.runner.progress.phase == "paused")
         go.set()

@@ -13,7 +13,7 @@ from flexdt.phantoms import Phantom, load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage import stored_samples as samples
 from flexdt.server.storage.sample_uploads import UploadHead
-from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore
+from flexdt.server.storage.stored_samples import EMPTY, MAX_CACHED_PHANTOMS, SampleStore
 from flexdt.twin.errors import LimitError
 
 TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]
@@ -81,7 +81,7 @@ def test_an_older_file_that_was_being_read_does_not_come_back(
 
 def test_many_threads_may_load(tmp_path: Path) -> None:
     store = SampleStore(open_data(tmp_path))
-    names = [f"normal-{k}" for k in range(1, 2 * KEPT)]
+    names = [f"normal-{k}" for k in range(1, 2 * MAX_CACHED_PHANTOMS)]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda i: store.load(names[i % len(names)]), range(600)))
     assert [p.name for p in found] == [names[i % len(names)] for i in range(600)]

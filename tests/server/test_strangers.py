@@ -30,7 +30,7 @@ from flexdt.protocol import (
 from flexdt.protocol.fields import Params
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.log import JsonLines, Sparing
-from flexdt.runtime.waiting_room import Room, neighbourhood
+from flexdt.runtime.waiting_room import WaitingList, neighbourhood
 from flexdt.server.network import tcp
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer, serve
@@ -110,7 +110,7 @@ NEW = ("session.hello", "session.ping", "safety.estop")
 def test_new_clients_are_served_whatever_peers_without_the_token_do(
     seed: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tcp.waiting_room, "WAITING", 12)
+    monkeypatch.setattr(tcp.waiting_room, "MAX_WAITING", 12)
     monkeypatch.setattr(tcp, "RESERVED_PLACES", 3)
     rng = random.Random(seed)
 
@@ -294,7 +294,7 @@ def test_without_a_token_a_crowd_at_a_full_server_displaces_only_its_own(
 def test_without_a_token_who_says_nothing_takes_no_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(tcp.waiting_room, "WAITING", 8)
+    monkeypatch.setattr(tcp.waiting_room, "MAX_WAITING", 8)
 
     async def main() -> None:
         app = App()
@@ -373,7 +373,7 @@ class Guest:
 def test_a_newcomer_gets_in_and_who_goes_is_the_oldest_of_the_most(
     most: int, steps: list[tuple[str, bool]]
 ) -> None:
-    room, inside = Room(most), list[Guest]()
+    room, inside = WaitingList(most), list[Guest]()
     for address, leaves in steps:
         if leaves and inside:
             room.leave(inside.pop(0))

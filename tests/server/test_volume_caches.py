@@ -101,10 +101,10 @@ def test_any_number_of_samples_is_shown_within_the_limits() -> None:
             assert 24.0 * mu[name] <= seen < 24.0 * 1.5 * mu[name]
             health = await pool._members[0].client.health()
             assert health.memory_used <= 3 * TAKES
-            used = sum(apart.nbytes for apart in imaging._known.values())
+            used = sum(apart.nbytes for apart in imaging._divided.values())
             assert used <= 3 * TAKES // 2
-            assert ("s7", "part") in imaging._known or name < "s7"
-            assert len(pool._values) == len(imaging._versions) == len(imaging._known)
+            assert ("s7", "part") in imaging._divided or name < "s7"
+            assert len(pool._values) == len(imaging._versions) == len(imaging._divided)
 
     with_projector(work, 3 * TAKES)
 

@@ -36,7 +36,7 @@ M = builtin_machine()
 P = builtin_profile(M.default_profile)
 
 
-def matter(wish: ScanSource) -> CheckInput:
+def check_input(wish: ScanSource) -> CheckInput:
     return CheckInput(wish, M, P, StartState.of(M), None, (), NOMINAL)
 
 
@@ -70,9 +70,9 @@ def same(a: ScanPlan, b: ScanPlan) -> bool:
 @pytest.mark.daily(1)
 def test_a_plan_made_apart_is_the_plan_made_here(wish: ScanSource) -> None:
     async def body(checks: Checks) -> None:
-        there = matter(wish)
+        there = check_input(wish)
         assert not there.light
-        found = await checks.sound(there)
+        found = await checks.runnable(there)
         plan, warnings = checking.planned(there)
         assert same(found.plan, plan)
         assert found.plan.machine is M
@@ -88,7 +88,7 @@ def test_a_plan_made_apart_is_the_plan_made_here(wish: ScanSource) -> None:
 
 
 OTHERS: dict[str, Callable[[CheckInput], Any]] = {
-    "wish": lambda m: ScanSource(long_script(2)),
+    "source": lambda m: ScanSource(long_script(2)),
     "machine": lambda m: M.model_copy(update={"safety_margin_mm": 3.0}),
     "profile": lambda m: P.model_copy(update={"name": "another"}),
     "start": lambda m: replace(m.start, xrays_on=True),
@@ -103,17 +103,17 @@ def test_a_plan_is_made_once_and_anew_where_anything_it_depends_on_is_another() 
     assert set(OTHERS) == {field.name for field in fields(CheckInput)}
 
     async def body(checks: Checks) -> None:
-        first = matter(ScanSource(long_script(1)))
+        first = check_input(ScanSource(long_script(1)))
         for name, other in OTHERS.items():
-            made = await checks.sound(first)
-            assert await checks.sound(replace(first)) is made, (
-                "equal matter, the same certificate"
+            made = await checks.runnable(first)
+            assert await checks.runnable(replace(first)) is made, (
+                "equal input, the same certificate"
             )
-            made = await checks.sound(first)
+            made = await checks.runnable(first)
             changed = replace(first, **{name: other(first)})
-            found = await checks.sound(changed)
+            found = await checks.runnable(changed)
             assert found is not made, name
-            assert found.matter is changed
+            assert found.check_input is changed
 
     checked(body)
 
@@ -129,7 +129,7 @@ def test_what_is_wrong_is_said_with_a_number_of_problems_and_the_rest_counted() 
 
     async def body(checks: Checks) -> None:
         with pytest.raises(RpcError) as refused:
-            await checks.sound(matter(ScanSource(text)))
+            await checks.runnable(check_input(ScanSource(text)))
         assert refused.value.code == Code.SCRIPT_INVALID
         assert isinstance(refused.value.data, list)
         assert len(refused.value.data) == checking.MAX_PROBLEMS
@@ -148,7 +148,7 @@ def test_a_report_too_large_is_refused_before_it_is_swept(
     monkeypatch.setattr(checking, "MAX_ANSWER", {Codec.JSON: 50_000})
     monkeypatch.setattr(checking, "collision_check", lambda *_: _unwanted)
     with pytest.raises(RpcError) as refused:
-        checking._encoded(matter(ScanSource(long_script(600))), Codec.JSON)
+        checking._encoded(check_input(ScanSource(long_script(600))), Codec.JSON)
     assert refused.value.code == Code.TOO_LARGE
     assert refused.value.data["allowed"] == 50_000  # type: ignore[index, call-overload]
 
@@ -168,11 +168,11 @@ def worked(body: Callable[[Workers], Awaitable[None]], **limits: Any) -> None:
 
 def heavy() -> CheckInput:
     """A check of some seconds."""
-    return matter(ScanSource(long_script(60_000)))
+    return check_input(ScanSource(long_script(60_000)))
 
 
 def light() -> CheckInput:
-    return matter(ScanSource(long_script(1)))
+    return check_input(ScanSource(long_script(1)))
 
 
 @pytest.mark.slow
@@ -201,7 +201,7 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
             os.kill(pid, signal.SIGCONT)
             await asyncio.sleep(0.05)
 
-    some = matter(ScanSource(long_script(4_000)))
+    some = check_input(ScanSource(long_script(4_000)))
 
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())
@@ -330,20 +330,20 @@ def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
     JobRecord(wish, StartConditions(StartState.of(M), Sample(), 1, 1)).write(
         open_data(tmp_path), "a"
     )
-    assert JobRecord.read(open_data(tmp_path), "a").wish.poses == wish.poses
+    assert JobRecord.read(open_data(tmp_path), "a").source.poses == wish.poses
     file = tmp_path / "jobs" / "a.json"
     document = json.loads(file.read_text())
     document["wish"]["poses"] = json.loads(document["wish"]["poses"])  # as it was before
     file.write_text(json.dumps(document))
-    assert JobRecord.read(open_data(tmp_path), "a").wish.poses == wish.poses
+    assert JobRecord.read(open_data(tmp_path), "a").source.poses == wish.poses
 
 
 @pytest.mark.slow
 def test_a_plan_comes_in_pieces_that_are_read_at_once() -> None:
-    plan = matter(ScanSource(script(60_000))).report().plan
-    pieces = checking._pieces_of(plan)
+    plan = check_input(ScanSource(script(60_000))).report().plan
+    pieces = checking._pickled_pieces(plan)
     assert max(len(parts) for _, parts in map(pickle.loads, pieces[1:])) <= 250
-    assert same(checking._joined(pieces, M, P), plan)
-    assert [g.files for g in checking._joined(pieces, M, P).groups] == [
+    assert same(checking._rebuilt_plan(pieces, M, P), plan)
+    assert [g.files for g in checking._rebuilt_plan(pieces, M, P).groups] == [
         g.files for g in plan.groups
     ]

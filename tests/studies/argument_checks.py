@@ -219,7 +219,7 @@ def sentence(
     ]
     words = " or ".join(dict.fromkeys(said))
     value = {**dict(zip(takes, call[0], strict=False)), **call[1]}.get(name)
-    return f"{where}: {name} is {signatures._shown(value)}; allowed: {words}"
+    return f"{where}: {name} is {signatures._value_words(value)}; allowed: {words}"
 
 
 WAYS: Final[dict[str, Callable[[], Callable[[Callable[..., Any], str], Check]]]] = {

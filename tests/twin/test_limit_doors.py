@@ -118,7 +118,7 @@ def by_following(machine: Machine, name: str, target: float) -> Outcome:
 
 def by_request(machine: Machine, name: str, target: float) -> Outcome:
     scanner = ScannerTwin(machine, profile_of(machine))
-    told = scanner.told_of({name: target}, 0.0)
+    told = scanner.limit_messages({name: target}, 0.0)
     try:
         scanner.move({name: target}, 0.0)
     except LimitError:

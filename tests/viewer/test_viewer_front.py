@@ -329,7 +329,7 @@ def test_silent_connections_give_way_to_newcomers_and_pages_stay(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Whatever peers without a request or without the token hold, pages are served."""
-    monkeypatch.setattr(waiting_room, "WAITING", 6)
+    monkeypatch.setattr(waiting_room, "MAX_WAITING", 6)
 
     async def run() -> None:
         front = Front(echo, nowhere, HTML, {}, TOKEN, max_scenes=1, max_pages=1)

@@ -60,12 +60,12 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
     """
     stuck = [pair for pair, gap in bodies_touching(scene, path.q[0]) if gap <= GRAZING_MM]
     others = first_contact(_without(scene, stuck), path)
-    found = [c for pair in stuck if (c := _of_pair(scene, path, pair)) is not None]
+    found = [c for pair in stuck if (c := _pair_contact(scene, path, pair)) is not None]
     contacts = [*found, *([] if others is None else [others])]
     return min(contacts, key=lambda contact: contact.time, default=None)
 
 
-def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
+def _pair_contact(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
     """Find the contact that stops one overlapping pair: coming closer, or touching again
     once free.
 

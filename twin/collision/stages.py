@@ -169,7 +169,7 @@ def stage_bodies(
     bodies = []
     for part in machine.components:
         origin, slides, turns = _chain(machine, part, shifts)
-        solid = _wherever(machine, part, _solid(part, profile, parameters))
+        solid = _enlarged_by_stage(machine, part, _solid(part, profile, parameters))
         group = _group(machine, part)
         bodies.append(Body(part.name, solid, origin, slides, turns, group, part.anchor))
     return bodies
@@ -212,7 +212,7 @@ def sample_bodies(
     return [
         Body(
             SAMPLE,
-            _wherever(machine, holder, _placed(piece, place, tau), place),
+            _enlarged_by_stage(machine, holder, _placed(piece, place, tau), place),
             origin,
             slides,
             p.angle_scale * turns,
@@ -253,7 +253,7 @@ def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatAr
     return shifts
 
 
-def _wherever(
+def _enlarged_by_stage(
     machine: Machine,
     part: Component,
     solid: UprightCylinder | Polytope,

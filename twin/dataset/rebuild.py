@@ -132,7 +132,7 @@ def rebuild(
             nominal = motor_poses(machine, profile, camera, positions)
             return Rebuilt(nominal, machine, profile, positions, tuple(notes))
         nothing = Profile(name=ZERO, machine=machine.name, source="no offsets")
-        offsets = _default(machine, profiles) or nothing
+        offsets = _default_profile(machine, profiles) or nothing
         heights = motor_poses(machine, offsets, machine.detector.camera, positions)
         why = (
             "no ROI and mode"
@@ -221,7 +221,7 @@ def _profile(
     if len(profiles) == 1:
         return profiles[0], ": as asked"
     if printed is None:
-        chosen = _default(machine, profiles)
+        chosen = _default_profile(machine, profiles)
         if chosen is None:
             return None
         return (chosen, ": the default, no figures to check it by")
@@ -230,7 +230,7 @@ def _profile(
     for profile in (*profiles, *own):
         if profile.machine == machine.name:
             ours = figures_of(motor_poses(machine, profile, camera, first), camera.shape)
-            if _agree(ours, printed):
+            if _figures_agree(ours, printed):
                 return profile, " reproduces the printed figures"
     return None
 
@@ -324,7 +324,7 @@ def _camera(
     return camera
 
 
-def _agree(ours: Figures, printed: Figures) -> bool:
+def _figures_agree(ours: Figures, printed: Figures) -> bool:
     """Return whether figures agree with the printed ones, within `MATCH_MM`, `MATCH_PX`
     and 1e-5 mm of pitch.
     """
@@ -335,7 +335,7 @@ def _agree(ours: Figures, printed: Figures) -> bool:
     )
 
 
-def _default(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
+def _default_profile(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
     """Find the default profile of a machine among `profiles`; zero offsets where it has
     none, None where it is missing.
     """

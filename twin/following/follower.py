@@ -119,7 +119,7 @@ class Follower:
         mirror = replace(mirror, heard_s=now, lines=(), connected=True)
         mirror = mirror.cleared("link")
         if heard.what == "SEND":
-            return self._sent(mirror, heard, now)
+            return self._begin_command(mirror, heard, now)
         waiting = mirror.asked(heard)
         if waiting is None and any(
             map(heard.may_answer, mirror.ended)
@@ -135,10 +135,10 @@ class Follower:
             mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
         if heard.what == "FDB":
             mirror = replace(mirror, speaks=mirror.speaks is not False)
-            return self._read(mirror, heard, waiting, now)
+            return self._compare_reading(mirror, heard, waiting, now)
         if heard.what == "RCV":
             return mirror
-        return self._ended(mirror, heard, waiting, now)
+        return self._end_command(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """Update the mirror after time without a message: raise alarms for overdue and
@@ -151,7 +151,7 @@ class Follower:
             now: moment [s].
         """
         if mirror.ends is False:
-            mirror = self._over(mirror, "", now)
+            mirror = self._end_overdue(mirror, "", now)
         for waiting in mirror.waiting.values():
             took = now - waiting.sent_s
             quiet = now - waiting.told_s
@@ -258,7 +258,7 @@ class Follower:
 
     # -- commands ----------------------------------------------------------------------------
 
-    def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
+    def _begin_command(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
         """Update the mirror with a command: prediction, place in the script, command
         under way.
 
@@ -277,9 +277,11 @@ class Follower:
         if (
             heard.named and (heard.key, heard.words[:2]) in ends
         ):  # its end was heard before it
-            return _after(mirror.finished(heard), heard.command, self.machine, now)
+            return _apply_settings(
+                mirror.finished(heard), heard.command, self.machine, now
+            )
         if not heard.asks:
-            mirror = self._over(_flushed(mirror, now), heard.words[0], now)
+            mirror = self._end_overdue(_record_unwaited(mirror, now), heard.words[0], now)
         name, argument = heard.words[:2]
         if (
             not (name in FIXED or self.machine.has(name))
@@ -291,12 +293,12 @@ class Follower:
             mirror = replace(mirror, axes={n: a.at_rest for n, a in mirror.axes.items()})
         waiting = Waiting(heard, now, now)
         if heard.command is not None:
-            mirror = self._on_script(mirror, heard.command, now)
-            mirror, waiting = self._predicted(mirror, waiting, heard.command, now)
+            mirror = self._follow_script(mirror, heard.command, now)
+            mirror, waiting = self._predict(mirror, waiting, heard.command, now)
         kept = dict(list(mirror.waiting.items())[1 - MAX_WAITING :])
         return replace(mirror, waiting={**kept, heard.identity: waiting})
 
-    def _over(self, mirror: Mirror, component: str, now: float) -> Mirror:
+    def _end_overdue(self, mirror: Mirror, component: str, now: float) -> Mirror:
         """End the commands whose predicted time is over, and apply their settings.
 
         Args:
@@ -313,11 +315,11 @@ class Follower:
                 and not waiting.superseded
                 and component in ("", waiting.heard.words[0])
             ):
-                mirror = _after(mirror, waiting.heard.command, self.machine, now)
+                mirror = _apply_settings(mirror, waiting.heard.command, self.machine, now)
                 mirror = mirror.with_waiting(waiting, superseded=True)
         return mirror
 
-    def _predicted(
+    def _predict(
         self, mirror: Mirror, waiting: Waiting, command: c.Command, now: float
     ) -> tuple[Mirror, Waiting]:
         """Predict one command, from the machine as it is now, and raise alarms for its
@@ -393,7 +395,7 @@ class Follower:
         what = f"{name} goes to {target:g} {axis.unit}, {left:g} from a limit"
         return _alarm(mirror, now, "warning", "limit_near", name, what)
 
-    def _on_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
+    def _follow_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
         """Find the command in the script: advance, or raise an alarm.
 
         Args:
@@ -455,7 +457,7 @@ class Follower:
 
     # -- replies -----------------------------------------------------------------------------
 
-    def _ended(
+    def _end_command(
         self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
     ) -> Mirror:
         """Update the mirror with the end of a command: record, range, positions, settings.
@@ -477,8 +479,8 @@ class Follower:
             return _rests(mirror, waiting)
         mirror = mirror.cleared(heard.words[0], "failed")
         if waiting is None:
-            mirror = _after(mirror, heard.command, self.machine, now)
-            return self._read(mirror, heard, None, now)
+            mirror = _apply_settings(mirror, heard.command, self.machine, now)
+            return self._compare_reading(mirror, heard, None, now)
         took = now - waiting.sent_s
         trigger = getattr(waiting.heard.command, "trigger", None)
         passed = trigger is not None and heard.reply.startswith("POS")
@@ -494,12 +496,12 @@ class Follower:
             else:
                 mirror = mirror.cleared(waiting.heard.words[0], "range")
         if waiting.targets:
-            return self._arrived(mirror, waiting, heard, now)
+            return self._record_arrival(mirror, waiting, heard, now)
         if waiting.heard.asks or waiting.superseded:
-            return self._read(mirror, heard, waiting, now)
-        return _after(mirror, waiting.heard.command, self.machine, now)
+            return self._compare_reading(mirror, heard, waiting, now)
+        return _apply_settings(mirror, waiting.heard.command, self.machine, now)
 
-    def _arrived(
+    def _record_arrival(
         self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float
     ) -> Mirror:
         """Update positions, limits and rates with the reply at the end of a move.
@@ -525,7 +527,7 @@ class Follower:
             mirror = mirror.with_axis(name, position=reply)
         if motor is None:
             return mirror
-        return self._compared(mirror, name, motor, now)
+        return self._compare_limits(mirror, name, motor, now)
 
     def _arrival(
         self, mirror: Mirror, name: str, there: float, meant: float, now: float
@@ -537,7 +539,7 @@ class Follower:
         what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
         return _alarm(mirror, now, "error", "offset", name, what)
 
-    def _compared(
+    def _compare_limits(
         self, mirror: Mirror, name: str, motor: MotorReply, now: float
     ) -> Mirror:
         """Compare limits and rates of a motor's reply with those of the machine file.
@@ -572,7 +574,7 @@ class Follower:
                 mirror = _alarm(mirror, now, "error", what, name, text)
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
-    def _read(
+    def _compare_reading(
         self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
     ) -> Mirror:
         """Compare a reading of a motor's position with its predicted path.
@@ -601,7 +603,7 @@ class Follower:
         if waiting is not None and moves and not _stays(mirror, name, waiting):
             return mirror
         if motor is not None:
-            mirror = self._compared(mirror, name, motor, now)
+            mirror = self._compare_limits(mirror, name, motor, now)
         seen = mirror.axes[name]
         path = mirror.axes[name].path
         unit = self.machine.axes[name].unit
@@ -723,7 +725,7 @@ def _bare(command: c.Command) -> c.Command:
     return bare
 
 
-def _flushed(mirror: Mirror, now: float) -> Mirror:
+def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
     """Add log lines for the commands that the sender has not waited for, now that another
     follows.
 
@@ -765,7 +767,7 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _after(
+def _apply_settings(
     mirror: Mirror, command: c.Command | None, machine: Machine, now: float
 ) -> Mirror:
     """Apply the end of a command to the mirror's settings: camera, tube, X-rays or an

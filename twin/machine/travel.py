@@ -30,19 +30,19 @@ class Arrival:
 
     Attributes:
         motors: motor -> target within its travel [mm, deg], or rate.
-        told: messages about what is beyond a limit by more than rounding.
+        messages: messages about what is beyond a limit by more than rounding.
         beyond: error for one that is beyond by more than the tolerance; None: there is
             none.
 
     Attributes:
         motors: motor -> target within its travel [mm, deg], or rate.
-        told: what lies beyond a limit by more than rounding, in words.
+        messages: what lies beyond a limit by more than rounding, in words.
         beyond: one that lies beyond by more than the tolerance, as an error; None: there
             is none.
     """
 
     motors: Mapping[str, float]
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     beyond: LimitError | None = None
 
     def is_clamped(self, machine: Machine) -> bool:

@@ -81,7 +81,7 @@ def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Tra
     """
     due = {name: drive for name, drive in drives.items() if drive.end > now}
     cells = _cells(due, now, most)
-    return {name: _along(drive, cells, now) for name, drive in due.items()}
+    return {name: _braked_trajectory(drive, cells, now) for name, drive in due.items()}
 
 
 def braked_apart(
@@ -303,7 +303,7 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
     )
 
 
-def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
+def _braked_trajectory(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
     """Convert the cells to one motor's trajectory.
 
     Args:

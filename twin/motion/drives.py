@@ -255,7 +255,7 @@ def with_settings(
     for what, value in settings:
         if value is None:
             continue
-        above = rate(machine, axis, what, value).told
+        above = rate(machine, axis, what, value).messages
         if not above and all(value * share >= MIN_RATE for share in shares.values()):
             continue
         low = MIN_RATE / min(shares.values())

@@ -224,24 +224,28 @@ class Lookahead:
         if contact.last_free_time <= self.now:
             return Joined({}, contact)
         others = any(name not in new for name in self.ahead())
-        halted = (self._alone(new, contact) if not others else None) or (
+        halted = (self._halt_alone(new, contact) if not others else None) or (
             self._new_halt_swept(new, contact)
             if others
             else self._halt_along(new, contact)
         )
         if halted is None and others and any(name in new for name in self.ahead()):
             halted = self._halt_along({**self.ahead(), **new}, contact)
-        if halted is None or not any(self._goes(name, t) for name, t in halted.items()):
+        if halted is None or not any(
+            self._advances(name, t) for name, t in halted.items()
+        ):
             return Joined({}, contact)
         return Joined(halted, contact)
 
-    def _goes(self, name: str, way: Trajectory) -> bool:
+    def _advances(self, name: str, way: Trajectory) -> bool:
         """Return whether a motor is under way, or gets farther than `MIN_STEP`."""
         here = self.drives[name].at(self.now)
         far = abs(way.target - here.position(self.now)) >= MIN_STEP
         return far or here.velocity(self.now) != 0.0
 
-    def _alone(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
+    def _halt_alone(
+        self, new: Trajectories, contact: Contact
+    ) -> dict[str, Trajectory] | None:
         """Shorten the motion of a single motor to its last free position.
 
         Args:
@@ -361,14 +365,16 @@ class Lookahead:
         """
         along = braked_along(self.drives, self.now, most)
         try:
-            quicker = self._quicker(along, most)
+            quicker = self._quicker_stop(along, most)
         except Exception:  # whatever a sweep meets, motors are stopped
             quicker = None
         if quicker is not None:
             return StopMotion.of(quicker, "apart", self.now)
         return StopMotion.of(along, "along", self.now)
 
-    def _quicker(self, along: Trajectories, most: Most) -> dict[str, Trajectory] | None:
+    def _quicker_stop(
+        self, along: Trajectories, most: Most
+    ) -> dict[str, Trajectory] | None:
         """Find a quicker stop: along the path for a while, then each motor by
         itself, if free.
 
@@ -443,7 +449,9 @@ class Lookahead:
         Returns:
             Motor -> trajectory; None if no halt is free.
         """
-        halted = self._alone(under_way, contact) or self._halt_along(under_way, contact)
+        halted = self._halt_alone(under_way, contact) or self._halt_along(
+            under_way, contact
+        )
         if halted is not None:
             return halted
         for trajectories in (

@@ -198,10 +198,10 @@ def released(safety: Safety, stop: int | None) -> Safety:
     ready = replace(safety, state="ready", blocked_attempts=0, reason="", stopped_by="")
     if safety.contact is None:
         return ready
-    return in_contact(ready, safety.contact)
+    return with_contact(ready, safety.contact)
 
 
-def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
+def with_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
     """Record that `pair` is in contact, or (None) that nothing is any more.
 
     Parts that have come apart leave the state blocked until a reset. An E-stop stays one.

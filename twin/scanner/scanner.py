@@ -46,7 +46,7 @@ from flexdt.twin.scanner.joining import (
     StopMotion,
     UnsweptProgramme,
 )
-from flexdt.twin.scanner.safety import Guard, after_contact, collision_error, in_contact
+from flexdt.twin.scanner.safety import Guard, after_contact, collision_error, with_contact
 from flexdt.twin.scanner.state import (
     AxisReading,
     CameraChange,
@@ -312,7 +312,7 @@ class ScannerTwin:
         )
         return {name: t.target for name, t in planned.items()}
 
-    def told_of(
+    def limit_messages(
         self, targets: Mapping[str, float], now: float, *, relative: bool = False
     ) -> list[str]:
         """List messages about targets beyond a limit that would arrive at the limit;
@@ -335,7 +335,9 @@ class ScannerTwin:
             )
             for axis, value in targets.items()
         )
-        return [f"{message}; set to the limit" for each in found for message in each.told]
+        return [
+            f"{message}; set to the limit" for each in found for message in each.messages
+        ]
 
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
         """Run `axis` at `velocity` until the lease ends or a limit nears, then brake.
@@ -434,7 +436,7 @@ class ScannerTwin:
         wanted = resolve_targets(self.machine, positions, self.positions(now))
         stand = {**self.targets(now), **wanted}
         self._take({name: motion.at_rest(x, now) for name, x in stand.items()})
-        self.safety = in_contact(self.safety, self._touching(now))
+        self.safety = with_contact(self.safety, self._touching(now))
 
     # Programmes
     # ---------------------------------------------------------------------------------
@@ -642,7 +644,7 @@ class ScannerTwin:
         """
         self.require_applicable(correction)
         self._set_stage(sample, correction, guard)
-        self.safety = in_contact(self.safety, self._touching(now))
+        self.safety = with_contact(self.safety, self._touching(now))
         pair = self.safety.contact
         if pair is None:
             return []
@@ -788,7 +790,7 @@ class ScannerTwin:
 
     def _safety_at(self, now: float) -> Safety:
         """Return the safety state, with contact judged by where the parts are."""
-        return in_contact(self.safety, self._touching(now))
+        return with_contact(self.safety, self._touching(now))
 
     def _require_ready(self, what: str, now: float) -> None:
         """Update the safety state, and raise SafetyError unless motion is allowed."""

@@ -39,7 +39,7 @@ from flexdt.twin.script.scan_request import ScanPosition, ScanRequest
 MAX_FRAMES: Final = 100_000
 _ROUNDED_MM: Final = 1e-4
 """Largest difference from a requested quantity that six decimals may cause [mm]."""
-BESIDE: Final = 0.1
+MAX_LATERAL_SHARE: Final = 0.1
 """Largest distance from the beam, as a part of the field of view, that no motor has to correct.
 
 Zero offsets are of that kind, a machine built otherwise is not (assumed).
@@ -77,7 +77,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     }
     changed_camera(panel, panel.camera, change)
     changed_tube(tube, TubeSettings(tube.kV, tube.power_W), request.kV, request.power_W)
-    attempts = list(_usual(request, MotorTargets(machine, profile)))
+    attempts = list(_distances_to_try(request, MotorTargets(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (
             (ScanPosition(sod),) if request.placements is None else request.placements
@@ -113,7 +113,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     return "".join(f"{row}\r\n" for row in writer.rows())
 
 
-def _usual(
+def _distances_to_try(
     request: ScanRequest, places: MotorTargets
 ) -> Iterator[tuple[float, float, float]]:
     """Yield SOD, SDD and height to try: as requested, else the usual ones, else
@@ -176,12 +176,14 @@ class _Writer(MotorTargets):
         w = self.request
         m = self.machine
         camera = self.camera
-        yield _row("tube", "set kV", _f(m.tube.kV if w.kV is None else w.kV))
+        yield _row("tube", "set kV", _decimal(m.tube.kV if w.kV is None else w.kV))
         yield _row(
-            "tube", "set power", _f(m.tube.power_W if w.power_W is None else w.power_W)
+            "tube",
+            "set power",
+            _decimal(m.tube.power_W if w.power_W is None else w.power_W),
         )
         yield _row("camera", "set mode", camera.mode)
-        yield _row("camera", "set exposure", _f(w.exposure_ms))
+        yield _row("camera", "set exposure", _decimal(w.exposure_ms))
         yield _row("camera", "set ROI", str(camera.roi))
 
     def references(self) -> Iterator[str]:
@@ -212,7 +214,7 @@ class _Writer(MotorTargets):
         yield _row("scanner", "write settings file")
         for i in range(w.frames):
             angle = check_target(self.machine, name, i * 360.0 / w.frames)
-            yield _row(name, "move absolute", _f(angle))
+            yield _row(name, "move absolute", _decimal(angle))
             yield _row("camera", "take image")
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
@@ -300,7 +302,7 @@ class _Writer(MotorTargets):
             yield _row(motor, "set speed", f"{pace:.10f}")
         yield from self.run_up(total, w.frames)
         for motor, (_, high, _) in targets.items():
-            yield _row(motor, "move absolute", _f(high), wait="no wait")
+            yield _row(motor, "move absolute", _decimal(high), wait="no wait")
         yield from self.sweep(total, w.frames, 0)
         for motor in targets:
             yield _row(motor, "set speed", f"{m.axis(motor).speed:.10f}")
@@ -319,7 +321,7 @@ class _Writer(MotorTargets):
         numbers of images."""
         name, rotation = self.rotation
         yield from self.drive(name, rotation.speed, rotation.acceleration)
-        yield _row(name, "move absolute", _f(-self.run_up_deg(total, frames)))
+        yield _row(name, "move absolute", _decimal(-self.run_up_deg(total, frames)))
         yield from self.drive(name, self.turn_speed(total, frames), rotation.acceleration)
         yield _row("camera", "set number of frames", str(frames))
         yield _row("camera", "set number of averages", str(self.request.averages))
@@ -335,7 +337,7 @@ class _Writer(MotorTargets):
         """
         name = self.rotation[0]
         end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
-        yield _row(name, "move absolute", _f(end), "0.000000", "POS")
+        yield _row(name, "move absolute", _decimal(end), "0.000000", "POS")
         yield _row(
             "camera",
             "take and save image sequence",
@@ -428,7 +430,9 @@ class _Writer(MotorTargets):
                 else:
                     size = cols * pixel
                 slack = (
-                    BESIDE * size * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
+                    MAX_LATERAL_SHARE
+                    * size
+                    * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
                 )
             if abs(asked - only) <= slack:
                 continue
@@ -459,14 +463,14 @@ class _Writer(MotorTargets):
         """Yield moves that start together; the second request of each waits for its arrival."""
         if len(targets) > 1:
             for name, value in targets.items():
-                yield _row(name, "move absolute", _f(value), wait="no wait")
+                yield _row(name, "move absolute", _decimal(value), wait="no wait")
         for name, value in targets.items():
-            yield _row(name, "move absolute", _f(value))
+            yield _row(name, "move absolute", _decimal(value))
 
     def drive(self, name: str, speed: float, acceleration: float) -> Iterator[str]:
         """Yield the speed and the acceleration of an axis."""
         yield _row(name, "set speed", f"{speed:.10f}")
-        yield _row(name, "set acceleration", _f(acceleration))
+        yield _row(name, "set acceleration", _decimal(acceleration))
 
     @property
     def camera(self) -> CameraSettings:
@@ -560,6 +564,6 @@ def _row(
     return "\t".join((component, command, first, second, wait, "", ""))
 
 
-def _f(value: float) -> str:
+def _decimal(value: float) -> str:
     """Format a number with six decimals."""
     return f"{value:.6f}"

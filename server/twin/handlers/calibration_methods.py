@@ -103,7 +103,7 @@ async def delete(
             ready()
             twin.corrections.forget(params.name, history)
 
-        await twin.keeper.keep(take, after, files)
+        await twin.state_store.keep(take, after, files)
     twin.tell("info", f"correction {params.name!r} was deleted")
     return p.CorrectionDeleted(name=params.name)
 

@@ -21,7 +21,7 @@ from flexdt.protocol.methods.document_messages import Scene
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.storage.corrections import History
-from flexdt.server.storage.memory import Memory, as_of
+from flexdt.server.storage.memory import Memory, with_scanner_state
 from flexdt.server.storage.scene_document import apply_settings, paces_of
 from flexdt.server.storage.stored_samples import ReceivedSample
 from flexdt.server.twin.core import TwinServer
@@ -132,14 +132,14 @@ async def change_settings(
     def after(memory: Memory) -> Memory:
         trial = copy.copy(twin.scanner)
         change(trial)
-        return as_of(memory, trial)
+        return with_scanner_state(memory, trial)
 
     def take() -> None:
         ready()
         change(twin.scanner)
         twin.changed()  # here: the client may be gone when this is saved
 
-    await twin.keeper.keep(take, after)
+    await twin.state_store.keep(take, after)
 
 
 async def change_stage(
@@ -209,7 +209,7 @@ async def change_stage(
         trial.correction = correction
         if scene is not None:
             apply_settings(scene, trial)
-        return as_of(memory, trial, twin.corrections.in_state(names))
+        return with_scanner_state(memory, trial, twin.corrections.in_state(names))
 
     def take() -> list[str]:
         """Change stage, correction and settings together, and stop motion that would
@@ -234,4 +234,4 @@ async def change_stage(
         twin.changed()
         return [] if halted is None else [halted.message]
 
-    return await twin.keeper.keep(take, after, files)
+    return await twin.state_store.keep(take, after, files)

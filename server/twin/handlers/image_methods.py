@@ -21,7 +21,7 @@ from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.server.twin.handlers.motion_methods import camera_change
-from flexdt.server.twin.hub import ImageWish
+from flexdt.server.twin.hub import ImageRequest
 from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -42,7 +42,7 @@ async def get_projection(
     shot = twin.live.now()
     elsewhere = any(x is not None for x in (params.positions, params.tube, params.camera))
     if elsewhere:
-        shot = _as_though(twin, shot, params)
+        shot = _predicted_shot(twin, shot, params)
     if params.binning > min(shot.camera.shape):
         raise invalid_params(
             f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
@@ -55,7 +55,7 @@ async def get_projection(
 
     def work() -> Encoded:
         """Compute and encode in a thread, as an image has some megabytes."""
-        view = ImageWish(params.kind, params.binning)
+        view = ImageRequest(params.kind, params.binning)
         way = twin.radiography
         rng = None
         if not elsewhere:
@@ -70,7 +70,7 @@ async def get_projection(
         return await asyncio.to_thread(work)
 
 
-def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
+def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
     """Return the shot with the requested positions, tube and camera in place of the
     present ones.
 

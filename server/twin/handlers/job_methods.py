@@ -17,7 +17,7 @@ from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.runtime.wire_errors import from_root
-from flexdt.server.scans.scan_job import ENDED, Job
+from flexdt.server.scans.scan_job import ENDED_PHASES, Job
 from flexdt.server.scans.scan_record import JobRecord, ScanSource
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
@@ -76,7 +76,7 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
         RpcError: -32002, a contact is ahead; the job stays paused.
     """
     job = twin.jobs.get(params.job)
-    if job.phase in ENDED and job.phase != "done":
+    if job.phase in ENDED_PHASES and job.phase != "done":
         await twin.submissions.again(job, h.ensure_allowed(twin, client, "a scan"))
         return twin.jobs.status(job)
     twin.jobs.resume(job)
@@ -108,11 +108,11 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
     twin.jobs.abort(job, params.reason, client.name)
     unsaved = ""
     try:
-        await twin.keeper.flush()
+        await twin.state_store.flush()
     except (OSError, DatasetError) as error:  # an abort does not fail because of the disk
         reason = from_root(str(error), twin.root)
         unsaved = f"the abort is not on the disk, and a killed server would not know it: {reason}"
-    status = await _when(twin, job, lambda: job.phase in ENDED)
+    status = await _when(twin, job, lambda: job.phase in ENDED_PHASES)
     if unsaved:
         warnings = [*status.warnings, unsaved]
     else:
@@ -147,13 +147,13 @@ async def forget(
 
     def take() -> list[Job]:
         gone = [
-            job for job in jobs if job.phase in ENDED
+            job for job in jobs if job.phase in ENDED_PHASES
         ]  # one may have been resumed meanwhile
         twin.jobs.forget(gone)
         twin.changed()
         return gone
 
-    gone = await twin.keeper.keep(take, files=files)
+    gone = await twin.state_store.keep(take, files=files)
     return p.JobForgetResult(jobs=[job.id for job in gone])
 
 

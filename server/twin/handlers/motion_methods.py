@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import scanner_messages as p
-from flexdt.server.scans.stage import finished
+from flexdt.server.scans.stage import wait_for_way
 from flexdt.server.twin import state_views
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import (
@@ -34,7 +34,7 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
     if params.plan:
         return await _move_around_obstacles(twin, client, params)
     now = twin.clock.now()
-    told = twin.scanner.told_of(params.targets, now, relative=params.relative)
+    told = twin.scanner.limit_messages(params.targets, now, relative=params.relative)
     with _cancelling_detour(twin):
         durations = twin.scanner.move(
             params.targets, now, relative=params.relative, shortest=params.shortest
@@ -95,7 +95,7 @@ async def _move_around_obstacles(
     """
     twin.detours.cancel()
     now = twin.clock.now()
-    told = twin.scanner.told_of(params.targets, now, relative=params.relative)
+    told = twin.scanner.limit_messages(params.targets, now, relative=params.relative)
     way = await twin.detours.plan(
         params.targets, relative=params.relative, shortest=params.shortest
     )
@@ -111,7 +111,7 @@ async def _move_around_obstacles(
     arrived = None
     moves = [dict(leg) for leg in way.legs]
     if params.wait:
-        short = await finished(task)
+        short = await wait_for_way(task)
         short += await _unreached_targets(
             twin, {m: t for leg in moves for m, t in leg.items()}
         )
@@ -173,7 +173,7 @@ def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     stopping = twin.scanner.estop(twin.clock.now(), client.name)
     twin.tell("warning", f"E-stop by {client.name}")
     twin.changed()
-    twin.keeper.changed(at_once=not in_force)  # a flood of them is one write
+    twin.state_store.changed(at_once=not in_force)  # a flood of them is one write
     return state_views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 

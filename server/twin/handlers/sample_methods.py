@@ -36,7 +36,7 @@ async def set_sample(
     assert name is not None
     head = twin.samples.head(name)
     if params.file is not None and head is None:
-        raise _unknown(twin, name)
+        raise _unknown_upload(twin, name)
     if params.offset is None:
         offset = StagePlacement()
     else:
@@ -63,7 +63,7 @@ async def list_samples(
         name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
     )
     shipped = await h.in_turns(
-        phantom_names(), lambda name: _info(name, load_phantom(name))
+        phantom_names(), lambda name: _sample_info(name, load_phantom(name))
     )
     heads = [
         head
@@ -139,7 +139,7 @@ async def upload(
                 upload=upload,
             )
         else:
-            await twin.keeper.keep(
+            await twin.state_store.keep(
                 lambda: twin.samples.know(upload),
                 files=lambda changes: twin.samples.store(changes, upload),
             )
@@ -149,7 +149,7 @@ async def upload(
         name=head.name,
         received=received,
         complete=True,
-        sample=_info(head.name, upload.phantom, head),
+        sample=_sample_info(head.name, upload.phantom, head),
         warnings=warnings,
     )
 
@@ -164,7 +164,7 @@ async def delete(
     async with twin.samples.turn, twin.stage_turn:
         head = twin.samples.head(name)
         if head is None:
-            raise _unknown(twin, name)
+            raise _unknown_upload(twin, name)
         _ensure_unused(twin, name)
 
         def take() -> None:
@@ -172,7 +172,7 @@ async def delete(
             _ensure_unused(twin, name)
             twin.samples.forget(name)
 
-        await twin.keeper.keep(
+        await twin.state_store.keep(
             take, files=lambda changes: twin.samples.remove(changes, name)
         )
         await asyncio.to_thread(twin.samples.tidy)
@@ -211,7 +211,9 @@ def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
         h.ensure_idle(twin, client, "sample.upload", "sample.upload")()
 
 
-def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> p.SampleInfo:
+def _sample_info(
+    name: str, phantom: Phantom, head: UploadHead | None = None
+) -> p.SampleInfo:
     """Describe a sample for the list; `head` is the description of an upload, None for a
     phantom.
     """
@@ -230,7 +232,7 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
     return p.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 
 
-def _unknown(twin: TwinServer, name: str) -> UnknownNameError:
+def _unknown_upload(twin: TwinServer, name: str) -> UnknownNameError:
     """Make the error for an upload that does not exist, with the last names; returned,
     not raised.
     """

@@ -13,11 +13,11 @@ from flexdt.protocol.fields import Empty, Nothing
 from flexdt.protocol.methods import document_messages as d
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods import session_messages as p
-from flexdt.server.scans.scan_job import ENDED
+from flexdt.server.scans.scan_job import ENDED_PHASES
 from flexdt.server.storage.scene_document import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_stage, ensure_idle
-from flexdt.server.twin.hub import ImageWish
+from flexdt.server.twin.hub import ImageRequest
 from flexdt.twin.errors import SafetyError
 
 document = cache(openrpc_document)
@@ -88,7 +88,7 @@ def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
 @answers(p.STATE_SUBSCRIBE)
 def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
     """Subscribe to events; the present state, image and jobs are sent at once."""
-    view = ImageWish(params.projection_kind, params.projection_binning)
+    view = ImageRequest(params.projection_kind, params.projection_binning)
     twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
     if "state" in params.topics:
         twin.hub.snapshot(client.peer, "state", twin.state())
@@ -96,7 +96,7 @@ def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
         twin.live.changed(again=True)
     if "job" in params.topics:
         for job in twin.jobs.all():
-            if job.phase not in ENDED or job is twin.jobs.get(None):
+            if job.phase not in ENDED_PHASES or job is twin.jobs.get(None):
                 twin.hub.snapshot(client.peer, "job", twin.jobs.status(job), slot=job.id)
     return Nothing()
 

@@ -187,7 +187,7 @@ class ImageCollector:
         self.names: set[str] = set()
         self.hint = averages
         self.inferred_averages: int | None = None
-        self._complained: set[str] = set()
+        self._reported: set[str] = set()
         if averages is not None:
             camera.assume("averages", averages)
 
@@ -199,10 +199,10 @@ class ImageCollector:
 
     def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
         """Simulate `take image`: one image; the number of frames is for sequences."""
-        self._taken(np.array([now], dtype=np.float64), now, step, command.line)
+        self._add_images(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
-        return self._busy(now, length, "take_image_overhead")
+        return self._keep_busy(now, length, "take_image_overhead")
 
     def save(self, command: c.SaveImage, now: float, _step: int) -> planned.Span:
         """Simulate `save image`: name the last image, which determines its kind; report
@@ -234,11 +234,11 @@ class ImageCollector:
                 self.images.append(saved)
             else:
                 self.images[self.last] = saved
-            self._saved(saved)
+            self._check_saved(saved)
             if self.moved:
                 what = f"{', '.join(self.moved)} still moves while {name} is taken"
                 self.findings.warn("moving", f"{what} (line {saved.line})")
-        return self._busy(now, 0.0, "save_image")
+        return self._keep_busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
         """Simulate `take and save image sequence`: back to back, during any motion.
@@ -263,7 +263,7 @@ class ImageCollector:
         starts = start + period * np.arange(frames, dtype=np.float64)
         exact: dict[str, FloatArray] = {}
         if trigger is not None and inference is not None:
-            starts, exact = self._fly(trigger, inference, start, period)
+            starts, exact = self._fly_scan_times(trigger, inference, start, period)
         elif moving and frames > 1:
             what = (
                 f"{', '.join(moving)} moves during the sequence without a trigger (POS)"
@@ -271,15 +271,15 @@ class ImageCollector:
             which = "where each image lies depends on the timing of commands"
             self.findings.warn("no_trigger", f"{what}: {which}")
         files = sequence_names(command.prefix, command.first, frames)
-        draft = self._taken(
+        draft = self._add_images(
             starts, start, step, command.line, kind_of(files[0]), files, exact
         )
         if draft.kind == "projection" and frames > 1 and not moving:
             self.findings.warn("static_sequence", "nothing moves during this sequence")
-        self._saved(draft)
+        self._check_saved(draft)
         self.trigger = None
         length = float(starts[-1] - start) + period
-        span = self._busy(start, length, self.machine.timing.sequence)
+        span = self._keep_busy(start, length, self.machine.timing.sequence)
         what = f": {frames} images" + (
             f" over {trigger.axis}" if trigger is not None else ""
         )
@@ -287,14 +287,14 @@ class ImageCollector:
 
     # time ----------------------------------------------------------------------------------
 
-    def _busy(self, start: float, length: float, kind: str) -> planned.Span:
+    def _keep_busy(self, start: float, length: float, kind: str) -> planned.Span:
         """Keep the camera busy for `length` [s] and the overhead of `kind`."""
         overhead = self.machine.timing.seconds(kind)
         end = start + length + overhead
         self.camera.free_at = end
         return planned.Span(start, end, overhead, kind)
 
-    def _taken(
+    def _add_images(
         self,
         starts: FloatArray,
         start: float,
@@ -383,7 +383,7 @@ class ImageCollector:
             how = f"{found.averages} inferred ({found.notes['averages']})"
             what = f"the number of averages is not set; {how}, and taken for images before this"
             self.findings.warn("averages_unsaid", f"{what} line too")
-            self._complained.add("averages")
+            self._reported.add("averages")
         if frames is None:
             count = 1 if found is None else found.frames
             how = "1 is assumed"
@@ -393,7 +393,7 @@ class ImageCollector:
             camera.assume("frames", count)
         return found
 
-    def _fly(
+    def _fly_scan_times(
         self, trigger: planned.Trigger, found: Inference, start: float, period: float
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Compute the nominal moments of a fly scan's images, and positions by the rule;
@@ -459,7 +459,7 @@ class ImageCollector:
 
     # findings about a saved image ----------------------------------------------------------
 
-    def _saved(self, draft: ExposureGroup) -> None:
+    def _check_saved(self, draft: ExposureGroup) -> None:
         """Note the names of saved images; warn of repeated names, missing settings and
         X-rays that do not fit the kind.
         """
@@ -469,7 +469,7 @@ class ImageCollector:
                 "overwrites", f"{clash} is saved twice; the last one stays"
             )
         self.names.update(draft.files)
-        self._unsaid(draft)
+        self._warn_of_defaults(draft)
         if draft.kind == "dark" and draft.xrays_on:
             self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
         if draft.kind != "dark" and not draft.xrays_on:
@@ -478,7 +478,7 @@ class ImageCollector:
                 what = "a flat image is"
             self.findings.warn("xrays_off", f"{what} taken with X-rays off")
 
-    def _unsaid(self, draft: ExposureGroup) -> None:
+    def _warn_of_defaults(self, draft: ExposureGroup) -> None:
         """Warn, once each, of the settings that a saved image takes from the machine's
         defaults.
         """
@@ -487,8 +487,8 @@ class ImageCollector:
         self._default("exposure_ms", "the exposure", f"{s.exposure_ms:g} ms")
         self._default("roi", "the ROI", str(s.roi))
         known = self.hint is not None or "averages" in self.camera.said
-        if not known and "averages" not in self._complained:
-            self._complained.add("averages")
+        if not known and "averages" not in self._reported:
+            self._reported.add("averages")
             self.findings.warn(
                 "averages_unsaid", "the number of averages is not set; 1 is assumed"
             )
@@ -498,8 +498,8 @@ class ImageCollector:
 
     def _default(self, name: str, what: str, value: str) -> None:
         """Warn once if the script states no value of a setting."""
-        if name not in self.camera.said | self.tube.said | self._complained:
-            self._complained.add(name)
+        if name not in self.camera.said | self.tube.said | self._reported:
+            self._reported.add(name)
             self.findings.warn(
                 "default_assumed",
                 f"{what} is not set; {value} of the machine file is assumed",

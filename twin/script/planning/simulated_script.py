@@ -224,7 +224,7 @@ class Simulation:
             return self.timed("command")
         return planned.Span(self.now, self.now + left, left, "xray_ready")
 
-    def _tube(self, change: Mapping[str, float]) -> planned.Span:
+    def _set_tube(self, change: Mapping[str, float]) -> planned.Span:
         """Set voltage or power; report a value that is not allowed and keep the old one.
 
         Args:
@@ -245,7 +245,7 @@ class Simulation:
 
     # camera --------------------------------------------------------------------------------
 
-    def _stated(self, change: CameraChange) -> planned.Span:
+    def _set_camera(self, change: CameraChange) -> planned.Span:
         """Set a camera setting; report a value that is not allowed and keep the old one.
 
         Args:
@@ -309,19 +309,19 @@ class Simulation:
         found = rate(self.machine, command.component, what, asked)
         note = ""
         shares = self.machine.moves(command.component)
-        self._tell(found)
+        self._report(found)
         for motor, value in found.motors.items():
             setattr(self.motors.all[motor], what, value)
-            if found.told and value < asked * abs(shares[motor]):
+            if found.messages and value < asked * abs(shares[motor]):
                 unit = (
                     f"{self.machine.axes[motor].unit}/{'s' if what == 'speed' else 's2'}"
                 )
                 note += f" (limited to {motor} {value:g} {unit})"
         return self.timed("set_motor", note=note)
 
-    def _tell(self, found: Arrival) -> None:
+    def _report(self, found: Arrival) -> None:
         """Report a target beyond a limit, as `twin/machine/travel.py` judges it."""
-        for message in found.told:
+        for message in found.messages:
             if found.is_clamped(self.machine):
                 self.findings.warn("limit_clamped", f"{message}; set to the limit")
             else:
@@ -345,9 +345,9 @@ class Simulation:
         found = arrival(self.machine, name, asked)
         targets = found.motors
         note = ""
-        self._tell(found)
+        self._report(found)
         for motor, target in targets.items():
-            if found.told and target != asked[motor]:
+            if found.messages and target != asked[motor]:
                 note += (
                     f" (limited to {motor} {target:g} {self.machine.axes[motor].unit})"
                 )
@@ -359,7 +359,9 @@ class Simulation:
         end = max(t.end for t in trajectories.values())
         release = None
         if command.wait is c.Wait.POS and command.trigger is not None:
-            release = self._pass(command, command.trigger, trajectories, begin, end)
+            release = self._register_trigger(
+                command, command.trigger, trajectories, begin, end
+            )
         if command.wait is not c.Wait.ACK:
             return planned.Span(self.now, end, release=release, note=note)
         kind = "move_standing"
@@ -367,7 +369,7 @@ class Simulation:
             kind = "move"
         return self.timed(kind, end - self.now, note)
 
-    def _pass(
+    def _register_trigger(
         self,
         command: c.MoveAbsolute,
         trigger: float,
@@ -426,8 +428,8 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.XrayOn: Simulation._xray_on,
     c.XrayOff: Simulation._xray_off,
     c.WaitXrayReady: Simulation._ready,
-    c.TubeSetting: lambda s, k: s._tube(k.arguments),
-    c.CameraSetting: lambda s, k: s._stated(k.arguments),
+    c.TubeSetting: lambda s, k: s._set_tube(k.arguments),
+    c.CameraSetting: lambda s, k: s._set_camera(k.arguments),
     c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
     c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
     c.TakeSequence: lambda s, k: s.imaging.sequence(k, s.now, len(s.steps)),
