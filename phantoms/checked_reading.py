@@ -53,7 +53,9 @@ class PhantomError(TwinError):
 
 
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
-    """Make the error for a value that is not what is `allowed` at key path `where`."""
+    """Make the error for a value that is not what is `allowed` at key path `where`;
+    returned, not raised.
+    """
     shown = repr(value)
     if len(shown) > 80:
         shown = shown[:77] + "..."
@@ -68,7 +70,7 @@ def mapping(value: object, where: str) -> Mapping[str, object]:
 
 
 def get(document: object, key: str, where: str) -> object:
-    """Return field `key` of `document`, which must have it."""
+    """Return field `key` of `document`; raise PhantomError if it is missing."""
     given = mapping(document, where)
     if key not in given:
         raise PhantomError(f"{where}.{key} is missing", {"path": f"{where}.{key}"})
@@ -115,7 +117,9 @@ def string(value: object, where: str) -> str:
 
 
 def number(value: object, where: str) -> float:
-    """Check that `value` is a number within what later arithmetic can take."""
+    """Return `value` as a float if it is a number up to `MAX_NUMBER`; raise PhantomError
+    otherwise.
+    """
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)
@@ -126,7 +130,9 @@ def number(value: object, where: str) -> float:
 
 
 def positive(value: object, where: str) -> float:
-    """Check that `value` is a length above 0."""
+    """Return `value` if it is a length from `MIN_LENGTH_MM` on; raise PhantomError
+    otherwise.
+    """
     found = number(value, where)
     if found < MIN_LENGTH_MM:
         raise wrong(value, where, f"a number from {MIN_LENGTH_MM:g} to {MAX_NUMBER:g}")
@@ -151,7 +157,7 @@ def lengths(value: object, where: str) -> analytic.Vector:
 
 
 def unit(value: object, where: str) -> analytic.Vector:
-    """Check that `value` is a unit vector."""
+    """Return `value` as a unit vector (3,); raise PhantomError otherwise."""
     found = vector(value, where)
     if abs(math.hypot(*found) - 1.0) > 1e-6:
         raise wrong(value, where, "a unit vector")
@@ -159,7 +165,7 @@ def unit(value: object, where: str) -> analytic.Vector:
 
 
 def axes(value: object, where: str) -> analytic.Matrix:
-    """Check that `value` is three orthogonal unit vectors."""
+    """Return `value` as three orthogonal unit vectors; raise PhantomError otherwise."""
     rows = each(value, where, unit)
     if len(rows) != 3 or not np.allclose(
         np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6

@@ -485,7 +485,13 @@ class _SeenDetail:
         )
 
     def unsaturated(self, layer: str, asked: ExposureSettings) -> ExposureSettings:
-        """Split the time into so many read-outs that the open beam does not saturate."""
+        """Split a setting's time into as many read-outs as keep the open beam below
+        saturation.
+
+        Args:
+            layer: name of the filter.
+            asked: the setting; its total time stays.
+        """
         time_ms = asked.exposure_ms * asked.averages
         whole = replace(asked, exposure_ms=time_ms, averages=1)
         chain = self.layers.chains[layer]

@@ -285,7 +285,11 @@ class Connection:
         self._begun.clear()
 
     def next_raw(self) -> bytes | Malformed | None:
-        """Take out the next message's bytes, or an error; None if none waits."""
+        """Take the next message's bytes, or an error, out of the queue; None if none
+        waits.
+
+        A fatal error closes the connection: nothing follows it.
+        """
         if not self.whole:
             return None
         raw = (self._ready or self._new).popleft()

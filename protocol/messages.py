@@ -175,7 +175,16 @@ def finite(data: object) -> object:
 
 
 def from_plain(document: object, max_batch: int = 1000) -> Message:
-    """Convert a decoded document to a message; batches of at most `max_batch`."""
+    """Convert a decoded document to a message; raises nothing.
+
+    Args:
+        document: plain data.
+        max_batch: largest number of messages in a batch.
+
+    Returns:
+        A message or a batch; `Malformed` for an empty or too large batch, or as
+        `_single`.
+    """
     if not isinstance(document, list):
         return _single(document)
     if not document:
@@ -258,7 +267,7 @@ def _request(document: dict[object, object], id: Id) -> Single:
 
 
 def _failure(id: Id, error: object) -> Single:
-    """Read the answer to a failed request."""
+    """Convert the answer to a failed request; `Malformed` if it has no code or message."""
     if isinstance(error, dict):
         code = error.get("code")
         message = error.get("message")

@@ -77,7 +77,9 @@ def invalid_request(why: str) -> RpcError:
 
 
 def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
-    """Make the error for an unknown method; it lists the methods."""
+    """Make the error -32601 for an unknown method, with all methods in its data;
+    returned, not raised.
+    """
     names = sorted(allowed)
     return RpcError(
         Code.METHOD_NOT_FOUND,
@@ -89,7 +91,13 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
 def invalid_params(
     message: str, problems: Sequence[Mapping[str, object]] = (), allowed: object = None
 ) -> RpcError:
-    """Make the error for parameters that do not fit; `problems` are made by `problem`."""
+    """Make the error -32602 for parameters that do not fit; returned, not raised.
+
+    Args:
+        message: for people.
+        problems: made by `problem`, for the data.
+        allowed: values, for the data; None for none.
+    """
     data: dict[str, object] = {"problems": [dict(p) for p in problems]}
     if allowed is not None:
         data["allowed"] = allowed

@@ -20,7 +20,9 @@ STOP_GRACE_S = 15.0
 
 
 def main() -> None:
-    """Watch standard input from a thread and run the named module as `__main__`."""
+    """Run the module named on the command line as `__main__`; a thread ends the process
+    with its parent.
+    """
     if len(sys.argv) < 2:
         sys.exit("usage: python -m flexdt.runtime.child MODULE [ARGUMENT...]")
     threading.Thread(target=_watch, name="parent-watch", daemon=True).start()

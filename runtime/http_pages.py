@@ -157,7 +157,9 @@ class _Server(ThreadingWSGIServer):
         super().__init__(*given, **more)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Admit a connection and start its thread."""
+        """Register a connection as not admitted, which may end the oldest such, and start
+        its thread.
+        """
         visitor = _Visitor(request, neighbourhood(str(client_address[0])))
         with self._lock:
             self._here[request] = visitor

@@ -34,7 +34,9 @@ def current() -> str:
 
 @contextmanager
 def traced(name: str) -> Iterator[None]:
-    """Set the id for the duration of the context, and for tasks started in it."""
+    """Give all log lines within the context, and in tasks started in it, the trace
+    `name`.
+    """
     token = _CURRENT.set(name)
     try:
         yield
@@ -132,7 +134,14 @@ def dropped() -> int:
 def log(
     event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
 ) -> None:
-    """Write one line; `error` adds the traceback of the exception being handled."""
+    """Write one log line, with the trace in force.
+
+    Args:
+        event: name of the event.
+        level: of `logging`.
+        error: add the traceback of the exception being handled.
+        facts: further members of the line.
+    """
     trace = current()
     if trace:
         facts.setdefault("trace", trace)

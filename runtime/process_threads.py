@@ -69,7 +69,9 @@ def _in_child() -> None:
 
 
 def watch() -> None:
-    """Set how kernel threads wait in this process, and restrict its forked children."""
+    """Let kernel threads sleep while they wait in this process (Linux), and have forked
+    children compute in one thread.
+    """
     if sys.platform == "linux":
         kernel_threads.waiting = load_sleeping()
     if hasattr(os, "register_at_fork"):

@@ -102,7 +102,7 @@ class _Work:
             self.due = now + (DRAWN_S if self.shown.bar else SILENT_S)
 
     def end(self) -> None:
-        """Take its bar away."""
+        """End the work and close its bar; later calls of `tell` show nothing."""
         with self.lock:
             self.ended = True
             if self.shown is not None:
@@ -276,7 +276,7 @@ def _show_until_end(what: str) -> Iterator[_Work]:
 
 @contextmanager
 def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
-    """Be in a work."""
+    """Register a work as the innermost one of this thread within the context."""
     works.append(one)
     try:
         yield

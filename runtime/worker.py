@@ -63,7 +63,12 @@ def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
 
 
 def limit(what: str, most: int) -> None:
-    """Limit one resource of this process."""
+    """Limit one resource of this process to `most`, or to the system's hard limit.
+
+    Args:
+        what: name of the resource, such as RLIMIT_CPU.
+        most: in the resource's unit.
+    """
     number = getattr(resource, what)
     hard = resource.getrlimit(number)[1]
     value = most

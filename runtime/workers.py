@@ -245,7 +245,9 @@ class Workers:
             raise busy(f"no process could be started: {error.strerror}", data) from None
 
     def _keep(self, worker: Worker) -> None:
-        """Return a process to the idle ones, and end them all after `MAX_IDLE_S`."""
+        """Return a process to the idle ones if it may work again, and end them all after
+        `MAX_IDLE_S` without work.
+        """
         if worker.kept:
             self._idle.append(worker)
         if self._timer is not None:

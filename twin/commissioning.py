@@ -197,7 +197,9 @@ def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
 
 
 def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> int:
-    """Projections that a command saves; a sequence without a number of frames has one."""
+    """Count the projections that a command saves; a sequence without a number of frames
+    has one.
+    """
     if isinstance(command, c.TakeSequence):
         names: Sequence[str | None] = sequence_names(
             command.prefix, command.first, frames or 1
@@ -245,7 +247,7 @@ def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
 
 
 def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
-    """How many motors have the limits that a machine file has for them."""
+    """Count the motors whose limits are those of a machine file."""
     own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
         axis is not None

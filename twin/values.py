@@ -75,7 +75,9 @@ class JsonValue:
 
 
 def told(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
-    """Describe a document's errors, place by place, as an error's message and data."""
+    """Describe a document's errors (at most 10), place by place: an error's message and
+    its data.
+    """
     lines = [
         f"{name}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
         for e in error.errors(include_url=False, include_context=False)[:10]

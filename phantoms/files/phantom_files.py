@@ -310,7 +310,7 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
 
 def _body(value: object, where: str) -> tuple[Vector, str]:
-    """Read the body: size [mm] and material."""
+    """Read the body of a bead file: size [mm] and material (abs if left out)."""
     given = reading.fields(
         value, where, {"size_mm": reading.lengths}, {"material": reading.string}
     )
@@ -318,7 +318,9 @@ def _body(value: object, where: str) -> tuple[Vector, str]:
 
 
 def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
-    """Read beads: position [mm], radius [mm], material."""
+    """Read the beads of a bead file: position [mm], radius [mm], material (steel if left
+    out) of each.
+    """
 
     def read(one: object, at: str) -> tuple[Vector, float, str]:
         needed = {"position_mm": reading.vector, "radius_mm": reading.positive}

@@ -394,7 +394,9 @@ class Directory:
                 os.fsync(fd)
 
     def close(self) -> None:
-        """Close the descriptor, once no call is under way."""
+        """Wait until no call is under way, then close the descriptor; later calls raise
+        OSError.
+        """
         with self._idle:
             self._idle.wait_for(lambda: self._busy == 0)
             self._closed = True

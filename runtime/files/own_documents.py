@@ -259,7 +259,15 @@ def read_or_set_aside(
 
 
 def set_aside(folder: Directory, name: str, error: object, without: str) -> None:
-    """Rename a damaged file, or another thing in its place, and log one line."""
+    """Rename a damaged file, or another thing in its place, and log one line; raises
+    nothing.
+
+    Args:
+        folder: of the file.
+        name: of the file.
+        error: why it is set aside.
+        without: event of the log line.
+    """
     file = folder.path / name
     aside = f"{file.stem}{ASIDE}{file.suffix}"
     try:

@@ -306,7 +306,9 @@ class Imaging:
             return apart.found, out
 
     async def nominal_integrals(self, sample: Sample, cone: ConeVec) -> Float32Array:
-        """Compute line integrals, float32 (n, rows, cols); see `nominal_paths`."""
+        """Compute line integrals without the hidden truth, float32 (n, rows, cols); see
+        `nominal_paths`.
+        """
         views, *grid = cone.shape
         if not sample.name:
             return np.zeros((views, *grid), dtype=np.float32)
@@ -324,7 +326,9 @@ class Imaging:
         return out
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
-        """Sample the materials of `sample` on a grid of about so many voxels, once."""
+        """Sample the materials of `sample` on a grid of about `voxels` cubes; the last
+        grid is kept.
+        """
         async with self._on_projector(sample, "material") as apart:
             phantom = apart.phantom
             if self._scatterer is None or self._scatterer[0] is not phantom:
@@ -369,7 +373,16 @@ class Imaging:
     def _too_large(
         self, sample: Sample, need: int, left: int, limit: int, who: str
     ) -> RpcError:
-        """Make the error for a sample that needs more memory than is left."""
+        """Make the error -32008 for a sample that needs more memory than is left;
+        returned, not raised.
+
+        Args:
+            sample: that is too large.
+            need: its memory [bytes].
+            left: memory that is left [bytes].
+            limit: memory in all [bytes].
+            who: owner of the memory, for the message.
+        """
         error = too_large(
             f"the sample {sample.name!r} in the memory of {who}", need, max(0, left)
         )
@@ -500,7 +513,9 @@ class Imaging:
         return named
 
     async def _remove(self, name: str, left: int) -> None:
-        """Have the projector remove all but the `left` newest versions."""
+        """Remove all but the `left` newest versions of a body, here and on the projector;
+        its errors are ignored.
+        """
         versions = self._versions[name]
         while len(versions) > left:
             with suppress(

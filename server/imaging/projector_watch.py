@@ -96,7 +96,13 @@ class ProjectorWatch:
             answer.cancel()
 
     def _report(self, client: Watched, problem: str | None) -> None:
-        """Record the problem of one projector; call `changed` if the overall one changes."""
+        """Record the problem of one projector; set `problem` and call `changed` if all
+        have one, or no longer.
+
+        Args:
+            client: of the projector.
+            problem: None if it answers.
+        """
         self._problems[client] = problem
         known = [self._problems.get(each) for each in self.clients]
         now = None if None in known else known[0]

@@ -18,7 +18,9 @@ class Deadlines:
         self._timers: dict[str, asyncio.TimerHandle] = {}
 
     def start(self, name: str, seconds: float | None) -> None:
-        """Start a timeout unless it is running; None seconds: there is none."""
+        """Start a timeout unless one of that name runs; after it `on_timeout` is called.
+        None seconds starts none.
+        """
         if seconds is not None and name not in self._timers:
             self._timers[name] = asyncio.get_running_loop().call_later(
                 seconds, self._on_timeout, name, seconds

@@ -22,7 +22,9 @@ class LoopTurns:
         self._due = False
 
     async def take(self, who: object, lane: int) -> None:
-        """Wait for a turn of a connection in a lane; lower lanes go first."""
+        """Wait for a turn of connection `who` in a lane; lower lanes go first,
+        connections one after another.
+        """
         loop = asyncio.get_running_loop()
         turn = loop.create_future()
         self._lanes[lane].setdefault(who, deque()).append(turn)

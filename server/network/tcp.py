@@ -343,7 +343,11 @@ class _Link(asyncio.BufferedProtocol):
                 self.server.look_soon(self)
 
     def eof_received(self) -> bool:
-        """Note the client's end of stream; replies may take `end_timeout_s`."""
+        """Note the client's end of stream; replies may take `end_timeout_s`.
+
+        Returns:
+            Whether the transport stays open for them: not under TLS.
+        """
         self.ended = True
         self.arrived.set()
         self.deadlines.stop("message")

@@ -108,7 +108,7 @@ class ComputeJob:
             raise self.error from None
 
     async def _in_turn(self, compute: ComputeThread, step: Step) -> object:
-        """Wait for the lane, then put the step into the thread's queue."""
+        """Wait for the lane, put the step into the thread's queue, and return its value."""
         if not self._in_hand:
             self._in_hand = await self.lane.in_hand.acquire()
         async with self.lane:
@@ -163,7 +163,17 @@ class ComputeThread:
 def projection_steps(
     body: Body, rows: npt.NDArray[np.float64], shape: tuple[int, int], block: int
 ) -> Iterator[Step]:
-    """Yield steps of `block` views each; every value is float32 (views, rows, cols)."""
+    """Yield functions that each project a block of views, for the compute thread.
+
+    Args:
+        body: volume, mesh or scene.
+        rows: cone_vec (n, 12).
+        shape: detector (rows, cols).
+        block: views of a step.
+
+    Returns:
+        Steps whose values are float32 (views, rows, cols).
+    """
 
     def step(part: npt.NDArray[np.float64]) -> Step:
         """Make the step of some rows."""

@@ -138,7 +138,9 @@ async def volume_get(
 
 
 async def volume_list(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """List the volumes and the memory they take."""
+    """List the volumes and their memory as a dict: volumes, memory_used and memory_limit
+    [bytes].
+    """
     return {
         "volumes": context.store.describe(),
         "memory_used": context.store.used,
@@ -260,7 +262,9 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 
 
 async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) -> object:
-    """Cancel a request of this client."""
+    """Cancel a request of this client; the answer, a dict with the key cancelled, says
+    whether there was one.
+    """
     job = client.jobs.get(p.request)
     if job is not None:
         job.end(cancelled(p.request))
@@ -320,7 +324,12 @@ def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | Tria
 
 
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
-    """Compute a back projection, added to `old`."""
+    """Compute a back projection on a grid; blocks.
+
+    Args:
+        p: projections, cone_vec and grid.
+        old: volume of that grid to which it is added, in a copy; None for none.
+    """
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
     volume = back(
         p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm)

@@ -83,7 +83,9 @@ class ProjectorServer(ListeningServer):
     # -- connections -------------------------------------------------------------------------
 
     def made(self, link: FrameLink) -> None:
-        """Register a new connection, which waits for a place."""
+        """Register a new connection in the waiting room; without a token its frames and
+        time are limited.
+        """
         client = JobClient(link, self.context.token, self.context.lines)
         self.context.clients[link] = client
         self.waiting.enter(client)
@@ -121,7 +123,7 @@ class ProjectorServer(ListeningServer):
         return min(MAX_FRAME, self.limits.max_message)
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
-        """Send an error and end the connection."""
+        """Log an error, send it, and end the connection."""
         self.context.lines.log(
             "refused", logging.WARNING, client=link.peer, reason=error.message
         )

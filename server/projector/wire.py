@@ -93,7 +93,7 @@ class FrameLink(asyncio.BufferedProtocol):
     # -- the transport's calls ---------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Tune the socket and call `on_made`."""
+        """Tune the socket, note the peer's address, and call `on_made`."""
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(high=SLICE_BYTES // 2)
         sock = self.transport.get_extra_info("socket")
@@ -154,7 +154,9 @@ class FrameLink(asyncio.BufferedProtocol):
             self._body = np.empty(size, np.uint8).data
 
     def eof_received(self) -> bool:
-        """Close the connection when the peer has closed its side; half a frame is an error."""
+        """Close the connection when the peer has closed its side; inside a frame call
+        `on_broken` first.
+        """
         if self.mid_frame and not self._over:
             self._over = True
             self.on_broken(self, parse_error("the stream ended inside a frame"))

@@ -142,7 +142,15 @@ class CheckInput:
     def free_moves(
         self, start: Mapping[str, float], goal: Mapping[str, float]
     ) -> list[dict[str, float]] | None:
-        """Find moves without a contact, one after the other; None if there are none."""
+        """Find moves without a contact for the machine and sample of this check.
+
+        Args:
+            start: axis -> position [mm, deg].
+            goal: axis -> target.
+
+        Returns:
+            Moves in order, each axis -> position; None if none were found.
+        """
         scene = build_scene(self.machine, self.profile, self.pieces, self.parameters)
         begin = self.start
         paces = {

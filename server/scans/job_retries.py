@@ -48,7 +48,14 @@ class Retry:
         return max(0.0, self._at - asyncio.get_running_loop().time())
 
     def schedule(self, error: Exception, go: Callable[[], None]) -> None:
-        """Call `go` after a while; a call that is pending already is kept."""
+        """Schedule a call of `go` after a pause that doubles with each attempt; a pending
+        call is kept.
+
+        Args:
+            error: for which it waits: after a full disk `go` is called only once there is
+                room.
+            go: resumes the job.
+        """
         if self.waits_s is None:
             pause = min(self._longest, self._first * 2.0**self._attempts)
             self._attempts += 1
@@ -61,7 +68,9 @@ class Retry:
             self._attempts = 0
 
     def cancel(self) -> None:
-        """Cancel the next attempt: a user takes over, or the job has ended."""
+        """Cancel the next attempt and reset the pause: a user takes over, or the job has
+        ended.
+        """
         if self._task is not None:
             self._task.cancel()
             self._task = None

@@ -88,7 +88,9 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
 def _remaining(
     trajectories: tuple[tuple[float, Trajectory], ...], tau: float
 ) -> tuple[Trajectory, ...]:
-    """Select an axis's trajectories from `tau` on, the current one cut."""
+    """Select the part of an axis's motion from plan time `tau` on; the current trajectory
+    is cut there.
+    """
     begun = [t for time, t in trajectories if time <= tau]
     later = tuple(t for time, t in trajectories if time > tau)
     if not begun or tau >= begun[-1].end:

@@ -197,7 +197,9 @@ class ScanRunner:
         self._wake()
 
     def abort(self, reason: str | None = None) -> None:
-        """End the run."""
+        """Request the end of the run: it raises `JobAborted`, with the reason, at its
+        next wait.
+        """
         if reason is not None:
             self._end = JobAborted(reason)
         self._abort = True
@@ -405,7 +407,14 @@ class ScanRunner:
         self._saved_settings = None
 
     async def _wait_for_request(self, tau: float) -> None:
-        """Pause until resume, step or abort."""
+        """Show the run as paused and wait for resume, step or abort.
+
+        Args:
+            tau: plan time at which it pauses [s].
+
+        Raises:
+            Exception: the run is to end (`JobAborted`).
+        """
         self._stop_due = False
         if self._pause:
             self._set_progress(phase="paused", tau=tau)

@@ -549,7 +549,15 @@ class Submissions:
         return name
 
     def _require_room(self, size: int, name: str) -> None:
-        """Refuse a scan that does not fit on the disk."""
+        """Check that the images of a scan that are not there yet fit on the disk.
+
+        Args:
+            size: of all images [bytes].
+            name: of the data set.
+
+        Raises:
+            DiskFullError: they do not.
+        """
         there = 0
         with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:
             images = (
@@ -560,7 +568,9 @@ class Submissions:
 
 
 def name_conflict(name: str, why: str) -> RpcError:
-    """Make the error for a data set's name that cannot be used."""
+    """Make the error -32602 for a data set's name that cannot be used; returned, not
+    raised.
+    """
     return invalid_params(
         f"the data set name {name!r} cannot be used: {why}",
         [problem("name", why, name)],

@@ -239,7 +239,9 @@ class Corrections:
         changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
 
     def forget(self, name: str, history: History) -> None:
-        """Remove a correction from memory; `history` is without it."""
+        """Remove a correction from memory (its file is removed elsewhere); `history` is
+        the one without it.
+        """
         del self._all[name]
         self._sources.pop(name, None)
         self._files.pop(name, None)
@@ -261,7 +263,12 @@ def _file(correction: NamedCorrection) -> str:
 
 
 def _joined(before: History, in_force: History) -> History:
-    """Join the history of the file and that of the state, which takes precedence."""
+    """Join the history of the file and that of the state, whose last name is in force.
+
+    Args:
+        before: of the file.
+        in_force: of the state: a whole history, or the one name in force.
+    """
     if len(in_force) != 1:
         return in_force
     [name] = in_force

@@ -83,7 +83,18 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
 def align(
     root: Directory, asked: p.CalibrationAlign, *_: object
 ) -> p.CalibrationAlignResult:
-    """Align a data set; blocks. Raises as `fit`."""
+    """Align a data set as `calibration.align` asks; blocks, for a worker process.
+
+    Args:
+        root: the data directory.
+        asked: parameters of `calibration.align`.
+
+    Returns:
+        The alignment's document; paths are relative to the data directory.
+
+    Raises:
+        TwinError: there is no such data set, or nothing can be aligned.
+    """
     from flexdt.library.analysis import align as align_data_set
 
     found = align_data_set(_dataset_path(root, asked.name), per_frame=asked.per_frame)

@@ -48,7 +48,11 @@ class UsedBytes:
         self._seen: dict[str, _Seen] = {}
 
     def count(self) -> int:
-        """Sum up the bytes of all files in it and its folders; links are not followed."""
+        """Sum up the bytes of all files in the directory and its folders; links are not
+        followed.
+
+        Folders that have not changed since the last call are not read again.
+        """
         with suppress(OSError):
             changed_ns = os.stat(self._root.fileno() or self._root.path).st_mtime_ns
             counted: dict[str, _Seen] = {}

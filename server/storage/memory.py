@@ -138,7 +138,9 @@ def with_scanner_state(
 
 
 def read_memory(root: Directory) -> Memory | None:
-    """Read the state of data directory `root`; None if there is none, or a damaged one."""
+    """Read the state of data directory `root`; None if there is none; a damaged file is
+    set aside.
+    """
     return own.read_or_set_aside(
         root,
         FILE,
@@ -374,7 +376,7 @@ class StateStore:
         return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
-        """Write the document and jobs, unless the server has ended."""
+        """Write the document and jobs to the disk, unless the server has ended; blocks."""
         # Ending cancels the task that waits for a worker thread, but not the thread.
         with self._file:
             if self._ended and not memory.ended:

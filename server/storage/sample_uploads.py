@@ -192,7 +192,9 @@ class Incoming:
             known.file.close()
 
     def _gap(self, name: str, start: int, received: int) -> LimitError:
-        """Make the error for a chunk that does not follow the last one."""
+        """Make the error for a chunk that does not follow the last one; returned, not
+        raised.
+        """
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
             f"chunks come in order, from 0, and {MAX_UPLOADS} uploads and {self._limit} "

@@ -113,7 +113,13 @@ def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, flo
 
 
 def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Set tube, camera and paces as in the scene; X-rays are not switched."""
+    """Set tube, camera and rates of the axes as in the scene; X-rays and motors stay as
+    they are.
+
+    Raises:
+        LimitError, UnknownNameError: a setting or an axis that this scanner does not
+            have.
+    """
     for axis, speed in scene.speeds.items():
         scanner.set_axis(axis, speed=speed)
     for axis, acceleration in scene.accelerations.items():

@@ -127,7 +127,7 @@ class ControlLease:
             self.holder = None
 
     def force(self, who: str) -> str | None:
-        """Take control from its present holder, which is returned."""
+        """Give control to `who`; return the holder who loses it, or None."""
         loser = None
         if self.holder != who:
             loser = self.holder
@@ -582,7 +582,17 @@ class TwinServer:
         correction: NamedCorrection | None,
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
-        """Create the guard for a sample and a correction; `upload` as for `Stage.pieces`."""
+        """Build, in a thread, the guard that finds contacts with a sample and a
+        correction.
+
+        Args:
+            sample: on the stage.
+            correction: in force; None for none.
+            upload: as for `Stage.pieces`.
+
+        Returns:
+            The guard; None for a machine without components.
+        """
         parameters = NOMINAL
         if correction is not None:
             parameters = correction.parameters
@@ -641,7 +651,9 @@ class TwinServer:
         self.hub.publish("log", entry, slot=None)
 
     def _job_changed(self, job: Job) -> None:
-        """Publish and log a job's change."""
+        """Publish a job's status, log a change of its phase, and mark the state as
+        changed.
+        """
         status = self.jobs.status(job)
         self.hub.publish("job", status, slot=job.id)
         if status.state not in ("running", job.logged):

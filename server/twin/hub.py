@@ -173,7 +173,9 @@ class Hub:
                 )
 
     def unsubscribe(self, listener: Peer, topics: Iterable[TopicName]) -> None:
-        """Send them no longer; topics that were not subscribed to are fine."""
+        """End subscriptions of `listener`; topics that were not subscribed to are
+        ignored.
+        """
         for topic in topics:
             subscription = self._listeners.get(topic, {}).pop(listener, None)
             if subscription is not None and subscription.timer is not None:

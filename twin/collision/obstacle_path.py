@@ -121,7 +121,13 @@ class _Planner:
         return contact
 
     def free(self, moved: Mapping[str, float], axis: str, value: float) -> bool:
-        """Return whether one motor's move is free; the answer is remembered."""
+        """Return whether one motor's move touches nothing; the answer is remembered.
+
+        Args:
+            moved: motor -> position before the move, where it is not that of the start.
+            axis: the motor.
+            value: its target [mm, deg].
+        """
         key = (tuple(sorted(moved.items())), axis, value)
         if key not in self.known:
             self.known[key] = self.contact(moved, {axis: value}) is None

@@ -199,7 +199,13 @@ def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
 
 
 def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArray:
-    """Compute a cone_vec row from nine numbers and the pixel pitch."""
+    """Compute a cone_vec row (12,) [mm] from nine numbers; the inverse of
+    `parameters_of`.
+
+    Args:
+        values: in the order of `NAMES` [deg, mm].
+        pitch_mm: of a pixel along u and v.
+    """
     gantry, out, turn = (math.radians(a) for a in values[:3])
     sid, sdd, sx, sy, px, py = values[3:]
     axes = TO_RTK.T @ rotation_y(gantry) @ rotation_x(out) @ rotation_z(turn)

@@ -387,7 +387,9 @@ class Follower:
         )
 
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
-        """Raise an alarm if a target is near a limit."""
+        """Return the mirror, with a warning (once) if a target is near a limit of its
+        motor.
+        """
         axis = self.machine.axes[name]
         left = min(target - axis.lower, axis.upper - target)
         if left >= NEAR_LIMIT_DISTANCE or ("limit", name) in mirror.active:
@@ -532,7 +534,15 @@ class Follower:
     def _arrival(
         self, mirror: Mirror, name: str, there: float, meant: float, now: float
     ) -> Mirror:
-        """Raise an alarm if a motor is not where its move led."""
+        """Return the mirror, with an alarm if a motor is not where its move led.
+
+        Args:
+            mirror: present state.
+            name: of the motor.
+            there: its position [mm, deg].
+            meant: target of the move.
+            now: moment [s].
+        """
         if abs(there - meant) <= TARGET_TOLERANCE:
             return mirror
         unit = self.machine.axes[name].unit
@@ -664,7 +674,7 @@ class Follower:
     def _outside(
         self, mirror: Mirror, waiting: Waiting, took: float, now: float
     ) -> Mirror:
-        """Raise an alarm about a time outside its range."""
+        """Return the mirror, with a warning about a command's time outside its range."""
         longer = "less"
         if took > waiting.most_s:
             longer = "more"
@@ -698,7 +708,9 @@ def _wider(found: Range) -> Range:
 
 
 def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
-    """Bring the motors of a move to rest, except those that another move has sent on."""
+    """Return the mirror with the motors of a move at rest, except those that another move
+    has sent on.
+    """
     for name in () if waiting is None else waiting.targets:
         if waiting is not None and _stays(mirror, name, waiting):
             mirror = replace(
@@ -749,7 +761,14 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
 
 
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
-    """Format the record's line of a command that a script can have."""
+    """Format the log line of a command that a script can have, once; empty for others.
+
+    Args:
+        waiting: record of the command.
+        wait: its wait.
+        took: its own time [s].
+        reply: of the machine.
+    """
     command = waiting.heard.command
     words = waiting.heard.words
     if waiting.written or command is None:

@@ -814,7 +814,7 @@ class ConeVec:
 
 
 def check_shape(shape: Shape2) -> Shape2:
-    """Check that (rows, cols) are positive integers; raise GeometryError otherwise."""
+    """Return (rows, cols) as integers; raise GeometryError unless both are positive."""
     rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
         what = f"detector shape {shape!r}; allowed: (rows, cols), both positive"

@@ -111,7 +111,9 @@ _KEY_LIMITS: Final = {
 
 
 def _one_word(name: str) -> str:
-    """Check that a name is one printable word of at most 100 characters."""
+    """Return a name if it is one printable word of at most 100 characters; raise
+    PydanticCustomError otherwise.
+    """
     if not (
         0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)
     ):
@@ -525,7 +527,7 @@ class EStop(_Frozen):
 
 
 def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
-    """Check that priors name offsets."""
+    """Return priors if they name offsets; raise PydanticCustomError otherwise."""
     for name in priors:
         if name not in NAMES:
             raise _refused(name, priors[name], f"a known offset: {', '.join(NAMES)}")
@@ -846,7 +848,7 @@ def _refuse_if(wrong: bool, at: str, value: object, allowed: str) -> None:
 
 
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
-    """Make the error for an axis that `machine` does not have."""
+    """Make the error for an axis that `machine` does not have; returned, not raised."""
     allowed = [*machine.axes, *machine.virtual_axes]
     return UnknownNameError.among(
         f"unknown axis {name!r}; {machine.name} has", name, allowed
@@ -1157,7 +1159,9 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 
 
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
-    """Write into `source` which values come from this file and which from the base."""
+    """Write into `merged["source"]` which values come from this file and which from the
+    base.
+    """
     if own and isinstance(old.get("source"), str) and "source" not in own:
         keys = ", ".join(key for key in own if key != "name")
         merged["source"] = (

@@ -174,7 +174,14 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 def braked_at(
     drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """Make `drives` follow `trajectories` and brake along their path from `at` on."""
+    """Return `drives` that follow `trajectories` and brake along their path from `at` on.
+
+    Args:
+        drives: motors; not changed.
+        at: start of braking [s].
+        trajectories: motor -> trajectory.
+        most: motor -> greatest acceleration; None: as planned.
+    """
     following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
     braked = braked_along(following, at, most)
     return {
@@ -292,7 +299,7 @@ class _State:
 
 
 def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
-    """Evaluate a motor at programme time `s`."""
+    """Evaluate a motor's velocity, acceleration and limit at programme time `s`."""
     leg = drive.at(s)
     velocity, acceleration, until = leg.law(s)
     return _State(

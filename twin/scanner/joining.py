@@ -427,7 +427,14 @@ class Lookahead:
         return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
 
     def halted_at_once(self, contact: Contact) -> Trajectories | None:
-        """Slow what is under way along its path from now on, if it rests before a contact."""
+        """Slow what is under way along its path from now on.
+
+        Args:
+            contact: ahead on it.
+
+        Returns:
+            Motor -> trajectory; None if it does not rest before the contact.
+        """
         if (
             programme_time_at_rest(self.drives, self.now, self.hardest)
             > contact.last_free_time

@@ -161,7 +161,9 @@ def after_free_motion(safety: Safety) -> Safety:
 
 
 def estopped(safety: Safety, by: str) -> Safety:
-    """Record a press of the E-stop, perhaps a repeated one: the next stop."""
+    """Return the state after a press of the E-stop, perhaps a repeated one: each is the
+    next stop.
+    """
     reason = "the E-stop is in force"
     return replace(
         safety, state="estopped", reason=reason, stop=safety.stop + 1, stopped_by=by

@@ -371,7 +371,13 @@ class _Writer(MotorTargets):
     def go(
         self, *quantities: str, place: ScanPosition | None = None, shift: float = 0.0
     ) -> Iterator[str]:
-        """Yield moves of the motors of `quantities` alone to their station."""
+        """Yield moves of the motors of `quantities` alone to their station.
+
+        Args:
+            *quantities: such as object_y.
+            place: of the sample; None: the request's SOD.
+            shift: of the detector sideways [mm].
+        """
         if place is None:
             at = ScanPosition(self.request.sod_mm)
         else:

@@ -22,7 +22,14 @@ from flexdt.server.twin.handlers import handler as h
 async def apply(
     twin: TwinServer, client: h.Client, params: p.CalibrationApply
 ) -> p.CorrectionResult:
-    """Apply a new correction instead of the last one."""
+    """Make a correction, put it in force instead of the last one, and save both.
+
+    The answer warns of motion that was halted because it would collide now.
+
+    Raises:
+        RpcError: -32602, the name is taken; -32003, the client has lost control.
+        CollisionError: bodies would be too close; nothing changes.
+    """
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
         history = twin.corrections.after(correction)
@@ -68,7 +75,9 @@ async def list_all(
 
 @h.answers(p.CALIBRATION_REVERT)
 async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.CorrectionResult:
-    """Apply the previous correction, or none."""
+    """Put the previous correction in force, or none; the answer warns of motion that was
+    halted.
+    """
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
@@ -109,7 +118,9 @@ async def delete(
 
 
 def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.CorrectionResult:
-    """Notify subscribers; motion that would collide in the new geometry has been halted."""
+    """Log a message and its warnings for all clients, and make the answer with the
+    correction in force.
+    """
     twin.tell("info", message)
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")

@@ -98,7 +98,9 @@ def ensure_idle(
 
 
 async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[View]:
-    """Apply `view` to each item; other requests are handled meanwhile."""
+    """Apply `view` to each item and return the results; other requests are handled
+    between them.
+    """
     views = []
     for at, item in enumerate(items, start=1):
         views.append(view(item))

@@ -158,7 +158,7 @@ async def forget(
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
-    """Return the status once `condition` holds, or after PATIENCE_S in any case."""
+    """Wait until `condition` holds, at most PATIENCE_S, and return the job's status."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + PATIENCE_S
     while not condition() and loop.time() < deadline:
@@ -167,7 +167,9 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
 
 
 def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
-    """Return the status of a job that is to continue, or raise if an obstacle blocks it."""
+    """Return the status of a job that is to continue; raise the CollisionError of one
+    that is paused by an obstacle.
+    """
     error = None
     if job.runner is not None:
         error = job.runner.progress.error

@@ -53,7 +53,12 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
 
 
 async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
-    """Wait until the motors rest; warnings: those that do not rest where they were to go."""
+    """Wait until the motors rest, and list a warning for each that rests elsewhere.
+
+    Args:
+        twin: whose motors.
+        wanted: motor -> target [mm, deg].
+    """
     await twin.motion_ended(wanted)
     reached = twin.scanner.positions(twin.clock.now())
     return [
@@ -124,7 +129,9 @@ async def _move_around_obstacles(
 
 @answers(p.AXES_JOG)
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
-    """Run until the lease ends (`twin.motion.drives.plan_jog`), or as far as it is free."""
+    """Run an axis until the lease ends (`twin.motion.drives.plan_jog`), or as far as it
+    is free; a way around obstacles is cancelled.
+    """
     with _cancelling_detour(twin):
         jogged = twin.scanner.jog(
             params.axis, params.velocity, params.lease_s, twin.clock.now()
@@ -156,7 +163,9 @@ async def set_axis(
 
 @answers(p.AXES_STOP)
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Bring the motors to rest; a running scan pauses."""
+    """Bring the motors to rest; a running scan pauses, a way around obstacles is
+    cancelled.
+    """
     twin.detours.cancel()
     twin.interrupt("stop")
     stopping = twin.scanner.stop(twin.clock.now())
@@ -166,7 +175,9 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 
 @answers(p.SAFETY_ESTOP)
 def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Stop as the machine's E-stop does, X-rays off; a running scan pauses."""
+    """Stop as the machine's E-stop does, X-rays off, and save that it is in force; a
+    running scan pauses.
+    """
     twin.detours.cancel()
     twin.interrupt("E-stop")
     in_force = twin.scanner.safety.state == "estopped"

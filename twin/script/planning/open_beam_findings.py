@@ -86,7 +86,18 @@ def brightest_beam(
     indices: list[int],
     physics: Physics,
 ) -> OpenBeam | None:
-    """Predict the brightest open beam of some images of a setting."""
+    """Predict the brightest open beam of some images of a setting.
+
+    Args:
+        plan: with the positions.
+        exposure: of the setting.
+        camera: of the setting.
+        indices: of the images.
+        physics: how counts are predicted.
+
+    Returns:
+        The beam; None if the physics cannot predict it.
+    """
     beams = [
         beam
         for view in _views(plan, camera, indices)

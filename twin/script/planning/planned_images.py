@@ -198,7 +198,16 @@ class ImageCollector:
     # commands ------------------------------------------------------------------------------
 
     def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
-        """Simulate `take image`: one image; the number of frames is for sequences."""
+        """Simulate `take image`: add one image; the number of frames is for sequences.
+
+        Args:
+            command: without arguments.
+            now: moment of the script [s].
+            step: index of the command's step.
+
+        Returns:
+            The time that the command takes.
+        """
         self._add_images(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
@@ -288,7 +297,9 @@ class ImageCollector:
     # time ----------------------------------------------------------------------------------
 
     def _keep_busy(self, start: float, length: float, kind: str) -> planned.Span:
-        """Keep the camera busy for `length` [s] and the overhead of `kind`."""
+        """Keep the camera busy for `length` [s] and the overhead of `kind`; return that
+        time span.
+        """
         overhead = self.machine.timing.seconds(kind)
         end = start + length + overhead
         self.camera.free_at = end
@@ -497,7 +508,9 @@ class ImageCollector:
             self._default("power_W", "the tube power", f"{draft.power_W:g} W")
 
     def _default(self, name: str, what: str, value: str) -> None:
-        """Warn once if the script states no value of a setting."""
+        """Warn, once, that the script states no value of setting `name`; `value` of the
+        machine file is assumed.
+        """
         if name not in self.camera.said | self.tube.said | self._reported:
             self._reported.add(name)
             self.findings.warn(

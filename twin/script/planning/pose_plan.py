@@ -162,7 +162,15 @@ def _arrival(
 
 
 def _legs(start: Pose, end: Pose, route: Route | None = None) -> Sequence[Pose] | None:
-    """List the moves between two poses: those of `route`, or all motors at once."""
+    """List the moves between two poses: those of `route`, or all motors at once.
+
+    Args:
+        start, end: motor -> position [mm, deg].
+        route: finds a free path; None: the direct one.
+
+    Returns:
+        Moves in order; None if the route finds none.
+    """
     goal = {axis: value for axis, value in end.items() if value != start[axis]}
     if route is None:
         return [goal] if goal else []

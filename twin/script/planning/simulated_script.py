@@ -166,7 +166,9 @@ class Simulation:
         return self.timed("command", note=" (no effect)")
 
     def _sample_info(self, command: c.SetSampleInfo) -> planned.Span:
-        """Take the sample's size from the argument, if it has one."""
+        """Set the sample's size from the argument, if it states one; return the time that
+        the command takes.
+        """
         size = sample_size(command.data)
         if size is not None:
             self.sample = size
@@ -198,7 +200,9 @@ class Simulation:
     # tube ----------------------------------------------------------------------------------
 
     def _xray_on(self, _command: c.XrayOn) -> planned.Span:
-        """Switch X-rays on, unless they are."""
+        """Switch X-rays on, unless they are, and set when they are ready; return the time
+        that it takes.
+        """
         if self.tube.on:
             return self.timed("command", note=" (already on)")
         span = self.timed("xrayon")
