@@ -63,7 +63,7 @@ def wrong(value: object, where: str, allowed: str) -> PhantomError:
 
 
 def mapping(value: object, where: str) -> Mapping[str, object]:
-    """Check that `value` is an object with named fields."""
+    """Return `value` if it is an object with named fields; raise PhantomError otherwise."""
     if not isinstance(value, Mapping):
         raise wrong(value, where, "an object")
     return value
@@ -110,7 +110,7 @@ def fields(
 
 
 def string(value: object, where: str) -> str:
-    """Check that `value` is a text of bounded length."""
+    """Return `value` if it is a text of bounded length; raise PhantomError otherwise."""
     if not isinstance(value, str) or len(value) > MAX_TEXT:
         raise wrong(value, where, f"a text of at most {MAX_TEXT} characters")
     return value
@@ -147,12 +147,12 @@ def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[
 
 
 def vector(value: object, where: str) -> analytic.Vector:
-    """Check that `value` is three finite numbers."""
+    """Return `value` as three finite numbers; raise PhantomError otherwise."""
     return _three(value, where, number)
 
 
 def lengths(value: object, where: str) -> analytic.Vector:
-    """Check that `value` is three numbers above 0."""
+    """Return `value` as three numbers above 0 [mm]; raise PhantomError otherwise."""
     return _three(value, where, positive)
 
 
@@ -224,7 +224,7 @@ PACK: Final = PlainSerializer(_pack, when_used="json")
 
 
 def _count(value: object, where: str) -> int:
-    """Check that `value` is a whole number from 0."""
+    """Return `value` if it is a whole number from 0; raise PhantomError otherwise."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise wrong(value, where, "a whole number from 0")
     return value

@@ -47,7 +47,9 @@ def payload(value: object) -> object:
 
 
 def no_truth(value: object) -> object:
-    """Check that a value is not true or false, which Python accepts as numbers."""
+    """Return a value that is not true or false, which Python accepts as numbers; raise
+    ValueError for those.
+    """
     if isinstance(value, bool):
         raise ValueError("a number is needed, not true or false")
     return value
@@ -59,14 +61,18 @@ def encoded(name: str) -> str:
 
 
 def line(value: str) -> str:
-    """Check that a text has no control characters or line ends."""
+    """Return a text without control characters and line ends; raise ValueError for any
+    other.
+    """
     if _CONTROL_CHARACTER.search(value):
         raise ValueError("control characters and line ends are not allowed")
     return value
 
 
 def lines(value: str) -> str:
-    """Check that a text has no control characters except TAB and line ends."""
+    """Return a text without control characters except TAB and line ends; raise ValueError
+    for any other.
+    """
     if _CONTROL_BUT_LINE_END.search(value):
         raise ValueError("control characters but TAB and line ends are not allowed")
     return value

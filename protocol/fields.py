@@ -134,7 +134,9 @@ class Params(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _few(cls, value: object) -> object:
-        """Reject an object with far more members than fields before they are validated."""
+        """Return the value unchanged; raise ValueError for an object with far more
+        members than fields, before they are validated.
+        """
         fields = cls.model_fields
         if isinstance(value, Mapping) and len(value) > len(fields) + MAX_UNKNOWN:
             raise ValueError(

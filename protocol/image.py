@@ -117,10 +117,14 @@ def _wire_dtype(name: str) -> np.dtype[np.generic]:
 
 
 def _shape(value: object) -> tuple[int, ...]:
-    """Check that a shape is a list of up to four sizes.
+    """Convert a shape to a tuple of up to four sizes.
+
+    Args:
+        value: of the field `shape`.
 
     Raises:
-        RpcError: -32602, anything else.
+        RpcError: -32602, no list, more than four, or a size that is no whole number from
+            0 to 2^31.
     """
     if (
         not isinstance(value, (list, tuple))

@@ -114,10 +114,10 @@ def parse_params(
 
 
 def parse_result(model: type[_M], given: object) -> _M:
-    """Validate a result against its model (for clients).
+    """Validate a result against its model (for clients) and return it as that model.
 
     Raises:
-        RpcError: -32603, the server's answer does not match the protocol.
+        RpcError: the answer does not fit the model.
     """
     try:
         return model.model_validate(given)

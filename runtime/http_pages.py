@@ -269,7 +269,9 @@ def _application(
             return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
 
     def application(asked: dict[str, Any], start: Callable[..., object]) -> list[bytes]:
-        """Answer a request, as WSGI has it."""
+        """Answer a request, as WSGI has it: begin the response by `start`, and return its
+        body.
+        """
         page = response(asked)
         body = page.text.encode()
         head = {

@@ -54,8 +54,8 @@ def in_notebook() -> bool:
     return getattr(shell, "kernel", None) is not None
 
 
-def told_time(done: float | None, seconds: float, left_s: float | None) -> str:
-    """Say how far work is and how long it takes.
+def time_words(done: float | None, seconds: float, left_s: float | None) -> str:
+    """Format how far work is and how long it takes.
 
     Args:
         done: fraction; None where nobody knows.
@@ -63,7 +63,7 @@ def told_time(done: float | None, seconds: float, left_s: float | None) -> str:
         left_s: estimate of the time left [s]; None where there is none.
 
     Example:
-        >>> told_time(0.25, 10.0, 30.0), told_time(None, 3.2, None)
+        >>> time_words(0.25, 10.0, 30.0), time_words(None, 3.2, None)
         ('25 %, 10 s, about 30 s left', '3 s')
     """
     if done is None:
@@ -87,7 +87,9 @@ class Lines:
         self, what: str, done: float | None, seconds: float, left_s: float | None
     ) -> None:
         """Write a line."""
-        self._log.warning("flexdt: still %s (%s)", what, told_time(done, seconds, left_s))
+        self._log.warning(
+            "flexdt: still %s (%s)", what, time_words(done, seconds, left_s)
+        )
 
     def close(self) -> None:
         """Leave the lines where they are."""
@@ -101,8 +103,15 @@ class TerminalBar:
     def show(
         self, what: str, done: float | None, seconds: float, left_s: float | None
     ) -> None:
-        """Draw over what was drawn before."""
-        time = told_time(done, seconds, left_s)
+        """Draw the bar over the one drawn before.
+
+        Args:
+            what: name of the work.
+            done: fraction, 0 to 1; None, if unknown, draws no bar.
+            seconds: since the work began.
+            left_s: time left [s]; None if unknown.
+        """
+        time = time_words(done, seconds, left_s)
         text = f"{what} {time}"
         if done is not None:
             full = round(WIDTH_CHARS * min(max(done, 0.0), 1.0))
@@ -142,7 +151,7 @@ class NotebookBar:
         value = ""
         if done is not None:
             value = f' value="{done:.3f}"'
-        text = f"{html.escape(what)} {told_time(done, seconds, left_s)}"
+        text = f"{html.escape(what)} {time_words(done, seconds, left_s)}"
         self._draw(
             f'<progress max="1"{value} aria-label="{html.escape(what)}"></progress> {text}'
         )

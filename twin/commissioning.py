@@ -490,8 +490,19 @@ def zero_offsets(
     def fitted(
         sides: FloatArray, rest: list[float], sigmas: list[float], *names: str
     ) -> tuple[FloatArray, FloatArray]:
-        """Put the first name's line and the other's value into `lines`; the rows beyond those
-        of the scans are priors, of the drift first."""
+        """Fit the first name's line and the other's value, put them into `lines`, and
+        note scans that contradict.
+
+        Args:
+            sides: (scans + priors, k) design matrix; rows beyond those of the scans are
+                priors, of the drift first.
+            rest: right-hand sides.
+            sigmas: of these.
+            *names: of one or two offsets.
+
+        Returns:
+            Values (k,) and covariance (k, k).
+        """
         at, covariance, pulls = _fit(sides, np.array(rest), np.array(sigmas), len(told))
         widths = np.sqrt(np.diag(covariance)).tolist()
         for name, i in zip(names, (0, 2), strict=False):

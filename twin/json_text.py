@@ -9,20 +9,7 @@ BYTE_ORDER_MARK: Final = "\ufeff"
 
 
 def parse_json(text: str, kind: type[dict[str, Any]] = dict) -> Any:
-    """Parse a document.
-
-    Args:
-        text: with or without a byte order mark.
-        kind: of its objects.
-
-    Raises:
-        ValueError: it is none, nests too deep, or holds a number of thousands of digits; says
-            so.
-
-    Example:
-        >>> parse_json("\ufeff[1]")
-        [1]
-    """
+    """Parse a JSON document to plain Python values."""
     try:
         return json.loads(text.removeprefix(BYTE_ORDER_MARK), object_pairs_hook=kind)
     except json.JSONDecodeError:

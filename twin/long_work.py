@@ -61,7 +61,7 @@ class Passes:
         self.advance: Advance = ignore
 
     def step(self) -> None:
-        """Note that a part has been seen."""
+        """Count one more pass and report the fraction done, which approaches 1."""
         self._seen += 1
         passes = self._seen / self._count
         self.advance(1.0 - 1.0 / (1.0 + passes))

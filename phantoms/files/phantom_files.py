@@ -100,7 +100,7 @@ def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Ph
 
 
 def _version(value: object, where: str) -> object:
-    """Check the version of a document."""
+    """Return the version of a document if it can be read; raise PhantomError otherwise."""
     if value != 1:
         raise reading.wrong(value, where, "1")
     return value
@@ -251,7 +251,7 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
 
 
 def _unit(value: object, where: str) -> object:
-    """Check the name of a length unit."""
+    """Return the name of a length unit; raise PhantomError for another."""
     if value not in UNITS_MM:
         raise reading.wrong(value, where, ", ".join(UNITS_MM))
     return value

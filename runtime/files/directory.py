@@ -444,7 +444,9 @@ class Directory:
                 self._idle.notify_all()
 
     def _open_below(self, above: Directory) -> int | None:
-        """Open the descriptor relative to the directory above, without following a link."""
+        """Open the descriptor relative to the directory above, without following a link;
+        None on a system without.
+        """
         if not _RELATIVE:
             return None
         with above._opened() as fd:

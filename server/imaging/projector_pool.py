@@ -193,8 +193,9 @@ class ProjectorPool:
                 task.cancel()
 
     def _free_member(self, asked: set[_Member], now: float) -> _Member | None:
-        """Choose the next projector: of the free ones that with least to do,
-        then the fastest."""
+        """Choose the next projector: of the free ones that with least to do, then the
+        fastest; None if none is free.
+        """
         limit = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (
             m

@@ -285,7 +285,8 @@ def _document() -> object:
 def _accumulator(
     context: Context, name: str | None, grid: wire.VoxelGrid
 ) -> Volume | None:
-    """Return the named volume that a back projection is added to, or None.
+    """Return the volume called `name`, to which a back projection is added; None if there
+    is none, or no name.
 
     Raises:
         RpcError: it is not a volume of this grid.
@@ -304,7 +305,7 @@ def _warnings(doubts: list[str]) -> dict[str, list[str]]:
 
 
 def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | TriangleMesh:
-    """Check a volume's values, and make its projection layout.
+    """Check a volume's values, make its projection layout, and return the volume; blocks.
 
     Args:
         volume: complete.

@@ -310,7 +310,13 @@ class Submissions:
         ensure_allowed()
 
         async def prepare() -> JobInputs:
-            """Check the scan again at its turn, and open its data set."""
+            """Check the scan again at its turn, and open its data set; return the inputs
+            of the job.
+
+            Raises:
+                RpcError: it may not run any more; DatasetWriteError: the data set cannot
+                    be opened.
+            """
             begun = job_record
             if (
                 not resume

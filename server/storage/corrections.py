@@ -284,7 +284,11 @@ def _read_history(data: bytes) -> History:
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
-    """Parse a correction and its origin, and check that it is plausible."""
+    """Parse a correction and its origin (or None), and check that it is plausible.
+
+    Raises:
+        ValueError, TwinError: no correction, or an implausible one.
+    """
     document = CorrectionFile.model_validate(own.read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)

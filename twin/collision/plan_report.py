@@ -92,7 +92,9 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
 def _least(
     search: PathSearch, contacts: Sequence[Contact]
 ) -> tuple[float, tuple[str, str] | None]:
-    """Find the least clearance [mm] and its pair; with contacts, those of the worst."""
+    """Find the least clearance [mm] and its pair (None if nothing is near); with
+    contacts, those of the worst.
+    """
     if contacts:
         worst = min(contacts, key=lambda c: c.clearance_mm)
         return worst.clearance_mm, worst.pair

@@ -664,10 +664,16 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
 
 
 def _validated(model: type[_M], content: object, file: str) -> _M:
-    """Validate content of `file` as a model.
+    """Validate content of `file` as a model, and return the model.
+
+    Args:
+        model: its class.
+        content: plain data.
+        file: name for error messages.
 
     Raises:
-        DatasetFormatError: the content does not fit; names file, key and value.
+        DatasetFormatError: the content does not fit; names file, key and value, for at
+            most 10 problems.
     """
     try:
         return model.model_validate(content)

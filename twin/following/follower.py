@@ -197,7 +197,9 @@ class Follower:
         return _alarm(mirror, now, "error", "lost", "link", what)
 
     def told(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
-        """Update the mirror with the alarms of `ahead`; those it has already are not new."""
+        """Return the mirror with the alarms of `ahead`: new ones are added, those that
+        are over end.
+        """
         found = tuple(alarms)
         still = {(a.kind, a.about) for a in found}
         kept = {k for k in mirror.active if not k[1].startswith("ahead") or k in still}

@@ -231,10 +231,8 @@ class Mirror:
         )
 
     def asked(self, reply: Heard) -> Waiting | None:
-        """Find the waiting command that `reply` belongs to: the one of its key.
-
-        Of several it is that of the same words, then that of the same tick, then the
-        oldest. Where there is no UUID, the arguments are the same, too, or left out.
+        """Find the waiting command that `reply` belongs to: the one of its key; None if
+        there is none.
         """
 
         def alike(asked: Waiting) -> tuple[bool, bool]:

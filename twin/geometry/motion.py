@@ -23,7 +23,7 @@ MOVABLE: Final = ("dO_x", "dO_y", "dO_z", "alpha", "dS_x", "dS_y", "dD_x", "dD_y
 
 
 def require_movable(names: Sequence[str]) -> Sequence[str]:
-    """Check that named parameters may move.
+    """Return the names if all are parameters that may differ from frame to frame.
 
     Raises:
         UnknownNameError: lists those that can.

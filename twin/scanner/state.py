@@ -107,7 +107,7 @@ class StagePlacement:
 
     @property
     def rotation(self) -> FloatArray:
-        """T_object_sample, rotation part, (3, 3)."""
+        """Turn of the sample on the stage, object from sample frame, (3, 3)."""
         rx, ry, rz = (math.radians(a) for a in (self.rx, self.ry, self.rz))
         turned: FloatArray = rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx)
         return turned

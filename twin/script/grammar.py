@@ -303,8 +303,17 @@ def vocabulary(component: str) -> tuple[str, ...]:
 
 
 def find(component: str, command: str) -> Spec | None:
-    """Look up the command of `component`, case and blanks aside; motors
-    share one vocabulary."""
+    """Look up the command of `component`, case and blanks aside; motors share one
+    vocabulary.
+
+    Args:
+        component: first column of a row; an unknown name is taken for a motor.
+        command: its name, as in the second column.
+
+    Returns:
+        Type, reader and number of arguments of the command; None if there is no such
+        command.
+    """
     table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
     spec = table.get(command.lower())
     if spec is not None:

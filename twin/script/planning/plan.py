@@ -216,7 +216,9 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     @cached_property
     def exposures(self) -> tuple[Exposure, ...]:
-        """Every image, one by one."""
+        """Every image of the plan as one value, in the order of time; long plans have
+        many.
+        """
         names = list(self.image_positions)
         rows = np.array([self.image_positions[n] for n in names]).T.tolist()
         out: list[Exposure] = []
