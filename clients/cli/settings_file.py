@@ -184,8 +184,17 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
 def _require_known(
     where: str, given: Iterable[str], known: Collection[str], tables: Sequence[str] = ()
 ) -> None:
-    """Check the keys of a table, or those outside all tables; the error lists keys and
-    tables."""
+    """Check the keys of a table, or those outside all tables.
+
+    Args:
+        where: beginning of the message.
+        given: keys.
+        known: the allowed ones.
+        tables: names of tables that are allowed, too.
+
+    Raises:
+        CommandError: an unknown key; lists keys and tables.
+    """
     for key in given:
         if key not in known:
             allowed = ", ".join((*known, *tables))

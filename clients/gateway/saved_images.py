@@ -281,8 +281,15 @@ def kind_of_file(file: str) -> FrameKind:
 
 
 def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:
-    """Copy an image, which never changes, into the folder: as a link if the disk has
-    links."""
+    """Copy an image, which never changes, from one folder into another: as a link if the disk
+    has links. Nothing happens where it cannot be copied.
+
+    Args:
+        name: of the file.
+        source: folder.
+        files: the other folder.
+        linked: try a link.
+    """
     with suppress(OSError, NotImplementedError):
         if linked:
             source.link(name, name, files)

@@ -38,7 +38,13 @@ LIGHT, DARK = (246, 248, 251), (16, 19, 25)
 
 
 def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
-    """Render a view as PNG, on the page's background.
+    """Render a client's view as PNG, on the page's background.
+
+    Args:
+        client: renders it.
+        width: [px].
+        height: [px].
+        dark: the page's colours.
 
     Raises:
         RuntimeError, TimeoutError: the browser does not answer.

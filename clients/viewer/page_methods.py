@@ -744,7 +744,13 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
 async def serve(
     name: str, viewer: Viewer, page: Page, given: Mapping[str, Any]
 ) -> object:
-    """Answer one request of a page.
+    """Answer one request of a page: check its parameters and call the method.
+
+    Args:
+        name: of METHODS.
+        viewer: the viewer.
+        page: that asks.
+        given: parameters.
 
     Raises:
         RpcError: -32602 with every problem of the parameters, or an error of the twin's code.

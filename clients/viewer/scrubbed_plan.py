@@ -94,6 +94,13 @@ async def make(
 ) -> Made:
     """Plan a script, in a process of its own where that may take long.
 
+    Args:
+        workers: these processes.
+        text: of the script.
+        machine: its machine.
+        profile: its profile.
+        state: of the twin, from which the script starts; None: from home.
+
     Raises:
         ScriptError: it does not parse.
         RpcError: it has too many images, or takes too long or too much memory.
@@ -129,7 +136,7 @@ def _made(text: str, machine: Machine, profile: Profile, state: State | None) ->
 def plan_text(
     text: str, machine: Machine, profile: Profile, state: State | None
 ) -> ScanPlan:
-    """Plan a script.
+    """Plan a script from the twin's positions on, or from the machine's start without a state.
 
     Raises:
         ScriptError: it does not parse.
@@ -192,8 +199,17 @@ def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
 def source_path(
     at: Mapping[str, FloatArray], machine: Machine, profile: Profile, state: State
 ) -> FloatArray:
-    """Compute the focal spot in the sample's frame (n, 3) [mm], for motor positions
-    (n,) [mm, deg]."""
+    """Compute the focal spot's path in the sample's frame.
+
+    Args:
+        at: axis -> positions (n,) [mm, deg].
+        machine: its machine.
+        profile: its profile.
+        state: gives camera and correction.
+
+    Returns:
+        (m, 3) [mm], about ORBIT_POINTS of the n.
+    """
     count = len(next(iter(at.values()), ()))
     if not count:
         return np.zeros((0, 3))

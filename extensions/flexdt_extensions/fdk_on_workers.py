@@ -129,7 +129,14 @@ def create(path: Path, grid: Grid) -> Any:
 
 
 def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
-    """Fill slab number `slab` with values (k, ny, nx), at each resolution."""
+    """Write a slab of a volume into its store, at each resolution.
+
+    Args:
+        group: of the store.
+        grid: of the volume.
+        slab: its number.
+        values: (k, ny, nx).
+    """
     first, _ = slabs(grid)[slab]
     for level in range(len(levels(grid))):
         start = first >> level

@@ -217,7 +217,14 @@ def _left_by_priors(
     loose_fit: FitResult,
     explained: Sequence[Finding],
 ) -> list[Finding]:
-    """Return the findings that remain with wider priors, where priors are off."""
+    """Return the findings that remain with wider priors, where priors are off.
+
+    Args:
+        state: the scans and their measurements.
+        usual: request with its priors.
+        loose_fit: the fit with wider ones.
+        explained: findings with the priors; one on the beads' tolerance stays.
+    """
     priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
     moved = [

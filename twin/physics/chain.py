@@ -281,7 +281,17 @@ def radiographs(
 def _as_line_integrals(
     chain: Chain, expected: Expected, view: FloatArray, exposure: ExposureSettings
 ) -> Float32Array:
-    """Compute -log of the signal over the open beam's, (rows, cols)."""
+    """Compute -log of the expected signal over the open beam's.
+
+    Args:
+        chain: tube and detector.
+        expected: the image.
+        view: cone_vec row (12,).
+        exposure: tube and time.
+
+    Returns:
+        (rows, cols).
+    """
     area = np.float32(weights_of(chain, exposure.kV)[0].sum() * mAs(exposure))
     least = np.float32(1e-6)
     lines = np.log(np.maximum(area * flux_of(view, expected.mean_e.shape), least))

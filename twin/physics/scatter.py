@@ -316,8 +316,18 @@ def scatter_image(
 def _energy_chances(
     thing: Object, row: FloatArray, mu: FloatArray, share: FloatArray
 ) -> FloatArray:
-    """Compute the chances to draw each energy, (s,): half as in the open beam, half as
-    behind the thickest part, where hard photons make most of the signal."""
+    """Compute the chances to draw each energy: half as in the open beam, half as behind the
+    thickest part, where hard photons make most of the signal.
+
+    Args:
+        thing: the object.
+        row: cone_vec row (12,).
+        mu: (materials, s) attenuations.
+        share: (s,) of each energy in the open beam.
+
+    Returns:
+        (s,), adding up to 1.
+    """
     axis = int(np.argmax(np.abs(np.cross(row[6:9], row[9:12]))))
     columns = thing.amounts.sum(axis=2 - axis, dtype=np.float64) * thing.voxel_mm[axis]
     thickest = columns.reshape(-1, len(mu))[np.argmax(columns.sum(axis=-1))]

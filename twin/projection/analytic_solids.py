@@ -259,8 +259,16 @@ def _pixels(
     ahead: npt.NDArray[np.bool_],
     shape: tuple[int, int],
 ) -> IntArray:
-    """Convert real ranges (n, 2) of columns and rows to whole pixels (n, 4); all if not
-    `ahead`.
+    """Convert ranges of columns and rows to whole pixels.
+
+    Args:
+        low: (n, 2) least column and row.
+        high: (n, 2) largest.
+        ahead: (n,) the range is known; otherwise all pixels are taken.
+        shape: (rows, cols).
+
+    Returns:
+        (n, 4) first row, row after the last, first column, column after the last.
     """
     first = np.where(ahead[:, None], np.ceil(low - 1e-6), 0).clip(0, shape[::-1])
     last = np.where(ahead[:, None], np.floor(high + 1e-6) + 1, np.inf).clip(

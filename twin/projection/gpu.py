@@ -292,7 +292,17 @@ def demand(work: Callable[[], Any]) -> Any:
 def project_there(
     box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]
 ) -> Any:
-    """Project a volume on the device to images (n, rows, cols) that stay there."""
+    """Project a volume on the device to images that stay there.
+
+    Args:
+        box: the layout's voxels.
+        voxels: of the layout, on the device.
+        views: (n, 12) rays in voxels.
+        shape: (rows, cols).
+
+    Returns:
+        (n, rows, cols) on the device.
+    """
     from numba import cuda
 
     images = cuda.device_array(len(views) * shape[0] * shape[1], np.float32)

@@ -175,8 +175,17 @@ def stacked(
     seen: npt.NDArray[np.bool_],
     pairs: npt.NDArray[np.intp],
 ) -> FloatArray:
-    """Compute eqs. 5.9, 5.10 and 5.11 stacked [px], from (frames, beads, 2) and
-    `bead_pairs`."""
+    """Compute the residuals of eqs. 5.9, 5.10 and 5.11, one after the other.
+
+    Args:
+        predicted: (frames, beads, 2) [px].
+        measured: (frames, beads, 2) [px].
+        seen: (frames, beads).
+        pairs: (m, 3) frame and two beads, of `bead_pairs`.
+
+    Returns:
+        Coordinates of seen beads, then distances of pairs [px].
+    """
     frame, a, b = pairs.T
     near = np.linalg.norm(predicted[frame, a] - predicted[frame, b], axis=1)
     real = np.linalg.norm(measured[frame, a] - measured[frame, b], axis=1)

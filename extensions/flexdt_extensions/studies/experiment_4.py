@@ -146,7 +146,17 @@ def true_angles(name: str, used: int) -> FloatArray:
 
 
 def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArray:
-    """Project the beads under a truth (six values of `SIX`), (used, k, 2) [px]."""
+    """Project the beads of a scan under a truth.
+
+    Args:
+        name: of the scan.
+        truth: the six values of `SIX`.
+        used: number of projections.
+        model: k beads.
+
+    Returns:
+        (used, k, 2) [px].
+    """
     angle = math.radians(truth[3])
     poses = poses_of(name, true_angles(name, used) + angle)
     poses = replace(

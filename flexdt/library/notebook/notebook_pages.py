@@ -282,7 +282,14 @@ def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.ui
 
 
 def _slider(count: int, what: str, handler: str, start: int) -> str:
-    """Write a slider at position `start`; hidden for a single picture."""
+    """Write a slider as HTML; hidden for a single picture.
+
+    Args:
+        count: positions.
+        what: its label.
+        handler: JavaScript to call when it moves.
+        start: first position.
+    """
     hidden = " hidden" if count < 2 else ""
     return (
         f'<input type="range" min="0" max="{max(count - 1, 0)}" value="{start}" '

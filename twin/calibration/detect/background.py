@@ -95,8 +95,14 @@ def _bends(
     variance: FloatArray,
     valid: npt.NDArray[np.bool_],
 ) -> bool:
-    """Check whether bent terms explain much in the median window, and most of its
-    residuals: they do not explain edges.
+    """Check whether bent terms explain much in the median window, and most of its residuals:
+    they do not explain edges.
+
+    Args:
+        gain: (m,) squares that bent terms explain, in units of the variance.
+        curved: (m,) sums of squares that they leave.
+        variance: (m,) of a block's mean.
+        valid: (m, b) usable blocks.
     """
     free = float(np.median(valid.sum(axis=1)))
     left = float(np.median(curved / np.maximum(variance, 1e-12))) - free

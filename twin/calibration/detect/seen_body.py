@@ -151,8 +151,16 @@ def see_body(
 def _shift_of_beads(
     cone: ConeVec, model: BeadModel, beads: npt.NDArray[np.intp], shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute how the spot of a bead moves with the bead: (m, 2, 3) pixels (column, row)
-    a millimetre.
+    """Compute how the spot of a bead moves with the bead.
+
+    Args:
+        cone: m views.
+        model: the beads.
+        beads: (m,) number of the bead in each view.
+        shape: (rows, cols).
+
+    Returns:
+        (m, 2, 3) pixels (column, row) for a millimetre along x, y and z.
     """
     one = np.arange(len(beads))
     there = cone.project_points(model.beads, shape)[one, beads]

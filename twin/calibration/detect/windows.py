@@ -275,8 +275,16 @@ def render_windows(
 def window_intensities(
     scene: Scene, cone: ConeVec, windows: Windows, fine: int
 ) -> Float32Array:
-    """Render the transmitted share of the open beam in every window, averaged over fine x
-    fine rays a pixel, (n, k, side, side).
+    """Render the transmitted share of the open beam in every window.
+
+    Args:
+        scene: to render.
+        cone: n views.
+        windows: k windows in each.
+        fine: rays along each side of a pixel, which are averaged.
+
+    Returns:
+        (n, k, side, side), from 0 to 1.
     """
     n, k = windows.corner.shape[:2]
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)

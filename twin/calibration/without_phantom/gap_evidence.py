@@ -95,7 +95,14 @@ def find_gap(
 
 
 def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:
-    """Check whether both ends of rays agree with a gap that single frames show."""
+    """Check whether both ends of rays agree with a gap that single frames show.
+
+    Args:
+        gap: column and width [px].
+        profile: steps that both ends of rays show.
+        axis: its column [px].
+        smoothing: of the profile [px]; gaps close to the axis need no step.
+    """
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
     if abs(step.width) > SIGMAS * step.sigma:

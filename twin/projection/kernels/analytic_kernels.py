@@ -96,9 +96,16 @@ def cut_by_quadric(t0, t1, q, d, e, first):
 
 @kernel
 def add_chords(row, t0, t1, weight, d, e, first):
-    """Add weight * chord length to row.
+    """Add weight * chord length to a row of pixels.
 
-    d + column * e is the ray from source to pixel [mm].
+    Args:
+        row: (k,) changed in place.
+        t0: (k,) beginnings of the chords, in lengths of the rays.
+        t1: (k,) ends; no chord where t1 < t0.
+        weight: factor.
+        d: (3,) ray from source to pixel of column 0 [mm].
+        e: (3,) its change by a column [mm].
+        first: the first pixel's column.
     """
     for i in range(row.size):
         c = first + i

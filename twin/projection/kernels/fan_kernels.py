@@ -115,7 +115,9 @@ def put(image, buffer, starts, ends, width, top, bottom):
 
 @kernel
 def take(image, buffer, starts, ends, width, top, bottom):
-    """Apply the transpose of `put`: copy the image's pixels into the buffer."""
+    """Apply the transpose of `put`, with its arguments: copy the image's pixels into the
+    buffer.
+    """
     for r in range(top, bottom):
         row = image[r, starts[r] : ends[r]]
         at = (r - top) * width
@@ -185,8 +187,14 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
 
     @parallel
     def project_fans(box, fans, shadows, workers, out):
-        """Fill out (n, rows, cols), but for views without a job; shadows (n, 4): rows and
-        columns of each view that the box can reach.
+        """Fill out with line integrals, but for views without a job.
+
+        Args:
+            box: voxels.
+            fans: of the plan, see `FanPlan.fans`.
+            shadows: (n, 4) rows and columns of each view that the box can reach.
+            workers: number of threads.
+            out: (n, rows, cols).
         """
         _ = key
         views, lines, jobs, room, widest = fans
@@ -299,7 +307,13 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
 
 @parallel
 def open_rest(box, slices, marks):
-    """Set voxel columns to which nothing was added to zero."""
+    """Set the voxel columns to zero to which nothing was added, and which hold anything.
+
+    Args:
+        box: voxels, changed in place.
+        slices: (s, 2) ranges of z.
+        marks: (s, 2 nx ny): see `siddon_kernels.open_column`.
+    """
     for ix in prange(box.nx):
         for part in range(len(slices)):
             low, high = slices[part]

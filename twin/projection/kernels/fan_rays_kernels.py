@@ -85,8 +85,18 @@ def oriented(box, g, lines, line, rows):
 
 @kernel
 def columns_of(lines, first, last, cols, starts, ends):
-    """Find the columns between two lines in each row, starts to ends; returns the widest
-    range.
+    """Find the columns between two lines in each row.
+
+    Args:
+        lines: (m, 2) column of each line in row 0, and its slope.
+        first: number of the first line.
+        last: number of the last line.
+        cols: of the image.
+        starts: (rows,) filled with the first column.
+        ends: (rows,) filled with the column after the last.
+
+    Returns:
+        The largest number of columns in a row, 1 at least.
     """
     a, b = lines[first], lines[last]
     width = 1
@@ -99,10 +109,18 @@ def columns_of(lines, first, last, cols, starts, ends):
 
 @kernel
 def collect(found, grid, g, lines, line, starts, width, shadow):
-    """Collect the pixels of a fan; returns their number.
+    """Collect the pixels of a fan, with slope, rise and span of their rays; returns their
+    number.
 
-    starts: first column of the job's buffer in each row; width: its columns; shadow: rows
-    and columns that the box can reach, the first of them the buffer's first.
+    Args:
+        found: filled.
+        grid: the box as seen along the fan.
+        g: (12,) source, first pixel minus source, u, v [voxels].
+        lines: (m, 2) column of each line in row 0, and its slope.
+        line: number of the fan's first line.
+        starts: first column of the job's buffer in each row.
+        width: its columns.
+        shadow: rows and columns that the box can reach, the first of them the buffer's first.
     """
     row, column, slot = found.row, found.column, found.slot
     low, high = lines[line], lines[line + 1]

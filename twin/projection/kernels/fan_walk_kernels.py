@@ -271,8 +271,8 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
 
 @inline
 def add_pair(flat, grid, j, i, a, b, value):
-    """Apply the transpose of `difference`: add value to level a, subtract it from level
-    b.
+    """Apply the transpose of `difference`, with its arguments: add value to level a, subtract
+    it from level b.
     """
     if i < 0 or i >= grid.nl:
         return
@@ -525,7 +525,9 @@ def prefetch_slab(flat, spans, grid, fan, j, transposed):
 
 @inline
 def open_slab(flat, marks, grid, j, i0, i1):
-    """Open the voxel columns l = i0 to i1 of slab j."""
+    """Open the voxel columns l = i0 to i1 of slab j, so that they may be added to; see
+    `siddon_kernels.open_column`.
+    """
     for i in range(max(i0, 0), min(i1, grid.nl - 1) + 1):
         mark = mark_of(grid, j, i)
         if marks[mark] == 0:

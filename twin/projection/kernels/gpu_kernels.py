@@ -600,9 +600,16 @@ def enter_box(s, d, n, enter, leave):
 def first_crossing(s, d, n, enter, unit):
     """Find the first crossing of an axis after the entry, in `unit`s of t.
 
+    Args:
+        s: the source's place along the axis [voxels].
+        d: the ray's length along it [voxels].
+        n: voxels along it.
+        enter: t of the entry into the box.
+        unit: factor on t.
+
     Returns:
-        voxel at entry, distance of the first crossing after it, distance between
-        crossings, and crossings until the box ends.
+        voxel at entry, distance of the first crossing after it, distance between crossings, and
+        crossings until the box ends.
     """
     at = plus(s, times(enter, d))
     # On the device, floor gives a float.

@@ -58,6 +58,13 @@ def clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz):
 def first_step(s, d, n, enter, hop):
     """Find the start of the walk along one axis.
 
+    Args:
+        s: the source's place along the axis [voxels].
+        d: the ray's length along it [voxels].
+        n: voxels along it.
+        enter: t of the entry into the box.
+        hop: places in memory from one voxel to the next.
+
     Returns:
         voxel at entry, steps left until the box ends, t of the next crossing, t between
         crossings, and the memory step signed by direction.
@@ -87,8 +94,8 @@ def open_column(flat, marks, at, first, nz):
 
 @kernel
 def ray_of(box, g, r, c):
-    """Compute the direction of pixel (r, c) from the source in voxels, and its length
-    [mm].
+    """Compute the ray from the source to pixel (r, c): its three components [voxels], and its
+    length [mm].
     """
     dx = g[3] + c * g[6] + r * g[9]
     dy = g[4] + c * g[7] + r * g[10]
@@ -163,11 +170,16 @@ def walk_ray(box, g, r, c, value, transposed):
 
 @parallel
 def project_rays(box, views, chosen, out, tile, first_job, last_job):
-    """Fill the chosen views of out (n, rows, cols) with line integrals.
+    """Fill the chosen views of `out` with line integrals, each ray on its own.
 
-    views (n, 12): source, first pixel centre minus source, u, v in voxel units of the box;
-    chosen: indices of views; tile: columns a job; of each chosen view one job after the
-    other.
+    Args:
+        box: voxels.
+        views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the box.
+        chosen: (k,) indices of views.
+        out: (n, rows, cols).
+        tile: columns of a job; of each chosen view one job after the other.
+        first_job: number of the first job.
+        last_job: number of the job after the last.
     """
     rows, cols = out.shape[1:]
     tiles = (cols + tile - 1) // tile

@@ -112,8 +112,17 @@ def rectified(
 def homography(
     old: FloatArray, new: FloatArray, shape: tuple[int, int], new_shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute (3, 3): homogeneous (column, row) on `new` to those on `old`, centres
-    integer.
+    """Compute the map of pixels between two panels of one source.
+
+    Args:
+        old: cone_vec row (12,) of the panel that was seen.
+        new: that of the other one.
+        shape: (rows, cols) of the old one.
+        new_shape: (rows, cols) of the other.
+
+    Returns:
+        (3, 3), from homogeneous (column, row) on `new` to those on `old`, pixel centres at
+        integers.
     """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
@@ -204,8 +213,13 @@ def window(
     rows: tuple[int, int],
     cols: tuple[int, int],
 ) -> ConeVec:
-    """Compute the geometry of rows and columns first <= i < last, which may be off the
-    panel.
+    """Compute the geometry of a part of the panel.
+
+    Args:
+        cone_vec: n views.
+        shape: (rows, cols) of the whole panel.
+        rows: first row, and the one after the last; they may be off the panel.
+        cols: first column, and the one after the last.
     """
     down, right = (
         (sum(part) - size) / 2 for part, size in zip((rows, cols), shape, strict=True)

@@ -316,7 +316,14 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
 def _widths(
     circle: Circle, panels: Panels, like: Volume, truncation: Truncation | None
 ) -> Widths:
-    """Find the rows and columns that a grid and the object beyond the panel's edges need."""
+    """Find the rows and columns that a grid and the object beyond the panel's edges need.
+
+    Args:
+        circle: of the sources.
+        panels: upright ones.
+        like: the grid.
+        truncation: of the object, None without.
+    """
     level, cols = panels.upright, panels.shape[1]
     near = columns_beyond(circle, level, cols)
     far = (0, 0) if truncation is None else truncation.columns(level, cols)

@@ -197,8 +197,8 @@ def add_line(acc, line, first, count, start, step):
 
 @kernel
 def add_line_wide(acc, line, first, count, start, step):
-    """Apply `add_line` to LANES at a time while that fits; needs MARGIN samples after the
-    end.
+    """Apply `add_line`, with its arguments, to LANES at a time while that fits; `line` needs
+    MARGIN samples after its end.
     """
     k = np.int64(0)
     if abs(step) < STEEPEST:
@@ -240,11 +240,16 @@ def _times(line, left, right, part):
 
 @inline
 def _column(g, cols, x, y):
-    """Find the column in which a view sees all voxels above one another at (x, y).
+    """Find the column in which a view sees all voxels above one another at (x, y) [mm].
+
+    Args:
+        g: (11,) row of the views' table, see `backproject`.
+        cols: of the image.
+        x: [mm].
+        y: [mm].
 
     Returns:
-        depth along the panel's normal [mm], 0 if the view does not see them, and the
-            column.
+        depth along the panel's normal [mm], 0 if the view does not see them, and the column.
     """
     x -= g[0]
     y -= g[1]
@@ -348,7 +353,17 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
 
 @fused
 def _add_places(acc, image, rows, at, across, down, weight):
-    """Add weight * the view's values at places to acc; image: (cols * rows,)."""
+    """Add a view's values at places, interpolated and weighed, to voxels.
+
+    Args:
+        acc: (n,) voxels, changed in place.
+        image: (cols * rows,).
+        rows: of the image.
+        at: (n,) index of the sample before each place.
+        across: (n,) fraction of a column behind it.
+        down: (n,) fraction of a row behind it.
+        weight: (n,).
+    """
     rows = np.uint64(rows)
     for k in range(at.size):
         i = np.uint64(at[k])
@@ -360,8 +375,22 @@ def _add_places(acc, image, rows, at, across, down, weight):
 
 @kernel
 def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
-    """Add one view to neighbouring voxels, acc (nx, nz) from (x, y) on: for few rows, for
-    which full registers would not pay."""
+    """Add one view to neighbouring voxels: for few rows, for which full registers would not
+    pay.
+
+    Args:
+        acc: (nx, nz) voxels from (x, y) on, changed in place.
+        image: (cols, rows) filtered.
+        rows: of the image.
+        g: (11,) row of the views' table, see `backproject`.
+        x: of the first voxel [mm].
+        y: of all [mm].
+        z0: of the lowest [mm].
+        dx: step along x [mm].
+        dz: step along z [mm].
+        at: room for indices.
+        parts: (3, WIDE) room.
+    """
     n, cols = len(acc), len(image)
     y -= g[1]
     slope = dx * g[3]

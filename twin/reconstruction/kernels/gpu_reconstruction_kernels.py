@@ -120,6 +120,9 @@ def edge_sum(
 ):
     """Compute a 32nd of the sum, over an edge's columns, of a row less the prisms' path
     lengths.
+
+    The first arguments are those of `filter_rows`; view, r: image and row; side: 0 left, 1
+    right; part: which 32nd.
     """
     row = min(max(top + r, 0), images.shape[1] - 1)
     first = images.shape[2] - edge if side else 0
@@ -403,7 +406,18 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @cuda.jit(device=True, inline=True)
 def differences(x, i, k, column, counts, stride, scale):
-    """Scaled differences of a voxel to the next along z, y and x; 0 behind the last."""
+    """Compute the scaled differences of a voxel to the next along z, y and x; 0 behind the
+    last.
+
+    Args:
+        x: flat voxels.
+        i: index of the voxel.
+        k: its z.
+        column: number of its voxel column.
+        counts: voxels along z, y, x.
+        stride: places from one voxel column to the next.
+        scale: (3,) factors.
+    """
     # The next along z is the next in memory, along x a column further, along y nx columns.
     nz, ny, nx = counts
     here = x[i]
@@ -415,7 +429,9 @@ def differences(x, i, k, column, counts, stride, scale):
 
 @cuda.jit
 def lengths(x, counts, stride, scale, out):
-    """Compute the length of each voxel's differences, whose sum is the total variation."""
+    """Fill `out` with the length of each voxel's differences, whose sum is the total variation;
+    arguments as those of `differences`.
+    """
     i = cuda.grid(1)
     if i < x.size:
         k, column = i % stride, i // stride

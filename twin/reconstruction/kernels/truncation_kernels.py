@@ -30,11 +30,15 @@ itself it is infinite."""
 
 @kernel
 def _chord(prism, source_x, source_y, x, y):
-    """Compute path length times attenuation through a prism, over the ray's horizontal
-    length.
+    """Compute path length times attenuation through a prism, over the ray's horizontal length.
 
-    The ray has the direction (x, y). prism: centre x, y; lower triangle (0, 0), (1, 0),
-    (1, 1) to the unit disc; attenuation.
+    Args:
+        prism: (6,) centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc;
+            attenuation.
+        source_x: [mm].
+        source_y: [mm].
+        x: horizontal direction of the ray.
+        y: likewise.
     """
     start_x = source_x - prism[0]
     start_y = source_y - prism[1]
@@ -50,10 +54,18 @@ def _chord(prism, source_x, source_y, x, y):
 
 @kernel
 def _edge_mean(line, before, first, last, lower, upper, share, across, high):
-    """Average a row less the prisms' path lengths over columns first <= c < last of the
-    panel.
+    """Average a row less the prisms' path lengths over columns first <= c < last of the panel.
 
-    line: the panel's row; before: columns before it among the widened ones.
+    Args:
+        line: the panel's row.
+        before: columns before it among the widened ones.
+        first: first column.
+        last: column after the last.
+        lower: (wide,) prisms' lengths of the row's lower band.
+        upper: (wide,) of its upper band.
+        share: how much the upper one counts.
+        across: (wide,) squares of the ray's horizontal part.
+        high: square of its vertical part.
     """
     total = 0.0
     for c in range(first, last):

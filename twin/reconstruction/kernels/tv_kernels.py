@@ -35,7 +35,15 @@ def differences(x, k, j, i, scale):
 
 @parallel
 def variation(x, scale, layers, first, last):
-    """Compute total variation by layers (nz,) float64, which the caller adds up."""
+    """Compute the total variation of layers first <= k < last, which the caller adds up.
+
+    Args:
+        x: (nz, ny, nx).
+        scale: (3,) factors on the differences.
+        layers: (nz,) float64, filled.
+        first: first layer.
+        last: layer after the last.
+    """
     ny, nx = x.shape[1:]
     for k in prange(first, last):
         total = 0.0  # in double precision: millions of small lengths

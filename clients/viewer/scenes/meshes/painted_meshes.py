@@ -99,7 +99,9 @@ def lathe(
 def _standing(
     mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str
 ) -> PaintedMesh:
-    """Move a mesh made about z to its place, turned to y if so wanted, and paint it."""
+    """Paint a mesh that was made about z, turned to y if `axis` says so, and moved to its
+    centre.
+    """
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)
