@@ -21,7 +21,6 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.plausibility.scan_geometry import radians_remedy
 
 MAX_CIRCLE_DEVIATION = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
@@ -350,13 +349,7 @@ def _check_covered(circle: Circle, widest: float) -> None:
             f"deg they do not see every line: FDK needs {need:.4g} deg (half a turn and "
             "the fan) without a gap, or gaps that have views on the other side"
         )
-        allowed = [float(need), 360.0]
-        remedy = radians_remedy(len(circle.step), float(span))
-        if remedy is not None:
-            raise GeometryError(
-                f"{why}; {remedy}", {"asked": float(span), "allowed": allowed}
-            )
-        raise no_fdk(why, float(span), allowed)
+        raise no_fdk(why, float(span), [float(need), 360.0])
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
