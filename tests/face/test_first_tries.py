@@ -62,9 +62,14 @@ def test_a_file_that_is_no_script_is_said_so_in_a_few_lines(
 ) -> None:
     noise = np.random.default_rng(6420 + seed).integers(0, 256, 60_000).astype(np.uint8)
     (tmp_path / "noise.bin").write_bytes(noise.tobytes())
-    assert run(["check", str(tmp_path / "noise.bin")]) == 1
+    (tmp_path / "table.csv").write_text("1.5,2.5,3.5\n" * 5000)
+    assert run(["check", str(tmp_path / "table.csv")]) == 1
     told = capsys.readouterr()
     assert "no line is a command of a scan script" in told.err
+    assert len(told.err.splitlines()) <= 30
+    assert run(["check", str(tmp_path / "noise.bin")]) == 1
+    told = capsys.readouterr()
+    assert "binary data" in told.err
     assert len(told.err.splitlines()) <= 30
 
 

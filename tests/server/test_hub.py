@@ -118,7 +118,9 @@ def test_each_view_is_rendered_once_however_many_listen() -> None:
         ears = [Ear() for _ in range(6)]
         for i, ear in enumerate(ears):
             hub.subscribe(
-                ear, ["projection"], view=ImageRequest("counts", 2) if i % 2 else ImageRequest()
+                ear,
+                ["projection"],
+                view=ImageRequest("counts", 2) if i % 2 else ImageRequest(),
             )
         made: list[ImageRequest] = []
 

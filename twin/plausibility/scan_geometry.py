@@ -202,19 +202,12 @@ def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     if len(cone_vec) < RADIANS_VIEWS or not about_z(cone_vec):
         return
     span = arc_deg(cone_vec)
-    remedy = radians_remedy(len(cone_vec), span)
-    if remedy is not None:
+    if 0.0 < span < RADIANS_SPAN:
         cause = f"{len(cone_vec)} views span {span:.4g} deg"
+        remedy = (
+            f"were radians given as degrees? np.rad2deg makes them {np.rad2deg(span):.4g}"
+        )
         yield Finding("angles in radians", cause, remedy, Severity.WARNING, span)
-
-
-def radians_remedy(views: int, span_deg: float) -> str | None:
-    """Ask whether an arc is one of radians given as degrees; None if it is not like one."""
-    if views < RADIANS_VIEWS or not 0.0 < span_deg < RADIANS_SPAN:
-        return None
-    return (
-        f"were radians given as degrees? np.rad2deg makes them {np.rad2deg(span_deg):.4g}"
-    )
 
 
 def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:

@@ -94,7 +94,9 @@ class SampleLook:
 
     def _reach(self, axes: int) -> float | None:
         """Compute the greatest distance from the origin along the first axes [mm]."""
-        far = [np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins]
+        far = [
+            np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins
+        ]
         return float(max(far)) / MM if far else None
 
 
