@@ -10,7 +10,11 @@ import natural_objects
 import numpy as np
 import pytest
 
-from flexdt.twin.calibration.without_phantom.hidden_gap import CHANCE, hidden_gap
+from flexdt.twin.calibration.without_phantom.hidden_gap import (
+    CHANCE,
+    _of_outlines,
+    hidden_gap,
+)
 
 FRAMES, ROWS, COLUMNS = 90, 16, 72
 
@@ -45,6 +49,7 @@ def test_sharp_edges_tell_a_gap_or_exclude_it() -> None:
         without = hidden_gap(streaks(rng, 0.3, 0, 0.0), axis, None, 1.5)
         assert without is not None
         assert without.likely is None
+        assert not without.open
         assert without.column_px < 0.1
 
 
@@ -55,7 +60,32 @@ def test_images_without_edges_leave_the_gap_in_the_sigma() -> None:
     assert found is not None
     assert found.likely is None
     assert 0.2 * CHANCE < found.chance < 2 * CHANCE
-    assert found.column_px > 0.05
+    assert found.open
+    assert found.column_px > 0.25
+
+
+def test_edges_elsewhere_do_not_exclude_a_gap_that_none_of_them_passes() -> None:
+    """A wall far from the axis of a round body: it was excluded, and 12 sigmas off."""
+    rng = np.random.default_rng(10)
+    frames = streaks(rng, 0.3, 0, 0.0)
+    for frame in frames:
+        frame[:, 22:50] = rng.normal(0, 0.02, (ROWS, 28))
+    found = hidden_gap(frames, 36.0, None, 1.5)
+    assert found is not None
+    assert found.open
+    assert found.column_px > 0.25
+
+
+def test_outlines_at_both_sides_are_no_gap() -> None:
+    """Edges turn back at mirror images of each other; a gap is at one side."""
+    beside = np.arange(-30, 31) + 0.2
+    found = np.full((3, 61), -2.0)
+    found[:, 10] = found[:, 51] = 8.0  # 19.8 columns to the left, 21.2 to the right
+    found[:, 15] = 8.0
+    left = found - _of_outlines(found, beside)
+    assert (left[:, 10] <= 0.0).all()
+    assert (left[:, 51] <= 0.0).all()
+    assert (left[:, 15] == 8.0).all()
 
 
 @pytest.mark.slow

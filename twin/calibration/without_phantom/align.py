@@ -211,7 +211,7 @@ def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]
             "column's sigma, and reconstruct closes it with the correction"
         )
     hidden = plane.hidden
-    if hidden is not None and hidden.column_px > plane.column_sigma_px / 2:
+    if hidden is not None and hidden.open:
         out.append(
             "the images do not exclude that a tile of the panel begins at columns "
             f"{hidden.first} to {hidden.last} behind a gap, which would move the axis by "

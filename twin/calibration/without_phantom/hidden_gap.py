@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter1d
 from scipy.special import log_softmax, logsumexp, softmax
 
 from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
@@ -29,10 +30,14 @@ from flexdt.twin.calibration.without_phantom.tile_gap import (
 )
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
-CHANCE: Final = 0.1
-"""Probability that a panel has a gap at one of the columns where it is hidden; assumed."""
+CHANCE: Final = 0.05
+"""Probability that a panel has a gap at one of the columns where it is hidden; assumed: most
+panels are one piece, or their gaps are closed by the camera."""
 REPORTED_ODDS: Final = 100.0
-"""Odds of a gap from which it is reported."""
+"""Odds of a gap from which it is reported, and odds against one from which it is excluded."""
+OPEN_SHARE: Final = 0.5
+"""Part of the width of gaps that a gap that is not excluded leaves open at least: the width
+times the root of its probability covers no gap."""
 WIDTHS_PX: Final = np.arange(0.25, 3.01, 0.25)
 """Widths of gaps that are tried [px]."""
 WIDTH_SPREAD_PX: Final = 1.0
@@ -47,8 +52,15 @@ LEAST_COLUMNS: Final = 14
 """Columns on each side of the axis whose borders are compared, at least."""
 EDGE_SHARE: Final = 0.2
 """Part of all places there that is compared, those with most change."""
+NOISE_QUANTILE, NOISE_QUANTILE_POWER = 0.2, 0.546
+"""Quantile of the changes at a border in a row, of all frames, and its share of their mean
+where they are noise (chi square of 7)."""
+EDGE_NOISE: Final = 4.0
+"""Changes over those of noise from which they are edges: noise has one in 10 000."""
 MOST_EDGES: Final = 30_000
 """Places that are compared, at most."""
+OUTLINE_COLUMNS: Final = 1
+"""By so many columns the two sides of an outline may differ from mirror images."""
 MIN_HIDDEN_PX: Final = 0.3
 """Width of gaps that are not hidden where both ends of rays determine steps to a third of
 it [px]."""
@@ -66,7 +78,8 @@ class HiddenGap(NamedTuple):
     Attributes:
         first, last: columns at which it may begin.
         chance: probability that there is one.
-        width_px: root mean square of its width, no gap included [px].
+        width_px: root mean square of its width, no gap included, and at least OPEN_SHARE of a
+            usual gap's where it is not excluded [px].
         likely: the gap, where its odds exceed REPORTED_ODDS.
     """
 
@@ -75,6 +88,11 @@ class HiddenGap(NamedTuple):
     chance: float
     width_px: float
     likely: Gap | None
+
+    @property
+    def open(self) -> bool:
+        """Whether the images do not exclude it."""
+        return self.chance * REPORTED_ODDS > 1.0 - self.chance
 
     @property
     def column_px(self) -> float:
@@ -132,6 +150,7 @@ def hidden_gap(
         return None
     columns = np.arange(low + SIDE, end - SIDE + 1)
     evidence = _evidence(stack[:, :, low:end])
+    evidence = evidence.beside(-_of_outlines(evidence.found, columns - 0.5 - axis))
     if profile is not None:
         evidence = evidence.beside(_evidence_of_rays(columns, axis, profile))
     hidden = np.abs(columns - 0.5 - axis) <= reach
@@ -141,6 +160,9 @@ def hidden_gap(
     # Blurred and noisy edges tell that there is a gap better than how wide it is.
     doubted = 0.5 * (evidence.widths + np.exp(_LOG_PRIOR))
     mean_square = float(odds @ (wide @ doubted)) / (1.0 + total)
+    if total * REPORTED_ODDS > 1.0:
+        usual = float(wide @ np.exp(_LOG_PRIOR[:, 0]))
+        mean_square = max(mean_square, OPEN_SHARE**2 * usual)
     shown = columns[hidden]
     best = int(odds.argmax())
     return HiddenGap(
@@ -174,6 +196,21 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
     return max(inner, float(profile.radii[int(told.argmax())]))
 
 
+def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
+    """Return the evidence (w, c) that outlines leave, where edges turn back at both sides of
+    the axis: that of the border at the other side.
+
+    Args:
+        found: logarithm of the likelihood of a gap over none, (w, c).
+        beside: of each border from the axis, even steps of a column, (c,) [px].
+    """
+    places = np.arange(len(beside))
+    mirror = np.rint(-2.0 * beside).astype(np.intp) + places
+    known = (np.abs(beside) > SIDE) & (mirror >= 0) & (mirror < len(places))
+    near = maximum_filter1d(found, 2 * OUTLINE_COLUMNS + 1, axis=1, mode="nearest")
+    return np.where(known, np.maximum(near[:, np.where(known, mirror, 0)], 0.0), 0.0)
+
+
 def _evidence_of_rays(
     columns: npt.NDArray[np.intp], axis: float, profile: Profile
 ) -> FloatArray:
@@ -189,6 +226,9 @@ def _evidence_of_rays(
 def _evidence(images: FloatArray) -> Evidence:
     """Judge gaps by single frames.
 
+    All places with most change tell whether there is a gap. Whether one would be visible
+    is told by the edges among them that pass its border: noise shows none.
+
     Args:
         images: frames of columns about the axis, (n, rows, c + 2 SIDE - 1).
     """
@@ -198,22 +238,48 @@ def _evidence(images: FloatArray) -> Evidence:
     )
     power = np.square(around).sum(axis=2)
     share = min(EDGE_SHARE, MOST_EDGES / power.size)
-    row, border = np.nonzero(power > np.quantile(power, 1.0 - share))
-    places, of_frame = power.shape[1], row // images.shape[1]
+    places = power > np.quantile(power, 1.0 - share)
+    of_rows = power.reshape(images.shape[0], -1)
+    noise = np.quantile(of_rows, NOISE_QUANTILE, axis=0) / NOISE_QUANTILE_POWER
+    edges = places & (of_rows > EDGE_NOISE * noise).reshape(power.shape)
+    told = _evidence_of(around, power, places, len(images), evenly=True)
+    shown = _evidence_of(around, power, edges, len(images), evenly=False)
+    return Evidence(np.maximum(told.found, shown.found), told.width)
+
+
+def _evidence_of(
+    around: FloatArray,
+    power: FloatArray,
+    seen: npt.NDArray[np.bool_],
+    frames: int,
+    evenly: bool,
+) -> Evidence:
+    """Judge gaps by some of the differences of neighbouring columns.
+
+    Args:
+        around: differences about each border, (m, c, 2 SIDE - 1).
+        power: their sums of squares, (m, c).
+        seen: those that count, (m, c).
+        frames: number of frames, of m / frames rows each.
+        evenly: a gap would be as visible at each border; else by the number that counts.
+    """
+    row, border = np.nonzero(seen)
+    places, of_frame = power.shape[1], row * frames // len(power)
     shape = len(BLURS_PX), len(WIDTHS_PX), places
     if not len(row):
         return Evidence(np.zeros(shape[1:]), np.zeros(shape[1:]))
     edges = around[row, border] / np.sqrt(power[row, border])[:, None]
+    count = np.bincount(border, minlength=places).astype(np.float64)
+    passed = np.full(places, count.mean()) if evenly else count
     of_distance = squares_by_distance(edges)
     without = likelihood(edges, of_distance, 0.0)
     judged = []
     for blur in BLURS_PX:
         for width in WIDTHS_PX.tolist():
             gain = likelihood(edges, of_distance, width, blur) - without
-            of_place = np.bincount(of_frame * places + border, gain, len(images) * places)
-            judged.append(
-                _beside_others(np.asarray(of_place.reshape(-1, places), np.float64))
-            )
+            of_place = np.bincount(of_frame * places + border, gain, frames * places)
+            gains = np.asarray(of_place.reshape(-1, places), np.float64)
+            judged.append(_beside_others(gains, passed))
     found = np.array([one.found for one in judged]).reshape(shape)
     gain = np.array([one.gain for one in judged]).reshape(shape)
     trust = np.array([one.trust for one in judged]).reshape(shape[:2]).min(axis=1)
@@ -238,27 +304,32 @@ class Judged(NamedTuple):
     trust: float
 
 
-def _beside_others(gains: FloatArray) -> Judged:
+def _beside_others(gains: FloatArray, count: FloatArray) -> Judged:
     """Judge a gap at each border by comparison with other borders.
 
     Args:
         gains: in log likelihood of a gap over none, by frame and border, (n, c).
+        count: edges that pass each border, (c,): so visible a gap would be there.
     """
     whole = gains.sum(axis=0)
-    usual = float(np.median(whole))
-    between = 1.4826 * float(np.median(np.abs(whole - usual)))
-    of_frames = float(np.median(np.sqrt(np.square(gains).sum(axis=0))))
-    spread = max(between, of_frames, 1e-6)
+    passed = np.maximum(count, 1.0)
+    rate = float(np.median(whole[count > 0.0] / count[count > 0.0]))
+    usual = rate * count
+    own = np.sqrt(passed)
+    between = 1.4826 * float(np.median((np.abs(whole - usual) / own)[count > 0.0]))
+    of_frames = np.sqrt(np.square(gains).sum(axis=0)) / own
+    spread = max(between, float(np.median(of_frames[count > 0.0])), 1e-6) * own
     excess = (whole - usual) / spread
     # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its
     # mean.
-    lost = max(-2.0 * usual, 0.0)
+    lost = np.maximum(-2.0 * usual, 0.0)
     short = np.minimum(excess - EVIDENCE_SHARES[:, None] * lost / spread, 0.0)
     found = np.logaddexp.reduce(_log_student(short), axis=0) - math.log(
         len(EVIDENCE_SHARES)
     )
     found = found - _log_student(np.maximum(excess, 0.0))
-    return Judged(np.asarray(found), whole, min(lost / spread**2, 1.0))
+    trust = float(np.median((lost / spread**2)[count > 0.0]))
+    return Judged(np.asarray(found), whole, min(trust, 1.0))
 
 
 def _log_student(deviation: FloatArray) -> FloatArray:
