@@ -10,6 +10,7 @@ determine more.
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -483,20 +484,36 @@ SECOND_SOD_RATIO: Final = 0.7
 """Source-object distance of a second placement over the first's: nearer, where offsets
 act differently."""
 
-_COMPARE: Final = "flexdt compare {data} --phantom {phantom} --out DIR"
+_CALIBRATE: Final = "flexdt calibrate {data} --phantom {phantom}"
+_REPORT: Final = f"{_CALIBRATE} --report report.html"
 NEXT: Final[Mapping[str, Sequence[str]]] = {
     "wrong_phantom": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
     "bead_size": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
-    "misfit": (
-        "flexdt calibrate {data} --phantom {phantom} --per-frame dO_x,dO_y,alpha",
-    ),
-    "angle_scale": (
-        "flexdt calibrate {data} --phantom {phantom} --free {free},angle_scale",
-    ),
-    "held_parameter": (),  # its own sentence names the parameter to free
 }
-"""Code of a finding that forbids a result -> commands that would settle it; other codes
-compare the images with the twin's."""
+"""Code of a finding that forbids a result -> commands that would settle it; other findings
+name the options in their text, or have a report that shows the shadows."""
+ADVISED: Final[Sequence[tuple[re.Pattern[str], str]]] = (
+    (re.compile(r"--per-frame ([\w,]+)"), _CALIBRATE + " --per-frame {advised}"),
+    (
+        re.compile(r"\bfree ((?:\w+, )*\w+)(?: too|$)"),
+        _CALIBRATE + " --free {free},{advised}",
+    ),
+)
+"""Advice in the text of a finding -> the command that follows it."""
+
+
+def settling_commands(finding: Finding) -> Sequence[str]:
+    """Return the commands that would settle a finding, with places for the data set's
+    words.
+    """
+    if finding.code in NEXT:
+        return NEXT[finding.code]
+    found = [
+        line.replace("{advised}", names[1].replace(", ", ","))
+        for advice, line in ADVISED
+        if (names := advice.search(finding.text)) is not None
+    ]
+    return found or [_REPORT]
 
 
 def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> str:
@@ -558,7 +575,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
     asked = [e for e in estimates.values() if e.asked]
     if result.errors and result.errors[0].code != UNDETERMINED:
         free = ",".join(name for name, e in estimates.items() if e.asked)
-        lines = NEXT.get(result.errors[0].code, (_COMPARE,))
+        lines = settling_commands(result.errors[0])
         return [
             line.format(data=names, phantom=shlex.quote(phantom), free=free)
             for line in lines

@@ -65,7 +65,7 @@ def test_images_without_edges_leave_the_gap_in_the_sigma() -> None:
 
 
 def test_edges_elsewhere_do_not_exclude_a_gap_that_none_of_them_passes() -> None:
-    """A wall far from the axis of a round body: it was excluded, and 12 sigmas off."""
+    """A wall far from the axis of a round body leaves room for a gap in the sigma."""
     rng = np.random.default_rng(10)
     frames = streaks(rng, 0.3, 0, 0.0)
     for frame in frames:

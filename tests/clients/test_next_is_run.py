@@ -1,0 +1,186 @@
+"""Every command that a calibration's report proposes is run on the scan that produced it.
+
+It must end right within 4 sigma, or refuse the numbers with a finding; files that it
+promises are there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import flexdt as fx
+from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
+from flexdt.clients.cli.command_tree import run
+from flexdt.library.calibration.calibrate import NEXT, settling_commands
+from flexdt.library.datasets.exchange import with_geometry
+from flexdt.twin.calibration.diagnose import error
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+
+FRAMES, SHAPE, PIXEL_MM = 16, (304, 382), 0.374
+SOD_MM, SDD_MM = 600.0, 1059.0
+TRUTH = {
+    "dO_x": 0.6,
+    "dO_y": -0.4,
+    "dO_z": 1.5,
+    "alpha": 21.0,
+    "tau_x": 0.3,
+    "tau_z": 0.2,
+}
+SIGMAS = 4.0
+
+
+def turned(sod: float = SOD_MM, factor: float = 1.0) -> Poses:
+    """A turn; its true angles are `factor` times those."""
+    angle = factor * 2.0 * math.pi * np.arange(FRAMES) / FRAMES
+    return Poses.upright([0, 0, 0], [0, sod, 0], [0, SDD_MM, 0], PIXEL_MM, angle)
+
+
+def swaying(poses: Poses) -> Poses:
+    """The mount moves to and fro across the beam and up and down."""
+    n = np.arange(len(poses))
+    sway = np.stack([0.6 * np.sin(1.9 * n), 0.0 * n, 0.4 * np.cos(2.7 * n)], axis=1)
+    return replace(poses, axis=poses.axis + sway)
+
+
+def elsewhere(poses: Poses) -> Poses:
+    """The panel is 25 mm further away than is said."""
+    return replace(poses, detector=poses.detector + [0.0, 25.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scan whose report proposes commands.
+
+    Attributes:
+        code: of the finding that decides; "": numbers are offered.
+        true: where everything really is.
+        phantom: that is named; the one that was scanned is "lego".
+        moving: parameters with another value in each frame.
+    """
+
+    code: str
+    true: Callable[[], Poses]
+    phantom: str = "lego"
+    moving: tuple[str, ...] = ()
+
+
+CASES = {
+    "right": Case("", turned),
+    "wrong_phantom": Case("wrong_phantom", turned, "normal"),
+    "moves": Case("vibration", lambda: swaying(turned()), moving=("dO_x", "dO_y")),
+    "angle_scale": Case("angle_scale", lambda: turned(factor=1.004)),
+    "reversed": Case("angle_reversed", lambda: turned(factor=-1.0)),
+    "held_parameter": Case("held_parameter", lambda: elsewhere(turned())),
+}
+
+
+def scanned(true: Poses, said: Poses, folder: Path) -> Path:
+    """Save a scan of the LEGO phantom at one geometry under another."""
+    geometry = true.cone_vec(Offsets.from_edge(TRUTH)).with_shape(SHAPE)
+    data = fx.simulate("lego", geometry, noise=1)
+    with_geometry(data, said.cone_vec(Offsets()).with_shape(SHAPE)).save(folder)
+    return folder
+
+
+def calibrated(words: list[str], report: Path) -> Any:
+    """Run a calibration by its command, and return its document."""
+    run(["calibrate", *words, "--report", str(report)])
+    return json.loads(report.read_text())
+
+
+def require_right_or_careful(document: Any, moving: tuple[str, ...] = ()) -> None:
+    """Check that the numbers are right, or withheld with a reason."""
+    if not document["identifiable"]:
+        assert any(p["severity"] == "error" for p in document["problems"])
+        return
+    for name, value in TRUTH.items():
+        found = document["parameters"][name]
+        if name not in moving:
+            assert abs(found["value"] - value) < SIGMAS * found["sigma"], name
+
+
+def proposed(case: Case, folder: Path) -> tuple[Path, list[str], Any]:
+    """Calibrate the scan of a case: its folder, what is proposed, and the document."""
+    scan = scanned(case.true(), turned(), folder / "scan")
+    document = calibrated([str(scan), "--phantom", case.phantom], folder / "first.json")
+    errors = [p["code"] for p in document["problems"] if p["severity"] == "error"]
+    assert errors[:1] == [case.code] * bool(case.code), document["problems"]
+    return scan, document["next"], document
+
+
+def filled_in(line: str, scan: Path, folder: Path) -> list[str]:
+    """Replace the words of a proposed command that its reader replaces."""
+    places = {
+        "SAMPLE": str(scan), "REPORT.json": str(folder / "first.json"), "NAME": "lego",
+        "PLACE-1": str(scan), "PLACE-2": str(folder / "nearer"),
+    }  # fmt: skip
+    words = shlex.split(line, comments=True)
+    assert words.pop(0) == "flexdt"
+    return [places.get(word, word) for word in words]
+
+
+def run_what_is_proposed(case: Case, folder: Path) -> None:
+    """Calibrate a scan and run every command that is proposed on it."""
+    scan, lines, _ = proposed(case, folder)
+    for line in lines:
+        words = filled_in(line, scan, folder)
+        if str(folder / "nearer") in words:
+            near = turned(0.75 * SOD_MM)
+            scanned(near, near, folder / "nearer")
+        if words[0] == "calibrate" and "--report" not in words:
+            document = calibrated(words[1:], folder / "next.json")
+            require_right_or_careful(document, case.moving)
+        elif words[0] == "calibrate":
+            assert run(words) == NOT_IDENTIFIABLE, line
+        else:
+            assert run(words) == 0, line
+        for i, word in enumerate(words):
+            if word in ("--out", "--report"):
+                assert Path(words[i + 1]).exists(), line
+
+
+@pytest.mark.parametrize("name", ["angle_scale"])
+def test_what_a_report_proposes_ends_right(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_what_is_proposed(CASES[name], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(2)
+@pytest.mark.parametrize("name", sorted(set(CASES) - {"angle_scale"}))
+def test_everything_a_report_proposes_ends_right_or_more_careful(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_what_is_proposed(CASES[name], tmp_path)
+
+
+def test_every_command_of_the_table_has_a_case() -> None:
+    unrun = {"bead_size"}  # as `wrong_phantom`
+    assert set(NEXT) <= {case.code for case in CASES.values()} | unrun
+
+
+def test_advice_in_a_sentence_becomes_a_command() -> None:
+    said = error(
+        "held_parameter", "dD_z is held at 0 mm: free dD_z, det_roll too, or hold it"
+    )
+    (line,) = settling_commands(said)
+    assert line.endswith(" --free {free},dD_z,det_roll")
+    (line,) = settling_commands(
+        error("drift", "dO_x moves: --per-frame dO_x,dO_y follows it")
+    )
+    assert line.endswith(" --per-frame dO_x,dO_y")
+    (line,) = settling_commands(error("one_bead", "a single shadow"))
+    assert line.endswith(" --report report.html")
