@@ -66,12 +66,16 @@ from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.tube import tube_of, tube_spectrum
 from flexdt.twin.scanner.state import readout_of
 from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.motor_targets import MotorTargets
 from flexdt.twin.script.scan_request import Kind as KindOfScan
 from flexdt.twin.script.scan_request import ScanRequest
 
+DISTANCE_DIGITS: Final = 6
+"""Decimals of the distances of a composed script [mm]."""
 MIN_DIFFERENCE: Final = 0.01
 """Least difference of two positions that are not the same [mm, deg]."""
 MAX_SHARED: Final = 2
@@ -512,29 +516,16 @@ async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
 
 
 async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
-    """Compose a script for the requested scan in the present geometry.
+    """Compose a script for the requested scan, from where motors stand.
+
+    Distances are those of the motors alone: a script moves motors, and the correction in
+    force, in which SOD and SDD are a little different, may not lead beyond their travel.
 
     Returns:
         `text`, and `moved`: axis -> its present position and the script's.
     """
     lab, state = _lab(viewer), viewer.state
-    request = ScanRequest(
-        kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms
-    )
-    if state is not None:
-        at = state.geometry
-        sod = at.SOD_mm
-        if params.voxel_um is not None:
-            sod = params.voxel_um / 1000.0 / state.camera.pixel_mm * at.SDD_mm
-        request = replace(
-            request,
-            sod_mm=round(sod, 4),
-            sdd_mm=round(at.SDD_mm, 4),
-            mode=state.camera.mode,
-            roi=Roi(*state.camera.roi),
-            kV=state.tube.kV if params.kV is None else params.kV,
-            power_W=state.tube.power_W if params.power_W is None else params.power_W,
-        )
+    request = scan_request(params, lab.machine, lab.profile, state)
     text = compose_script(request, lab.machine, lab.profile)
     if state is None:
         return {"text": text, "moved": {}}
@@ -543,6 +534,36 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
         now, then = (f"{axis}\tmove absolute\t{value:.6f}\t" for value in moved.pop(axis))
         text = text.replace(then, now)
     return {"text": text, "moved": moved}
+
+
+def scan_request(
+    params: Compose, machine: Machine, profile: Profile, state: State | None
+) -> ScanRequest:
+    """Make the request of a scan: as wished, and for the rest as the twin stands.
+
+    Args:
+        params: the wish.
+        machine, profile: the twin's.
+        state: of the twin; None leaves all else to the machine.
+    """
+    request = ScanRequest(
+        kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms
+    )
+    if state is None:
+        return request
+    places, stand = MotorTargets(machine, profile), motors(machine, state)
+    sod, sdd = (places.value(name, stand) for name in ("object_y", "detector_y"))
+    if params.voxel_um is not None:
+        sod = params.voxel_um / 1000.0 / state.camera.pixel_mm * sdd
+    return replace(
+        request,
+        sod_mm=round(sod, DISTANCE_DIGITS),
+        sdd_mm=round(sdd, DISTANCE_DIGITS),
+        mode=state.camera.mode,
+        roi=Roi(*state.camera.roi),
+        kV=state.tube.kV if params.kV is None else params.kV,
+        power_W=state.tube.power_W if params.power_W is None else params.power_W,
+    )
 
 
 def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, float]]:
