@@ -4,8 +4,9 @@ rendering.
     python docs/tools/page_pictures.py [--out docs/images] [--url http://127.0.0.1:8080/]
 
 Starts a lab of its own, unless it is given the address of one whose machine stands at home.
-Writes viewer-first.png, viewer-four-views.png, viewer-scan.png, viewer-design.png and
-viewer-virtual.png, in COLORS colours. Needs Debian's chromium, playwright and Pillow.
+Writes viewer-first.png, viewer-four-views.png, viewer-scan-it.png, viewer-scan.png,
+viewer-design.png and viewer-virtual.png, in COLORS colours. Needs Debian's chromium, playwright
+and Pillow.
 """
 
 from __future__ import annotations
@@ -107,9 +108,20 @@ def four_views(browser: Any, url: str, to: Path) -> None:
     page.close()
 
 
+def scan_it(browser: Any, url: str, to: Path) -> None:
+    """The volume of what stands on the stage, in the scene and beside its truth."""
+    page = opened(browser, url, "iso", "move")
+    page.click("#scan-it")
+    page.locator("#volume-beside").wait_for()
+    page.add_style_tag(content=".inset { visibility: hidden }")
+    taken(page, to / "viewer-scan-it.png")
+    page.close()
+
+
 def scan(browser: Any, url: str, to: Path) -> None:
     """Save a plan's timeline and the scan designer, and run the scan for `virtual`."""
     page = opened(browser, url, "iso", "scan")
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     page.select_option("#wish-kind", "step")
     page.fill("#wish-frames", "13")
     page.click("#compose")
@@ -156,7 +168,7 @@ def main() -> None:
         sync_playwright() as play,
     ):
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        for picture in (first, four_views, scan, virtual):
+        for picture in (first, four_views, scan_it, scan, virtual):
             picture(browser, url, chosen.out)
         browser.close()
 
