@@ -80,7 +80,8 @@ async def volume_put(
         p: parameters.
 
     Returns:
-        A dict with the keys name, received [bytes], total [bytes] and complete.
+        A dict with the keys name, received [bytes], total [bytes], complete and, where its
+        values are doubtful, warnings.
 
     Raises:
         RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
