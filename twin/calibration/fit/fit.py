@@ -619,6 +619,9 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
     Few positions may be explained in two ways: by priors that hold and noise, or by
     priors that are off and hardly any noise. The more likely one is returned.
 
+    Few positions may be explained in two ways: by priors that hold and noise, or by
+    priors that are off and hardly any noise. The more likely one is returned.
+
     Returns:
         The solution, and the spread of the whitened residuals by which its priors were
         weighted, from the previous pass.
