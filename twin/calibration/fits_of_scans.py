@@ -11,6 +11,7 @@ import numpy as np
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
 )
+from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX
 from flexdt.twin.calibration.fit.fit import FitResult, Solver, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,
@@ -29,8 +30,8 @@ from flexdt.twin.geometry.poses import Poses
 MEASURED = Solver(floor_px=0.3, spread_px=1.0)
 """Positions of a second measurement are never taken to be better than a third of their
 sigma: in images without noise, positions off by a thousandth of a pixel are no outliers."""
-FOUND = Solver(spread_px=0.02)
-"""Positions of a first measurement have no sigma of their own: .005 to .09 px, assumed."""
+FOUND = Solver(spread_px=POSITION_SPREAD_PX)
+"""Positions of a first measurement have no sigma of their own."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
 

@@ -6,9 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.fitted import (
-    MISFIT_PX,
-)
 from flexdt.twin.calibration.fit.priors import known, known_strain, require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
@@ -47,7 +44,7 @@ class CalibrationRequest:
             known. The scans' apply to parameters that are not free, these to any.
         bound: sigma [mm, deg] beyond which the result is not identifiable.
         known_sizes: the beads' radii are known; else they were taken from the spots.
-        misfit_px: residual above which a fit is not to be used unless explained.
+        misfit_px: residual up to which a fit is used, whatever its positions scatter.
         per_frame: those that may also differ from frame to frame, see `fit.fitted_motion`.
 
     Raises:
@@ -65,7 +62,7 @@ class CalibrationRequest:
     priors: Mapping[str, float] = field(default_factory=dict)
     bound: float = BOUND
     known_sizes: bool = True
-    misfit_px: float = MISFIT_PX
+    misfit_px: float = 0.0
     per_frame: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

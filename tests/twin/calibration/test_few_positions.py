@@ -8,6 +8,7 @@ from causes_named import calibrated, worst_error
 from faults_drawn import RANGE, UNSEEN, Believed, Faulty, World, in_images, shadows
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.diagnose.fitted import largest_residual
 from flexdt.twin.calibration.fit.certificate import spread_of_residuals
 from flexdt.twin.calibration.fit.fit import Solver, estimate_geometry
 from flexdt.twin.calibration.fit.priors import ASSUMED
@@ -95,3 +96,21 @@ def test_columns_cost_no_more_than_one_degree_of_freedom_each() -> None:
         normal = rows.T @ rows
         told = float(np.trace(np.linalg.solve(normal + np.diag(weight), normal)))
         assert freedom == pytest.approx(12.0 - told, abs=1e-3)
+
+
+@pytest.mark.parametrize("chance", [0.05, 0.01])
+def test_a_misfit_is_as_rare_as_is_said_among_scatters_that_are_drawn(
+    chance: float,
+) -> None:
+    """Positions of 0.02 px that are known with three degrees of freedom."""
+    scan = two_beads(7)
+    fit = calibrated(scan).fit
+    assert fit is not None
+    rng = np.random.default_rng(12)
+    power = np.square(rng.normal(size=(200_000, 3))).sum(axis=1)
+    drawn = 0.02 * np.sqrt(3.0 / power)
+    more = float(np.mean(drawn > largest_residual(fit, chance)))
+    assert more == pytest.approx(chance, rel=0.1)
+    assert largest_residual(fit, chance, sigmas_known=True) > largest_residual(
+        fit, chance
+    )

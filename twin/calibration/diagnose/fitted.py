@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
+from scipy.special import chdtri
 
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
@@ -19,6 +20,7 @@ from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.diagnose.causes import Known, Refit, explained_by_causes
 from flexdt.twin.calibration.diagnose.frame_numbers import frame_numbers
 from flexdt.twin.calibration.diagnose.named_causes import named_causes
+from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit, derivative, follow_motion
 from flexdt.twin.calibration.fit.residual_structure import MOVING
@@ -39,8 +41,11 @@ OF_RESIDUALS = frozenset(
     )
 )
 """Codes of findings about residuals: they hold for that fit alone."""
-MISFIT_PX = 0.10
-"""Residual of the final fit above which its numbers are not to be used unless explained."""
+MISFIT_CHANCE: Final = 0.01
+"""Probability of positions that scatter so much, below which a fit is not to be used unless
+its residuals are explained."""
+EXPLAINED_CHANCE: Final = 0.001
+"""The same of what may remain of a motion that is named."""
 AS_GOOD = 1.5
 """A fit whose residuals are at most so many times as large explains the data as well."""
 BLOCK_SHARE = 0.7
@@ -48,7 +53,7 @@ BLOCK_SHARE = 0.7
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
 NOISE_SIGMAS = 1.5
-"""Stated sigmas below which residuals are noise, however large."""
+"""Stated sigmas up to which residuals are noise, however large."""
 MAX_SIZE_ERROR = 0.04
 """Deviation of the spots' radii from the expected ones that indicates a wrong scale."""
 BLUR_TOLERANCE = 0.6
@@ -70,8 +75,6 @@ ALIKE_MOTION: Final = {
 """Parameter -> other motions that look like this motion of the object."""
 OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
 """Codes of findings on motion that may be followed from frame to frame."""
-EXPLAINED_PX: Final = 0.2
-"""Residual that may remain of a motion that is named."""
 MOST_FRAMES: Final = 720
 """Scans of more frames are not looked at: four motions at once take seconds there."""
 
@@ -261,7 +264,7 @@ def explain_residuals(
     known: Known,
     refit: Refit,
     sigmas_known: bool,
-    misfit_px: float = MISFIT_PX,
+    misfit_px: float = 0.0,
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name the causes that would explain them.
 
@@ -270,7 +273,7 @@ def explain_residuals(
         known: statements on the phantom and the positions.
         refit: fits again with more parameters free.
         sigmas_known: the positions' sigmas were measured, and are no more than compared.
-        misfit_px: residual above which the fit explains nothing, if noise does not.
+        misfit_px: residual up to which the fit is used, whatever its positions scatter.
 
     Returns:
         The fit to be reported (with the causes that explain the residuals) and the findings.
@@ -284,8 +287,8 @@ def explain_residuals(
         fit, told = plain, []
     certificate = fit.certificate
     out = [*_lost_beads(fit), *_drifts(fit), *told]
-    noisy = sigmas_known and certificate.noise < NOISE_SIGMAS
-    bad = certificate.rms_px >= misfit_px and not noisy
+    limit = max(misfit_px, largest_residual(fit, MISFIT_CHANCE, sigmas_known))
+    bad = certificate.rms_px >= limit
     if bad or plain.certificate.used.sum() < MOST_USED * plain.problem.seen.sum():
         turned = _angle_scale(plain, refit)
         if turned is not None:
@@ -370,6 +373,24 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
     return [error("too_many_outliers", text)] if share > 0.35 else []
 
 
+def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) -> float:
+    """Compute the root mean square residual [px] that a right fit exceeds by chance.
+
+    Positions scatter by their stated sigmas and, from image to image, by
+    `certificate.POSITION_SPREAD_PX` with SPREAD_FREEDOM degrees of freedom.
+
+    Args:
+        fit: whose residuals are judged.
+        chance: probability of more.
+        sigmas_known: the positions' sigmas were measured, and are no more than compared.
+    """
+    usual = SPREAD_FREEDOM / float(chdtri(SPREAD_FREEDOM, 1.0 - chance))
+    certificate = fit.certificate
+    measured = sigmas_known and certificate.noise > 0.0
+    stated = certificate.rms_px / certificate.noise if measured else 0.0
+    return math.hypot(POSITION_SPREAD_PX * math.sqrt(usual), NOISE_SIGMAS * stated)
+
+
 def _explained(better: FitResult, fit: FitResult) -> bool:
     """Check whether the residuals shrink enough from `fit` to `better`, without many more spots
     left out.
@@ -378,7 +399,7 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
     return (
         better.identifiable
         and rms < 0.5 * fit.certificate.rms_px
-        and rms < MISFIT_PX
+        and rms < largest_residual(better, MISFIT_CHANCE)
         and better.certificate.used.sum() >= MOST_USED * fit.certificate.used.sum()
     )
 
@@ -435,7 +456,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         better, found = follow_motion(fit, names, refit)
     except TwinError:
         return None
-    if not better.certificate.rms_px < min(0.5 * before, EXPLAINED_PX):
+    remaining = largest_residual(better, EXPLAINED_CHANCE)
+    if not better.certificate.rms_px < min(0.5 * before, remaining):
         return None
     use = problem.seen
     effects = []

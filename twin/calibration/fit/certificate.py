@@ -44,6 +44,8 @@ RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
 MAX_ROUNDING = 1e-9
 """Residuals of exact positions [whitened] below which structure is rounding."""
+POSITION_SPREAD_PX = 0.02
+"""Assumed: what positions scatter by beyond the noise of their image: .005 to .09 px."""
 SPREAD_FREEDOM = 3.0
 """Degrees of freedom that a spread expected of the residuals counts for; assumed. Two
 positions to spare may agree by chance 20 times better than they are known."""
