@@ -110,7 +110,11 @@ if (
 
             return version("flexdt")
         if name not in _HOMES:
-            raise AttributeError(f"module 'flexdt' has no attribute {name!r}")
+            from difflib import get_close_matches
+
+            near = get_close_matches(name, _HOMES, 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise AttributeError(f"module 'flexdt' has no attribute {name!r}{hint}")
         from importlib import import_module
 
         module, colon, attribute = _HOMES[name].partition(":")

@@ -341,6 +341,8 @@ class Known:
         hint = ""
         if swapped:
             hint = f"; are {label} and {swapped[-1]} in the wrong order?"
+        elif name in dir(value) and not isinstance(value, type):
+            hint = f"; its .{name} may be meant"
         told = re.search(
             rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M
         )

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.client import twin_methods
+from flexdt.library.calibration.calibrate import _digits
 from flexdt.protocol import RpcError
 
 SCAN = fx.ConeVec.circular(sod=600, sdd=1059, angles=8, shape=(12, 16), pixel=4.0)
@@ -107,3 +109,46 @@ def test_names_are_completed(
         run([])
     found = capsys.readouterr().out.split()
     assert {"flexray", "micro_ct"} <= set(found) or {"lego", "chiral"} <= set(found)
+
+
+def test_a_result_in_place_of_its_correction_names_it() -> None:
+    data = fx.DataSet.from_arrays(COUNTS, SCAN, flat=np.full((12, 16), 1000))
+    with pytest.raises(fx.TwinError, match=r"its \.correction may be meant"):
+        data.with_correction(data.align())  # type: ignore[arg-type]
+
+
+def test_a_misspelt_name_of_the_library_has_a_suggestion() -> None:
+    with pytest.raises(AttributeError, match="did you mean 'simulate'"):
+        fx.simulat  # type: ignore[attr-defined] # noqa: B018
+
+
+@pytest.mark.parametrize("flats", [("flat_0.tif", "white.tif"), ()])
+def test_counts_without_a_flat_say_how_to_name_it(
+    flats: tuple[str, ...], tmp_path: Path
+) -> None:
+    for name in (*(f"proj_{i}.tif" for i in range(8)), *flats):
+        tifffile.imwrite(tmp_path / name, COUNTS[0])
+    data = fx.read_tiffs(tmp_path, SCAN, frames="proj*")
+    [told] = [text for text in data.warnings if "no flat image" in text]
+    assert "flat='io*'" in told
+    assert ("flat_0.tif looks like one" in told) == bool(flats)
+    with pytest.raises(fx.TwinError, match=r"no flat field .*read_tiffs"):
+        data.line_integrals()
+    with pytest.raises(fx.TwinError, match=r"no projections match 'none\*'.*proj_0"):
+        fx.read_tiffs(tmp_path, SCAN, frames="none*")
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "shown"),
+    [
+        (-1.73331, 1.0725, ("-1.7", "1.1")),
+        (0.0123456, 0.00098, ("0.01235", "0.00098")),
+        (1059.25, 12.3, ("1059", "12")),
+        (1.5, 0.0, ("1.5", "0")),
+        (None, None, ("-", "-")),
+    ],
+)
+def test_values_end_at_the_second_digit_of_their_sigma(
+    value: float | None, sigma: float | None, shown: tuple[str, str]
+) -> None:
+    assert _digits(value, sigma) == shown

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypedDict
+from typing import Any, Final, Literal, TypedDict
 
 import numpy as np
 
@@ -36,6 +36,10 @@ from flexdt.twin.machine.description import DetectorSpec, Machine, Profile, Tube
 from flexdt.twin.machine.kinematics import motor_poses
 
 SafetyName = Literal["ready", "blocked", "estopped"]
+
+
+UNITS_OF_SETTINGS: Final = {"kV": " kV", "power_W": " W", "exposure_ms": " ms"}
+"""Unit behind the limits of a setting."""
 
 
 @dataclass(frozen=True)
@@ -380,7 +384,8 @@ def _require_within(
 ) -> None:
     """Raise LimitError unless a setting is within its range."""
     if not lower <= value <= upper:
-        what = f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]"
+        unit = UNITS_OF_SETTINGS.get(name, "")
+        what = f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]{unit}"
         raise LimitError(
             what, {"setting": name, "asked": value, "allowed": [lower, upper]}
         )

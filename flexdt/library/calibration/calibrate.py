@@ -91,7 +91,7 @@ class Outcome(Generic[Images_co]):
         """Show the verdict, and the parameters with their standard deviations."""
         heads = ("parameter", "value", "sigma", "unit")
         rows = (
-            (name, _digits(found["value"]), _digits(found["sigma"]), found["unit"])
+            (name, *_digits(found["value"], found["sigma"]), found["unit"])
             for name, found in self.parameters.items()
             if found["asked"]
         )
@@ -147,9 +147,14 @@ class Outcome(Generic[Images_co]):
         )
 
 
-def _digits(value: object) -> str:
-    """Write a number with five digits; "-" where it must not be used."""
-    return f"{value:.5g}" if isinstance(value, float | int) else "-"
+def _digits(value: object, sigma: object) -> tuple[str, str]:
+    """Write a value to the second digit of its sigma; "-" where it must not be used."""
+    if not isinstance(sigma, float | int) or not 0.0 < sigma < math.inf:
+        shown = f"{value:.5g}" if isinstance(value, float | int) else "-"
+        return shown, f"{sigma:.2g}" if isinstance(sigma, float | int) else "-"
+    places = max(0, 1 - math.floor(math.log10(sigma)))
+    shown = f"{value:.{places}f}" if isinstance(value, float | int) else "-"
+    return shown, f"{sigma:.{places}f}"
 
 
 def calibrate_with(

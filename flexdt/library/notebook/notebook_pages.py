@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 MOST_PICTURES: Final = 24
 """Pictures behind a slider; of more, so many are taken, evenly spread."""
-SIDE_PX: Final = 220
+SIDE_PX: Final = 320
 """Longest side of a picture."""
 DRAWING_PX: Final = 420
 """Side of the drawing of a geometry."""

@@ -8,6 +8,7 @@ texts alone). Errors are typed and name the file; what leaves the rest usable is
 from __future__ import annotations
 
 import fnmatch
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
@@ -62,6 +63,8 @@ from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.image_order import duplicate
 from flexdt.twin.signatures import public
 
+FLAT_NAME: Final = re.compile(r"flat|white|bright|open|blank|gain|^io", re.IGNORECASE)
+"""Words in the names of flat images."""
 AGREE_MM: Final = 1e-6
 """Largest difference of a file's cone_vec from the one of its motor positions [mm]."""
 MAX_SETTINGS_BYTES: Final = 16 << 20
@@ -168,8 +171,9 @@ def read_tiffs(
     chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
     if not chosen:
         taken = f": dark={dark!r} and flat={flat!r} took {', '.join(sorted(others)[:3])}"
+        there = f"; there are {', '.join(names[:3])} ..." if names else "; it is empty"
         raise DatasetMissingError(
-            f"{content.path}: no projections match {frames!r}{taken if others else ''}",
+            f"{content.path}: no projections match {frames!r}{taken if others else there}",
             {"path": str(content.path), "missing": [frames]},
         )
     first = read_values(content.path / chosen[0])
@@ -183,7 +187,25 @@ def read_tiffs(
     if first.dtype != np.uint16:
         made = _of_floats(content.path, cone, chosen, darks, flats)
         return replace(made, warnings=(*made.warnings, *doubts))
+    if not flats:
+        doubts = [*doubts, _without_flat(content.path.name, names, flat)]
     return listed(content, cone, chosen, darks, flats, warnings=doubts)
+
+
+def _without_flat(folder: str, names: Sequence[str], pattern: str) -> str:
+    """Say what a scan without flat images lacks, and which files may be such images.
+
+    Args:
+        folder: name of the folder.
+        names: of all files in it, sorted.
+        pattern: that no file matches.
+    """
+    some = [name for name in names if FLAT_NAME.search(name)]
+    guess = f"; {some[0]} looks like one" if some else ""
+    return (
+        f"{folder}: no flat image matches flat={pattern!r}{guess}; counts become line "
+        "integrals by one"
+    )
 
 
 def _of_floats(
