@@ -95,7 +95,7 @@ class Material:
 
 @lru_cache
 def materials() -> Mapping[str, Material]:
-    """Load all bundled materials by name."""
+    """Load all bundled materials, name -> material; read once."""
     text = (resources.files("flexdt.phantoms") / "data" / "materials.toml").read_text(
         "utf-8"
     )

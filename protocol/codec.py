@@ -96,6 +96,9 @@ def json_pieces(document: object) -> list[bytes]:
     large: list[bytes | memoryview] = []
 
     def default(value: object) -> object:
+        """Encode a value that JSON lacks; a large binary one goes to `large`, and a mark
+        in its place.
+        """
         if not isinstance(value, (bytes, bytearray, memoryview)):
             return _plain(value)
         if len(value) < MIN_PIECEWISE_BYTES:

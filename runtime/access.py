@@ -200,7 +200,13 @@ def token_matches(given: str | None, token: str) -> bool:
 
 
 def read_token(file: Path | None) -> str | None:
-    """Read the token: first line of `file`, else the environment's FLEXDT_TOKEN, else None.
+    """Read the token that a server requires or a client brings.
+
+    Args:
+        file: whose first line it is; None: the environment's FLEXDT_TOKEN.
+
+    Returns:
+        The token; None without a file and without the variable.
 
     Raises:
         AccessError: the file cannot be read or holds no token.

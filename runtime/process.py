@@ -124,7 +124,9 @@ class ServerLoop(asyncio.SelectorEventLoop):
         lines = Sparing(burst=1)
 
         def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-            """Log what asyncio reports; errors of the system without a traceback."""
+            """Log what asyncio reports: once in a while of each kind, errors of the
+            system without a traceback.
+            """
             what = str(context.get("message"))
             error = context.get("exception")
             kind = f"{what} {type(error).__name__}"
@@ -265,6 +267,7 @@ def stop_signal() -> asyncio.Event:
     watch = signal.set_wakeup_fd(-1)
 
     def begin_to_stop() -> None:
+        """Set the event, and wake the reader of the descriptor that was set before."""
         stop.set()
         if watch != -1:
             with contextlib.suppress(OSError):

@@ -109,6 +109,9 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
     ]
 
     def declaring(function: Thing) -> Thing:
+        """Replace `**options` in the function's signature and docstring, and return the
+        function.
+        """
         said = inspect.signature(function)
         named = [p for p in said.parameters.values() if p.kind is not p.VAR_KEYWORD]
         function.__signature__ = said.replace(parameters=[*named, *more])  # type: ignore[attr-defined]
@@ -168,6 +171,7 @@ def _checked(function: Thing, text: str) -> Thing:
 
     @wraps(function)
     def call(*given: Any, **named: Any) -> Any:
+        """Check the arguments of a call, then call the function."""
         # Types that have been allowed together once are not looked at again.
         types_of = (*map(_type, given), *named, *map(_type, named.values()))
         if None in types_of or types_of not in known.allowed:

@@ -250,7 +250,13 @@ class Directory:
         return os.fdopen(file, "w+b", buffering=0)
 
     def open(self, name: str) -> BinaryIO:
-        """Open a regular file for reading.
+        """Open a regular file for reading; a link is not followed.
+
+        Args:
+            name: of the file.
+
+        Returns:
+            The binary file, which the caller closes.
 
         Raises:
             OSError: there is none: a FileNotFoundError, or it is no regular file.

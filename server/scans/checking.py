@@ -354,6 +354,7 @@ def _refusing_large(
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
+        """Sweep a plan unless its report would be too large."""
         size_of = sum(STEP_BYTES + len(s.what) + len(s.assumed_from) for s in plan.steps)
         if most is not None and size_of > most:
             raise too_large("a report", f"more than {size_of}", most)

@@ -77,6 +77,13 @@ class Retry:
         self._attempts = 0
 
     async def _wait(self, error: Exception, go: Callable[[], None], pause: float) -> None:
+        """Pause, again and again while the disk is full, then call `go`.
+
+        Args:
+            error: for which it waits.
+            go: resumes the job.
+            pause: between attempts [real s].
+        """
         while True:
             await asyncio.sleep(pause)
             if not isinstance(error, DiskFullError) or _has_room(error):

@@ -96,10 +96,10 @@ class Jobs:
         return list(self._all.values())
 
     def get(self, job: str | None) -> Job:
-        """Return the job named `job`, or for None the current or else the last one.
+        """Return the job with id `job`, or for None the current or else the last one.
 
         Raises:
-            UnknownNameError: lists the existing jobs.
+            UnknownNameError: lists the existing jobs, at most `MAX_NAMED_JOBS`.
         """
         if job is None and self.current is not None:
             return self.current
@@ -676,6 +676,9 @@ def _logged(produce: Produce, job: str) -> Produce:
     """
 
     async def work(batch: Sequence[Exposure]) -> None:
+        """Produce a batch of frames under its trace; log a programming error and raise
+        it.
+        """
         try:
             with traced(f"{job}.{batch[0].file}"):
                 await produce(batch)

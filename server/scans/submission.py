@@ -255,6 +255,9 @@ class Submissions:
             self.job_files.put(changes, drafts[0].memory())
 
         def take() -> Job:
+            """Put the drafted job into the queue; raise if its name has been taken
+            meanwhile.
+            """
             ensure_allowed()
             [draft] = drafts
             if self.jobs.uses(draft.folder):
@@ -363,6 +366,7 @@ class Submissions:
         parameters = scanner.parameters
 
         def work() -> CheckInput:
+            """Compute the sample's shapes and put the input together, in a thread."""
             if scanner.machine.components:
                 pieces = stage.pieces(stands)
             else:

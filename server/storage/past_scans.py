@@ -500,7 +500,7 @@ def _with_thumbnail(
     """
 
     def make() -> ImageValue | str:
-        """Make the thumbnail of the middle projection; "" if there is none."""
+        """Read the middle projection and make its thumbnail, 8-bit; "" if there is none."""
         folder = files.list_folder(path)
         images = list(folder.projections.values())
         if not images:

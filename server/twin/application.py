@@ -106,6 +106,7 @@ def twin_pages(
     """
 
     def health() -> dict[str, object]:
+        """Return the facts of `/healthz`: server, projector and job."""
         job = twin.jobs.current
         return {
             "server": f"flexdt {twin.version}",

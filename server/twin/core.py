@@ -425,7 +425,9 @@ class TwinServer:
             )
 
     def _readable_sample(self, sample: Sample) -> Sample:
-        """Return the stored sample, or the empty stage if the sample cannot be read."""
+        """Read the stored sample, and return the empty stage, with a warning in the log,
+        if that fails.
+        """
         head = self.samples.head(sample.name)
         if head is not None and head.kind == "voxels":
             sample = replace(sample, material=None)

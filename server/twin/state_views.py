@@ -51,8 +51,12 @@ def geometry_view(readout: Readout | None) -> w.GeometryState:
 def safety_view(
     safety: Safety, clearance: NearestPair | None, margin_mm: float
 ) -> w.SafetyState:
-    """Convert safety state and clearance to their wire form; below `margin_mm` is a
-    warning.
+    """Convert safety state and clearance to their wire form.
+
+    Args:
+        safety: of the scanner.
+        clearance: smallest one now; None for a machine without components.
+        margin_mm: a clearance below it is a warning.
     """
     if clearance is None or not math.isfinite(clearance.mm):
         near = None

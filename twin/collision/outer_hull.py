@@ -67,7 +67,14 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
 
 
 def _planes(solid: Polytope) -> FloatArray:
-    """Compute outward planes (m, 4) of the solid's largest faces: n . x + d <= 0 inside."""
+    """Compute the outward planes of the solid's largest faces, at most `MAX_PLANES`.
+
+    Args:
+        solid: convex.
+
+    Returns:
+        (m, 4): unit normal n and offset d, with n . x + d <= 0 inside [mm].
+    """
     a, b, c = np.moveaxis(solid.vertices[solid.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1)

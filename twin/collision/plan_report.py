@@ -53,6 +53,7 @@ def collision_check(
     def check(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
+        """Sweep a plan with the machine's bodies and the sample; see `collision_report`."""
         if sample is None:
             pieces = _from_size(size)
         else:

@@ -244,6 +244,7 @@ class _Overlap:
         (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
 
         def gaps(directions: FloatArray) -> FloatArray:
+            """Compute the gaps between the bodies along directions (k, 3), (k,) [mm]."""
             reach = self._reach_of(0, directions, self.turned)
             return (
                 directions @ (at_a - at_b)

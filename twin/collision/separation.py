@@ -55,7 +55,16 @@ def separation_of(
     def separate(
         offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
-        """Separate the two solids in a pose; thread-safe."""
+        """Compute the separation of the two solids in a pose; thread-safe.
+
+        Args:
+            offset: from b's origin to a's (3,) [mm].
+            turn_a, turn_b: orientations (3, 3); None for a body that never turns.
+
+        Returns:
+            Gap [mm] and unit normal (3,) from b to a; a gap of 0 for solids that touch or
+            overlap.
+        """
         # Nothing is shared that changes: several threads may call at once.
         ra, rb = (_IDENTITY if turn is None else turn for turn in (turn_a, turn_b))
         object_a = fcl.CollisionObject(shape_a, fcl.Transform(ra, offset + ra @ shift_a))

@@ -117,7 +117,11 @@ _KINDS: Final[Mapping[Kind, tuple[Callable[[Any], str], Callable[[str], object]]
 
 
 def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
-    """Write `scan settings.txt` (CRLF) for a scan; absent fields have no line."""
+    """Format `scan settings.txt` (CRLF) for a scan.
+
+    Args:
+        scan: a record, or the settings themselves; fields that are None have no line.
+    """
     if isinstance(scan, ScanRecord):
         s = settings_of(scan)
     else:

@@ -31,10 +31,13 @@ _TALL_MM: Final = 2000.0
 
 
 def format_xre(record: ScanRecord) -> str:
-    """Write `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
+    """Format `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
 
     Values of the maker's reconstruction and of hardware the twin does not model are zero
     or empty there, so that readers find every key.
+
+    Args:
+        record: of the scan.
     """
     s = settings_of(record)
     camera = record.camera

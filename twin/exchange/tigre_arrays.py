@@ -181,7 +181,14 @@ def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatA
 
 
 def _axes(turns: FloatArray) -> FloatArray:
-    """Compute Rz Ry Rx (n, 3, 3) of turns about x, y and z (n, 3) [rad]."""
+    """Compute the rotations Rz Ry Rx of turns; the inverse of `_turns`.
+
+    Args:
+        turns: about x, y and z (n, 3) [rad].
+
+    Returns:
+        (n, 3, 3).
+    """
     yaw, pitch, roll = turns.T
     one = np.ones_like(yaw)
     zero = np.zeros_like(yaw)

@@ -397,8 +397,14 @@ def require_applicable(
     camera: CameraSettings,
     correction: NamedCorrection | None,
 ) -> None:
-    """Check that a correction leaves a geometry that a scanner can have, anywhere
-    in the travel.
+    """Check that a correction leaves a geometry that a scanner can have, anywhere in the
+    travel.
+
+    Args:
+        machine: with the travel of its motors.
+        profile: zero offsets.
+        camera: settings in force.
+        correction: None checks the nominal geometry.
 
     Raises:
         GeometryError: it does not; the message names the offset or the check.

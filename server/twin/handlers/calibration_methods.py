@@ -92,8 +92,12 @@ async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.Correct
 async def delete(
     twin: TwinServer, client: h.Client, params: p.CalibrationDelete
 ) -> p.CorrectionDeleted:
-    """Delete a correction from the list and the history of `revert`; data sets keep
-    theirs.
+    """Delete a correction and its file from the list and the history of `revert`; data
+    sets keep theirs.
+
+    Raises:
+        UnknownNameError: there is no such correction.
+        LimitError: it is in force.
     """
     async with twin.stage_turn:
         history = twin.corrections.without(params.name)

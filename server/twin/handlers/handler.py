@@ -198,6 +198,7 @@ async def change_stage(
     change = await asyncio.to_thread(change.certified)
 
     def files(changes: Changes) -> None:
+        """Add the files of upload, correction and history to the change."""
         if upload is not None:
             twin.samples.store(changes, upload)
         if correction is not None:
@@ -206,6 +207,7 @@ async def change_stage(
             twin.corrections.store_history(changes, history)
 
     def after(memory: Memory) -> Memory:
+        """Return the state's document as it is after the change."""
         trial = copy.copy(scanner)
         trial.sample = sample
         trial.correction = correction

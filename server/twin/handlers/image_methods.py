@@ -35,6 +35,12 @@ async def get_projection(
 ) -> Encoded:
     """Compute an image at the present pose, or predict one for other poses or settings.
 
+    A prediction has the public geometry and no noise; at the present pose the hidden
+    truth and noise are in the image.
+
+    Returns:
+        The image, encoded for the connection, with marks of its pixels where asked for.
+
     Raises:
         RpcError: -32008, it would be larger than an answer may be.
         TwinError: the machine does not have a motor or a setting.
@@ -142,7 +148,13 @@ def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryR
 
 @answers(p.EXPOSURE_PREDICT)
 async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -> Encoded:
-    """Predict the image quality of a circular scan at the present distances.
+    """Predict the image quality of a circular scan at the present distances, in a worker
+    process.
+
+    Settings that the request leaves out are the present ones.
+
+    Returns:
+        The forecast, encoded for the connection.
 
     Raises:
         LimitError: the stage is empty, or a setting is beyond the machine's limits.

@@ -140,12 +140,16 @@ async def forget(
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 
     def files(changes: Changes) -> None:
+        """Remove the jobs' files, and the records of scans whose data sets do not exist."""
         for job in jobs:
             twin.job_files.remove(changes, job.id)
             if twin.directory.stat(job.name) is None:  # nothing is left to go on with
                 JobRecord.forget(changes, twin.directory, job.name)
 
     def take() -> list[Job]:
+        """Remove the jobs from the list, except those that were resumed meanwhile; return
+        them.
+        """
         gone = [
             job for job in jobs if job.phase in ENDED_PHASES
         ]  # one may have been resumed meanwhile

@@ -216,6 +216,7 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
     stops = twin.scanner.stops
 
     def change(scanner: ScannerTwin) -> None:
+        """Set the tube; refuse X-rays on after a stop that came later than the request."""
         now = twin.clock.now()
         if params.on and twin.scanner.stops != stops:
             raise SafetyError(

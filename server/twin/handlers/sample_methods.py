@@ -58,7 +58,9 @@ async def set_sample(
 async def list_samples(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.SampleListResult | Encoded:
-    """List everything that may be put on the stage."""
+    """List the empty stage, shipped phantoms and uploads, with their sizes, and all
+    materials.
+    """
     empty = p.SampleInfo(
         name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
     )
@@ -80,7 +82,13 @@ async def list_samples(
 async def mesh(
     twin: TwinServer, client: h.Client, params: p.SampleMesh
 ) -> p.SampleMeshResult:
-    """Send a part of the mesh of the sample on the stage, for drawing."""
+    """Send a part of the mesh (binary STL) of the sample on the stage, for drawing.
+
+    The mesh is made once for each sample, in a thread.
+
+    Raises:
+        LimitError: the stage is empty.
+    """
     sample = twin.scanner.sample
     if not sample.name:
         raise LimitError("nothing stands on the stage", {"asked": "sample.mesh"})
@@ -158,7 +166,13 @@ async def upload(
 async def delete(
     twin: TwinServer, client: h.Client, params: p.SampleDelete
 ) -> p.SampleDeleteResult:
-    """Delete an upload, unless it is on the stage or in a scan that has not ended."""
+    """Delete an upload and its files, unless it is on the stage or in a scan that has not
+    ended.
+
+    Raises:
+        UnknownNameError: no such upload.
+        LimitError, RpcError: it is in use.
+    """
     name = params.name
     ready = h.ensure_allowed(twin, client, "sample.delete")
     async with twin.samples.turn, twin.stage_turn:

@@ -142,6 +142,9 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
             await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
 
     def ready() -> None:
+        """Raise if motion was stopped meanwhile, a job runs, or the client has lost
+        control.
+        """
         if twin.scanner.stops != stops:
             raise SafetyError(
                 "the scene is not loaded: motion was stopped meanwhile",

@@ -130,7 +130,9 @@ class Simulation:
             )
 
     def _release(self, command: c.Command, span: planned.Span) -> float:
-        """Return the moment at which the script goes on after a command."""
+        """Compute the moment [s] at which the script goes on after a command, by its
+        wait.
+        """
         if command.wait is c.Wait.ACK:
             return max(self.now, span.end)
         if command.wait is c.Wait.POS and span.release is not None:
