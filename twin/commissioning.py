@@ -265,13 +265,13 @@ def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
         scans: of which the folders are named.
         known: machines that they may be of.
     """
-    told = {scan.name: scanner_of(scan, known) for scan in scans}
-    serials = {one.serial for one in told.values()} - {""}
-    machines = {one.machine for one in told.values()} - {""}
+    scanners = {scan.name: scanner_of(scan, known) for scan in scans}
+    serials = {one.serial for one in scanners.values()} - {""}
+    machines = {one.machine for one in scanners.values()} - {""}
     if max(len(serials), len(machines)) < 2:
         return ""
     groups: dict[Scanner, list[str]] = {}
-    for name, one in told.items():
+    for name, one in scanners.items():
         groups.setdefault(one, []).append(name)
     words = []
     for one, names in groups.items():
@@ -296,7 +296,7 @@ def contradictions(
         shipped: machine of the file.
         fitted: machine with the signs and limits that the scans show.
     """
-    said: dict[str, list[tuple[Any, list[str]]]] = {}
+    statements: dict[str, list[tuple[Any, list[str]]]] = {}
     lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
     every = [
         (f"{name} in {scan.name}", value, who, name)
@@ -324,15 +324,17 @@ def contradictions(
             slack = (0.0, rebuild.MATCH_MM)
         else:
             slack = (RELATIVE_TOLERANCE, 0.0)
-        told = said.setdefault(about, [])
-        names = next((n for other, n in told if _agree(value, other, slack)), None)
+        values = statements.setdefault(about, [])
+        names = next((n for other, n in values if _agree(value, other, slack)), None)
         if names is None:
-            told.append((value, [who]))
+            values.append((value, [who]))
         elif who not in names:
             names.append(who)
-    for about, told in said.items():
-        if len(told) > 1:
-            yield Finding(about, "; ".join(f"{_plain(v)} in {_some(n)}" for v, n in told))
+    for about, values in statements.items():
+        if len(values) > 1:
+            yield Finding(
+                about, "; ".join(f"{_plain(v)} in {_some(n)}" for v, n in values)
+            )
     for scan in scans:
         try:
             if scan.settings is not None and scan.settings.mode is not None:
@@ -383,10 +385,10 @@ def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any
             "binning": camera.binning,
             "binned_pixel_mm": pixel,
         }
-    for who, told in sources.items():
+    for who, statements in sources.items():
         for name in (*scan_settings.ENTRIES, "shape", *read):
-            if told.get(name) not in (None, ""):
-                yield name, told[name], who
+            if statements.get(name) not in (None, ""):
+                yield name, statements[name], who
 
 
 def _common_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
@@ -480,11 +482,11 @@ def zero_offsets(
     findings = list[Finding]()
     columns = dict[str, tuple[float, float, float]]()
     last = max((scan.date for scan in scans if scan.date is not None), default=None)
-    told = [
+    aligned = [
         s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters
     ]
-    drifts = len({s.date for s in told if s.date is not None}) >= FOR_A_LINE
-    told = [s for s in told if s.date is not None or not drifts]
+    drifts = len({s.date for s in aligned if s.date is not None}) >= FOR_A_LINE
+    aligned = [s for s in aligned if s.date is not None or not drifts]
     width = prior_widths(machine, usual)["dD_x"]
 
     def fitted(
@@ -503,35 +505,40 @@ def zero_offsets(
         Returns:
             Values (k,) and covariance (k, k).
         """
-        at, covariance, pulls = _fit(sides, np.array(rest), np.array(sigmas), len(told))
+        at, covariance, pulls = _fit(
+            sides, np.array(rest), np.array(sigmas), len(aligned)
+        )
         widths = np.sqrt(np.diag(covariance)).tolist()
         for name, i in zip(names, (0, 2), strict=False):
             slope = {"per_year": float(at[1]), "drift_sigma": widths[1]}
             value = lines[name].value + float(at[i])
             more = slope if drifts and i == 0 else {}
-            lines[name] = Line(value, widths[i], scans=len(told), **more)
-        for scan, pull in zip(told, pulls.tolist(), strict=True):
+            lines[name] = Line(value, widths[i], scans=len(aligned), **more)
+        for scan, pull in zip(aligned, pulls.tolist(), strict=True):
             if abs(pull) > MAX_SIGMAS:
                 text = f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
                 findings.append(Finding(names[0], text))
         return at, covariance
 
-    if told:
+    if aligned:
         years = np.array(
             [
                 (s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0
-                for s in told
+                for s in aligned
             ]
         )
-        found = [s.aligned.parameters for s in told if s.aligned]
+        found = [s.aligned.parameters for s in aligned if s.aligned]
         rolls = [p["det_roll"] for p in found]
-        sides = np.vstack([np.column_stack([np.ones(len(told)), years]), [0.0, 1.0]])
+        sides = np.vstack([np.column_stack([np.ones(len(aligned)), years]), [0.0, 1.0]])
         rest = [*(r.value - base.det_roll_deg for r in rolls), 0.0]
         fitted(
             sides, rest, [*(r.sigma for r in rolls), DRIFT_PRIOR_PER_YEAR], "det_roll_deg"
         )
         seen = np.array(
-            [_axis(machine, s, base, r.value) for s, r in zip(told, rolls, strict=True)]
+            [
+                _axis(machine, s, base, r.value)
+                for s, r in zip(aligned, rolls, strict=True)
+            ]
         )
         sides = np.column_stack([seen[:, 1], seen[:, 1] * years, seen[:, 2]])
         measured = [p["axis_column_px"] for p in found]
@@ -545,7 +552,7 @@ def zero_offsets(
         at, covariance = fitted(known, rest, sigmas, "axs_tan", "det_tan")
         spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, covariance, sides))
         for s, m, *more in zip(
-            told, measured, seen[:, 0] + sides @ at, spread, strict=True
+            aligned, measured, seen[:, 0] + sides @ at, spread, strict=True
         ):
             columns[s.name] = (m.value, float(more[0]), float(more[1]))
     day = "undated"

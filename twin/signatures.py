@@ -100,7 +100,7 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
     Args:
         declared: the TypedDict, whose docstring has a last section `Args:`.
     """
-    told = inspect.cleandoc(declared.__doc__ or "").partition("Args:\n")[2]
+    descriptions = inspect.cleandoc(declared.__doc__ or "").partition("Args:\n")[2]
     hints = typing.get_type_hints(declared)
     keyword = inspect.Parameter.KEYWORD_ONLY
     more = [
@@ -112,11 +112,11 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
         """Replace `**options` in the function's signature and docstring, and return the
         function.
         """
-        said = inspect.signature(function)
-        named = [p for p in said.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        function.__signature__ = said.replace(parameters=[*named, *more])  # type: ignore[attr-defined]
+        signature = inspect.signature(function)
+        named = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        function.__signature__ = signature.replace(parameters=[*named, *more])  # type: ignore[attr-defined]
         text = inspect.cleandoc(function.__doc__ or "")
-        function.__doc__ = text.replace("    options: OPTIONS", told.rstrip())
+        function.__doc__ = text.replace("    options: OPTIONS", descriptions.rstrip())
         return function
 
     return declaring
@@ -156,10 +156,10 @@ def public(thing: Thing) -> Thing:
                     type(member)(_checked(inside, inspect.getdoc(inside) or "")),
                 )
             elif inspect.isfunction(member):
-                said = text
+                description = text
                 if name != "__init__":
-                    said = inspect.getdoc(member) or ""
-                setattr(thing, name, _checked(member, said))
+                    description = inspect.getdoc(member) or ""
+                setattr(thing, name, _checked(member, description))
     return thing
 
 
@@ -224,9 +224,9 @@ class Known:
         )
         found = {}
         for name, parameter in self.signature.parameters.items():
-            said = parameter.annotation
+            annotation = parameter.annotation
             found[name] = kind_of(
-                eval(said, {}, names) if isinstance(said, str) else said
+                eval(annotation, {}, names) if isinstance(annotation, str) else annotation
             )
         return {name: kind for name, kind in found.items() if kind is not None}
 
@@ -308,8 +308,8 @@ class Known:
                 hint = ""
                 if near is not None:
                     hint = f" (did you mean {near!r}?)"
-                said = f"{where} has no argument {name!r}{hint}"
-                raise ArgumentError.instead(said, name, self._names())
+                problem = f"{where} has no argument {name!r}{hint}"
+                raise ArgumentError.instead(problem, name, self._names())
         return found
 
     def _mistake(
@@ -347,15 +347,15 @@ class Known:
             hint = f"; are {label} and {swapped[-1]} in the wrong order?"
         elif name in dir(value) and not isinstance(value, type):
             hint = f"; its .{name} may be meant"
-        told = re.search(
+        described = re.search(
             rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M
         )
         more = ""
-        if told:
-            more = f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})"
-        said = f"{where}: {label} is {_value_words(value)}"
+        if described:
+            more = f" ({' '.join(described[1].split()).split('. ')[0].rstrip('.')})"
+        problem = f"{where}: {label} is {_value_words(value)}"
         return ArgumentError.instead(
-            said, repr(value)[:100], words + more + hint, argument=label
+            problem, repr(value)[:100], words + more + hint, argument=label
         )
 
 

@@ -31,10 +31,10 @@ def require_bytes(path: Path, needed: int) -> None:
     """
     free = free_bytes(path)
     if needed > free:
-        said = (
+        problem = (
             f"{os.strerror(errno.ENOSPC)}: it takes {needed} bytes; {free} bytes are free"
         )
-        raise OSError(errno.ENOSPC, said, str(path))
+        raise OSError(errno.ENOSPC, problem, str(path))
 
 
 @contextmanager
@@ -62,8 +62,8 @@ def room_named(path: Path) -> Iterator[None]:
         if number is None and free < FULL_BYTES:
             number = errno.ENOSPC
         if number in NO_ROOM:
-            said = f"{os.strerror(number)}; {free} bytes are free"
-            raise OSError(number, said, str(path)) from None
+            problem = f"{os.strerror(number)}; {free} bytes are free"
+            raise OSError(number, problem, str(path)) from None
         if number is None or not isinstance(error, OSError):
             raise
         raise type(error)(number, error.strerror, str(path)) from None

@@ -225,12 +225,12 @@ class Imaging:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
         cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
-        async with self._on_projector(sample, "part") as apart:
-            factors = [factor for _, factor in apart.found]
+        async with self._on_projector(sample, "part") as divided:
+            factors = [factor for _, factor in divided.found]
             if factors == [1.0]:
-                return await self.projector.project(apart.names[0], cone, camera.shape)
+                return await self.projector.project(divided.names[0], cone, camera.shape)
             total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
-            for name, factor in zip(apart.names, factors, strict=True):
+            for name, factor in zip(divided.names, factors, strict=True):
                 total += np.float32(factor) * await self.projector.project(
                     name, cone, camera.shape
                 )
@@ -269,11 +269,13 @@ class Imaging:
                 np.empty((0, len(cone), *camera.shape), dtype=np.float32),
                 cone.rows,
             )
-        async with self._on_projector(sample, "material") as apart:
-            out = np.empty((len(apart.names), len(cone), *camera.shape), dtype=np.float32)
-            for i, name in enumerate(apart.names):
+        async with self._on_projector(sample, "material") as divided:
+            out = np.empty(
+                (len(divided.names), len(cone), *camera.shape), dtype=np.float32
+            )
+            for i, name in enumerate(divided.names):
                 out[i] = await self.projector.project(name, cone, camera.shape)
-            return apart.found, out, cone.rows
+            return divided.found, out, cone.rows
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
         """Compute material -> path [mm] to the one pixel of `cone`, n = 1, in
@@ -301,9 +303,9 @@ class Imaging:
         views, *grid = cone.shape
         if not sample.name:
             return (), np.empty((0, views, *grid), dtype=np.float32)
-        async with self._on_projector(sample, "material") as apart:
-            out = await self._along(apart, sample.offset.to_sample(cone))
-            return apart.found, out
+        async with self._on_projector(sample, "material") as divided:
+            out = await self._along(divided, sample.offset.to_sample(cone))
+            return divided.found, out
 
     async def nominal_integrals(self, sample: Sample, cone: ConeVec) -> Float32Array:
         """Compute line integrals without the hidden truth, float32 (n, rows, cols); see
@@ -312,16 +314,16 @@ class Imaging:
         views, *grid = cone.shape
         if not sample.name:
             return np.zeros((views, *grid), dtype=np.float32)
-        async with self._on_projector(sample, "part") as apart:
-            parts = await self._along(apart, sample.offset.to_sample(cone))
-            factors = np.array([factor for _, factor in apart.found], dtype=np.float32)
+        async with self._on_projector(sample, "part") as divided:
+            parts = await self._along(divided, sample.offset.to_sample(cone))
+            factors = np.array([factor for _, factor in divided.found], dtype=np.float32)
             return np.asarray(np.tensordot(factors, parts, axes=1), dtype=np.float32)
 
-    async def _along(self, apart: _DividedSample, cone: ConeVec) -> Float32Array:
+    async def _along(self, divided: _DividedSample, cone: ConeVec) -> Float32Array:
         """Project each piece of a sample, float32 (pieces, n, rows, cols)."""
         views, *grid = cone.shape
-        out = np.empty((len(apart.names), views, *grid), dtype=np.float32)
-        for i, name in enumerate(apart.names):
+        out = np.empty((len(divided.names), views, *grid), dtype=np.float32)
+        for i, name in enumerate(divided.names):
             out[i] = await self.projector.project(name, cone, cone.of_shape(None))
         return out
 
@@ -329,11 +331,13 @@ class Imaging:
         """Sample the materials of `sample` on a grid of about `voxels` cubes; the last
         grid is kept.
         """
-        async with self._on_projector(sample, "material") as apart:
-            phantom = apart.phantom
+        async with self._on_projector(sample, "material") as divided:
+            phantom = divided.phantom
             if self._scatterer is None or self._scatterer[0] is not phantom:
                 size = phantom.size_mm
-                thing = await asyncio.to_thread(scatter_object, apart.found, size, voxels)
+                thing = await asyncio.to_thread(
+                    scatter_object, divided.found, size, voxels
+                )
                 self._scatterer = phantom, thing
                 return thing
             return self._scatterer[1]
@@ -352,21 +356,21 @@ class Imaging:
         if not sample.name:
             return
         async with self._sending:
-            apart = await self._divide(sample, pieces)
-        mine = (_name(sample), pieces)
+            divided = await self._divide(sample, pieces)
+        own_key = (_name(sample), pieces)
         if self.memory_limit is not None:
             others = sum(
-                self._divided[key].nbytes for key in self._pinned_keys() if key != mine
+                self._divided[key].nbytes for key in self._pinned_keys() if key != own_key
             )
             left = self.memory_limit - others
-            if apart.nbytes > left:
+            if divided.nbytes > left:
                 raise self._too_large(
-                    sample, apart.nbytes, left, self.memory_limit, "the twin"
+                    sample, divided.nbytes, left, self.memory_limit, "the twin"
                 )
         available = None
         if self.room is not None:
             available = await self.room()
-        need = sum(memory_of(body) for body in apart.bodies)
+        need = sum(memory_of(body) for body in divided.bodies)
         if available is not None and need > available:
             raise self._too_large(sample, need, available, available, "the projector")
 
@@ -408,19 +412,19 @@ class Imaging:
             The pieces, with their names on the projector.
         """
         async with self._sending:
-            apart = await self._divide(sample, pieces)
-            apart.users += 1
+            divided = await self._divide(sample, pieces)
+            divided.users += 1
             try:
-                if not apart.names:
-                    await self._send_bodies(apart, _name(sample), pieces)
+                if not divided.names:
+                    await self._send_bodies(divided, _name(sample), pieces)
                 await self._forget_old()
             except BaseException:
-                apart.users -= 1
+                divided.users -= 1
                 raise
         try:
-            yield apart
+            yield divided
         finally:
-            apart.users -= 1
+            divided.users -= 1
 
     async def _divide(self, sample: Sample, pieces: Pieces) -> _DividedSample:
         """Divide the sample as it is now, in a thread, or reuse its pieces; with
@@ -432,26 +436,26 @@ class Imaging:
         """
         key = (_name(sample), pieces)
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
-        apart = self._divided.pop(key, None)
-        if apart is None or apart.phantom is not phantom:
+        divided = self._divided.pop(key, None)
+        if divided is None or divided.phantom is not phantom:
             if pieces == "part":
                 found: Any = await asyncio.to_thread(attenuating, phantom)
                 bodies = [body for body, _ in found]
             else:
                 found = await asyncio.to_thread(channels, phantom)
                 bodies = [channel.body for channel in found]
-            apart = _DividedSample(phantom, found, bodies)
-        self._divided[key] = apart
-        return apart
+            divided = _DividedSample(phantom, found, bodies)
+        self._divided[key] = divided
+        return divided
 
     async def _send_bodies(
-        self, apart: _DividedSample, name: str, pieces: Pieces
+        self, divided: _DividedSample, name: str, pieces: Pieces
     ) -> None:
         """Send the pieces of a sample and record their names."""
-        single = pieces == "part" and len(apart.bodies) == 1
-        apart.names = [
+        single = pieces == "part" and len(divided.bodies) == 1
+        divided.names = [
             await self._ensure_sent(name if single else f"{name}, {pieces} {i}", body)
-            for i, body in enumerate(apart.bodies)
+            for i, body in enumerate(divided.bodies)
         ]
 
     def _pinned_keys(self) -> set[_Key]:
@@ -468,16 +472,16 @@ class Imaging:
             limit_bytes = math.inf
         else:
             limit_bytes = self.memory_limit
-        used = sum(apart.nbytes for apart in self._divided.values())
+        used = sum(divided.nbytes for divided in self._divided.values())
         newest = next(reversed(self._divided))
-        for key, apart in list(self._divided.items()):
+        for key, divided in list(self._divided.items()):
             if used <= limit_bytes and len(self._divided) <= MAX_SAMPLES:
                 return
-            if key in stays or key == newest or apart.users:
+            if key in stays or key == newest or divided.users:
                 continue
-            used -= apart.nbytes
+            used -= divided.nbytes
             del self._divided[key]
-            for name in {named.rpartition(" #")[0] for named in apart.names}:
+            for name in {named.rpartition(" #")[0] for named in divided.names}:
                 await self._remove(name, 0)
                 del self._versions[name]
 

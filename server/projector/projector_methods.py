@@ -183,7 +183,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
     rows = views.rows
     boxes = volume.boxes if isinstance(volume, Volume) else None
     found = examine(Operation.PROJECT, views, p.detector, boxes=boxes)
-    told = _warnings(settled(found, GeometryError))
+    warnings = _warnings(settled(found, GeometryError))
     block = views_a_block(p.detector)
     if p.key is not None:
         context.supersede(client, p.key)
@@ -195,11 +195,11 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
         assert isinstance(images, np.ndarray)
         context.views += len(images)
         if len(images) == len(rows) and images.nbytes + SPARE_BYTES <= MAX_FRAME:
-            return {**image.encode(images), **told}
+            return {**image.encode(images), **warnings}
         parts += await context.send_parts(client, id, images, done * view)
         done += len(images)
     shape = [len(rows), *p.detector]
-    return {"dtype": "float32", "shape": shape, "parts": parts, **told}
+    return {"dtype": "float32", "shape": shape, "parts": parts, **warnings}
 
 
 async def backproject(

@@ -62,9 +62,7 @@ class Stage:
         self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = (
             OrderedDict()
         )
-        self._convex_pieces_of: OrderedDict[_Content, tuple[Polytope, ...]] = (
-            OrderedDict()
-        )
+        self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
         """Load the phantom of a sample; None for an empty stage.
@@ -98,7 +96,7 @@ class Stage:
             The pieces; empty for an empty stage.
         """
         before = self._content(sample, upload)
-        pieces = self._convex_pieces_of.get(before)
+        pieces = self._pieces.get(before)
         if pieces is None:
             if upload is None:
                 phantom = self.phantom(sample)
@@ -112,9 +110,9 @@ class Stage:
             now = self._content(sample, upload)
             if before[1] not in (None, now[1]):
                 return pieces  # another file came under the name meanwhile
-            self._convex_pieces_of[now] = pieces
-            while len(self._convex_pieces_of) > MAX_CACHED_SCENES:
-                self._convex_pieces_of.popitem(last=False)
+            self._pieces[now] = pieces
+            while len(self._pieces) > MAX_CACHED_SCENES:
+                self._pieces.popitem(last=False)
         return pieces
 
     def size(self, sample: Sample) -> SampleSize | None:
@@ -353,17 +351,17 @@ class ObstacleMoves:
         """
         scanner = self.scanner
         clock = self.clock
-        mine: int | None = None
+        own_programme: int | None = None
         """Number of the last leg's programme, to detect other motion."""
         for leg in way.legs:
             await clock.at_rest(scanner.rest_time)
-            if mine is not None and scanner.programmes != mine:
+            if own_programme is not None and scanner.programmes != own_programme:
                 raise SafetyError(
                     "other motion has begun or motion was stopped; no further leg starts",
                     {"asked": dict(leg), "allowed": "asking again"},
                 )
             scanner.move(leg, clock.now())
-            mine = scanner.programmes
+            own_programme = scanner.programmes
             self.changed()
         await clock.at_rest(scanner.rest_time)
 

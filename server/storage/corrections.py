@@ -20,7 +20,7 @@ from pydantic import Field, TypeAdapter
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, problem
-from flexdt.runtime.files import own_documents as own
+from flexdt.runtime.files import own_documents as documents
 from flexdt.runtime.files.directory import Directory
 from flexdt.server.storage.scene_document import correction_fields, correction_of
 from flexdt.twin.dataset.dataset_errors import DiskFullError
@@ -63,14 +63,14 @@ class Corrections:
         self._sources: dict[str, str | None] = {}
         self._files: dict[str, str] = {}
         """Name of a correction -> its file."""
-        for file in own.ours(folder):
+        for file in documents.ours(folder):
             without = "a correction cannot be read; without it"
-            found = own.read_or_set_aside(folder, file, _read, without)
+            found = documents.read_or_set_aside(folder, file, _read, without)
             if found is not None:
                 self.know(*found)
                 self._files.setdefault(found[0].name, file)
         without = "the history of corrections cannot be read; without it"
-        before = own.read_or_set_aside(folder, HISTORY, _read_history, without)
+        before = documents.read_or_set_aside(folder, HISTORY, _read_history, without)
         known = _joined(before or [], list(in_force))
         self.filed = before is not None or len(known) < 2
         """Whether the history has a file; without one it is part of the state."""
@@ -178,7 +178,7 @@ class Corrections:
         return [*self.history, name][-MAX_HISTORY:]
 
     def store(
-        self, changes: own.Changes, correction: NamedCorrection, source: str | None
+        self, changes: documents.Changes, correction: NamedCorrection, source: str | None
     ) -> None:
         """Write a new correction; a known one stays as it is.
 
@@ -204,7 +204,7 @@ class Corrections:
         has no file."""
         return history[-1:] if self.filed else history
 
-    def store_history(self, changes: own.Changes, history: History) -> None:
+    def store_history(self, changes: documents.Changes, history: History) -> None:
         """Write the history; on a full disk it stays as it was, which costs steps
         of `revert` only.
 
@@ -234,7 +234,7 @@ class Corrections:
             )
         return [known for known in self.history if known != name]
 
-    def remove(self, changes: own.Changes, name: str) -> None:
+    def remove(self, changes: documents.Changes, name: str) -> None:
         """Delete a correction's file, among other changes."""
         changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
 
@@ -259,7 +259,7 @@ class Corrections:
 def _file(correction: NamedCorrection) -> str:
     """Return the file name of a correction."""
     stamp = correction.date.split(".")[0].replace(":", "")
-    return f"{stamp} {own.file_stem(correction.name)}.json"
+    return f"{stamp} {documents.file_stem(correction.name)}.json"
 
 
 def _joined(before: History, in_force: History) -> History:
@@ -280,7 +280,9 @@ def _joined(before: History, in_force: History) -> History:
 
 def _read_history(data: bytes) -> History:
     """Parse the history."""
-    return _HISTORY_TYPE.validate_python(own.read_json(data), strict=True)[-MAX_HISTORY:]
+    return _HISTORY_TYPE.validate_python(documents.read_json(data), strict=True)[
+        -MAX_HISTORY:
+    ]
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
@@ -289,7 +291,7 @@ def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
     Raises:
         ValueError, TwinError: no correction, or an implausible one.
     """
-    document = CorrectionFile.model_validate(own.read_json(data))
+    document = CorrectionFile.model_validate(documents.read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)
     return correction, document.source

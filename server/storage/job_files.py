@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.state_model import JobPhase
-from flexdt.runtime.files import own_documents as own
+from flexdt.runtime.files import own_documents as documents
 from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name
@@ -82,14 +82,14 @@ class JobFiles:
     def read(self) -> list[JobMemory]:
         """Read every job in the order made; set aside files that cannot be read."""
         found = []
-        for file in own.ours(self._folder):
+        for file in documents.ours(self._folder):
             without = "a job cannot be read; without it (its data set stays)"
-            job = own.read_or_set_aside(self._folder, file, _reader(file), without)
+            job = documents.read_or_set_aside(self._folder, file, _reader(file), without)
             if job is not None:
                 found.append(job)
         return sorted(found, key=lambda job: number_of(job.id))
 
-    def put(self, changes: own.Changes, job: JobMemory) -> None:
+    def put(self, changes: documents.Changes, job: JobMemory) -> None:
         """Write a job, among other changes.
 
         Raises:
@@ -98,7 +98,7 @@ class JobFiles:
         self._records.make()
         changes.put(self._folder, _file(job.id), _text(job))
 
-    def remove(self, changes: own.Changes, job: str) -> None:
+    def remove(self, changes: documents.Changes, job: str) -> None:
         """Delete a job's file, among other changes; none there is no error."""
         changes.remove(self._folder, _file(job))
 
@@ -116,14 +116,14 @@ class JobFiles:
 
     def clear(self) -> None:
         """Delete the file of every job."""
-        for file in own.ours(self._folder):
+        for file in documents.ours(self._folder):
             with suppress(DatasetWriteError):
                 self._folder.discard(file)
 
     def settle(self) -> None:
         """Clean the folders at the start: delete the rest of killed writers; set aside
         other entries in place of folders."""
-        own.settle(self._records, [FOLDER])
+        documents.settle(self._records, [FOLDER])
 
 
 def number_of(job: str) -> int:
@@ -134,7 +134,7 @@ def number_of(job: str) -> int:
 
 def _file(job: str) -> str:
     """Return the file name of a job."""
-    return f"{own.file_stem(job)}.json"
+    return f"{documents.file_stem(job)}.json"
 
 
 def _text(job: JobMemory) -> bytes:
@@ -148,7 +148,7 @@ def _reader(file: str) -> Callable[[bytes], JobMemory]:
 
     def read(data: bytes) -> JobMemory:
         """Parse a job and check its name."""
-        found = JobFile.model_validate(own.read_json(data))
+        found = JobFile.model_validate(documents.read_json(data))
         if file != _file(found.id):
             raise ValueError(f"it is about {found.id!r}")
         return JobMemory.model_validate(found.model_dump(exclude={"schema_version"}))

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.runtime.files import own_documents as own
+from flexdt.runtime.files import own_documents as documents
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.spare_files import SpareFiles
 from flexdt.runtime.log import log
@@ -141,10 +141,10 @@ def read_memory(root: Directory) -> Memory | None:
     """Read the state of data directory `root`; None if there is none; a damaged file is
     set aside.
     """
-    return own.read_or_set_aside(
+    return documents.read_or_set_aside(
         root,
         FILE,
-        lambda data: Memory.model_validate(own.read_json(data)),
+        lambda data: Memory.model_validate(documents.read_json(data)),
         "the last state cannot be read; starting anew",
     )
 
@@ -291,7 +291,7 @@ class StateStore:
         self,
         take: Callable[[], T],
         after: Callable[[Memory], Memory] | None = None,
-        files: Callable[[own.Changes], None] | None = None,
+        files: Callable[[documents.Changes], None] | None = None,
     ) -> T:
         """Write a change that must survive, then apply it.
 
@@ -313,7 +313,7 @@ class StateStore:
         self,
         take: Callable[[], T],
         after: Callable[[Memory], Memory] | None,
-        files: Callable[[own.Changes], None] | None,
+        files: Callable[[documents.Changes], None] | None,
     ) -> T:
         """Write a change to the disk, then apply it; restore the disk if either fails.
 
@@ -333,7 +333,7 @@ class StateStore:
             document = None
             if after is not None:
                 document = after(self._make(False))
-            changes = own.Changes()
+            changes = documents.Changes()
             try:
                 await asyncio.to_thread(self._put_all, changes, document, files)
                 taken = take()
@@ -401,9 +401,9 @@ class StateStore:
 
     def _put_all(
         self,
-        changes: own.Changes,
+        changes: documents.Changes,
         document: Memory | None,
-        files: Callable[[own.Changes], None] | None,
+        files: Callable[[documents.Changes], None] | None,
     ) -> None:
         """Write files and the document as undoable changes.
 
@@ -418,7 +418,7 @@ class StateStore:
             if document is not None:
                 changes.put(self._root, FILE, _text(document), self._spares.keep)
 
-    def _undo(self, changes: own.Changes) -> None:
+    def _undo(self, changes: documents.Changes) -> None:
         """Undo the changes."""
         with self._file:
             changes.undo()

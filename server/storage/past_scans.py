@@ -696,7 +696,7 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
         pieces = (
             UprightCylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),
         )
-        what = "the machine and the cylinder context the sample"
+        what = "the machine and the cylinder around the sample"
     correction = document.correction_in_force()
     offsets = NOMINAL
     if correction is not None:

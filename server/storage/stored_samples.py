@@ -22,7 +22,7 @@ import numpy as np
 from flexdt import phantoms
 from flexdt.phantoms import Phantom, PhantomError
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.runtime.files import own_documents as own
+from flexdt.runtime.files import own_documents as documents
 from flexdt.runtime.files.directory import TEMPORARY, Directory
 from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.mesh_workers import mesh_apart, scene_apart
@@ -96,9 +96,9 @@ class SampleStore:
         self._incoming: Incoming = Incoming(folder, 2 * limit, room)
         self._heads: dict[str, UploadHead] = {}
         """Their revisions are those of their files; those of older servers have none."""
-        for file in own.ours(folder):
+        for file in documents.ours(folder):
             without = "an upload cannot be read; without it"
-            head = own.read_or_set_aside(folder, file, _head_of(file), without)
+            head = documents.read_or_set_aside(folder, file, _head_of(file), without)
             if (
                 head is not None
                 and head.name != EMPTY
@@ -213,7 +213,7 @@ class SampleStore:
                 f"{head.name!r} is {what}'s name; choose another",
                 {"asked": head.name, "taken": [EMPTY, *phantoms.phantom_names()]},
             )
-        own.file_stem(head.name)
+        documents.file_stem(head.name)
         if head.name not in self._heads and len(self._heads) >= self._most:
             raise LimitError(
                 f"there are {len(self._heads)} uploads, {self._most} allowed; "
@@ -240,14 +240,14 @@ class SampleStore:
             worn = (material, _parse(head, raw, material))
         return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
-    def store(self, changes: own.Changes, upload: ReceivedSample) -> None:
+    def store(self, changes: documents.Changes, upload: ReceivedSample) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.
 
         Raises:
             DatasetWriteError: the system cannot write.
         """
         head = upload.head
-        stem = own.file_stem(upload.head.name)
+        stem = documents.file_stem(upload.head.name)
         changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
         document = head.model_dump(by_alias=True, exclude={"start", "data"})
         document["revision"] = upload.revision
@@ -263,13 +263,13 @@ class SampleStore:
             if upload.worn is not None:
                 self._keep((name, upload.worn[0]), upload.worn[1], upload.revision)
 
-    def remove(self, changes: own.Changes, name: str) -> None:
+    def remove(self, changes: documents.Changes, name: str) -> None:
         """Delete the description of an upload; `tidy` removes its bytes after `forget`.
 
         Raises:
             DatasetWriteError: the system refuses.
         """
-        changes.remove(self._folder, f"{own.file_stem(name)}.json")
+        changes.remove(self._folder, f"{documents.file_stem(name)}.json")
 
     def forget(self, name: str) -> None:
         """Remove an upload from memory."""
@@ -310,7 +310,7 @@ class SampleStore:
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         names = self._folder.names()
         for file in fnmatch.filter(names, f"*.{'?' * 16}.bin"):
-            damaged = f"{file.split('.')[0]}{own.ASIDE}.json" in names
+            damaged = f"{file.split('.')[0]}{documents.ASIDE}.json" in names
             if file not in known and not damaged:
                 with suppress(OSError):
                     self._folder.unlink(file)
@@ -374,10 +374,10 @@ class SampleStore:
                     self._heads.get(head.name) is head
                 ):  # else another has come under this name
                     del self._heads[head.name]
-                    for damaged in (file, f"{own.file_stem(head.name)}.json"):
+                    for damaged in (file, f"{documents.file_stem(head.name)}.json"):
                         if self._folder.stat(damaged) is not None:
                             without = "an upload cannot be read; without it"
-                            own.set_aside(self._folder, damaged, error, without)
+                            documents.set_aside(self._folder, damaged, error, without)
             raise PhantomError(
                 f"the upload {head.name!r} cannot be read: {error}"
             ) from None
@@ -450,8 +450,8 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
 def _bytes_file(name: str, revision: str | None) -> str:
     """Return the file name of an upload's bytes; earlier servers had one file for each name."""
     if revision is None:
-        return f"{own.file_stem(name)}.bin"
-    return f"{own.file_stem(name)}.{revision}.bin"
+        return f"{documents.file_stem(name)}.bin"
+    return f"{documents.file_stem(name)}.{revision}.bin"
 
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
@@ -460,8 +460,8 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
 
     def read(data: bytes) -> UploadHead:
         """Parse a description and check its name."""
-        head = UploadHead.model_validate(own.read_json(data))
-        if file != f"{own.file_stem(head.name)}.json":
+        head = UploadHead.model_validate(documents.read_json(data))
+        if file != f"{documents.file_stem(head.name)}.json":
             raise ValueError(f"it is about {head.name!r}")
         return head
 

@@ -142,9 +142,9 @@ class Hub:
             self.unsubscribe(listener, [topic])
             subscription = _Subscription(view, interval)
             self._listeners.setdefault(topic, {})[listener] = subscription
-            told = self._last_sent.get((listener, topic), -1)
+            last_sent = self._last_sent.get((listener, topic), -1)
             for earlier in self._kept.get(topic, ()):
-                if earlier.seq > told:
+                if earlier.seq > last_sent:
                     self._deliver(listener, subscription, earlier)
 
     def _require_room(

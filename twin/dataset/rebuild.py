@@ -241,16 +241,16 @@ def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machin
     Returns:
         None if no machine fits, or several by their motors.
     """
-    said = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
+    stated = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
     for machine in machines:
         names = {
             _word(machine.scanner_name),
             _word(machine.scanner_type),
             _word(machine.name),
         }
-        if said & names or any(s.startswith(n) for s in said for n in names if n):
+        if stated & names or any(s.startswith(n) for s in stated for n in names if n):
             return machine
-    if said:
+    if stated:
         return None
     complete = [m for m in machines if set(m.axes) <= set(settings.motors)]
     if len(complete) == 1:

@@ -170,9 +170,13 @@ def _date(moment: datetime) -> str:
 
 def _motor(name: str, motor: MotorLine) -> str:
     """Format a motor's line: position and, if known, speed and acceleration."""
-    said = {name: motor.value, "speed": motor.speed, "acceleration": motor.acceleration}
+    numbers = {
+        name: motor.value,
+        "speed": motor.speed,
+        "acceleration": motor.acceleration,
+    }
     return " ; ".join(
-        f"{key} : {value:f}" for key, value in said.items() if value is not None
+        f"{key} : {value:f}" for key, value in numbers.items() if value is not None
     )
 
 

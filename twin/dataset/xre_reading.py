@@ -105,9 +105,9 @@ class XreSettings:
 
 
 def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatError:
-    said = f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}"
+    problem = f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}"
     where = {"path": XRE_SETTINGS, "section": section, "key": key}
-    return DatasetFormatError.instead(said, text[:200], allowed, **where)
+    return DatasetFormatError.instead(problem, text[:200], allowed, **where)
 
 
 def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:

@@ -189,8 +189,8 @@ def read_flexdata(
     )
     rows = circle.cone_vec().rows - np.array([0, 0, moved[0]] * 2 + [0.0] * 6)
     version = records.get("flextoml_version")
-    said = f"flextoml_version is {version!r}; this reads {VERSION}"
-    notes = () if version == VERSION else (said,)
+    note = f"flextoml_version is {version!r}; this reads {VERSION}"
+    notes = () if version == VERSION else (note,)
     return ScanGeometry(cone_vec_of(rows, file), shape, notes=notes).rows_up()
 
 

@@ -55,8 +55,8 @@ class ScanGeometry:
     def __post_init__(self) -> None:
         for what, count in (("real rows", self.real), ("files", self.files or None)):
             if count is not None and len(count) != len(self):
-                said = f"{len(self)} views but {len(count)} {what}"
-                raise ExchangeError.instead(said, len(count), len(self))
+                problem = f"{len(self)} views but {len(count)} {what}"
+                raise ExchangeError.instead(problem, len(count), len(self))
         if self.shape is not None and min(self.shape) < 1:
             raise ExchangeError(
                 f"detector shape {self.shape}; allowed: at least one pixel"

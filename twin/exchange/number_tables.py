@@ -108,15 +108,15 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
         header = []
     lost = [name for name in VECTOR_NAMES if name not in header]
     if lost:
-        said = f"{file}: the header lacks {', '.join(lost)}"
-        raise ExchangeError.instead(said, header, VECTOR_NAMES, missing=lost)
+        problem = f"{file}: the header lacks {', '.join(lost)}"
+        raise ExchangeError.instead(problem, header, VECTOR_NAMES, missing=lost)
     at = [header.index(name) for name in VECTOR_NAMES]
     rows = []
     files = []
     for number, cells in lines[1:]:
         if len(cells) != len(header):
-            said = f"{file}:{number}: {len(cells)} cells"
-            raise ExchangeError.instead(said, len(cells), len(header), line=number)
+            problem = f"{file}:{number}: {len(cells)} cells"
+            raise ExchangeError.instead(problem, len(cells), len(header), line=number)
         rows.append(_numbers([cells[i] for i in at], file, number))
         files.append(cells[header.index("file")] if "file" in header else "")
     return ScanGeometry(
@@ -163,8 +163,8 @@ def read_tomosipo(
     """
     lost = [name for name in TOMOSIPO_NAMES if name not in arrays]
     if lost:
-        said = f"{file} lacks {', '.join(lost)}"
-        raise ExchangeError.instead(said, list(arrays), TOMOSIPO_NAMES, missing=lost)
+        problem = f"{file} lacks {', '.join(lost)}"
+        raise ExchangeError.instead(problem, list(arrays), TOMOSIPO_NAMES, missing=lost)
     vectors = [arrays[name] for name in TOMOSIPO_NAMES[1:]]
     shape = arrays["shape"]
     for name, array in zip(TOMOSIPO_NAMES[1:], vectors, strict=True):
@@ -226,8 +226,8 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
         word = str(error).partition(": ")[2][:42]
         raise ExchangeError(f"{file}:{line}: {word} is no number", where) from None
     if len(found) != 12:
-        said = f"{file}:{line}: {len(found)} numbers"
-        raise ExchangeError.instead(said, len(found), 12, **where)
+        problem = f"{file}:{line}: {len(found)} numbers"
+        raise ExchangeError.instead(problem, len(found), 12, **where)
     return found
 
 
@@ -294,9 +294,9 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         ExchangeError: another kind or schema, or a wrong value; names file and key.
     """
     document = read_json(text, file)
-    if (said := (document.get("kind"), document.get("schema"))) != (KIND, SCHEMA):
-        what = f"{file}: kind {said[0]!r}, schema {said[1]!r}"
-        raise ExchangeError.instead(what, list(said), f"{KIND!r}, schema {SCHEMA}")
+    if (form := (document.get("kind"), document.get("schema"))) != (KIND, SCHEMA):
+        what = f"{file}: kind {form[0]!r}, schema {form[1]!r}"
+        raise ExchangeError.instead(what, list(form), f"{KIND!r}, schema {SCHEMA}")
     try:
         found = _Document.model_validate(
             {k: v for k, v in document.items() if v is not None}

@@ -155,8 +155,8 @@ def read_rtk(
     except ElementTree.ParseError as error:
         raise ExchangeError(f"{file} is not valid XML: {error}", {"path": file}) from None
     if root.tag != _ROOT or root.get("version") != VERSION:
-        said = f"{file}: {root.tag} version {root.get('version')}"
-        raise ExchangeError.instead(said, root.tag, f"{_ROOT} version {VERSION}")
+        problem = f"{file}: {root.tag} version {root.get('version')}"
+        raise ExchangeError.instead(problem, root.tag, f"{_ROOT} version {VERSION}")
     common = dict.fromkeys(NAMES, 0.0)  # numbers before the views hold for all
     rows: list[FloatArray] = []
     stated: list[tuple[float, float]] = []
@@ -166,10 +166,10 @@ def read_rtk(
             for entry in element:
                 _take(entry, values, file)
             if values["SourceToDetectorDistance"] == 0.0:
-                said = (
+                problem = (
                     f"{file}: view {len(rows)} is parallel (no source-detector distance)"
                 )
-                raise ExchangeError.instead(said, 0.0, "a cone beam", row=len(rows))
+                raise ExchangeError.instead(problem, 0.0, "a cone beam", row=len(rows))
             rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
             stated.append(
                 (values["SourceToIsocenterDistance"], values["SourceToDetectorDistance"])
@@ -235,10 +235,10 @@ def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> No
         value = math.nan
     if not math.isfinite(value):
         text = (entry.text or "")[:40]
-        said = f"{file}: {entry.tag} is {text!r}"
-        raise ExchangeError.instead(said, text, "a finite number", path=entry.tag)
+        problem = f"{file}: {entry.tag} is {text!r}"
+        raise ExchangeError.instead(problem, text, "a finite number", path=entry.tag)
     if entry.tag in values:
         values[entry.tag] = value
     elif value != 0.0:  # RadiusCylindricalDetector and whatever else bends the geometry
-        said = f"{file}: {entry.tag} = {value:g} is not understood"
-        raise ExchangeError.instead(said, value, NAMES, path=entry.tag)
+        problem = f"{file}: {entry.tag} = {value:g} is not understood"
+        raise ExchangeError.instead(problem, value, NAMES, path=entry.tag)

@@ -286,12 +286,12 @@ def would_touch(
     how = near
     if ahead > 0.0:
         how = f"would collide in {ahead:.3g} s"
-    told = {
+    facts = {
         "asked": what,
         "pair": list(pair),
         "time_s": ahead,
         "last_free": dict(last_free),
     }
     return CollisionError(
-        f"{what}: {' and '.join(pair)} {how}; {outcome}", {**told, **data}
+        f"{what}: {' and '.join(pair)} {how}; {outcome}", {**facts, **data}
     )

@@ -501,12 +501,12 @@ def _timing(
         for kind, times in samples.items()
     }
     update = {f"{kind}_s": round(x, _TIME_DECIMALS) for kind, x in medians.items()}
-    told = {
+    others = {
         "source": source,
         "drift": round(math.expm1(abs(shift)), _TIME_DECIMALS),
         "spread": spread,
     }
-    return before.model_copy(update={**update, **told})
+    return before.model_copy(update={**update, **others})
 
 
 def _log(time: float) -> float:

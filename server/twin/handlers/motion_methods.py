@@ -34,17 +34,17 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
     if params.plan:
         return await _move_around_obstacles(twin, client, params)
     now = twin.clock.now()
-    told = twin.scanner.limit_messages(params.targets, now, relative=params.relative)
+    limits = twin.scanner.limit_messages(params.targets, now, relative=params.relative)
     with _cancelling_detour(twin):
         durations = twin.scanner.move(
             params.targets, now, relative=params.relative, shortest=params.shortest
         )
-    warnings = told
+    warnings = limits
     arrived = None
     if params.wait:
         wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
         short = await _unreached_targets(twin, wanted)
-        warnings = [*told, *short]
+        warnings = [*limits, *short]
         arrived = not short
     seconds = max(durations.values(), default=0.0)
     return p.MoveResult(
@@ -100,7 +100,7 @@ async def _move_around_obstacles(
     """
     twin.detours.cancel()
     now = twin.clock.now()
-    told = twin.scanner.limit_messages(params.targets, now, relative=params.relative)
+    limits = twin.scanner.limit_messages(params.targets, now, relative=params.relative)
     way = await twin.detours.plan(
         params.targets, relative=params.relative, shortest=params.shortest
     )
@@ -112,7 +112,7 @@ async def _move_around_obstacles(
             twin.tell("warning", f"the way around ended early: {task.exception()}")
 
     task.add_done_callback(report)
-    warnings = [*told, *way.warnings]
+    warnings = [*limits, *way.warnings]
     arrived = None
     moves = [dict(leg) for leg in way.legs]
     if params.wait:
