@@ -342,11 +342,10 @@ async def sequence(
         reply = await _adopt(twin, folder, state)
     except BaseException as error:
         if armed is not None and armed.ended is not None:
-            armed.ended.set_exception(
-                error
-                if isinstance(error, Refusal)
-                else Refusal("the sequence was cut short")
-            )
+            if isinstance(error, Refusal):
+                armed.ended.set_exception(error)
+            else:
+                armed.ended.set_exception(Refusal("the sequence was cut short"))
             # The sequence reports the same error: mark the move's as retrieved, so asyncio
             # logs nothing.
             armed.ended.exception()

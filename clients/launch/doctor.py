@@ -149,11 +149,9 @@ def threads() -> CheckOutcome:
     policy."""
     import numba
 
-    usable = (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count()
-    )
+    usable = os.cpu_count()
+    if hasattr(os, "sched_getaffinity"):
+        usable = len(os.sched_getaffinity(0))
     found = f"{usable} of {os.cpu_count()} cores usable, {numba.get_num_threads()} numba threads"
     found += f", threading layer {numba.threading_layer()}"
     if numba.threading_layer() == "omp":

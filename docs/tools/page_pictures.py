@@ -109,7 +109,7 @@ def four_views(browser: Any, url: str, to: Path) -> None:
 
 
 def scan_it(browser: Any, url: str, to: Path) -> None:
-    """The volume of what stands on the stage, in the scene and beside its truth."""
+    """Picture the volume of what stands on the stage, in the scene and beside its truth."""
     page = opened(browser, url, "iso", "move")
     page.click("#scan-it")
     page.locator("#volume-beside").wait_for()

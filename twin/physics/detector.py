@@ -232,15 +232,12 @@ class Detector:
         # In pixels of the twin as it is usually read out, binned 2 x.
         area = across * up / (2 * PixelGrid.pitch_mm) ** 2
         gain = self.electrons_per_count
+        if gain is None:
+            gain = FULL_WELL_E[0] * area / 2.0**self.bits
         dark = self.dark_e_per_s
-        return replace(
-            self,
-            pixels=pixels,
-            electrons_per_count=FULL_WELL_E[0] * area / 2.0**self.bits
-            if gain is None
-            else gain,
-            dark_e_per_s=4.0 * DARK_E_PER_S * area if dark is None else dark,
-        )
+        if dark is None:
+            dark = 4.0 * DARK_E_PER_S * area
+        return replace(self, pixels=pixels, electrons_per_count=gain, dark_e_per_s=dark)
 
     def camera(self, shape: tuple[int, int]) -> CameraSettings:
         """Make camera settings that read out all of (rows, cols) pixels.

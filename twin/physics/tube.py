@@ -65,16 +65,13 @@ class TubeModel:
         for one in self.filters:
             name = f"{_FILTER}{one.substance.name}_mm"
             layers[name] = layers.get(name, 0.0) + one.thickness_mm
-        return {
+        figures = {
             "tube_spot_mm_per_W": self.spot_mm_per_W,
             "tube_smallest_spot_mm": self.smallest_spot_mm,
-            **(
-                {"tube_spot_points": float(self.spot_points)}
-                if self.spot_points > 1
-                else {}
-            ),
-            **layers,
         }
+        if self.spot_points > 1:
+            figures["tube_spot_points"] = float(self.spot_points)
+        return figures | layers
 
     @classmethod
     def of_figures(cls, figures: Mapping[str, float]) -> TubeModel:

@@ -164,7 +164,14 @@ def bias_of(
 
 
 def _bias_of(scan: CoarseScan) -> Bias:
-    """Reconstruct a coarse scan and bound its errors, cause by cause."""
+    """Reconstruct a coarse scan and bound its errors, cause by cause.
+
+    Args:
+        scan: few views and pixels of the whole scan.
+
+    Returns:
+        The bound, with the contradiction if images and geometry do not fit each other.
+    """
     values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
     data = np.nan_to_num(values)
     nodes = UniformNodes.of(values, scan.rim)

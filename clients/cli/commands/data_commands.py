@@ -117,7 +117,9 @@ def reconstruct(
         made_of = None
     else:
         made_of = option_values.names(material)
-    middle = "X,Y,Z, e.g. 0,0,-5.5"
+    center_mm = None
+    if center is not None:
+        center_mm = option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5")
     request = VolumeRequest(
         algorithm=algorithm or DEFAULT,
         voxel_mm=voxel,
@@ -127,9 +129,7 @@ def reconstruct(
         iterations=iterations,
         weight=weight,
         window=chosen(ReconstructSettings).window,
-        center_mm=None
-        if center is None
-        else option_values.triple(center, "center", middle),
+        center_mm=center_mm,
         rings=rings,
         material=made_of,
         kV=kv,
@@ -258,9 +258,9 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
         case "twin":
             with twin() as client:
                 in_force = client.calibration()
-            return NOMINAL if in_force is None else Offsets.from_edge(
-                in_force.parameters
-            ), None
+            if in_force is None:
+                return NOMINAL, None
+            return Offsets.from_edge(in_force.parameters), None
     report = read_report(Path(named))
     return report.parameters, report
 

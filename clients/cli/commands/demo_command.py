@@ -375,9 +375,8 @@ def _compare_with_truth(
         rows.append((name, f"{true:.5f}", value, sigma, unit))
     tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit")))
     inside = inside_95(outcome, truth)
-    tell(
-        "the truth lies inside the joint 95 % ellipsoid"
-        if inside
-        else "a miss: the truth lies outside the joint 95 % ellipsoid"
-    )
+    if inside:
+        tell("the truth lies inside the joint 95 % ellipsoid")
+    else:
+        tell("a miss: the truth lies outside the joint 95 % ellipsoid")
     return inside

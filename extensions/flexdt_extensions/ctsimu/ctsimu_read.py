@@ -146,14 +146,15 @@ class ScenarioReader:
         known, real = (cone_vec_of(r, self._file) for r in rows_of)
         same = np.array_equal(known.rows, real.rows)
         name = self._at("file").get("name")
+        notes: tuple[str, ...] = ()
+        if not same:
+            notes = ("some deviations or drifts are unknown to reconstruction",)
         return ScanGeometry(
             known,
             (rows // bins[1], cols // bins[0]),
             None if same else real,
             name if isinstance(name, str) else "",
-            notes=()
-            if same
-            else ("some deviations or drifts are unknown to reconstruction",),
+            notes=notes,
         )
 
     def _bins(self, rows: int, cols: int) -> tuple[int, int]:

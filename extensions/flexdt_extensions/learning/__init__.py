@@ -35,13 +35,13 @@ ENVIRONMENTS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
 
 for _name, (_entry, _options) in ENVIRONMENTS.items():
     if _name not in gymnasium.registry:
-        _turns = _options.get("action") == "discrete"
+        _vector = None
+        if _options.get("action") == "discrete":
+            _vector = f"{_HERE}.vector_scanning:ScanVectorEnv"
         gymnasium.register(
             id=_name,
             entry_point=_entry,
-            vector_entry_point=f"{_HERE}.vector_scanning:ScanVectorEnv"
-            if _turns
-            else None,
+            vector_entry_point=_vector,
             kwargs=_options,
         )
 

@@ -200,6 +200,11 @@ def run_design(
     entries: list[dict[str, Any]] = []
     for model in (ours, theirs):
         guess = forecast(model, scans, request.criterion)
+        measured = None
+        if request.trials >= 2 and math.isfinite(guess.worst):
+            measured = measured_spread(
+                model, scans, trials=request.trials, seed=request.seed
+            )
         entries.append(
             {
                 "name": model.name,
@@ -207,16 +212,15 @@ def run_design(
                 "score": guess.score,
                 "sigmas": guess.sigmas,
                 "image_sigmas": guess.image_sigmas,
-                "measured": measured_spread(
-                    model, scans, trials=request.trials, seed=request.seed
-                )
-                if request.trials >= 2 and math.isfinite(guess.worst)
-                else None,
+                "measured": measured,
                 "shadows_used": guess.used,
                 "determined": guess.worst <= BOUND / TOLERANCE["mm"],
                 "identified": share_identified(model, scans, seed=request.seed),
             }
         )
+    gain = None
+    if entries[1]["determined"]:
+        gain = entries[1]["score"] / entries[0]["score"]
     document: dict[str, Any] = {
         "criterion": request.criterion,
         "criterion_text": CRITERIA[request.criterion],
@@ -230,9 +234,7 @@ def run_design(
         "discarded": found.discarded,
         "design": entries[0],
         "spiral": entries[1],
-        "gain": entries[1]["score"] / entries[0]["score"]
-        if entries[1]["determined"]
-        else None,
+        "gain": gain,
         "assumed": list(phantom.assumed),
     }
     if out is not None:

@@ -286,11 +286,9 @@ class ImageSet:
 
     def _reference_counts(self) -> tuple[int, int]:
         """Count the dark and the flat images, of files or in memory."""
-        kept = (
-            (None, None)
-            if self.arrays is None
-            else (self.arrays.darks, self.arrays.flats)
-        )
+        kept: tuple[npt.NDArray[Any] | None, npt.NDArray[Any] | None] = (None, None)
+        if self.arrays is not None:
+            kept = (self.arrays.darks, self.arrays.flats)
         dark, flat = (
             len(files) if images is None else len(images)
             for files, images in zip((self.darks, self.flats), kept, strict=True)
@@ -314,6 +312,9 @@ class ImageSet:
         chosen = np.arange(len(self))[index]
         arrays = self.arrays
         frames = tuple(self.frames[i] for i in chosen)
+        truth = None
+        if hasattr(self.truth, "of_views"):
+            truth = self.truth.of_views(chosen)
         return replace(
             self,
             frames=frames,
@@ -322,9 +323,7 @@ class ImageSet:
             nominal=None if self.nominal is None else self.nominal[chosen],
             positions={name: values[chosen] for name, values in self.positions.items()},
             arrays=None if arrays is None else arrays.of_views(chosen),
-            truth=self.truth.of_views(chosen)
-            if hasattr(self.truth, "of_views")
-            else None,
+            truth=truth,
         )
 
     def __iter__(self) -> Iterator[Float32Array]:

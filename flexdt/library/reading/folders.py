@@ -418,6 +418,9 @@ def _from_texts(
             "angles follow "
             "the text"
         )
+    full_scale = None
+    if rebuilt.machine is not None:
+        full_scale = (1 << rebuilt.machine.detector.bits) - 1
     return listed(
         content,
         rebuilt.poses.cone_vec(),
@@ -433,9 +436,7 @@ def _from_texts(
         machine=rebuilt.machine,
         profile=rebuilt.profile,
         settings=settings,
-        full_scale=None
-        if rebuilt.machine is None
-        else (1 << rebuilt.machine.detector.bits) - 1,
+        full_scale=full_scale,
     )
 
 
