@@ -32,8 +32,6 @@ MEASURED = Solver(floor_px=0.3, spread_px=1.0)
 sigma: in images without noise, positions off by a thousandth of a pixel are no outliers."""
 FOUND = Solver(spread_px=POSITION_SPREAD_PX)
 """Positions of a first measurement have no sigma of their own."""
-AS_GOOD = 1.2
-"""A fit whose residuals are at most so many times as large explains the data as well."""
 
 
 def fit_with_loose_priors(
@@ -53,9 +51,23 @@ def fit_with_loose_priors(
     loose = replace(request, priors=wide_priors, bound=math.inf)
     out = refit_scans(state, loose, wide)
     freed = wide.bead_prior_mm if request.bead_tolerance_mm is None else 0.0
-    if freed > 0 and out.certificate.rms_px > AS_GOOD * wide.certificate.rms_px:
+    if freed > 0 and _beads_explain_more(wide, out):
         out = refit_scans(state, loose, wide, bead_tolerance_mm=freed)
     return out
+
+
+def _beads_explain_more(freed: FitResult, loose: FitResult) -> bool:
+    """Check whether the places of beads explain residuals better than loose priors, by the
+    likelihood less the price of their columns (Schwarz, Annals of Statistics 6 (1978) 461).
+
+    Args:
+        freed: the fit with free beads.
+        loose: the fit with loose priors, the beads at their stated places.
+    """
+    count = 2 * int(loose.certificate.used.sum())
+    columns = 3 * len(freed.problem.model)
+    gain = count * math.log(loose.certificate.rms_px / freed.certificate.rms_px)
+    return gain > 0.5 * columns * math.log(count)
 
 
 def _start(state: Calibration, request: CalibrationRequest) -> list[Offsets]:

@@ -161,6 +161,13 @@ def test_no_drawn_cause_is_offered_wrong(kind: str, seed: int) -> None:
     assert not scored(kind, 500 + seed).wrong
 
 
+def test_beads_freed_for_a_tile_are_not_given_up_for_a_loose_prior() -> None:
+    """Of 2 x 2 tiles one border passes few beads: it was refused as a pitch of 2.6 deg."""
+    found = scored("four_tiles", 3009)
+    assert found.offered, found.said
+    assert found.worst < 4.0
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_an_exact_phantom_has_no_cause(seed: int) -> None:
     found = scored("nothing", seed)
