@@ -117,3 +117,24 @@ def test_what_stands_still_on_the_axis_is_no_bad_pixel() -> None:
     found = bad_pixels(lambda: views, 30.5)
     assert found is not None
     assert np.argwhere(found.mask).tolist() == [[4, 12]]
+
+
+@pytest.mark.parametrize("columns", [[50, 51, 52], [49, 51, 53, 54, 55], [8, 9, 10, 12]])
+def test_bad_pixels_that_hide_each_other_are_found(columns: list[int]) -> None:
+    """Three in a row have two bad neighbours each."""
+    counts = counts_of(3)
+    counts[:, 9, columns] = 0
+    told = next(one for one in reconstructed(counts)[1] if "do not respond" in one)
+    assert len(columns) <= int(told.split()[0]) <= len(columns) + 1
+
+
+@pytest.mark.parametrize("width", [1, 4, 12, 64])
+def test_a_thin_layer_of_the_object_is_no_row_of_bad_pixels(width: int) -> None:
+    """A leaf as thick as a row, which is as wide and turns about the axis."""
+    rng = np.random.default_rng(8)
+    views = rng.normal(0.0, 0.004, (20, 30, 61)).astype(np.float32)
+    for view, turn in zip(views, np.linspace(0.0, 2.0 * np.pi, 20), strict=True):
+        middle = 30.0 + 24.0 * np.sin(turn)
+        first, last = (int(np.clip(middle + side * width / 2, 0, 61)) for side in (-1, 1))
+        view[14, first : max(last, first + 1)] += 0.6
+    assert bad_pixels(lambda: views, 30.0) is None

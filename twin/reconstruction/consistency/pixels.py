@@ -4,7 +4,9 @@ An object turns, so that what it gives to a pixel beyond its neighbours in the r
 gives in few views. A pixel that is beyond them by far more than other pixels, in the root
 of the mean square over all but a few views, is a bad one; so is a column of such pixels.
 Near the rotation axis an object hardly moves: there a pixel must also be beyond its
-neighbours in the column, or the complete column is bad.
+neighbours in the column, or the complete column is bad. Elsewhere a pixel beyond its
+neighbours in the column is bad, too, such as three in a row that hide each other, unless it
+belongs to a layer of the object.
 """
 
 from __future__ import annotations
@@ -129,15 +131,32 @@ def _outliers(
         first = int(np.clip(np.ceil(axis_column - reach), 0, view.shape[1]))
         near = slice(first, int(np.clip(np.floor(axis_column + reach) + 1, first, None)))
         along.add(np.square(_beyond_neighbours(view)))
-        down.add(np.square(_beyond_neighbours(view[:, near].T).T))
+        down.add(np.square(_beyond_neighbours(view.T).T))
     if not along.count:
         return np.zeros((1, 1), np.bool_), np.zeros((1, 1), np.float32)
     response = along.root()
     mask = _outlying(response)
+    in_column = _outlying(down.root().T).T
+    cluster = _short_groups(in_column)
+    cluster[:, near] = False
     if mask[:, near].size:
         whole = mask[:, near].mean(axis=0) > MIN_COLUMN_SHARE
-        mask[:, near] &= whole | _outlying(down.root())
-    return mask, response
+        mask[:, near] &= whole | in_column[:, near]
+    response = np.where(cluster, np.maximum(response, down.root()), response)
+    return mask | cluster, response
+
+
+def _short_groups(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Keep pixels with another one among their neighbours in the row, (rows, cols).
+
+    A thin layer of the object gives longer runs than a pixel and its neighbours.
+    """
+    from scipy.ndimage import binary_opening, convolve1d
+
+    window = np.ones(2 * NEIGHBOURS + 1, np.uint8)
+    several = convolve1d(mask.astype(np.uint8), window, axis=1, mode="constant") >= 2
+    longer = binary_opening(mask, np.ones((1, 2 * NEIGHBOURS + 2), np.bool_))
+    return np.asarray(mask & several & ~longer)
 
 
 def _lasting_or_flickering(
@@ -147,7 +166,12 @@ def _lasting_or_flickering(
 
     An object's features stay before a pixel for a row of views and leave it.
     """
-    distances = np.array([_beyond_neighbours(view)[mask] for view in views])
+    distances = np.array(
+        [
+            np.maximum(_beyond_neighbours(view), _beyond_neighbours(view.T).T)[mask]
+            for view in views
+        ]
+    )
     usual = np.sqrt(np.mean(np.square(distances), axis=0))
     deviates = distances > np.maximum(MIN_DEVIATION_RATIO * usual, 2.0 * MIN_BAD_RESPONSE)
     changes = (deviates[1:] != deviates[:-1]).sum(axis=0)
