@@ -152,7 +152,21 @@ def widened(
     )
     out = np.full((len(images), *shape), np.nan, np.float32)
     views.widen(out)
+    check_weighed(views, out)
     return out
+
+
+def check_weighed(views: Views, plain: Float32Array) -> None:
+    """Rows that are weighed while they are continued are these rows times their weights,
+    and zeros follow them."""
+    n, rows, wide = plain.shape
+    weighed = np.full((n, rows, wide + 3), np.nan, np.float32)
+    views.widen(weighed, weighed=True)
+    length = np.sqrt(views.across[:, None] + views.up[:, :, None])
+    wanted = plain * (views.factors[:, None] / length)
+    most = np.abs(wanted).max(axis=2, keepdims=True)
+    assert (np.abs(weighed[..., :wide] - wanted) <= ROUNDING * most).all()
+    assert not weighed[..., wide:].any()
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -20,6 +20,7 @@ from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
 from flexdt.twin.reconstruction.feldkamp.filtering import (
     filtered,
+    padded_length,
     response_of_length,
     taps,
 )
@@ -102,16 +103,17 @@ class OnProcessor:
 
 
 def _weighed(views: Views) -> Float32Array:
-    """Compute weighted rows for the filter, (n, rows, cols)."""
+    """Compute weighted rows for the filter, padded with zeros for it, (n, rows, columns)."""
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
-    n, wide, _, rows = views.sizes
-    ready = np.empty((n, rows, wide), np.float32)
-    images, top = views.images, views.top
+    n, _, _, rows = views.sizes
+    ready = np.empty((n, rows, padded_length(views.response)), np.float32)
     if views.wider:
-        views.widen(ready)
-        images, top = ready, 0
-    fdk_kernels.weigh(images, top, views.factors, views.across, views.up, ready)
+        views.widen(ready, weighed=True)
+    else:
+        fdk_kernels.weigh(
+            views.images, views.top, views.factors, views.across, views.up, ready
+        )
     return ready
 
 

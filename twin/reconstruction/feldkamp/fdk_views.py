@@ -101,9 +101,13 @@ class Views:
         )
         return out
 
-    def widen(self, out: Float32Array) -> None:
-        """Write the rows that are needed, continued beyond the panel's edges, (n, rows,
-        cols)."""
+    def widen(self, out: Float32Array, *, weighed: bool = False) -> None:
+        """Write the rows that are needed, continued beyond the panel's edges.
+
+        Args:
+            out: (n, rows, columns or more), filled; 0 in columns after these.
+            weighed: multiply by factors / length of the ray to the pixel.
+        """
         from flexdt.twin.reconstruction.kernels import truncation_kernels
 
         on = self.beyond
@@ -119,6 +123,7 @@ class Views:
             on.fade,
             self.across,
             self.up,
+            self.factors if weighed else self.factors[:, :0].copy(),
             out,
         )
 

@@ -642,12 +642,13 @@ def weigh(images, first, factors, across, up, out):
 
     images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its
     outermost ones.
-    out: float32 (n, rows, cols).
+    out: float32 (n, rows, cols or more); 0 in columns after these.
     factors: float64 (n, cols).
     across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n,
     rows) [mm^2].
     """
-    n, rows, cols = out.shape
+    n, rows, padded = out.shape
+    cols = factors.shape[1]
     for job in prange(n * rows):
         view = job // rows
         r = job % rows
@@ -656,6 +657,8 @@ def weigh(images, first, factors, across, up, out):
         for c in range(cols):
             weight = np.float32(factors[view, c] / math.sqrt(across[view, c] + high))
             out[view, r, c] = images[view, seen, c] * weight
+        for c in range(cols, padded):
+            out[view, r, c] = np.float32(0)
 
 
 @parallel

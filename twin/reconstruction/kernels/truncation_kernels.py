@@ -17,6 +17,7 @@ from numba import prange
 
 from flexdt.twin.projection.kernels.compiling import kernel, parallel, serial
 
+ONE = np.float32(1)
 PARAMETERS = 6
 MAX_STEPS = 100
 """Largest number of evaluations of a fit: usually a dozen is enough."""
@@ -76,12 +77,26 @@ def _edge_mean(line, before, first, last, lower, upper, share, across, high):
 
 
 @kernel
-def _continue_side(out, first, last, lower, upper, share, across, high, rest, fade):
+def _continue_side(
+    out, first, last, near, lower, upper, share, across, high, rest, fade, factors
+):
     """Fill columns first <= c < last of a row: the prisms, and the rest at the edge fading
-    out."""
+    out, times the columns' factors over the rays' lengths, if there are factors.
+
+    near: first and last of these columns in which some of the rest is left.
+    """
+    if factors.size == 0:
+        for c in range(first, last):
+            model = lower[c] + share * (upper[c] - lower[c])
+            out[c] = np.float32(model * math.sqrt(across[c] + high) + rest * fade[c])
+        return
+    part = np.float32(share)
     for c in range(first, last):
-        model = lower[c] + share * (upper[c] - lower[c])
-        out[c] = np.float32(model * math.sqrt(across[c] + high) + rest * fade[c])
+        model = lower[c] + part * (upper[c] - lower[c])
+        out[c] = model * np.float32(factors[c])
+    for c in range(near[0], near[1]):
+        inverse = ONE / math.sqrt(np.float32(across[c] + high))
+        out[c] += np.float32(rest * fade[c]) * inverse * np.float32(factors[c])
 
 
 @parallel
@@ -111,9 +126,9 @@ def prism_lengths(before, cols, edge, plane, prisms, out):
 
 @parallel
 def continue_rows(
-    images, first, before, edge, lengths, band, share, cut, fade, across, up, out
+    images, first, before, edge, lengths, band, share, cut, fade, across, up, factors, out
 ):
-    """Continue rows beyond the panel's edges.
+    """Continue rows beyond the panel's edges; with factors, weigh them in the same pass.
 
     images: float32 (n, rows of the panel, cols).
     first: row of the panel that is the first of `out`; rows beyond it repeat its
@@ -126,12 +141,21 @@ def continue_rows(
     fade: (wide,) part of it that is left in each column.
     across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n,
     rows) [mm^2].
-    out: float32 (n, rows, wide).
+    factors: (n, wide) that rows are multiplied by, over the rays' lengths, as
+    `fdk_kernels.weigh` does; (n, 0) for rows as they are.
+    out: float32 (n, rows, wide or more); 0 in columns after these.
     """
-    n, rows, wide = out.shape
+    n, rows, padded = out.shape
+    wide = across.shape[1]
     cols = images.shape[2]
     after = before + cols
     bands = lengths.shape[1]
+    begin = 0
+    while begin < before and fade[begin] == 0.0:
+        begin += 1
+    end = wide
+    while end > after and fade[end - 1] == 0.0:
+        end -= 1
     for job in prange(n * rows):
         view = job // rows
         r = job % rows
@@ -144,12 +168,26 @@ def continue_rows(
         low = _edge_mean(line, before, 0, edge, lower, upper, part, flat, high)
         top = _edge_mean(line, before, other, cols, lower, upper, part, flat, high)
         row = out[view, r]
-        _continue_side(row, 0, before, lower, upper, part, flat, high, low * cut[r], fade)
-        for c in range(cols):
-            row[before + c] = line[c]
+        weights = factors[view]
+        rest = low * cut[r]
+        near = (begin, before)
         _continue_side(
-            row, after, wide, lower, upper, part, flat, high, top * cut[r], fade
+            row, 0, before, near, lower, upper, part, flat, high, rest, fade, weights
         )
+        if factors.shape[1]:
+            for c in range(cols):
+                inverse = ONE / math.sqrt(np.float32(flat[before + c] + high))
+                row[before + c] = line[c] * np.float32(weights[before + c]) * inverse
+        else:
+            for c in range(cols):
+                row[before + c] = line[c]
+        rest = top * cut[r]
+        near = (after, end)
+        _continue_side(
+            row, after, wide, near, lower, upper, part, flat, high, rest, fade, weights
+        )
+        for c in range(wide, padded):
+            row[c] = np.float32(0)
 
 
 @kernel
