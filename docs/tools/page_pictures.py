@@ -113,7 +113,6 @@ def scan_it(browser: Any, url: str, to: Path) -> None:
     page = opened(browser, url, "iso", "move")
     page.click("#scan-it")
     page.locator("#volume-beside").wait_for()
-    page.add_style_tag(content=".inset { visibility: hidden }")
     taken(page, to / "viewer-scan-it.png")
     page.close()
 

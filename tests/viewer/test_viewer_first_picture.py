@@ -206,8 +206,13 @@ def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
     own = np.asarray(painted.convert("L"), dtype=np.float32)
     part = np.s_[60:-130, 130:-20]  # without buttons, tag and the sample's picture
     assert np.corrcoef(live[part].ravel(), own[part].ravel())[0, 1] > 0.8
-    page.locator(".view .inset").click()
+    inset = page.locator(".view .inset")
+    inset.click()
+    inset.wait_for(state="hidden")  # the view itself shows the sample now
+    page.click(".view .home")
+    inset.wait_for()
     page.keyboard.press("Alt+0")
+    inset.wait_for(state="hidden")
     page.close()
 
 

@@ -62,7 +62,10 @@ function frame(view) {
     const home = el("button", {
         class: "home",
         title: "Back to this view's preset",
-        onclick: () => call("viewer.camera", { view }),
+        onclick: () => {
+            box.classList.remove("near");
+            return call("viewer.camera", { view });
+        },
     }, "⌂");
     const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
     box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
@@ -76,7 +79,11 @@ function frame(view) {
     box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample));
     return { box, iframe, tag, src, sample };
 }
-const closer = (view) => call("viewer.camera", { view, sample: true }).catch(() => { });
+// Where the camera is near the sample, its own picture is not needed.
+function closer(view) {
+    open.get(view)?.box.classList.add("near");
+    return call("viewer.camera", { view, sample: true }).catch(() => { });
+}
 export function nearSample() {
     for (const view of open.keys())
         if (view !== "beam")

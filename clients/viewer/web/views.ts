@@ -79,7 +79,10 @@ function frame(view: View): Frame {
     {
       class: "home",
       title: "Back to this view's preset",
-      onclick: () => call("viewer.camera", { view }),
+      onclick: () => {
+        box.classList.remove("near");
+        return call("viewer.camera", { view });
+      },
     },
     "⌂",
   );
@@ -97,7 +100,11 @@ function frame(view: View): Frame {
   );
   return { box, iframe, tag, src, sample };
 }
-const closer = (view: View) => call("viewer.camera", { view, sample: true }).catch(() => {});
+// Where the camera is near the sample, its own picture is not needed.
+function closer(view: View) {
+  open.get(view)?.box.classList.add("near");
+  return call("viewer.camera", { view, sample: true }).catch(() => {});
+}
 export function nearSample(): void {
   for (const view of open.keys()) if (view !== "beam") void closer(view);
 }
