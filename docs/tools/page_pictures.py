@@ -109,8 +109,10 @@ def four_views(browser: Any, url: str, to: Path) -> None:
 
 
 def scan_it(browser: Any, url: str, to: Path) -> None:
-    """Picture the volume of what stands on the stage, in the scene and beside its truth."""
+    """Picture the gear's volume in the scene and beside its truth; the stage stays nearer."""
     page = opened(browser, url, "iso", "move")
+    page.locator("#scan-it-sample option[value=gear]").wait_for(state="attached")
+    page.select_option("#scan-it-sample", "gear")
     page.click("#scan-it")
     page.locator("#volume-beside").wait_for()
     taken(page, to / "viewer-scan-it.png")
@@ -167,7 +169,7 @@ def main() -> None:
         sync_playwright() as play,
     ):
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        for picture in (first, four_views, scan_it, scan, virtual):
+        for picture in (first, four_views, scan, virtual, scan_it):
             picture(browser, url, chosen.out)
         browser.close()
 
