@@ -18,12 +18,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import psutil
 
 from flexdt.clients.launch.processes import Servers
 
@@ -65,6 +63,28 @@ class Moment:
         )
 
 
+def processor_s(pid: int) -> float | None:
+    """Read what a process has used [s]; None where it has ended."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def family(pid: int) -> set[int]:
+    """List a process and all that it has started, and so on."""
+    parents: dict[int, int] = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            words = path.read_text().rpartition(")")[2].split()
+            parents[int(path.parent.name)] = int(words[1])
+    found = {pid}
+    while more := {one for one, parent in parents.items() if parent in found} - found:
+        found |= more
+    return found
+
+
 class Meter:
     """Adds up processor seconds, those of processes that have ended included.
 
@@ -79,17 +99,10 @@ class Meter:
 
     def now(self) -> Moment:
         """Read the clocks of all processes."""
-        own = {p.pid: p for p in psutil.Process().children(recursive=True)}
-        lab = {self._servers} | {
-            p.pid for p in psutil.Process(self._servers).children(recursive=True)
-        }
-        for pid, process in own.items():
-            with_kind = ("servers" if pid in lab else "browser", pid)
-            try:
-                used = process.cpu_times()
-            except psutil.Error:
-                continue
-            self._seen[with_kind] = used.user + used.system
+        lab = family(self._servers)
+        for pid in family(os.getpid()) - {os.getpid()}:
+            if (used := processor_s(pid)) is not None:
+                self._seen["servers" if pid in lab else "browser", pid] = used
         total = dict.fromkeys(self._ended, 0.0)
         for (kind, _), seconds in self._seen.items():
             total[kind] += seconds

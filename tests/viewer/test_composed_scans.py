@@ -53,7 +53,7 @@ def test_a_correction_does_not_move_the_detector(seed: int) -> None:
     )
     text = compose_script(request, MACHINE, PROFILE)
     lines = [line.split("\t") for line in text.split("\r\n") if "move absolute" in line]
-    for axis, wanted in at.items():
-        told = [float(line[2]) for line in lines if line[0] == axis]
+    for name, wanted in at.items():
+        told = [float(line[2]) for line in lines if line[0] == name]
         assert told
         assert max(abs(value - wanted) for value in told) < 1e-5

@@ -61,7 +61,7 @@ def test_a_volumes_reach_is_that_of_its_object_and_not_of_noise() -> None:
         shape = rng.integers(24, 40, 3)
         radius = float(rng.uniform(5.0, 8.0))
         middle = [float(rng.uniform(radius + 1, n - radius - 1)) for n in shape]
-        places = np.moveaxis(np.indices(shape), 0, -1) + 0.5
+        places = np.moveaxis(np.indices(tuple(shape)), 0, -1) + 0.5
         ball = np.linalg.norm(places - middle, axis=-1) <= radius
         noise = rng.random(tuple(shape)) < 0.01
         codes = np.where(ball | noise, 65535, 1).ravel().tolist()
