@@ -257,9 +257,9 @@ class Tube:
         """Make the exposure settings of this tube during one image.
 
         Example:
-            >>> Tube(kV=60, power_W=30).exposure(100.0, averages=4)
-            ExposureSettings(kV=60.0, power_W=30.0, exposure_ms=100.0, averages=4,
-            xrays_on=True)
+            >>> lit = Tube(kV=60, power_W=30).exposure(100.0, averages=4)
+            >>> lit.kV, lit.power_W, lit.exposure_ms, lit.averages, lit.xrays_on
+            (60.0, 30.0, 100.0, 4, True)
         """
         return ExposureSettings(
             float(self.kV), float(self.power_W), float(exposure_ms), int(averages)

@@ -66,11 +66,13 @@ def fdk(
             sides.
 
     Examples:
-        A cube of 0.02 / mm, projected and reconstructed:
+        A cube of 0.02 / mm with two denser bars, projected and reconstructed:
 
         >>> from flexdt.twin.projection import forward
         >>> cube = np.zeros((24, 24, 24), np.float32)
         >>> cube[6:18, 6:18, 6:18] = 0.02
+        >>> cube[8:14, 3:6, 14:17] = 0.03
+        >>> cube[4:8, 10:14, 18:22] = 0.03
         >>> volume = Volume(cube, 0.5)
         >>> turn = np.linspace(0, 2 * np.pi, 90, endpoint=False)
         >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(90)
