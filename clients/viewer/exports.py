@@ -34,7 +34,8 @@ Form = Literal["html", "viser"]
 """Form of an exported file: an HTML page by itself, or viser's own format."""
 FRAMES: Final = 240
 REPLAY_S: Final = 12.0
-LIGHT, DARK = (246, 248, 251), (16, 19, 25)
+LIGHT = (246, 248, 251)
+DARK = (16, 19, 25)
 
 
 def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
@@ -52,9 +53,10 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
     rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(
         np.float32
     )
-    alpha = (
-        rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
-    )
+    if rgba.shape[2] == 4:
+        alpha = rgba[:, :, 3:4] / 255.0
+    else:
+        alpha = np.ones_like(rgba[:, :, :1])
     flat = rgba[:, :, :3] * alpha + np.array(DARK if dark else LIGHT) * (1.0 - alpha)
     return png_of(flat.astype(np.uint8))
 
@@ -163,11 +165,10 @@ def beside(state: State | None, image: ShownImage | None) -> str:
         "axes": "x right, y to the detector, z up",
     }
     lines = "<br>".join(f"{name}: {html.escape(value)}" for name, value in rows.items())
-    film = (
-        ""
-        if image is None
-        else base64.b64encode(png_of(grey(image, window_of(image)))).decode()
-    )
+    if image is None:
+        film = ""
+    else:
+        film = base64.b64encode(png_of(grey(image, window_of(image)))).decode()
     source = f"data:image/png;base64,{film}"
     return (
         '<aside style="position:fixed;left:8px;bottom:8px;width:230px;padding:8px;'

@@ -53,7 +53,8 @@ class ImageFeed:
         """
         self.kind = kind
         self.newest: ShownImage | None = None
-        self._take, self._died = take, died
+        self._take = take
+        self._died = died
         self._raw: Mapping[str, object] | None = None
         self._due = asyncio.Event()
         self._address = address
@@ -80,7 +81,8 @@ class ImageFeed:
 
     def stop(self) -> asyncio.Future[Any]:
         """Listen no longer, from now on; done once the connection has ended."""
-        tasks, self._tasks = self._tasks, []
+        tasks = self._tasks
+        self._tasks = []
         for task in tasks:
             task.cancel()
         return asyncio.gather(*tasks, return_exceptions=True)
@@ -98,8 +100,14 @@ class ImageFeed:
     def _arrived(self, topic: str, params: Mapping[str, object]) -> None:
         """Keep the newest image, and wake the task that takes it."""
         if topic == "projection":
-            hello = None if self._link is None else self._link.hello
-            self._twin = "" if hello is None else hello.instance or ""
+            if self._link is None:
+                hello = None
+            else:
+                hello = self._link.hello
+            if hello is None:
+                self._twin = ""
+            else:
+                self._twin = hello.instance or ""
             self._raw = params
             self._due.set()
 
@@ -107,7 +115,8 @@ class ImageFeed:
         """Take each new image coarse at once, and in full once no other follows within
         `SETTLE_S`. Runs until cancelled; an image that cannot be shown is logged.
         """
-        shown_coarse, sound = False, True
+        shown_coarse = False
+        sound = True
         while True:
             try:
                 async with asyncio.timeout(SETTLE_S if shown_coarse else None):
@@ -149,9 +158,18 @@ def radiograph(params: Mapping[str, object], twin: str = "") -> ShownImage:
     event = Event.from_wire(params)
     shot = event.data
     assert isinstance(shot, Projection)
-    time = event.time if shot.time is None else shot.time
-    flags = None if shot.flags is None else shot.flags.model_dump()
-    origin = None if shot.origin is None else shot.origin.model_dump()
+    if shot.time is None:
+        time = event.time
+    else:
+        time = shot.time
+    if shot.flags is None:
+        flags = None
+    else:
+        flags = shot.flags.model_dump()
+    if shot.origin is None:
+        origin = None
+    else:
+        origin = shot.origin.model_dump()
     return ShownImage(
         pixels=shot.image,
         kind=shot.kind,

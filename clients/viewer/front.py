@@ -121,14 +121,20 @@ class Front:
             max_scenes, max_pages: largest numbers of open views and pages.
             still: makes a picture of the scene; None for none.
         """
-        self._page, self._connect = page, connect
+        self._page = page
+        self._connect = connect
         self.doorkeeper = MessageFilter()
-        self._max_scenes, self.scenes = max_scenes, 0
-        self._max_pages, self._pages = max_pages, 0
+        self._max_scenes = max_scenes
+        self.scenes = 0
+        self._max_pages = max_pages
+        self._pages = 0
         self.admission = Admission()
-        self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
+        self._guessing = asyncio.Lock()
+        self._closing = asyncio.Event()
         self.wrong_tokens = 0
-        self._downloads, self._token, self._still = downloads, token, still
+        self._downloads = downloads
+        self._token = token
+        self._still = still
         more = b"<style>%s</style><script>%s</script><script>%s</script>" % (
             page_file("scene.css"),
             page_file(TRANSLUCENT),
@@ -140,7 +146,8 @@ class Front:
             MARK, b'<script src="%b"></script>' % self._program_path.encode(), 1
         )
         self._scene_html = bare.replace(b"<head>", b"<head>" + more, 1)
-        self._loopback, self._secure = True, False
+        self._loopback = True
+        self._secure = False
         self._server: Server | None = None
 
     @property
@@ -163,7 +170,8 @@ class Front:
             OSError: the address is taken or not ours.
         """
         check_bind(host, self._token)
-        self._loopback, self._secure = is_loopback(host), ssl is not None
+        self._loopback = is_loopback(host)
+        self._secure = ssl is not None
         self._server = await serve(
             self._serve,
             host,
@@ -218,7 +226,8 @@ class Front:
         if denied is None:
             cast(BrowserConnection, connection).admit()
         if denied is None and url.path == "/still.jpg" and self._still is not None:
-            asked, picture = {k: v[-1] for k, v in parse_qs(url.query).items()}, None
+            asked = {k: v[-1] for k, v in parse_qs(url.query).items()}
+            picture = None
             with contextlib.suppress(TimeoutError):
                 picture = await asyncio.wait_for(self._still(asked), STILL_S)
             if picture is None:
@@ -239,9 +248,9 @@ class Front:
         """
         if request.headers.get("Upgrade", "").lower() == "websocket":
             known = PAGE_PATH.fullmatch(url.path) or SCENE_PATH.fullmatch(url.path)
-            return (
-                None if known else _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
-            )
+            if known:
+                return None
+            return _plain(http.HTTPStatus.NOT_FOUND, "no such connection")
         if SCENE_PATH.fullmatch(url.path):
             return _kept(request, self._scene_html, "text/html; charset=utf-8")
         if self._program and url.path == self._program_path:
@@ -257,7 +266,10 @@ class Front:
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             disposition = f'attachment; filename="{file.name}"'
             return _response(file.content, kind, {"Content-Disposition": disposition})
-        name = PAGE if url.path == "/" else url.path.removeprefix("/")
+        if url.path == "/":
+            name = PAGE
+        else:
+            name = url.path.removeprefix("/")
         if not re.fullmatch(r"[a-z0-9_-]+\.(html|css|js|svg)", name):
             return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
         try:
@@ -301,7 +313,10 @@ class Front:
             return None
         given = parse_qs(url.query).get("token", [None])[0]
         if given is not None and token_matches(given, self._token):
-            secure = "; Secure" if self._secure else ""
+            if self._secure:
+                secure = "; Secure"
+            else:
+                secure = ""
             cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/{secure}"
             headers = Headers(
                 {"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"}
@@ -317,8 +332,14 @@ class Front:
                 async with self._guessing, asyncio.timeout(GUESS_S):
                     await self._closing.wait()
         wrong = given is not None
-        asked = token_form(wrong) if url.path == "/" else NO_TOKEN.encode()
-        form = "text/html" if url.path == "/" else "text/plain"
+        if url.path == "/":
+            asked = token_form(wrong)
+        else:
+            asked = NO_TOKEN.encode()
+        if url.path == "/":
+            form = "text/html"
+        else:
+            form = "text/plain"
         return _response(
             asked, f"{form}; charset=utf-8", status=http.HTTPStatus.UNAUTHORIZED
         )
@@ -448,7 +469,8 @@ def _kept(
             http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b""
         )
     if "gzip" in request.headers.get("Accept-Encoding", ""):
-        body, more["Content-Encoding"] = _packed(body), "gzip"
+        body = _packed(body)
+        more["Content-Encoding"] = "gzip"
     return _response(body, kind, more)
 
 

@@ -66,11 +66,10 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     limits = with_limits(options.limit, ViewerLimits())
     machine = read_if_there(options.machine, machines.parsed)
     profile = read_if_there(options.profile, parse_profile)
-    looks = (
-        own_looks(machine, options.machine.parent)
-        if machine and options.machine
-        else None
-    )
+    if machine and options.machine:
+        looks = own_looks(machine, options.machine.parent)
+    else:
+        looks = None
     viewer = Viewer(
         twin_address, ANSWERS, machine, profile, token, options.data, limits, looks
     )

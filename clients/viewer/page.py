@@ -102,13 +102,15 @@ class Page:
         """The data set whose images this page shows instead of live ones."""
         self.block = ""
         """The key of the last block of a volume offered to the page."""
-        self._connection, self._local = connection, local
+        self._connection = connection
+        self._local = local
         self.link = KeptConnection(address, person, on_change=self._link_changed)
         self._notes: deque[str] = deque()
         self._newest: dict[str, str | bytes] = {}
         self._sent_at: dict[str, deque[float]] = {slot: deque() for slot in ON_THE_WAY}
         """Times at which messages not yet acknowledged were sent."""
-        self._image, self._part = memoryview(b""), PART_BYTES
+        self._image = memoryview(b"")
+        self._part = PART_BYTES
         self._due = asyncio.Event()
         self._over = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -222,7 +224,8 @@ class Page:
             self._image = memoryview(image)  # type: ignore[arg-type]
         if not self._image or not self._may_send("image"):
             return None
-        part, self._image = self._image[: self._part], self._image[self._part :]
+        part = self._image[: self._part]
+        self._image = self._image[self._part :]
         return (b"\0" if self._image else b"\1") + part
 
     def _may_send(self, slot: str) -> bool:
@@ -242,7 +245,10 @@ class Page:
             return
         took_s = time.monotonic() - sent.popleft()
         if slot == "image":
-            self._part = LARGE_PART_BYTES if took_s < QUICK_S else PART_BYTES
+            if took_s < QUICK_S:
+                self._part = LARGE_PART_BYTES
+            else:
+                self._part = PART_BYTES
         self._due.set()
 
     async def _handle(self, text: str) -> None:
@@ -354,7 +360,11 @@ def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
         request = json.loads(text)
     except RecursionError:
         raise ValueError("nested too deep") from None
-    id: Any = request.get("id") if isinstance(request, dict) else ()
+    id: Any
+    if isinstance(request, dict):
+        id = request.get("id")
+    else:
+        id = ()
     named = id is None or (isinstance(id, str) and len(id) <= MAX_WORD)
     if named or (isinstance(id, int) and abs(id) < 2**64):
         return id, request
@@ -367,7 +377,8 @@ def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     Raises:
         ValueError: it has none.
     """
-    method, params = message.get("method"), message.get("params") or {}
+    method = message.get("method")
+    params = message.get("params") or {}
     if isinstance(method, str) and isinstance(params, dict):
         return method, params
     raise ValueError("it has a method, and params by name")

@@ -52,7 +52,8 @@ class SceneClients:
         Args:
             scenes: viser's server.
         """
-        self._scenes, self._server = scenes, scenes.server
+        self._scenes = scenes
+        self._server = scenes.server
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Standpoint] = {}
@@ -113,7 +114,10 @@ class SceneClients:
     def page_of(self, client_id: int | None) -> str | None:
         """Return the page that a client belongs to."""
         with self._lock:
-            who = None if client_id is None else self._who.get(client_id)
+            if client_id is None:
+                who = None
+            else:
+                who = self._who.get(client_id)
         return None if who is None else who.page
 
     def follow(self, camera: Standpoint) -> None:
@@ -212,7 +216,10 @@ class SceneClients:
             client: of viser; its path names page and view.
         """
         path = self._scenes.path_of(client.client_id)
-        match = None if path is None else SCENE_PATH.fullmatch(path)
+        if path is None:
+            match = None
+        else:
+            match = SCENE_PATH.fullmatch(path)
         if match is None:
             return
         who = Who(match[1], match[2])

@@ -25,11 +25,9 @@ def page_file(name: str) -> bytes:
         FileNotFoundError: there is none of this name.
     """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
-    return (
-        content.replace(BOXES.encode(), boxes(LAYERS).encode(), 1)
-        if name == PAGE
-        else content
-    )
+    if name == PAGE:
+        return content.replace(BOXES.encode(), boxes(LAYERS).encode(), 1)
+    return content
 
 
 def token_form(wrong: bool) -> bytes:
@@ -38,7 +36,10 @@ def token_form(wrong: bool) -> bytes:
     Args:
         wrong: whether a wrong one was given.
     """
-    said = b'<p id="wrong" role="alert">This is not it.</p>' if wrong else b""
+    if wrong:
+        said = b'<p id="wrong" role="alert">This is not it.</p>'
+    else:
+        said = b""
     return page_file(TOKEN_FORM).replace(WRONG_MARK.encode(), said, 1)
 
 

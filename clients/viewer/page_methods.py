@@ -278,7 +278,9 @@ async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
     """Return the first camera of a view in a pane of this page; empty where it is not
     known."""
     fitted = viewer.clients.cameras.get(params.view)
-    return {} if fitted is None else asdict(fitted.at(params.aspect))
+    if fitted is None:
+        return {}
+    return asdict(fitted.at(params.aspect))
 
 
 async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
@@ -290,15 +292,20 @@ async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
 
 async def window(viewer: Viewer, page: Page, params: Window) -> object:
     """Set the window [low, high] of the panel in all scenes; None chooses it automatically."""
-    low, high = params.low, params.high
-    viewer.window = None if low is None or high is None else (low, high)
+    low = params.low
+    high = params.high
+    if low is None or high is None:
+        viewer.window = None
+    else:
+        viewer.window = (low, high)
     viewer.feeds["line_integral"].again()
     return {}
 
 
 async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
     """Show this page the ray of a pixel; returns its path lengths through materials."""
-    lab, world = _lab(viewer), viewer.world
+    lab = _lab(viewer)
+    world = viewer.world
     clients = viewer.clients.of(page.id)
     if params.pixel is None or world is None:
         lab.plan.ray(clients, None)
@@ -316,7 +323,9 @@ async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
         `energy_keV`, `photons`, `mean_keV`, `filters`, and `limits` of tube and camera.
     """
     machine = _lab(viewer).machine
-    tube, lit, panel = tube_of(machine.tube), machine.tube, machine.detector
+    tube = tube_of(machine.tube)
+    lit = machine.tube
+    panel = machine.detector
     behind = tube_spectrum(params.kV, tube)
     layers = [
         {"material": f.substance.name, "thickness_mm": f.thickness_mm}
@@ -345,7 +354,8 @@ async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
     Raises:
         RpcError: a data set is open on this page.
     """
-    lab, text = _lab(viewer), params.text
+    lab = _lab(viewer)
+    text = params.text
     if page.recorded is not None:
         raise RpcError(Code.BUSY, "a data set is open: close it to scrub a plan")
     if text is None:
@@ -369,7 +379,8 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
     Returns:
         The result of `dataset.get`; empty for None.
     """
-    lab, name = _lab(viewer), params.name
+    lab = _lab(viewer)
+    name = params.name
     clients = viewer.clients.of(page.id)
     told: Any = None
     if name is not None:
@@ -399,7 +410,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     Raises:
         RpcError: no data set is open, or another one was opened meanwhile.
     """
-    lab, name = _lab(viewer), page.recorded
+    lab = _lab(viewer)
+    name = page.recorded
     if name is None:
         raise RpcError(
             Code.INVALID_PARAMS, "open a data set first: there is nothing to show"
@@ -409,7 +421,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     names = ("name", "index", "file", "image", "projection", "time_s", "positions")
     about = {key: told[key] for key in names}
     about["problem"] = ""
-    pixels, virtual = wire_image.decode(told), None
+    pixels = wire_image.decode(told)
+    virtual = None
     if params.virtual and told["image"] == "projection" and told["positions"]:
         try:
             virtual, about["virtual_origin"] = await _virtual(page, told)
@@ -506,12 +519,14 @@ async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
 
 async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
     """Compare the volume with the truth of its sample; its document brings the figures."""
-    correction = None if viewer.state is None else viewer.state.correction
-    now = (
-        None
-        if correction is None
-        else correction.model_dump(include={"name", "parameters"})
-    )
+    if viewer.state is None:
+        correction = None
+    else:
+        correction = viewer.state.correction
+    if correction is None:
+        now = None
+    else:
+        now = correction.model_dump(include={"name", "parameters"})
     return (await _of_volume(viewer, params, "compare", json.dumps(now)))[0]
 
 
@@ -524,7 +539,8 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
     Returns:
         `text`, and `moved`: axis -> its present position and the script's.
     """
-    lab, state = _lab(viewer), viewer.state
+    lab = _lab(viewer)
+    state = viewer.state
     request = scan_request(params, lab.machine, lab.profile, state)
     text = compose_script(request, lab.machine, lab.profile)
     if state is None:
@@ -551,7 +567,8 @@ def scan_request(
     )
     if state is None:
         return request
-    places, stand = MotorTargets(machine, profile), motors(machine, state)
+    places = MotorTargets(machine, profile)
+    stand = motors(machine, state)
     sod, sdd = (places.value(name, stand) for name in ("object_y", "detector_y"))
     if params.voxel_um is not None:
         sod = params.voxel_um / 1000.0 / state.camera.pixel_mm * sdd
@@ -575,7 +592,8 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
         there nor at home; axes that the script moves between projections are left out.
     """
     plan = plans.plan_text(text, lab.machine, lab.profile, state)
-    stands, found = motors(lab.machine, state), {}
+    stands = motors(lab.machine, state)
+    found = {}
     for axis, there in plans.projection_positions(plan).items():
         if not len(there) or np.ptp(there) > MIN_DIFFERENCE:
             continue
@@ -603,7 +621,10 @@ async def estimate(
     Over a connection of its own: other requests of the page do not wait for this one.
     """
     at = viewer.twin_address
-    name = "fit" if isinstance(params, CalibrationFit) else "align"
+    if isinstance(params, CalibrationFit):
+        name = "fit"
+    else:
+        name = "align"
     asked = Ask(f"calibration.{name}", params.model_dump(exclude_none=True), None)
     async with AsyncTwinClient(
         at.host, at.port, at.token, name=f"flexdt viewer ({name})", ssl=at.ssl
@@ -620,7 +641,8 @@ async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
 
 async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
     """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
-    lab, time_s = _lab(viewer), params.time_s
+    lab = _lab(viewer)
+    time_s = params.time_s
     if time_s is None:
         lab.plan.unghost(viewer.clients.of(page.id))
         return {"positions": None}
@@ -654,12 +676,16 @@ async def export(viewer: Viewer, page: Page, params: Export) -> object:
     Raises:
         RpcError: there is no plan to replay, or too many exports are running.
     """
-    lab, form = _lab(viewer), params.format
+    lab = _lab(viewer)
+    form = params.format
     if not params.replay:
         seen = next(
             iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None
         )
-        camera = FREE if seen is None else exports.standpoint(seen)
+        if seen is None:
+            camera = FREE
+        else:
+            camera = exports.standpoint(seen)
         make = partial(
             exports.scene_file,
             viewer.viser,

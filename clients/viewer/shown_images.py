@@ -69,7 +69,9 @@ def window_of(image: ShownImage) -> tuple[float, float]:
         low = min(low, 0.0)
         if (matter := pixels[pixels > AIR]).size:
             high = float(np.percentile(matter, 98.0))
-    return (low, high) if high - low > 1e-6 else (low, low + 1.0)
+    if high - low > 1e-6:
+        return (low, high)
+    return (low, low + 1.0)
 
 
 def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
@@ -101,13 +103,15 @@ def packed(
         beads: predicted bead centres (column, row) in pixels of the full image.
         facts: more entries of the header.
     """
-    full, pair = image.pixels.shape, image.virtual is not None
+    full = image.pixels.shape
+    pair = image.virtual is not None
     if image.virtual is not None:
         image = replace(image, pixels=np.concatenate([image.pixels, image.virtual]))
     values = np.asarray(
         binned_mean(image.pixels, 2) if coarse else image.pixels, dtype=np.float32
     )
-    low, scale = 0.0, 1.0
+    low = 0.0
+    scale = 1.0
     if image.kind == "line_integral" or coarse:
         low = float(values.min(initial=0.0))
         scale = max(float(values.max(initial=0.0)) - low, 1e-6) / TOP

@@ -111,14 +111,19 @@ class Viewer:
     ) -> None:
         """Prepare link, feeds, viser's server and the pages' state; `start` listens.
         See the class."""
-        self.twin_address, self._token = address, token
-        self._machine, self._profile, self.looks = machine, profile, looks
-        self.data, self.limits = data, limits or ViewerLimits()
+        self.twin_address = address
+        self._token = token
+        self._machine = machine
+        self._profile = profile
+        self.looks = looks
+        self.data = data
+        self.limits = limits or ViewerLimits()
         self.failed = asyncio.Event()
         self.grower = LiveReconstruction(self._grown)
         self.opened = self.drawn = self.sharing = 0
         self._pictured: object = None
-        self._placed, self._stills = asyncio.Event(), Stills()
+        self._placed = asyncio.Event()
+        self._stills = Stills()
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
         self.lab: LabScene | None = None
@@ -126,12 +131,14 @@ class Viewer:
         self.world: World | None = None
         self.look: SampleLook = NOTHING
         self.window: tuple[float, float] | None = None
-        self.wardrobe, self.tags = MeshCache(), NameTags()
+        self.wardrobe = MeshCache()
+        self.tags = NameTags()
         self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)
         self._local = {name: partial(answer, self) for name, answer in answers.items()}
         self._raw: Mapping[str, Any] | None = None
         self._due = asyncio.Event()
-        self._twin_time, self._told = 0.0, -1
+        self._twin_time = 0.0
+        self._told = -1
         self._heard_at = time.monotonic()
         self._built = 0
         self.near: Sequence[str] = ()
@@ -274,7 +281,8 @@ class Viewer:
         before: World | None = None
         while True:
             await asyncio.sleep(NAMES_S)
-            lab, world = self.lab, self.world
+            lab = self.lab
+            world = self.world
             if lab is not None and world is not None:
                 if before is not None and np.allclose(before.view.rows, world.view.rows):
                     self.clients.fit()
@@ -322,7 +330,8 @@ class Viewer:
 
     async def _draw(self) -> None:
         """Draw the newest state, at most `DRAW_HZ` times a second, for ever."""
-        loop, sound = asyncio.get_running_loop(), True
+        loop = asyncio.get_running_loop()
+        sound = True
         while True:
             await self._due.wait()
             self._due.clear()
@@ -355,7 +364,8 @@ class Viewer:
             self.state is None or self.state.sample != state.sample or lab is not before
         )
         first = self.state is None
-        self.state, self.world = state, world
+        self.state = state
+        self.world = world
         if sample_changed:
             await self._dress(lab, state)
         rim_mm = views.rim(world, [skin.vertices for skin in self.look.skins])
@@ -371,7 +381,10 @@ class Viewer:
                 feed.again()
         near = nearest(state.safety)
         lab.update(state, world)
-        self.near = near["pair"] if near["close"] else ()
+        if near["close"]:
+            self.near = near["pair"]
+        else:
+            self.near = ()
         if any("ranges" in page.shown for page in self.pages.values()):
             lab.draw_ranges(state)
         self._placed.set()
@@ -399,13 +412,17 @@ class Viewer:
         machine = self._machine or builtin_machine(
             "flexray" if hello is None else hello.machine
         )
-        named = None if hello is None else hello.profile
+        if hello is None:
+            named = None
+        else:
+            named = hello.profile
         profile = self._profile or profile_of(machine, named)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
             scene = await asyncio.to_thread(
                 LabScene, self.viser, machine, profile, self._dragged, self.looks
             )
-            self.lab, self._built = scene, self.scenes.said
+            self.lab = scene
+            self._built = self.scenes.said
             for page in self.pages.values():
                 page.say("layers", **page.shown.told)
         return self.lab
@@ -446,7 +463,9 @@ class Viewer:
             image: to show.
             coarse: at half the resolution, while images follow each other.
         """
-        lab, world, look = self.lab, self.world, self.look
+        lab = self.lab
+        world = self.world
+        look = self.look
         if lab is None or world is None:
             return
         beads: list[list[float]] = []
@@ -456,7 +475,10 @@ class Viewer:
         content = packed(image, coarse=coarse, beads=beads, facts={"at": time.time()})
         if image.kind == "line_integral":
             window = self.window or window_of(image)
-            small = image.pixels[::2, ::2] if coarse else image.pixels
+            if coarse:
+                small = image.pixels[::2, ::2]
+            else:
+                small = image.pixels
             shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
             lab.show_image(grey(shown, window), small, world)
             self._pictured = coarse, window, image.cone_vec
@@ -475,7 +497,8 @@ class Viewer:
         known."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._placed.wait(), STILL_S)
-        lab, world = self.lab, self.world
+        lab = self.lab
+        world = self.world
         camera = self.clients.cameras.get(asked.get("view", ""))
         if lab is None or world is None or camera is None:
             return None
@@ -520,11 +543,10 @@ class Viewer:
             log("a page was refused", logging.WARNING, page=id, reason=reason)
             await connection.close(TRY_AGAIN, reason)
             return
-        asked = (
-            parse_qs(urlsplit(connection.request.path).query)
-            if connection.request
-            else {}
-        )
+        if connection.request:
+            asked = parse_qs(urlsplit(connection.request.path).query)
+        else:
+            asked = {}
         person = "".join(
             c for c in asked.get("person", [""])[0] if c.isprintable()
         ).strip()[:40]
@@ -564,7 +586,8 @@ class Viewer:
 
     def _joined(self, client: viser.ClientHandle, id: str) -> None:
         """Draw a page's plan path in its new view; called in one of viser's threads."""
-        page, lab = self.pages.get(id), self.lab
+        page = self.pages.get(id)
+        lab = self.lab
         if page is not None and page.orbit is not None and lab is not None:
             lab.plan.orbit([client], page.orbit)
 

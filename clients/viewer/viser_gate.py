@@ -71,7 +71,10 @@ class Scenes:
             label: of the server.
         """
         usual = tempfile.gettempdir()
-        short = usual if len(usual.encode()) <= LONGEST_TMP else "/tmp"
+        if len(usual.encode()) <= LONGEST_TMP:
+            short = usual
+        else:
+            short = "/tmp"
         clear_left_behind(Path(short))
         self._folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=short))  # 0700
         self.path = self._folder / "viser"
@@ -108,8 +111,13 @@ class Scenes:
     def path_of(self, client_id: int) -> str | None:
         """Return the path of a client's connection; None when it has closed."""
         connection = self.server._websock_server._live_connections.get(client_id)
-        request = None if connection is None else connection.request
-        return None if request is None else str(request.path.partition("?")[0])
+        if connection is None:
+            request = None
+        else:
+            request = connection.request
+        if request is None:
+            return None
+        return str(request.path.partition("?")[0])
 
     @property
     def said(self) -> int:
@@ -204,7 +212,8 @@ def _listening_at(path: Path) -> Iterator[None]:
         GateError: viser starts its server in another way.
     """
     listener = socket.socket(socket.AF_UNIX)
-    serve, used = library.serve, False
+    serve = library.serve
+    used = False
 
     def privately(handler: Any, host: Any, port: Any, **options: Any) -> Any:
         nonlocal used

@@ -92,11 +92,10 @@ def _fan(
         (0.0, max(cut, 1.0)) if side < 0.0 else (min(max(cut, 0.0), length - 1.0), length)
     )
     half = 0.5 * float(np.linalg.norm(across))
-    first, last = middle @ along - half, middle @ along + half
-    low, high = (
-        min(first * near, first * far) / length,
-        max(last * near, last * far) / length,
-    )
+    first = middle @ along - half
+    last = middle @ along + half
+    low = min(first * near, first * far) / length
+    high = max(last * near, last * far) / length
     rows, cols = SHAPE
     a = near + (np.arange(cols) + 0.5) * (far - near) / cols
     b = low + (np.arange(rows)[:, None] + 0.5) * (high - low) / rows

@@ -42,11 +42,13 @@ def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str
     Returns:
         part -> height of the other one's top in the part's own frame [mm].
     """
-    low, high = {}, {}
+    low = {}
+    high = {}
     for part in parts:
         middle = bodies[part.name].origin + np.asarray(part.center_mm)
         half = np.asarray(part.size_mm) / 2.0
-        low[part.name], high[part.name] = middle - half, middle + half
+        low[part.name] = middle - half
+        high[part.name] = middle + half
     found: dict[str, float] = {}
     for part in parts:
         for other in parts:

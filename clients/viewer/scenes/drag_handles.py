@@ -48,7 +48,8 @@ class Gizmos:
 
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
         """Add a handle for each stage; `drag` gets the axes' targets when one is dragged."""
-        self._machine, self._drag = machine, drag
+        self._machine = machine
+        self._drag = drag
         self._positions: dict[str, float] = {}
         self._at: dict[str, tuple[float, ...]] = {}
         self._handles = [self._add(server, stage) for stage in STAGES]

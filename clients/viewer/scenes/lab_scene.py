@@ -64,7 +64,8 @@ NEAR: Final = ("sample_mount", "sample_holder")
 WORLD_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The pose of parts in the world's own frame."""
 AXIS_REACH_MM: Final = 120.0
-SCALE_MM, AXES_MM = 500.0, 150.0
+SCALE_MM = 500.0
+AXES_MM = 150.0
 
 
 class LabScene:
@@ -86,7 +87,9 @@ class LabScene:
         looks: Mapping[str, bytes] | None = None,
     ) -> None:
         """Build all nodes, each shown or hidden as in `Shown()`; see the class."""
-        self._server, self.machine, self.profile = server, machine, profile
+        self._server = server
+        self.machine = machine
+        self.profile = profile
         self._own = looks or {}
         self._collision = build_scene(machine, profile)
         self._bodies = {b.name: b for b in self._collision.bodies}
@@ -160,7 +163,8 @@ class LabScene:
                     receive_shadow=False,
                 )
         pieces, lamp = cabinet(room)
-        self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), WORLD_POSE
+        self._solids["cabinet"] = cut(pieces)
+        self._sent["cabinet"] = WORLD_POSE
         still: Any = {"cast_shadow": False, "receive_shadow": False}
         self._lamp = scene.add_icosphere(
             "/cabinet/lamp",
@@ -229,7 +233,8 @@ class LabScene:
 
     def _build_labels(self) -> None:
         """Build the world's axes and a scale on the floor."""
-        scene, (x, y, z) = self._server.scene, _scale_mm(self.machine)
+        scene = self._server.scene
+        (x, y, z) = _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
         scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN)
         scene.add_frame(
@@ -242,7 +247,9 @@ class LabScene:
     def named(self, world: World, shown: Shown) -> list[Name]:
         """List the names shown now, and their places."""
         if "labels" not in shown:
-            return names_of_image(world) if "names" in shown else []
+            if "names" in shown:
+                return names_of_image(world)
+            return []
         first = _scale_mm(self.machine)
         out: list[Name] = [
             (f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM)
@@ -297,8 +304,10 @@ class LabScene:
 
     def _place(self, name: str, turn: FloatArray, at: FloatArray) -> None:
         pose = (*quaternion(turn), *(at * MM).tolist())
-        self._sent[name], frame = pose, self._frames[name]
-        frame.wxyz, frame.position = pose[:4], pose[4:]
+        self._sent[name] = pose
+        frame = self._frames[name]
+        frame.wxyz = pose[:4]
+        frame.position = pose[4:]
 
     def _show_beam(self, state: State, world: World) -> None:
         """Move edges, spot, lamp, cross and axis to a state, and colour them by X-rays on
@@ -310,7 +319,8 @@ class LabScene:
         """
         on = state.tube.on
         points = np.concatenate([world.source[None], world.corners]) * MM
-        self._lit, self._lamp.color = on, LAMP[on]
+        self._lit = on
+        self._lamp.color = LAMP[on]
         self._shade.light(on)
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
@@ -329,8 +339,10 @@ class LabScene:
         at = (world.detector - GAP_MM * world.normal) * MM
         width = float(np.linalg.norm(world.u)) * cols * MM
         height = float(np.linalg.norm(world.v)) * rows * MM
-        u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
-        self._image.render_width, self._image.render_height = width, height
+        u = world.u / np.linalg.norm(world.u)
+        v = world.v / np.linalg.norm(world.v)
+        self._image.render_width = width
+        self._image.render_height = height
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
         self._image.position = tuple(at)
 
@@ -395,7 +407,8 @@ class LabScene:
             vertices = (vertices_mm * MM).astype(np.float32)
             triangles = np.asarray(faces, dtype=np.uint32)
             if self._surface is not None:
-                self._surface.vertices, self._surface.faces = vertices, triangles
+                self._surface.vertices = vertices
+                self._surface.faces = triangles
                 return
             self._surface = self._server.scene.add_mesh_simple(
                 "/object/surface",
@@ -472,7 +485,10 @@ class LabScene:
         }
         skins = () if self._look is None else self._look.skins
         within = faded and self._surface is not None
-        opacity = min(shown.opacity, FADED_OPACITY) if within else shown.opacity
+        if within:
+            opacity = min(shown.opacity, FADED_OPACITY)
+        else:
+            opacity = shown.opacity
         clear = {
             f"/sample/{s.name}": _clear(opacity, s.dense and not within) for s in skins
         }
@@ -523,12 +539,14 @@ def _scale_mm(machine: Machine) -> FloatArray:
     """Compute the place of the scale: next to the lowest part, at the height of its
     top."""
     ground = ground_of(machine)
-    (x, y, z), middle = ground.size_mm, np.array(ground.center_mm)
+    (x, y, z) = ground.size_mm
+    middle = np.array(ground.center_mm)
     return np.asarray(middle + [0.45 * x, -0.4 * y, z / 2 + 2.0])
 
 
 def _panel_rotation(world: World) -> FloatArray:
-    u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
+    u = world.u / np.linalg.norm(world.u)
+    v = world.v / np.linalg.norm(world.v)
     return np.stack([u, np.cross(u, v), -v], axis=1)
 
 
@@ -540,7 +558,8 @@ def _axis_points() -> npt.NDArray[np.float32]:
 
 def _cross_points() -> npt.NDArray[np.float32]:
     """Return the four lines (4, 2, 3) of a cross with an open centre [m]."""
-    r, g = 7.0 * MM, 1.5 * MM
+    r = 7.0 * MM
+    g = 1.5 * MM
     return np.array(
         [[[s * g, 0, 0], [s * r, 0, 0]] for s in (-1, 1)]
         + [[[0, 0, s * g], [0, 0, s * r]] for s in (-1, 1)],

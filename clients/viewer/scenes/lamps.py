@@ -13,7 +13,8 @@ import viser
 SKY: Final = "/lights/sky"
 GROUND: Final = (120, 116, 112)
 SKY_COLOR: Final = (236, 242, 255)
-KEY, KEY_AT = "/lights/key", (1.8, -2.2, 3.2)
+KEY = "/lights/key"
+KEY_AT = (1.8, -2.2, 3.2)
 FILL_AT: Final = (-2.6, 1.4, 1.2)
 """Position of the fill light [m]."""
 

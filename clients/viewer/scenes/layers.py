@@ -92,7 +92,10 @@ class Shown:
         """
         on = {name for name, wanted in layers.items() if wanted}
         off = {name for name, wanted in layers.items() if wanted is False}
-        opaque = self.opacity if opacity is None else opacity
+        if opacity is None:
+            opaque = self.opacity
+        else:
+            opaque = opacity
         return replace(self, layers=self.layers - off | on, opacity=opaque)
 
     @property

@@ -21,11 +21,14 @@ from flexdt.clients.viewer.scenes.world import MM, World
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine
 
-WAYS, RINGS_PX = 24, (26.0, 44.0, 66.0, 92.0, 124.0, 164.0, 220.0, 300.0, 420.0)
+WAYS = 24
+RINGS_PX = (26.0, 44.0, 66.0, 92.0, 124.0, 164.0, 220.0, 300.0, 420.0)
 """Directions, and distances [px], in which a place is sought, the near ones first."""
 GAP_PX = 5.0
 """Least distance between boxes, and to the picture's edge [px]."""
-LETTER_PX, LINE_PX, PAD_PX = 6.6, 17.0, 10.0
+LETTER_PX = 6.6
+LINE_PX = 17.0
+PAD_PX = 10.0
 """Widest letter, height and margin of viser's labels on a screen [px]."""
 LEAST_PX = 260
 """Least width of a view with names [px]."""
@@ -54,7 +57,8 @@ def laid_out(
     size = sizes.max(
         axis=0, initial=0.0
     )  # of every place, so that any name has room in it
-    places, named = np.zeros((0, 2)), np.zeros(0, dtype=int)
+    places = np.zeros((0, 2))
+    named = np.zeros(0, dtype=int)
     for k in np.argsort(anchors[:, 1]):
         if not ((anchors[k] >= 0.0) & (anchors[k] <= area)).all():
             continue
@@ -72,10 +76,8 @@ def laid_out(
         )
         cost = np.where(inside & apart, preference + 4.0 * covered, np.inf)
         if np.isfinite(cost).any():
-            places, named = (
-                np.vstack([places, middles[np.argmin(cost)]]),
-                np.append(named, k),
-            )
+            places = np.vstack([places, middles[np.argmin(cost)]])
+            named = np.append(named, k)
     # Where two leaders crossed, their names could change places and both would be shorter.
     lengths = np.linalg.norm(places[:, None] - anchors[named], axis=2)
     place, name = linear_sum_assignment(lengths)
@@ -110,7 +112,8 @@ def names_of_parts(
         if (pose := poses.get(part.name)) is not None and (
             part.axis is not None or part.role
         ):
-            (x, _, z), middle = part.size_mm, np.array(part.center_mm)
+            (x, _, z) = part.size_mm
+            middle = np.array(part.center_mm)
             turn = Rotation.from_quat(pose[:4], scalar_first=True)
             at = turn.apply((middle + [x / 2, 0.0, z / 2]) * MM) + pose[4:]
             out.append((part.name.replace("_", " "), np.asarray(at)))
@@ -134,7 +137,8 @@ class NameTags:
         camera = client.camera
         area = float(camera.image_width), float(camera.image_height)
         names = names if area[0] >= LEAST_PX else ()
-        eye, ahead = camera.position, camera.look_at - camera.position
+        eye = camera.position
+        ahead = camera.look_at - camera.position
         ahead = ahead / np.linalg.norm(ahead)
         right = np.cross(ahead, camera.up_direction)
         right /= np.linalg.norm(right)

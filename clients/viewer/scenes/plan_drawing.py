@@ -26,7 +26,8 @@ PATH = (90, 120, 255)
 HOME = "/object/plan"
 """The node that holds the paths in all scenes: one switch for all of them."""
 ORBIT = f"{HOME}/orbit"
-RAY, RAY_COLOR = "/ray", (255, 60, 160)
+RAY = "/ray"
+RAY_COLOR = (255, 60, 160)
 
 
 class PlanDrawing:
@@ -76,7 +77,8 @@ class PlanDrawing:
                             position=at,
                         )
                     else:
-                        handle.wxyz, handle.position = turn, at
+                        handle.wxyz = turn
+                        handle.position = at
 
     def unghost(self, clients: Iterable[viser.ClientHandle]) -> None:
         """Show them no longer."""
@@ -91,7 +93,10 @@ class PlanDrawing:
             clients: that see it.
             points: (n, 3) [mm], object frame.
         """
-        steps = None if points is None else np.stack([points[:-1], points[1:]], axis=1)
+        if points is None:
+            steps = None
+        else:
+            steps = np.stack([points[:-1], points[1:]], axis=1)
         _draw_lines(clients, ORBIT, steps, PATH, 1.5)
 
     def ray(self, clients: Sequence[viser.ClientHandle], ends: FloatArray | None) -> None:

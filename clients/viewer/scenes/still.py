@@ -27,10 +27,12 @@ NEAR_M = 0.02
 LARGE_MM = 250.0
 PLACES_AT_ONCE = 1 << 21
 """Number of places of the screen that are tested at a time: some 100 MB."""
-SMOOTH, SMALL_PX = 2, 1 << 17
+SMOOTH = 2
+SMALL_PX = 1 << 17
 """Computed pixels of each side of a pixel, in pictures with no more pixels: a view's
 own would take three times as long, and is soon replaced."""
-SKY, KEY = (0.62, (0.55, -0.6, 0.58))
+SKY = 0.62
+KEY = (0.55, -0.6, 0.58)
 """Part of light from all sides, and the direction of the rest."""
 GROUND = {False: ((248, 250, 253), (217, 225, 236)), True: ((42, 49, 64), (15, 19, 26))}
 """Dark page or not -> colour of the background above and below, as the scenes have it."""
@@ -90,11 +92,15 @@ def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
     """
     import cv2
 
-    (cols, rows), (first, right, _, down) = IMAGE_CELLS, world.corners - world.normal
+    (cols, rows) = IMAGE_CELLS
+    (first, right, _, down) = world.corners - world.normal
     colors = cv2.resize(rgb, IMAGE_CELLS, interpolation=cv2.INTER_AREA).reshape(-1, 3)
     y, x = (part[..., None] for part in np.mgrid[: rows + 1, : cols + 1])
     grid = (first + (right - first) * x / cols + (down - first) * y / rows) * MM
-    a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+    a = grid[:-1, :-1]
+    b = grid[:-1, 1:]
+    c = grid[1:, 1:]
+    d = grid[1:, :-1]
     halves = [
         np.stack(three, axis=2).reshape(-1, 3, 3) for three in ((a, d, c), (a, c, b))
     ]
@@ -123,7 +129,10 @@ def drawn(
     """
     import cv2
 
-    fine = SMOOTH if size[0] * size[1] <= SMALL_PX else 1
+    if size[0] * size[1] <= SMALL_PX:
+        fine = SMOOTH
+    else:
+        fine = 1
     width, height = (fine * side for side in size)
     above, below = (np.array(color, dtype=np.float32) for color in GROUND[dark])
     down = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
@@ -191,7 +200,8 @@ def _projected(
     Returns:
         (n, 3, 3) column, row [px] and inverse depth [1/m]; NaN too near the eye.
     """
-    eye, up = np.asarray(camera.position), np.asarray(camera.up)
+    eye = np.asarray(camera.position)
+    up = np.asarray(camera.up)
     ahead = np.asarray(camera.look_at) - eye
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, up)
@@ -223,7 +233,8 @@ def _filled(
     x, y, inverse = np.moveaxis(corners, 2, 0)
     # An edge, and the inverse depth, is a plane over the screen: of each its slopes and its
     # height at the middle of the triangle's first pixel.
-    to_x, to_y = np.roll(x, -1, axis=1) - x, np.roll(y, -1, axis=1) - y
+    to_x = np.roll(x, -1, axis=1) - x
+    to_y = np.roll(y, -1, axis=1) - y
     area = to_x[:, 0] * to_y[:, 1] - to_y[:, 0] * to_x[:, 1]
     edges = np.stack([-to_y, to_x], axis=2)
     at = to_x * (low[:, 1:] + 0.5 - y) - to_y * (low[:, :1] + 0.5 - x)
@@ -244,13 +255,12 @@ def _filled(
     power = np.ceil(np.log2(sides)).astype(int)
     for across, down in np.unique(power[whole], axis=0).tolist():
         of_class = np.flatnonzero(whole & (power == (across, down)).all(axis=1))
-        columns, rows = (
-            np.arange(2**across)[None, None],
-            np.arange(2**down)[None, :, None],
-        )
+        columns = np.arange(2**across)[None, None]
+        rows = np.arange(2**down)[None, :, None]
         pieces = 1 + (len(of_class) << (across + down)) // PLACES_AT_ONCE
         for some in np.array_split(of_class, pieces):
-            first, last = low[some].astype(int), high[some].astype(int)
+            first = low[some].astype(int)
+            last = high[some].astype(int)
             inside = (columns < (last - first)[:, :1, None]) & (
                 rows < (last - first)[:, 1:, None]
             )

@@ -10,7 +10,8 @@ from typing import Final
 from flexdt.clients.viewer.scenes.still import Shape, drawn, jpeg
 from flexdt.clients.viewer.scenes.views import Fitted
 
-LEAST_PX, MOST_PX = 32, 1200
+LEAST_PX = 32
+MOST_PX = 1200
 MOST_BYTES: Final = 60_000
 MAX_PICTURES: Final = 16
 

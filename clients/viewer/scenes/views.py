@@ -31,7 +31,8 @@ MAX_SIZE_RATIO = 3.0
 looks at the panel's centre instead and the frame is no longer exact."""
 WIDE = 1.35
 """Aspect (width over height) of a pane whose size is not known yet."""
-MIN_ASPECT, MAX_ASPECT = 0.3, 4.0
+MIN_ASPECT = 0.3
+MAX_ASPECT = 4.0
 """Range of aspects for which cameras are made."""
 ROOM = 0.9
 """Part of the picture, in width and height, that fitted points take."""
@@ -55,7 +56,8 @@ def _way(yaw_deg: float, pitch_deg: float) -> Vector:
     >>> _way(0.0, 0.0)
     (-0.0, 1.0, -0.0)
     """
-    yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
+    yaw = math.radians(yaw_deg)
+    pitch = math.radians(pitch_deg)
     level = math.cos(pitch)
     return (-math.sin(yaw) * level, math.cos(yaw) * level, -math.sin(pitch))
 
@@ -188,7 +190,8 @@ def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArr
         )
         / MM
     )
-    low, high = ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
+    low = ends[:, 0].min(axis=0)
+    high = ends[:, 1].max(axis=0)
     pick = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)])
     corners = world.sample @ np.where(pick, high, low)
     middle = world.axis
@@ -223,7 +226,8 @@ def fitted(
     ahead = np.asarray(way) / np.linalg.norm(way)
     axes = _axes(ahead)
     seen = points @ axes.T
-    eye, back = np.zeros(3), []
+    eye = np.zeros(3)
+    back = []
     for k, share in ((0, bounded(aspect)), (1, 1.0)):
         slope = ROOM * share * math.tan(0.5 * fov)
         # On the left each point wants x - eye >= -slope * (depth - eye's depth); right
@@ -254,19 +258,28 @@ def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
         panel's middle.
     """
     rows, cols = world.shape
-    pu, pv = float(np.linalg.norm(world.u)), float(np.linalg.norm(world.v))
+    pu = float(np.linalg.norm(world.u))
+    pv = float(np.linalg.norm(world.v))
     column, row = world.piercing_px.tolist()
-    width, height = cols * pu, rows * pv
-    left, top = (column + 0.5) * pu, (row + 0.5) * pv
-    half_w, half_h = max(left, width - left), max(top, height - top)
+    width = cols * pu
+    height = rows * pv
+    left = (column + 0.5) * pu
+    top = (row + 0.5) * pv
+    half_w = max(left, width - left)
+    half_h = max(top, height - top)
     exact = (
         2.0 * half_w <= MAX_SIZE_RATIO * width and 2.0 * half_h <= MAX_SIZE_RATIO * height
     )
     if exact:
-        target, far = world.foot, world.distance
+        target = world.foot
+        far = world.distance
     else:
-        left, top, half_w, half_h = 0.5 * width, 0.5 * height, 0.5 * width, 0.5 * height
-        target, far = world.detector, float(np.linalg.norm(world.detector - world.source))
+        left = 0.5 * width
+        top = 0.5 * height
+        half_w = 0.5 * width
+        half_h = 0.5 * height
+        target = world.detector
+        far = float(np.linalg.norm(world.detector - world.source))
     up = tuple((-world.v / pv).tolist())
     eye = Standpoint(_m(world.source), _m(target), up, 2.0 * math.atan2(half_h, far))
     return eye, {

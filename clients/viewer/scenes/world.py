@@ -93,7 +93,8 @@ class World:
     def pixel(self, column: float, row: float) -> FloatArray:
         """Compute the centre of a pixel (3,) [mm]."""
         rows, cols = self.shape
-        across, down = column - (cols - 1) / 2, row - (rows - 1) / 2
+        across = column - (cols - 1) / 2
+        down = row - (rows - 1) / 2
         return np.asarray(self.detector + across * self.u + down * self.v)
 
     @property
@@ -117,7 +118,9 @@ def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
 def parameters_of(state: State) -> Offsets:
     """Return the correction in force, or none."""
     correction = state.correction
-    return NOMINAL if correction is None else Offsets.from_edge(correction.parameters)
+    if correction is None:
+        return NOMINAL
+    return Offsets.from_edge(correction.parameters)
 
 
 def motors(machine: Machine, state: State) -> dict[str, float]:
@@ -132,7 +135,8 @@ def world_of(machine: Machine, profile: Profile, state: State) -> World:
         machine, profile: the twin's.
         state: as the twin sends it.
     """
-    camera, positions = camera_of(machine, state.camera), motors(machine, state)
+    camera = camera_of(machine, state.camera)
+    positions = motors(machine, state)
     offset = StagePlacement(**state.sample.offset.model_dump())
     return placed(machine, profile, camera, positions, parameters_of(state), offset)
 
@@ -162,7 +166,10 @@ def placed(
     stage = Rigid(turn, pivot + turn @ (pose.mount[0] - tau))
     # The rows are the authority on geometry: back from the object's frame to the world.
     view = stage @ pose.cone_vec(p).with_shape(camera.shape)
-    at = StagePlacement() if offset is None else offset
+    if offset is None:
+        at = StagePlacement()
+    else:
+        at = offset
     on_stage = Rigid(at.rotation, np.array([at.x, at.y, at.z]))
     source, detector, u, v = view.rows.reshape(4, 3)
     shifts = source - pose.source[0], detector - pose.detector[0]
@@ -190,7 +197,8 @@ def beads_on(
         Those within the image, (column, row) in pixels.
     """
     points = world.stage.inverse @ world.sample @ beads
-    rows, cols = shape[0], shape[1]
+    rows = shape[0]
+    cols = shape[1]
     pixels = ConeVec(np.asarray(cone_vec)).project_points(points, (rows, cols))[0]
     inside = (pixels > -0.5).all(axis=1) & (pixels < [cols - 0.5, rows - 0.5]).all(axis=1)
     return [[float(c), float(r)] for c, r in pixels[inside]]

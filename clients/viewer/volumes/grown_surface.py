@@ -83,7 +83,8 @@ def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Face
     number = np.full(mixed.shape, -1, dtype=np.int32)
     cells = np.argwhere(mixed)
     number[mixed] = np.arange(len(cells))
-    sums, counts = np.zeros((len(cells), 3)), np.zeros(len(cells))
+    sums = np.zeros((len(cells), 3))
+    counts = np.zeros(len(cells))
     for a, b in _EDGES:
         low, high = (data[tuple((cells + end).T)].astype(np.float64) for end in (a, b))
         crossed = (low > level) != (high > level)

@@ -160,7 +160,8 @@ class Held:
         """Store a volume (nz, ny, nx), from which requests get slices, and its size for their
         answers.
         """
-        self.grid, self.volumes = grid, {"volume": data}
+        self.grid = grid
+        self.volumes = {"volume": data}
         self.about |= {
             "size": list(data.shape[::-1]),
             "voxel_mm": float(np.max(grid.voxel_mm)),
@@ -190,7 +191,9 @@ def grow(
     whole = field_of_view(cone_vec, shape)
     voxel_mm = whole.shape[2] * float(np.max(whole.voxel_mm)) / side
     like = as_volume(field_of_view(cone_vec, shape, voxel_mm))
-    target, told, drawn = OnProcessor(like), 0.0, 0.0
+    target = OnProcessor(like)
+    told = 0.0
+    drawn = 0.0
     held.hold(target.volume().transpose(2, 0, 1), like)
 
     def parts() -> Iterator[Float32Array]:
@@ -237,16 +240,15 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         TwinError: as `reconstruct_volume`.
     """
     data = load_dataset(folder)
-    held.dataset, held.request = (
-        data,
-        VolumeRequest(binning=max(1, round(data.shape[1] / side))),
-    )
+    held.dataset = data
+    held.request = VolumeRequest(binning=max(1, round(data.shape[1] / side)))
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
         volume = reconstruct_volume(
             data, held.request, progress=_share(held, "done"), errors=True
         )
-    said, accuracy = [str(doubt.message) for doubt in doubts], volume.accuracy
+    said = [str(doubt.message) for doubt in doubts]
+    accuracy = volume.accuracy
     if (
         accuracy is not None and not accuracy.warnings
     ):  # the accuracy has the same warnings
@@ -275,7 +277,9 @@ def _share(held: Held, name: str) -> Callable[[float, float], None]:
 
 
 def _named(correction: NamedCorrection | None) -> str:
-    return "no correction" if correction is None else f"correction “{correction.name}”"
+    if correction is None:
+        return "no correction"
+    return f"correction “{correction.name}”"
 
 
 def _facts(data: DataSet) -> dict[str, Any]:
@@ -284,7 +288,8 @@ def _facts(data: DataSet) -> dict[str, Any]:
     Returns:
         `sample`, `started` and `kV`.
     """
-    settings, document = data.settings, data.document
+    settings = data.settings
+    document = data.document
     return {
         "sample": "" if document is None else document.sample.name,
         "started": "" if document is None else f"{document.started:%Y-%m-%d %H:%M}",
@@ -304,7 +309,9 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
     Raises:
         TwinError: the truth is not known, or there is no volume of a past scan.
     """
-    data, grid, request = held.dataset, held.grid, held.request
+    data = held.dataset
+    grid = held.grid
+    request = held.request
     if data is None or grid is None or request is None:
         raise TwinError(
             "only the finished volume of a past scan is compared with its truth", {}
@@ -314,13 +321,12 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
     truth = held.volumes.setdefault("truth", truth_of(data, grid))
     held.volumes["difference"] = held.volumes["volume"] - truth
     rows = {_named(data.correction): figures(held.volumes["volume"], truth, voxel_mm)}
-    other = (
-        NOMINAL
-        if data.correction is not None
-        else None
-        if now is None
-        else now.parameters
-    )
+    if data.correction is not None:
+        other = NOMINAL
+    elif now is None:
+        other = None
+    else:
+        other = now.parameters
     if other is not None:
         same = replace(
             request, voxel_mm=voxel_mm, shape=grid.shape, center_mm=grid.center_mm
@@ -407,7 +413,8 @@ def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> N
 
 def main() -> None:
     """Run the process: the volume in a thread, requests from standard input meanwhile."""
-    parent, served = os.getppid(), Served()
+    parent = os.getppid()
+    served = Served()
     os.nice(5)  # neither twin nor viewer waits for a volume
     warm()
     if not (line := sys.stdin.readline()):

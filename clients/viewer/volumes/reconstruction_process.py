@@ -42,7 +42,8 @@ class LiveReconstruction:
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         """Prepare reconstructions, whose lines `tell` gets; processes are started when needed."""
-        self._tell, self.newest = tell, ""
+        self._tell = tell
+        self.newest = ""
         self._asked: Wish = ()
         self._task: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
@@ -73,7 +74,9 @@ class LiveReconstruction:
         if self._task is not None:
             self._task.cancel()
             self._ending = self._task
-        self._task, self._asked, self.newest = None, (), ""
+        self._task = None
+        self._asked = ()
+        self.newest = ""
         self._hang_up()
 
     async def close(self) -> None:
@@ -119,7 +122,8 @@ class LiveReconstruction:
         Args:
             asked: the words of its first line.
         """
-        spare, self._spare = self._spare, None
+        spare = self._spare
+        self._spare = None
         process = await (spare or _started())
         assert process.stdout is not None
         assert process.stdin is not None

@@ -49,7 +49,10 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         TwinError: the sample is not known.
     """
     document = dataset.document
-    name = "" if document is None else document.sample.name
+    if document is None:
+        name = ""
+    else:
+        name = document.sample.name
     if not is_shipped(name):
         raise TwinError(
             f"{dataset.where}: what the sample {name!r} is made of is not known here; "
@@ -57,15 +60,22 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
             "phantoms of flexdt, in scans of the twin",
             {"asked": name, "allowed": "a phantom that ships with flexdt"},
         )
-    phantom, voxel = load_phantom(name), min(like.voxel_xyz)
+    phantom = load_phantom(name)
+    voxel = min(like.voxel_xyz)
     if phantom.is_voxels:
-        whole, data, half = phantom.volume(), phantom.volume().data, 0.0
+        whole = phantom.volume()
+        data = phantom.volume().data
+        half = 0.0
     else:  # means over two voxels a side, centred half a voxel before the later one
         whole = phantom.volume(voxel / 2)
-        data, half = np.pad(whole.data, (0, 1)), 0.5
+        data = np.pad(whole.data, (0, 1))
+        half = 0.5
         for axis in range(3):
             data = (data + np.roll(data, 1, axis)) / np.float32(2)
-    stands = StagePlacement() if dataset.folder is None else placement(dataset.folder)
+    if dataset.folder is None:
+        stands = StagePlacement()
+    else:
+        stands = placement(dataset.folder)
     back = stands.rotation.T
     shift = np.array([stands.x, stands.y, stands.z])
     nz, ny, nx = like.shape
@@ -123,18 +133,21 @@ def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[
     inside = ndimage.binary_erosion(alike)
     if not inside.any():  # walls of a few voxels
         inside = alike
-    seen_mu = float(values[inside].mean()) if inside.any() else math.nan
-    solid, seen = truth > mu / 2, known & (values > seen_mu / 2)
+    if inside.any():
+        seen_mu = float(values[inside].mean())
+    else:
+        seen_mu = math.nan
+    solid = truth > mu / 2
+    seen = known & (values > seen_mu / 2)
     enclosed = known & np.stack([ndimage.binary_fill_holes(layer) for layer in solid])
     whole = max(1, int(enclosed.sum()))
     box = ndimage.find_objects(solid.astype(np.int8))
     around = tuple(slice(max(0, s.start - 3), s.stop + 3) for s in box[0]) if box else ...
     apart = (values[around] - truth[around])[known[around]]
-    rms = (
-        float(np.sqrt(np.mean(np.square(apart, dtype=np.float64))))
-        if apart.size
-        else math.nan
-    )
+    if apart.size:
+        rms = float(np.sqrt(np.mean(np.square(apart, dtype=np.float64))))
+    else:
+        rms = math.nan
     filled = np.where(known, values, 0.0)
     pairs = {
         "attenuation": (seen_mu, mu),
@@ -197,10 +210,8 @@ def extent(
     there = solid.any(axis=-1)
     if not there.any():
         return math.nan
-    first, last = (
-        solid.argmax(axis=-1),
-        solid.shape[-1] - 1 - solid[..., ::-1].argmax(axis=-1),
-    )
+    first = solid.argmax(axis=-1)
+    last = solid.shape[-1] - 1 - solid[..., ::-1].argmax(axis=-1)
     widest = there & (last - first >= (last - first)[there].max() - 1)
     profile = np.pad(np.median(np.moveaxis(values, axis, -1)[widest], axis=0), 1)
     above = np.flatnonzero(profile > seen / 2)

@@ -68,7 +68,8 @@ def room_of(machine: Machine) -> Room:
     and the floor's height.
     """
     low, high = reach_of(machine)
-    across, tall = (high - low)[:2].max(), (high - low)[2]
+    across = (high - low)[:2].max()
+    tall = (high - low)[2]
     scale = float(min(across / DRAWN_FOR_MM[0], tall / DRAWN_FOR_MM[1]))
     return Room(low, high, scale, float(low[2]) - BELOW_MM * scale)
 
@@ -84,7 +85,8 @@ def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
     """
     limits = np.array([(axis.lower, axis.upper) for axis in machine.axes.values()])
     bodies = {body.name: body for body in stage_bodies(machine, profile_of(machine))}
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
     for part in machine.components:
         body = bodies[part.name]
         corners = np.concatenate([piece.mesh.vertices for piece in pieces_of(part)])
@@ -113,12 +115,16 @@ def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
         Pieces, and the place of its lamp (3,) [mm].
     """
     s = room.scale
-    low, high = room.low - s * np.array(ROOM_MM), room.high + s * np.array(ROOM_MM)
+    low = room.low - s * np.array(ROOM_MM)
+    high = room.high + s * np.array(ROOM_MM)
     low[2] = room.floor_mm
-    (x0, y0, z0), (x1, y1, _) = low, high
-    door_y, (wide, tall) = 0.3 * y0 + 0.7 * y1, s * np.array(DOOR_MM)
+    (x0, y0, z0) = low
+    (x1, y1, _) = high
+    door_y = 0.3 * y0 + 0.7 * y1
+    (wide, tall) = s * np.array(DOOR_MM)
     door_top = z0 + tall
-    left, right = door_y - wide / 2, door_y + wide / 2
+    left = door_y - wide / 2
+    right = door_y + wide / 2
     walls = trimesh.creation.box(bounds=[low, high])
     upward = walls.face_normals[:, 2].copy()
     walls.invert()  # they are seen from within

@@ -152,7 +152,9 @@ def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh
 def _linear(channel: int) -> float:
     """Convert a channel of sRGB to glTF's: linear, 0 to 1."""
     c = channel / 255.0
-    return c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4)
+    if c <= 0.04045:
+        return c / 12.92
+    return float(((c + 0.055) / 1.055) ** 2.4)
 
 
 def turn_matrix(axis: Vector, angle: float) -> FloatArray:

@@ -86,7 +86,8 @@ def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
         (sides * piece.get(share, MIDDLE) + piece.get(more, MIDDLE)).tolist()
         for share, more in (("share", "mm"), ("at", "at_mm"))
     )
-    paint, axis = PAINTS[piece["paint"]], piece.get("axis", "z")
+    paint = PAINTS[piece["paint"]]
+    axis = piece.get("axis", "z")
     made = []
     for angle in np.radians(piece.get("turned_deg", [0.0])):
         match piece["solid"]:
