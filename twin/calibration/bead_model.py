@@ -78,7 +78,9 @@ class BeadModel:
     @property
     def contrasts(self) -> FloatArray:
         """Contrast of each bead to a common factor, (k,)."""
-        return 2.0 * self.bead_radius_mm if self.contrast is None else self.contrast
+        if self.contrast is None:
+            return 2.0 * self.bead_radius_mm
+        return self.contrast
 
     def mirrored(self) -> BeadModel:
         """Return the mirror image (x to -x), as of a model of the wrong handedness."""

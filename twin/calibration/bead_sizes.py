@@ -28,7 +28,10 @@ def judge_first_sizes(
         fit: gives the geometry of each scan.
     """
     out = []
-    allowed = BLURRED_FIRST if request.second_look else OTHER_BEADS
+    if request.second_look:
+        allowed = BLURRED_FIRST
+    else:
+        allowed = OTHER_BEADS
     sized = zip(state.scans, state.identifications, state.looks, strict=True)
     for g, (scan, found, looks) in enumerate(sized):
         radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))

@@ -67,15 +67,14 @@ def lag_of(
     light = np.exp(-images)
     if usable is not None:  # One that shows what the frame before shows is no lag.
         light[~usable] = np.nan
-    sums, some = [], slice(None, None, max(1, len(light) // LAG_SAMPLE))
+    sums = []
+    some = slice(None, None, max(1, len(light) // LAG_SAMPLE))
     for step in (1, -1):
         there = _rolled(plan, step)
         shadow = np.roll(light, step, axis=0)
         shadow[0 if step == 1 else -1] = np.nan  # the first has none before it
-        shown, near = (
-            np.exp(-frames.windows(there)[some]),
-            _near(there.corner[some], plan, some),
-        )
+        shown = np.exp(-frames.windows(there)[some])
+        near = _near(there.corner[some], plan, some)
         if usable is not None:
             shown[~usable[some]] = np.nan
         sums.append(_products(shown, np.where(near, np.nan, shadow[some])))

@@ -50,7 +50,10 @@ def fit_with_loose_priors(
     wide_priors = loosened({**request.priors, **priors_of(state.scans, request)})
     loose = replace(request, priors=wide_priors, bound=math.inf)
     out = refit_scans(state, loose, wide)
-    freed = wide.bead_prior_mm if request.bead_tolerance_mm is None else 0.0
+    if request.bead_tolerance_mm is None:
+        freed = wide.bead_prior_mm
+    else:
+        freed = 0.0
     if freed > 0 and _beads_explain_more(wide, out):
         out = refit_scans(state, loose, wide, bead_tolerance_mm=freed)
     return out
@@ -105,9 +108,10 @@ def fit_scans(
     Returns:
         The fit; with motion, its sigmas contain the motion's uncertainty.
     """
-    tolerance = (
-        request.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
-    )
+    if bead_tolerance_mm is None:
+        tolerance = request.bead_tolerance_mm
+    else:
+        tolerance = bead_tolerance_mm
     seen = state.measured or state.identifications
     weighed = positions_weighed(state)
     frames = [len(scan.poses) for scan in state.scans]
@@ -135,7 +139,9 @@ def fit_scans(
         strain=strain_prior(state.model, request) if strain is None else strain,
         arc=arc,
     )
-    return fit if state.motion is None else aware(fit, state.motion)
+    if state.motion is None:
+        return fit
+    return aware(fit, state.motion)
 
 
 def refit_scans(
@@ -171,7 +177,10 @@ def refit_scans(
         state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))
-    turning = fit.problem.curvature is not None if arc is None else arc
+    if arc is None:
+        turning = fit.problem.curvature is not None
+    else:
+        turning = arc
     return fit_scans(
         state,
         freed,

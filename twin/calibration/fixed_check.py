@@ -157,7 +157,8 @@ def _centre(asked: CalibrationRequest) -> dict[str, float]:
 
 def _fixed_values(state: Calibration, asked: CalibrationRequest) -> dict[str, float]:
     """Return the fixed main parameters with their values."""
-    centre, known = _centre(asked), priors_of(state.scans, asked)
+    centre = _centre(asked)
+    known = priors_of(state.scans, asked)
     return {n: centre[n] for n in SIX if n not in asked.free and n not in known}
 
 

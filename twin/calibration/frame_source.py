@@ -53,12 +53,15 @@ def without_repeats(looks: Sequence[FrameSpots]) -> tuple[FrameSpots, ...]:
     """
     out = list(looks)
     for i in range(1, len(out)):
-        a, b = looks[i - 1].detections, looks[i].detections
+        a = looks[i - 1].detections
+        b = looks[i].detections
         same = len(a) == len(b) >= 2 and bool(np.abs(a.centers - b.centers).max() < 1e-7)
         if same and looks[i].state is FrameState.USABLE:
             out[i] = FrameSpots(b, FrameState.REPEATED)
     repeated = sum(look.state is FrameState.REPEATED for look in out)
-    return tuple(looks) if 2 * repeated > len(out) else tuple(out)
+    if 2 * repeated > len(out):
+        return tuple(looks)
+    return tuple(out)
 
 
 class Frames(Protocol):

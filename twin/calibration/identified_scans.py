@@ -123,7 +123,10 @@ def _numbers(
     n = len(counts)
     parts = [slice(0, n // 2), slice(n // 2, n), slice(n // 4, n - n // 4)]
     halves = (attempt(detections[part], model, scan.poses[part]) for part in parts)
-    first = [] if found is None or found.typical_px > CLEAR_PX else [found]
+    if found is None or found.typical_px > CLEAR_PX:
+        first = []
+    else:
+        first = [found]
     for base in chain(first, halves, [found]):
         if base is None or not base.typical_px < NEAR_PX:
             continue

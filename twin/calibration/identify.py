@@ -39,7 +39,8 @@ LOOSE_PX = 0.6
 loosened."""
 LOOSE_FACTOR = 15.0
 """Factor on the priors of panel and axis then."""
-WIDE_PX, NARROW_PX = (120.0, 60.0, 40.0), (25.0, 15.0, 10.0)
+WIDE_PX = (120.0, 60.0, 40.0)
+NARROW_PX = (25.0, 15.0, 10.0)
 """Gates of the rounds from all start angles, and of those from the promising ones."""
 MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
@@ -261,16 +262,20 @@ class _Shadows:
     def of(cls, detections: Sequence[Detections]) -> _Shadows:
         """Pack the spots of all frames into arrays, padded to the largest number."""
         counts = np.array([len(d) for d in detections], dtype=np.int64)
-        n, m = len(detections), max(int(counts.max()), 1)
+        n = len(detections)
+        m = max(int(counts.max()), 1)
         points = np.full((n, m, 2), np.inf)
         covariances = np.full((n, m, 2, 2), np.nan)
-        bias, radii = np.zeros((n, m)), np.zeros((n, m))
+        bias = np.zeros((n, m))
+        radii = np.zeros((n, m))
         whole = np.zeros((n, m), dtype=bool)
         for i, d in enumerate(detections):
             k = len(d)
             points[i, :k] = d.centers - (np.array(d.shape[::-1]) - 1) / 2
             covariances[i, :k] = d.covariances
-            bias[i, :k], radii[i, :k], whole[i, :k] = d.bias, d.radii_px, d.whole
+            bias[i, :k] = d.bias
+            radii[i, :k] = d.radii_px
+            whole[i, :k] = d.whole
         return cls(points, covariances, bias, radii, whole, counts)
 
     def picked(
@@ -287,7 +292,8 @@ class _Shadows:
             k), 0 for them.
         """
         seen = index >= 0
-        rows, pick = np.arange(len(index))[:, None], np.maximum(index, 0)
+        rows = np.arange(len(index))[:, None]
+        pick = np.maximum(index, 0)
         tracks = self.points[rows, pick] + origin[:, None, :]
         return (
             np.where(seen[..., None], tracks, np.nan),
@@ -415,7 +421,8 @@ def _followed(
     Returns:
         The hypothesis, with its loss per possible match.
     """
-    used, before = math.nan, np.zeros(0, np.int64)
+    used = math.nan
+    before = np.zeros(0, np.int64)
     try:
         predicted = _predicted(problem, x)
         for gate in gates:
@@ -427,7 +434,9 @@ def _followed(
             if gate == used and np.array_equal(index, before):
                 break
             x = solve(_with_tracks(problem, shadows, index), solver, x=x).x
-            predicted, used, before = _predicted(problem, x), gate, index
+            predicted = _predicted(problem, x)
+            used = gate
+            before = index
     except TwinError:
         return _Hypothesis(x, math.inf, 0)
     loss, matches = _loss(predicted, shadows, cap)
@@ -451,11 +460,16 @@ def _rounds(
     Returns:
         The refined hypothesis; with the parameters of `h` if its loss is not finite.
     """
-    x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
+    if math.isfinite(h.loss):
+        x = h.x
+    else:
+        x = _vote(problem, shadows, h.x)
     quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
     # One loss for all rounds, so that hypotheses can be compared: capped at the same distance.
     found = _followed(problem, shadows, x, gates, quick, 40.0, give_up=True)
-    return found if math.isfinite(found.loss) else replace(found, x=h.x)
+    if math.isfinite(found.loss):
+        return found
+    return replace(found, x=h.x)
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
@@ -557,7 +571,8 @@ def _report(
     Raises:
         TwinError: there is no hypothesis, or the best one has no finite loss.
     """
-    model, poses = problem.model, problem.poses
+    model = problem.model
+    poses = problem.poses
     if not finals or not math.isfinite(finals[0].loss):
         raise TwinError(
             "the shadows found do not fit the phantom in any orientation",
@@ -576,7 +591,10 @@ def _report(
     residual = np.linalg.norm(tracks - problem.origin[:, None, :] - predicted, axis=2)[
         seen
     ]
-    spread = float(np.median(residual)) / RAYLEIGH_MEDIAN if seen.any() else math.inf
+    if seen.any():
+        spread = float(np.median(residual)) / RAYLEIGH_MEDIAN
+    else:
+        spread = math.inf
     total = max(int(shadows.counts.sum()), 1)
     rivals = []
     for h in finals[1:]:

@@ -53,12 +53,17 @@ class Calibration:
     @property
     def motions(self) -> tuple[Motion, ...]:
         """The motion of each scan; empty if it was not requested."""
-        return () if self.motion is None else self.motion.motions
+        if self.motion is None:
+            return ()
+        return self.motion.motions
 
     @property
     def panel(self) -> Panel | None:
         """Distortion and lag of the panel, where either was found."""
-        panel = None if self.fit is None else self.fit.panel
+        if self.fit is None:
+            panel = None
+        else:
+            panel = self.fit.panel
         if not (seen := [lag.part for lag in self.lags if lag.seen]):
             return panel
         return replace(

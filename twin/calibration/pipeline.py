@@ -102,8 +102,14 @@ def calibrate(
         TwinError: a scan has no frames, or the same images as another.
         GeometryError: rows counted upwards, or columns from right to left.
     """
-    asked = CalibrationRequest() if request is None else request
-    solids = getattr(phantom, "scene", None) if scene is None else scene
+    if request is None:
+        asked = CalibrationRequest()
+    else:
+        asked = request
+    if scene is None:
+        solids = getattr(phantom, "scene", None)
+    else:
+        solids = scene
     require_scans(scans)
     state = _detected(scans, with_contrast(bead_model(phantom), solids), detector)
     if state.errors:

@@ -48,7 +48,8 @@ def measure_again(
     Returns:
         The state with the measurements, the fit to them, and the iterations of all fits.
     """
-    first, iterations = (state, fit), 0
+    first = (state, fit)
+    iterations = 0
     windows = sum(len(s.frames) for s in state.scans) * len(state.model)
     draft = windows <= FEW_WINDOWS
     for _ in range(MOST_ROUNDS):
@@ -79,7 +80,9 @@ def _measured(
     Returns:
         The state with measurements and lags, and the windows of each scan.
     """
-    measured, lags, plans = [], [], []
+    measured = []
+    lags = []
+    plans = []
     model = replace(state.model, beads=fit.beads)
     for g, scan in enumerate(state.scans):
         cone = scan.poses.cone_vec(fit.group_parameters[g])
@@ -88,9 +91,10 @@ def _measured(
         contrast = seen_contrasts(model, spots, state.identifications[g].index)
         images = scan.frames.windows(plan)
         usable = np.array([look.state is FrameState.USABLE for look in state.looks[g]])
-        lag = (
-            state.lags[g] if state.measured else lag_of(images, scan.frames, plan, usable)
-        )
+        if state.measured:
+            lag = state.lags[g]
+        else:
+            lag = lag_of(images, scan.frames, plan, usable)
         if lag.seen:
             images = without_lag(scan.frames, plan, lag)
         images[~usable] = np.nan

@@ -59,7 +59,8 @@ def link(
         TwinError: fewer than three markers are found.
     """
     counts = np.array([len(d) for d in detections], dtype=np.int64)
-    n, m = len(detections), max(int(counts.max(initial=0)), 1)
+    n = len(detections)
+    m = max(int(counts.max(initial=0)), 1)
     shape = detections[0].shape
     points = np.full((n, m, 2), np.inf)
     for i, d in enumerate(detections):
@@ -85,7 +86,8 @@ def link(
         index = assign(cone.project_points(places, shape), points, counts, gate)
         often = np.count_nonzero(index >= 0, axis=0)
         enough = often >= max(3, MIN_SEEN_SHARE * np.count_nonzero(counts))
-        index, places = index[:, enough], places[enough]
+        index = index[:, enough]
+        places = places[enough]
         if gate != GATES_PX[-1] and enough.sum() >= 3:
             tracks = _picked(points, index)
             fit = estimate_geometry(
@@ -100,7 +102,8 @@ def link(
                 priors={"det_roll": 1.0},
                 bound=np.inf,
             )
-            places, at = fit.beads, fit.parameters
+            places = fit.beads
+            at = fit.parameters
     order = np.argsort(-places[:, 2])
     return index[:, order], places[order], at
 
@@ -200,14 +203,16 @@ def _found(
             j = int(
                 usable[(int(np.searchsorted(usable, i)) + max(step, 1)) % len(usable)]
             )
-            a, b = ray[i, : counts[i], None], ray[j, None, : counts[j]]
+            a = ray[i, : counts[i], None]
+            b = ray[j, None, : counts[j]]
             between = source[j] - source[i]
             dot = (a * b).sum(axis=2)
             # The nearest points of two lines.
             with np.errstate(invalid="ignore", divide="ignore"):
                 s = ((a @ between) - dot * (b @ between)) / (1 - dot**2)
                 t = (dot * (a @ between) - (b @ between)) / (1 - dot**2)
-            p, q = source[i] + s[..., None] * a, source[j] + t[..., None] * b
+            p = source[i] + s[..., None] * a
+            q = source[j] + t[..., None] * b
             near = np.linalg.norm(p - q, axis=2) < gap
             candidates.append(((p + q) / 2)[near])
     places = np.concatenate(candidates)

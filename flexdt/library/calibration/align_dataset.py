@@ -112,7 +112,10 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     # Once, also where a result is aligned again.
     doubts = dict.fromkeys((*data.warnings, *image_doubts(data)))
     data = replace(data, warnings=tuple(doubts))
-    base = NOMINAL if data.correction is None else data.correction.parameters
+    if data.correction is None:
+        base = NOMINAL
+    else:
+        base = data.correction.parameters
     frames, poses = _at_rest(data)
     passes = long_work.Passes(len(data))
     with long_work.during("aligning") as passes.advance:

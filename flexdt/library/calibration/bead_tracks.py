@@ -61,7 +61,10 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
     before = predictions(
         fit, tuple(NOMINAL if c is None else c.parameters for c in corrections)
     )
-    after = predictions(fit, fit.group_parameters) if result.identifiable else None
+    if result.identifiable:
+        after = predictions(fit, fit.group_parameters)
+    else:
+        after = None
     measured = fit.problem.pixels
     rows: list[dict[str, Any]] = []
     for (dataset, part), correction in zip(outcome.parts, corrections, strict=True):
@@ -106,7 +109,9 @@ def _pixels(points: npt.NDArray[np.float64]) -> list[list[float] | None]:
 
 def _seen_rms(residual: FloatArray) -> float | None:
     """Return `coordinate_rms`, or None if no bead was seen."""
-    return coordinate_rms(residual) if np.isfinite(residual).any() else None
+    if np.isfinite(residual).any():
+        return coordinate_rms(residual)
+    return None
 
 
 def coordinate_rms(residual: FloatArray) -> float:

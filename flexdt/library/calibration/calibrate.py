@@ -150,10 +150,16 @@ class Outcome(Generic[Images_co]):
 def _digits(value: object, sigma: object) -> tuple[str, str]:
     """Write a value to the second digit of its sigma; "-" where it must not be used."""
     if not isinstance(sigma, float | int) or not 0.0 < sigma < math.inf:
-        shown = f"{value:.5g}" if isinstance(value, float | int) else "-"
+        if isinstance(value, float | int):
+            shown = f"{value:.5g}"
+        else:
+            shown = "-"
         return shown, f"{sigma:.2g}" if isinstance(sigma, float | int) else "-"
     places = max(0, 1 - math.floor(math.log10(sigma)))
-    shown = f"{value:.{places}f}" if isinstance(value, float | int) else "-"
+    if isinstance(value, float | int):
+        shown = f"{value:.{places}f}"
+    else:
+        shown = "-"
     return shown, f"{sigma:.{places}f}"
 
 
@@ -233,7 +239,8 @@ def calibrate_datasets(
             scale,
             sought,
         )
-        beads, radii = result.model.beads, result.model.bead_radius_mm
+        beads = result.model.beads
+        radii = result.model.bead_radius_mm
         size = tuple((np.ptp(beads, axis=0) + 2 * radii.max()).tolist())
         target = Phantom(
             UNKNOWN, "markers of unknown positions", Scene(()), size, beads, radii
@@ -262,7 +269,10 @@ def calibrate_datasets(
     result = with_undetermined(result)
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
-    given = phantom if isinstance(phantom, str) else target.name
+    if isinstance(phantom, str):
+        given = phantom
+    else:
+        given = target.name
     document["next"] = next_commands(result, [d.where for d in datasets], given)
     if result.identifiable and result.motions:
         document["motion"] = [m.to_dict() for m in result.motions]
@@ -374,7 +384,10 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     """
     fit = result.fit
     frames = sum(len(s.frames) for s in result.scans)
-    seen = image_quantities(fit) if fit is not None and result.identifiable else ()
+    if fit is not None and result.identifiable:
+        seen = image_quantities(fit)
+    else:
+        seen = ()
     document: dict[str, object] = {
         "verdict": verdict_of(result, seen),
         "identifiable": result.identifiable,
@@ -403,7 +416,10 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     parameters = {}
     for name, e in certificate.estimates.items():
         known = offered and math.isfinite(e.sigma)
-        hidden = {} if known else dict.fromkeys(NUMBERS) | {"priors": {}}
+        if known:
+            hidden = {}
+        else:
+            hidden = dict.fromkeys(NUMBERS) | {"priors": {}}
         parameters[name] = asdict(e) | hidden
     document |= {
         "parameters": parameters,
@@ -479,7 +495,9 @@ def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
 
 
 def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    if np.isfinite(value):
+        return float(value)
+    return None
 
 
 SHARP_PX: Final = 0.25
@@ -533,11 +551,10 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         why = [f.text for f in result.errors] or list(weak) or ["there is no fit"]
         return f"Not to be used: {why[0]}."
     column = _column(seen)
-    use = (
-        "Safe to reconstruct"
-        if column.sigma <= SHARP_PX
-        else "Too uncertain for a sharp volume"
-    )
+    if column.sigma <= SHARP_PX:
+        use = "Safe to reconstruct"
+    else:
+        use = "Too uncertain for a sharp volume"
     if result.fit.panel is not None:
         use += " with this correction, which undoes the panel's distortion"
     if any(f.code == "saturated" for f in result.findings):
@@ -576,7 +593,10 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         phantom: its name or file.
     """
     names = " ".join(shlex.quote(one) for one in data)
-    estimates = {} if result.fit is None else result.fit.certificate.estimates
+    if result.fit is None:
+        estimates = {}
+    else:
+        estimates = result.fit.certificate.estimates
     asked = [e for e in estimates.values() if e.asked]
     if result.errors and result.errors[0].code != UNDETERMINED:
         free = ",".join(name for name, e in estimates.items() if e.asked)

@@ -64,7 +64,8 @@ def report(outcome: Outcome[ImageSet]) -> str:
         A page with verdict, findings, parameters, residuals, trajectories and ellipses.
     """
     document: Any = outcome.document
-    result, names = outcome.calibration, ", ".join(d.name for d in outcome.datasets)
+    result = outcome.calibration
+    names = ", ".join(d.name for d in outcome.datasets)
     body: list[str] = [
         heading(f"Calibration of {names}"),
         paragraph(
@@ -263,7 +264,10 @@ def _maps(
     """
     places = fit.problem.pixels
     rms = fit.certificate.rms_px
-    factor = 10.0 ** math.floor(math.log10(30.0 / rms)) if rms > 0 else 1.0
+    if rms > 0:
+        factor = 10.0 ** math.floor(math.log10(30.0 / rms))
+    else:
+        factor = 1.0
     out = []
     for dataset, part in outcome.parts:
         every = slice(None, None, max(1, math.ceil(places[part].shape[0] / MAP_FRAMES)))

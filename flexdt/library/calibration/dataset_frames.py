@@ -40,7 +40,8 @@ class DatasetFrames:
         """Take a data set, whose counts are kept if they are few bytes, and a function that is
         called after each frame.
         """
-        self._dataset, self._seen = dataset, seen
+        self._dataset = dataset
+        self._seen = seen
         rows, cols = dataset.shape
         self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
         self._kept: dict[int, Counts] = {}

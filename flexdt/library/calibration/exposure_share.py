@@ -36,4 +36,6 @@ def exposure_share(data: ImageSet) -> float | None:
         return None
     between_s = float(np.median(np.diff([frame.time_s for frame in frames])))
     exposed_s = frames[0].exposure_ms * frames[0].averages / 1000.0
-    return min(exposed_s / between_s, 1.0) if between_s > 0.0 else None
+    if between_s > 0.0:
+        return min(exposed_s / between_s, 1.0)
+    return None

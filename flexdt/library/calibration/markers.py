@@ -150,11 +150,9 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
     path = Path(source)
-    return (
-        _of_array(path, views)
-        if path.suffix.lower() == ".npy"
-        else _of_table(path, views)
-    )
+    if path.suffix.lower() == ".npy":
+        return _of_array(path, views)
+    return _of_table(path, views)
 
 
 def _of_array(path: Path, views: int) -> Markers:
@@ -198,7 +196,10 @@ def _of_table(path: Path, views: int) -> Markers:
         rows = list(csv.reader(io.StringIO(read_text(path))))
     except csv.Error as error:
         raise TwinError(f"cannot read {path}: {error}") from None
-    head = [word.strip().lower() for word in rows[0]] if rows else []
+    if rows:
+        head = [word.strip().lower() for word in rows[0]]
+    else:
+        head = []
     at = {
         n: next((head.index(w) for w in words if w in head), -1)
         for n, words in NAMES.items()
@@ -208,15 +209,22 @@ def _of_table(path: Path, views: int) -> Markers:
         raise TwinError.instead(
             said, head, "frame, marker, column, row and, optionally, sigma"
         )
-    width = head.index("sigma") if "sigma" in head else -1
+    if "sigma" in head:
+        width = head.index("sigma")
+    else:
+        width = -1
     marks: list[tuple[str, Mark]] = []
     for line, row in enumerate(rows[1:], start=2):
         if not any(word.strip() for word in row):
             continue
         try:
-            frame, name = int(row[at["frame"]]), row[at["marker"]].strip()
+            frame = int(row[at["frame"]])
+            name = row[at["marker"]].strip()
             x, y = (float(row[at[n]] or "nan") for n in ("column", "row"))
-            sigma = float(row[width]) if width >= 0 else None
+            if width >= 0:
+                sigma = float(row[width])
+            else:
+                sigma = None
         except (ValueError, IndexError):
             raise TwinError(
                 f"{path}, line {line}: {','.join(row)!r} is not {head}"
@@ -240,7 +248,10 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
     """
     try:
         frame, name, column, line, sigma = row
-        stated = None if sigma is None else float(sigma)
+        if sigma is None:
+            stated = None
+        else:
+            stated = float(sigma)
         return where, (
             operator.index(frame),
             str(name),
@@ -265,7 +276,10 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     """
     seen: dict[tuple[int, str], tuple[float, float, float]] = {}
     for where, (frame, name, x, y, stated) in marks:
-        sigma = ASSUMED_PX if stated is None else stated
+        if stated is None:
+            sigma = ASSUMED_PX
+        else:
+            sigma = stated
         if not 0 <= frame < views or (frame, name) in seen or not 0 < sigma <= WIDEST_PX:
             raise TwinError.instead(
                 f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px",
@@ -314,7 +328,8 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots]
         The frames' spots, and (n, k) the number of each marker's spot, -1 where unseen.
     """
     seen = markers.seen
-    looks, index = [], np.full(seen.shape, -1, dtype=np.int64)
+    looks = []
+    index = np.full(seen.shape, -1, dtype=np.int64)
     for i, row in enumerate(seen):
         k = int(row.sum())
         index[i, row] = np.arange(k)
@@ -420,8 +435,12 @@ def calibrate_unknown(
     )
     model = BeadModel(places, radii, 0.0, "unknown")
     if scale is None:
-        told = "estimated" if "dO_z" in request.free else "free"
-        told = "from the prior on dO_z" if "dO_z" in request.priors else told
+        if "dO_z" in request.free:
+            told = "estimated"
+        else:
+            told = "free"
+        if "dO_z" in request.priors:
+            told = "from the prior on dO_z"
         found = _calibrated(data, looks, index, model, want, images)
         found = _turning_back(found, data, markers)
         return found, {"markers": _described(found, names, index), "scale": told}
@@ -446,11 +465,13 @@ def calibrate_unknown(
         found = _calibrated(data, looks, index, model, scaled, images)
         if found.fit is None:
             break
-        beads, last = found.fit.beads, ratio
+        beads = found.fit.beads
+        last = ratio
         ratio = scale.mm / float(np.linalg.norm(beads[pair[0]] - beads[pair[1]]))
         if abs(ratio - 1.0) < 0.1 * scale.sigma_mm / scale.mm:
             break
-        radii, model = radii * last, replace(model, beads=beads)
+        radii = radii * last
+        model = replace(model, beads=beads)
     said = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
     found = _turning_back(found, data, markers)
     return found, {"markers": _described(found, names, index), "scale": said}

@@ -57,7 +57,8 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
         flat: (m, side, side) line integrals, nan outside the image.
         alone: (m, side, side) the beads alone, rendered there.
     """
-    m, side = flat.shape[0], flat.shape[1]
+    m = flat.shape[0]
+    side = flat.shape[1]
     count = side // BLOCK_PX
     edge = (side - count * BLOCK_PX) // 2
     seen, beads = (_blocks(a, edge, count) for a in (flat, alone))
@@ -77,7 +78,10 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     misfit = (
         (curved if bent else straight) / np.maximum(free, 1) / np.maximum(variance, 1e-12)
     )
-    typical = max(float(np.median(misfit[enough])), 1.0) if enough.any() else 1.0
+    if enough.any():
+        typical = max(float(np.median(misfit[enough])), 1.0)
+    else:
+        typical = 1.0
     ratio = np.where(enough, np.maximum(misfit / typical, 1.0), 1.0)
     limit = 1.0 + FAR_OUT * np.sqrt(2.0 / np.maximum(free, 1))
     bend: Float32Array | None = None

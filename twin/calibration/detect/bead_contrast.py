@@ -34,9 +34,13 @@ def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
         Limits of radius, of likeness (none if the beads are of several kinds) and of the
         faintest contrast.
     """
-    sizes, contrasts = model.bead_radius_mm, model.contrasts
+    sizes = model.bead_radius_mm
+    contrasts = model.contrasts
     dark = contrasts[contrasts > 0]
-    faintest = float(dark.min() / dark.max()) if len(dark) else 1.0
+    if len(dark):
+        faintest = float(dark.min() / dark.max())
+    else:
+        faintest = 1.0
     several = (
         sizes.max() > MAX_KIND_RATIO * sizes.min() or faintest * MAX_KIND_RATIO < 1.0
     )

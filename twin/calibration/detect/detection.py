@@ -146,7 +146,10 @@ def detect_beads(
     >>> detect_beads(0.1 * chord, radius_px=(5, 20)).centers.round(2) + 0.0
     array([[90., 50.]])
     """
-    how = SpotFinder() if detector is None else detector
+    if detector is None:
+        how = SpotFinder()
+    else:
+        how = detector
     if radius_px is not None:
         how = replace(how, radius_px=radius_px)
     data = np.ascontiguousarray(image, dtype=np.float32)
@@ -157,7 +160,12 @@ def detect_beads(
     if how.intensities:
         data = of_intensity(data)
     low = how.radius_px[0]
-    factor = 4 if low >= 4.5 else 2 if low >= 2.5 else 1
+    if low >= 4.5:
+        factor = 4
+    elif low >= 2.5:
+        factor = 2
+    else:
+        factor = 1
     whole, cut = _candidates(coarser(data, factor), factor, how)
     found = [r for r in (_measure(data, c, how) for c in whole) if r is not None]
     found = _alike(_distinct(found, kernels.SCORE, 0.5), how)
@@ -174,7 +182,8 @@ def coarser(image: Float32Array, factor: int) -> Float32Array:
     """Average factor x factor pixels; incomplete blocks at the far edges are dropped."""
     if factor == 1:
         return image
-    rows, cols = image.shape[0] // factor, image.shape[1] // factor
+    rows = image.shape[0] // factor
+    cols = image.shape[1] // factor
     if rows == 0 or cols == 0:
         return np.zeros((rows, cols), dtype=np.float32)
     part = image[: rows * factor, : cols * factor]
@@ -268,7 +277,8 @@ def _window(
     """Cut out the pixels within `reach` of a place; also return the column and row of the
     first.
     """
-    left, top = max(int(x - reach), 0), max(int(y - reach), 0)
+    left = max(int(x - reach), 0)
+    top = max(int(y - reach), 0)
     part = image[top : int(y + reach) + 2, left : int(x + reach) + 2]
     return np.ascontiguousarray(part), left, top
 
@@ -429,7 +439,8 @@ def _pack(
     rows = np.array([*whole, *cut]).reshape(-1, kernels.RESULTS)
     flags = np.array([True] * len(whole) + [False] * len(cut), dtype=bool)
     order = np.lexsort((-rows[:, kernels.PEAK], ~flags))
-    rows, flags = rows[order], flags[order]
+    rows = rows[order]
+    flags = flags[order]
     return Detections(
         rows[:, [kernels.X, kernels.Y]],
         covariances_of(rows),

@@ -51,7 +51,8 @@ def centroids(
         least: (m,) noise by which pixels are weighted.
     """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
-    least = np.zeros(len(results)) if least is None else least
+    if least is None:
+        least = np.zeros(len(results))
     for i in index:
         x, y = patches.offsets[i]
         kernels.measure(
@@ -97,7 +98,9 @@ def fits(
 def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
     """Return the typical noise of line integrals around complete spots; 0 without any."""
     good = results[entire, kernels.OK] > 0
-    return float(np.median(results[entire[good], kernels.NOISE])) if good.any() else 0.0
+    if good.any():
+        return float(np.median(results[entire[good], kernels.NOISE]))
+    return 0.0
 
 
 def take(
@@ -159,7 +162,10 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
         if len(values) >= 3:
             out[bead] = np.median(values)
     known = np.isfinite(out)
-    ratio = float(np.median(out[known] / given[known])) if known.any() else 1.0
+    if known.any():
+        ratio = float(np.median(out[known] / given[known]))
+    else:
+        ratio = 1.0
     out[~known] = given[~known] * ratio
     return np.broadcast_to(out, shape).ravel().copy()
 

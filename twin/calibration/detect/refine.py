@@ -133,8 +133,12 @@ def measure_beads(
     n, k = windows.corner.shape[:2]
     side = windows.side
     body: Float32Array | None = None
-    data, seen = images, NO_BODY
-    described = Scene(()) if scene is None else without_beads(scene, model)
+    data = images
+    seen = NO_BODY
+    if scene is None:
+        described = Scene(())
+    else:
+        described = without_beads(scene, model)
     if described.solids:
         seen = see_body(images, described, cone, model, windows)
         if seen.factor > 0:
@@ -159,11 +163,17 @@ def measure_beads(
         sharp = seen_sharpness(sharp, patches, sample, cone, model)
     balls = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
     if sharp.blur < BODY_BLUR_PX:
-        alone = None if draft else render_windows(balls, cone, windows)
+        if draft:
+            alone = None
+        else:
+            alone = render_windows(balls, cone, windows)
     else:
         # A blurred image comes from pixels that integrate, so an edge must not be put where the
         # nearest ray is.
-        fine = 3 if n * k <= FEW_WINDOWS and not draft else 2
+        if n * k <= FEW_WINDOWS and not draft:
+            fine = 3
+        else:
+            fine = 2
         rest = rest_of_blur(sharp.true, fine)
         beads = render_windows(balls, cone, windows, fine)
         alone = blurred_windows(beads, rest)
@@ -252,7 +262,8 @@ def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> 
     few = patches.entire[patches.entire // beads % max(1, frames // FADING_FRAMES) == 0]
     found = centroids(patches, few)
     seen = found[:, kernels.OK] > 0
-    level, thick = behind.plane[:, 0], body
+    level = behind.plane[:, 0]
+    thick = body
     if body is not None:
         thick = np.asarray(body.reshape(-1, *patches.flat.shape[1:]))
         level = level + thick[:, thick.shape[1] // 2, thick.shape[1] // 2]

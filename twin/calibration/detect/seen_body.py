@@ -99,25 +99,26 @@ def see_body(
     """
     frames, beads = np.nonzero(~windows.crowded)
     some = np.linspace(0, len(frames) - 1, min(BODY_SAMPLE, len(frames))).astype(np.intp)
-    frames, beads = frames[some], beads[some]
+    frames = frames[some]
+    beads = beads[some]
     if len(frames) == 0:
         return SeenBody(1.0)
-    few, near = windows.pick(frames, beads), cone[frames]
+    few = windows.pick(frames, beads)
+    near = cone[frames]
     ring = _rings(few) & np.isfinite(images[frames, beads])
     seen = _levelled(images[frames, beads], ring)
     dof = np.maximum(ring.sum(axis=(1, 2)), 1)
     along = _shift_of_beads(near, model, beads, windows.shape)
-    body, shift = SeenBody(1.0), np.zeros(3)
+    body = SeenBody(1.0)
+    shift = np.zeros(3)
     for turn in range(ROUNDS):
         moved = SeenBody(1.0, body.shift_mm).scene(described)
         image = render_windows(moved, near, few)
         image = (blurred_windows(image, blur) if blur > 0 else image)[:, 0]
         here = _levelled(np.asarray(image), ring)
         if turn == 0:
-            power, push = (
-                np.einsum("mp,mp->m", here, here),
-                np.einsum("mp,mp->m", here, seen),
-            )
+            power = np.einsum("mp,mp->m", here, here)
+            push = np.einsum("mp,mp->m", here, seen)
             telling = power > 1e-6 * dof
             if not telling.any():
                 return SeenBody(1.0)
@@ -138,7 +139,8 @@ def see_body(
         pull = np.einsum("m,mpi,mp->i", weight, design, seen)
         pull[1:] -= hold * factor * shift
         found = np.linalg.solve(normal, pull)
-        factor, step = float(found[0]), found[1:] / float(found[0])
+        factor = float(found[0])
+        step = found[1:] / float(found[0])
         shift = shift + step
         if factor < LEAST_BODY or float(np.linalg.norm(shift)) > FAR_MM:
             return SeenBody(0.0)

@@ -164,7 +164,8 @@ def _as_rendered(
     balls = balls_of(model, true.lift * patches.peaks[:k], true.size)
     rays = render_windows(balls, cone[frames], few, CHECK_FINE)
     seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
-    side, every = few.side, np.arange(len(sample))
+    side = few.side
+    every = np.arange(len(sample))
     rendered = replace(
         patches,
         flat=seen.reshape(-1, side, side),
@@ -196,7 +197,8 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     """
     if len(sample) < 3:
         return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
-    masks, blurs = usable(patches, sample), np.array(BLURS)
+    masks = usable(patches, sample)
+    blurs = np.array(BLURS)
 
     def tried(veil: float, blurs: FloatArray) -> _Tried:
         """Fit the windows with each blur, from the least on, until one leaves much more than
@@ -209,7 +211,8 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
         Returns:
             `blurs`; the median misfits, inf where not tried; and fitted over predicted radii.
         """
-        misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
+        misfit = np.full(len(blurs), np.inf)
+        scale = np.ones(len(blurs))
         for i, trial in enumerate(blurs.tolist()):
             results = fits(patches, sample, (trial, veil), True, masks)
             good = sample[results[sample, kernels.OK] > 0]
@@ -236,7 +239,8 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
         if not found[-1][1].min() < found[-2][1].min():
             break
     least = np.array([misfit.min() for _, misfit, _ in found])
-    veil, last = _lowest(np.array(VEILS[: len(found)]), least), found[int(least.argmin())]
+    veil = _lowest(np.array(VEILS[: len(found)]), least)
+    last = found[int(least.argmin())]
     if veil > 0.0:
         last = tried(veil, near(last))
     best = _lowest(last[0], last[1])

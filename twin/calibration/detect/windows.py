@@ -166,10 +166,13 @@ def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
     Returns:
         (rows, columns) as slices of the window, and the same of the image.
     """
-    (rows, cols), side = windows.shape, windows.side
+    (rows, cols) = windows.shape
+    side = windows.side
     x, y = windows.corner[frame, bead].tolist()
-    left, top = max(x, 0), max(y, 0)
-    right, bottom = max(min(x + side, cols), left), max(min(y + side, rows), top)
+    left = max(x, 0)
+    top = max(y, 0)
+    right = max(min(x + side, cols), left)
+    bottom = max(min(y + side, rows), top)
     return (
         (slice(top - y, bottom - y), slice(left - x, right - x)),
         (slice(top, bottom), slice(left, right)),
@@ -192,7 +195,8 @@ def mended(images: Float32Array, windows: Windows) -> Float32Array:
     side = windows.side
     noise = float(np.median(pixel_noise(images.reshape(-1, side, side), 0, side)))
     low = np.full(windows.shape, np.inf, dtype=np.float32)
-    high, seen = -low, np.zeros(windows.shape, dtype=np.uint16)
+    high = -low
+    seen = np.zeros(windows.shape, dtype=np.uint16)
     places = [
         (f, k, *overlap(windows, f, k))
         for f, k in np.ndindex(*images.shape[:2])

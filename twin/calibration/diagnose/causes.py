@@ -158,8 +158,11 @@ class Candidates:
             known: statements on the phantom and the positions.
             borders: panel borders that are causes, too.
         """
-        problem, x = fit.problem, fit.solution.x
-        self.fit, self.known, self.borders = fit, known, tuple(borders)
+        problem = fit.problem
+        x = fit.solution.x
+        self.fit = fit
+        self.known = known
+        self.borders = tuple(borders)
         self.count = problem.layout.parameter_count
         everything, there = _with_every_column(problem, x, panel_of(fit, borders))
         rows = everything.jacobian(there, problem.seen)[
@@ -177,7 +180,8 @@ class Candidates:
         causes = there - everything.start
         causes[: self.count] = 0.0
         values = left.ravel() + rows @ causes
-        self.rows, self.values = table, values * share[:, 0]
+        self.rows = table
+        self.values = values * share[:, 0]
         self.table = Table(self.rows, self.values, known.floor)
         self.causes = self._causes(everything)
         self._judged: dict[Choice, Judged | None] = {}
@@ -218,11 +222,13 @@ class Candidates:
         Returns:
             Causes with their columns, the widths to try, and a width that always holds.
         """
-        layout, known = everything.layout, self.known
+        layout = everything.layout
+        known = self.known
         out = []
         exact = known.bead_tolerance_mm == 0
         if not exact:
-            first, last = layout.strain_columns.start, layout.strain_columns.stop
+            first = layout.strain_columns.start
+            last = layout.strain_columns.stop
             parts = range(first, first + STRETCHES), range(first + STRETCHES, last)
             for name, part, said in zip(SHAPES, parts, known.strain, strict=True):
                 widths = tuple(w for w in STRAIN_WIDTHS if w > 1.5 * said)
@@ -290,7 +296,9 @@ class Candidates:
     def evidence(self, choice: Choice) -> float:
         """Return the logarithm of a choice's probability, up to a constant."""
         model = self.judged(choice)
-        return -math.inf if model is None else model.evidence
+        if model is None:
+            return -math.inf
+        return model.evidence
 
     def best(self) -> Choice:
         """Find the most likely choice, by changing one cause at a time from several starts."""
@@ -309,7 +317,10 @@ class Candidates:
             for s in tops.values()
             if self.evidence(s) > self.evidence(nothing) - math.log(10.0)
         ]
-        starts = [nothing, *likely[:3]] if likely else [nothing]
+        if likely:
+            starts = [nothing, *likely[:3]]
+        else:
+            starts = [nothing]
         if not likely:
             return nothing
         return max((self._climbed(start) for start in starts), key=self.evidence)
@@ -456,7 +467,9 @@ def explained_by_causes(
             chosen = wider.best()
             if not wider.width(chosen, border_name(more)):
                 break
-            borders, candidates, choice = wider.borders, wider, chosen
+            borders = wider.borders
+            candidates = wider
+            choice = chosen
         borders = tuple(b for b in borders if candidates.width(choice, border_name(b)))
         options = _options(candidates, choice, borders)
         if tuple(options.values()) == applied or not (applied or any(options.values())):
@@ -542,7 +555,9 @@ def _options(
 def image_shape(fit: FitResult) -> tuple[int, int] | None:
     """Return (rows, cols) of the images; None where they differ."""
     sizes = np.unique(2 * fit.problem.origin + 1, axis=0)
-    return (int(sizes[0, 1]), int(sizes[0, 0])) if len(sizes) == 1 else None
+    if len(sizes) == 1:
+        return (int(sizes[0, 1]), int(sizes[0, 0]))
+    return None
 
 
 def panel_of(fit: FitResult, borders: Sequence[Border]) -> PanelModel | None:
@@ -550,7 +565,9 @@ def panel_of(fit: FitResult, borders: Sequence[Border]) -> PanelModel | None:
     several shapes.
     """
     shape = image_shape(fit)
-    return None if shape is None else PanelModel(1.0, shape, tuple(borders))
+    if shape is None:
+        return None
+    return PanelModel(1.0, shape, tuple(borders))
 
 
 def border_name(border: Border) -> str:
@@ -585,7 +602,8 @@ def _with_every_column(
         The problem, and values of all columns; 0 for those that the fit does not have.
     """
     old = problem.layout
-    count, k = old.parameter_count, len(problem.model)
+    count = old.parameter_count
+    k = len(problem.model)
     terms = () if panel is None else panel.names
     names = [
         *old.names[:count],

@@ -81,16 +81,18 @@ def judge_frames(
     Returns:
         Warnings, and errors where no frame is usable; empty if all show beads.
     """
-    out, name = [], scan.name
+    out = []
+    name = scan.name
     n = len(looks)
     for state, (code, what) in _STATES.items():
         some = [look for look in looks if look.state is state]
         files = sorted({look.unusable for look in some if look.unusable})
         text = f"{name}: {len(some)} of {n} frames are {what}; the others are used"
         if files:
-            more = (
-                f" (and {len(files) - MAX_SHOWN} more)" if len(files) > MAX_SHOWN else ""
-            )
+            if len(files) > MAX_SHOWN:
+                more = f" (and {len(files) - MAX_SHOWN} more)"
+            else:
+                more = ""
             text += f"; unusable: {'; '.join(files[:MAX_SHOWN])}{more}"
         if some:
             out.append((error if len(some) == n else warning)(code, text))
@@ -187,7 +189,10 @@ def explain_identification(
     """
     most = max((len(d) for d in detections), default=0)
     if most == 1:
-        judged = warning if len(model) == 1 and found is not None else error
+        if len(model) == 1 and found is not None:
+            judged = warning
+        else:
+            judged = error
         return judged(
             "one_bead",
             f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
@@ -268,7 +273,10 @@ def _without_bad_frames(found: Identification) -> Identification:
     After the fit they are listed; they do not suggest another phantom.
     """
     seen = (found.index >= 0).sum(axis=1)
-    usual = np.median(seen[seen > 0]) if seen.any() else 0
+    if seen.any():
+        usual = np.median(seen[seen > 0])
+    else:
+        usual = 0
     bad = (seen > 0) & (seen <= 0.7 * usual)
     if not bad.any() or bad.sum() > 0.2 * len(seen):
         return found
@@ -336,7 +344,8 @@ def _alternative(
     Returns:
         Its finding; None if no mistake explains the spots.
     """
-    n, k = len(poses), len(model)
+    n = len(poses)
+    k = len(model)
     trials: list[tuple[str, str, dict[str, Any]]] = []
     for factor, true, said in (
         ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ()
@@ -447,7 +456,10 @@ def _in_motion(
 
     def fitted(motion: MotionFit | None = None) -> FitResult:
         """Fit all parameters, frames displaced by `motion`; without it at the stated poses."""
-        moved = here if motion is None else motion.motions[0].applied(here)
+        if motion is None:
+            moved = here
+        else:
+            moved = motion.motions[0].applied(here)
         return estimate_geometry(
             found.tracks,
             model,

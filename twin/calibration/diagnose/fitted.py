@@ -126,7 +126,10 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     # A frame of a block that happens to fit is of it all the same.
     at_end = bad[0] == 0 or bad[-1] == n - 1
     block = len(bad) >= 2 and at_end and len(bad) >= BLOCK_SHARE * (bad[-1] - bad[0] + 1)
-    listed = f"{bad[0]} to {bad[-1]}" if block else ", ".join(str(i) for i in bad[:12])
+    if block:
+        listed = f"{bad[0]} to {bad[-1]}"
+    else:
+        listed = ", ".join(str(i) for i in bad[:12])
     # A drift of something else leaves its ends out, too.
     if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
         return error(
@@ -177,8 +180,13 @@ def judge_first_size(
         for b, j in enumerate(found.index[f].tolist())
         if j >= 0 and look.detections.whole[j]
     ]
-    ratio = float(np.median(ratios)) if ratios else 1.0
-    return None if abs(ratio - 1.0) < allowed else _other_size(ratio)
+    if ratios:
+        ratio = float(np.median(ratios))
+    else:
+        ratio = 1.0
+    if abs(ratio - 1.0) < allowed:
+        return None
+    return _other_size(ratio)
 
 
 def judge_size(measured: Refined, radius_px: float) -> Finding | None:
@@ -284,7 +292,8 @@ def explain_residuals(
     fit, causes = explained_by_causes(fit, known, refit)
     told = named_causes(fit, plain, causes)
     if "beads" in causes.applied and _one_is_elsewhere(plain, fit):
-        fit, told = plain, []
+        fit = plain
+        told = []
     certificate = fit.certificate
     out = [*_lost_beads(fit), *_drifts(fit), *told]
     limit = max(misfit_px, largest_residual(fit, MISFIT_CHANCE, sigmas_known))
@@ -317,13 +326,18 @@ def _drifts(fit: FitResult) -> list[Finding]:
     """List warnings: the strongest drift or jump, and errors that beads of a frame or turns of
     a bead share.
     """
-    certificate, out = fit.certificate, []
+    certificate = fit.certificate
+    out = []
     for drift in certificate.drifts[:1]:
         estimate = certificate.estimates.get(drift.column)
-        unit = "" if estimate is None else estimate.unit
-        how = (
-            "during the scan" if drift.step_at is None else f"near frame {drift.step_at}"
-        )
+        if estimate is None:
+            unit = ""
+        else:
+            unit = estimate.unit
+        if drift.step_at is None:
+            how = "during the scan"
+        else:
+            how = f"near frame {drift.step_at}"
         out.append(
             warning(
                 "drift",
@@ -354,23 +368,30 @@ def _drifts(fit: FitResult) -> list[Finding]:
 def _looks_alike(column: str) -> str:
     """Return words on other motions that look like a change of a parameter."""
     name = column.split("@")[0]
-    return (
-        f" (or {ALIKE_MOTION[name]}, which looks alike)" if name in ALIKE_MOTION else ""
-    )
+    if name in ALIKE_MOTION:
+        return f" (or {ALIKE_MOTION[name]}, which looks alike)"
+    return ""
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
     """List beads that were left out in most of their frames."""
-    problem, used = fit.problem, fit.certificate.used
-    seen, kept = problem.seen.sum(axis=0), used.sum(axis=0)
+    problem = fit.problem
+    used = fit.certificate.used
+    seen = problem.seen.sum(axis=0)
+    kept = used.sum(axis=0)
     lost = np.flatnonzero((seen >= 3) & (kept < 0.5 * seen)).tolist()
     if lost:
         text = f"bead {', '.join(map(str, lost))} is not where the phantom's model has it and was"
-        judged = warning if len(problem.model) - len(lost) >= 3 else error
+        if len(problem.model) - len(lost) >= 3:
+            judged = warning
+        else:
+            judged = error
         return [judged("bead_displaced", f"{text} left out")]
     share = 1.0 - used.sum() / max(int(problem.seen.sum()), 1)
     text = f"{100 * share:.0f} % of the positions had to be left out"
-    return [error("too_many_outliers", text)] if share > 0.35 else []
+    if share > 0.35:
+        return [error("too_many_outliers", text)]
+    return []
 
 
 def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) -> float:
@@ -387,7 +408,10 @@ def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) 
     usual = SPREAD_FREEDOM / float(chdtri(SPREAD_FREEDOM, 1.0 - chance))
     certificate = fit.certificate
     measured = sigmas_known and certificate.noise > 0.0
-    stated = certificate.rms_px / certificate.noise if measured else 0.0
+    if measured:
+        stated = certificate.rms_px / certificate.noise
+    else:
+        stated = 0.0
     return math.hypot(POSITION_SPREAD_PX * math.sqrt(usual), NOISE_SIGMAS * stated)
 
 
@@ -447,7 +471,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         A finding with the parameter and how it moves; None if no motion explains them, or it
         cannot be fitted.
     """
-    problem, before = fit.problem, fit.certificate.rms_px
+    problem = fit.problem
+    before = fit.certificate.rms_px
     sizes = np.bincount(problem.group)
     names = [n for n in MOVING if n in fit.values or n + "@0" in fit.values]
     if sizes.min() < 12 or sizes.max() > MOST_FRAMES or not names or not fit.identifiable:
@@ -466,7 +491,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         effects.append(reach * max(float(np.ptp(m.values[:, i])) for m in found.motions))
     first = int(np.argmax(effects))
     motion = max(found.motions, key=lambda m: float(np.ptp(m.values[:, first])))
-    name, curve = names[first], motion.values[:, first]
+    name = names[first]
+    curve = motion.values[:, first]
     said = [
         f"{n} by {to_edge(n, float(np.ptp(motion.values[:, i]))):.3g} {UNITS[n]}"
         for i, n in sorted(enumerate(names), key=lambda pair: -effects[pair[0]])
@@ -485,7 +511,10 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
             "rms (up to "
             f"{np.abs(off).max():.3f})",
         )
-    code = "vibration" if how.startswith("from frame") else "drift"
+    if how.startswith("from frame"):
+        code = "vibration"
+    else:
+        code = "drift"
     return error(
         code,
         f"{', '.join(said)} moves during the scan, {how}{_looks_alike(name)}: --per-frame "

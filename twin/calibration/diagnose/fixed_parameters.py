@@ -218,7 +218,8 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     gradient = np.where(some, 1.0 / values, 0.0)
     y = vectors @ (gradient * (vectors.T @ moved))
     everything = np.linalg.inv(curvature + LOOSE_FACTOR**2 * np.eye(len(width)))
-    gains, alone = [], []
+    gains = []
+    alone = []
     for j in range(len(width)):
         priors = np.full(len(width), LOOSE_FACTOR**2)
         priors[j] = 1e-6 * LOOSE_FACTOR**2
@@ -233,13 +234,15 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     order = np.argsort(gains)[::-1].tolist()
     best = gains[order[0]]
     enough = best > DOUBT_SIGMAS**2
-    likely = (
-        [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)]
-        if enough
-        else []
-    )
+    if enough:
+        likely = [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)]
+    else:
+        likely = []
     if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
-        factor = math.sqrt(square / count) if chance < NARROW_CHANCE else 1.0
+        if chance < NARROW_CHANCE:
+            factor = math.sqrt(square / count)
+        else:
+            factor = 1.0
         return PriorsJudged(None, factor, tuple(names[i] for i in likely))
     likely = likely or order[:1]
     causes = tuple(names[i] for i in likely)
@@ -302,9 +305,10 @@ def doubtful(
 
 def narrow_priors(judged: PriorsJudged) -> Finding:
     """Make the finding that the priors are widened by the factor of `judged`."""
-    cause = (
-        f"; {' or '.join(judged.causes)} alone would explain it" if judged.causes else ""
-    )
+    if judged.causes:
+        cause = f"; {' or '.join(judged.causes)} alone would explain it"
+    else:
+        cause = ""
     return warning(
         "priors_narrow",
         f"the images have detector and axis {judged.factor:.1f} times as far from where "

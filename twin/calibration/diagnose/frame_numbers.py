@@ -96,9 +96,10 @@ class FrameNumbers:
             _change(int(i), int(settled[i] - settled[i - 1]))
             for i in changes[:MAX_SHOWN].tolist()
         )
-        more = (
-            "" if len(changes) <= MAX_SHOWN else f" (and {len(changes) - MAX_SHOWN} more)"
-        )
+        if len(changes) <= MAX_SHOWN:
+            more = ""
+        else:
+            more = f" (and {len(changes) - MAX_SHOWN} more)"
         return error(
             "frame_numbers",
             f"{name}: {said}{more}: the frames' angles are those of other frames; number them "
@@ -109,12 +110,18 @@ class FrameNumbers:
 def _change(frame: int, steps: int) -> str:
     """Describe lost frames (`steps` > 0) or repeated ones (< 0) at a frame, for the finding."""
     if steps < 0:
-        times = "" if steps == -1 else f" {-steps} times"
+        if steps == -1:
+            times = ""
+        else:
+            times = f" {-steps} times"
         return (
             f"frame {frame} shows the angle of frame {frame - 1} again, and all after it come "
             f"late: doubled{times}"
         )
-    lost = "a frame is" if steps == 1 else f"{steps} frames are"
+    if steps == 1:
+        lost = "a frame is"
+    else:
+        lost = f"{steps} frames are"
     return f"{lost} lost between frames {frame - 1} and {frame}"
 
 
@@ -172,7 +179,8 @@ def _angles(angle: FloatArray, shift: int) -> FloatArray:
         shift: at most MOST_SHIFT either way.
     """
     n = len(angle)
-    first, last = angle[1] - angle[0], angle[-1] - angle[-2]
+    first = angle[1] - angle[0]
+    last = angle[-1] - angle[-2]
     beyond = np.arange(1, MOST_SHIFT + 1)
     whole = np.concatenate(
         [angle[0] - first * beyond[::-1], angle, angle[-1] + last * beyond]

@@ -112,7 +112,10 @@ def _strained(found: Found) -> Finding | None:
     alike = [
         CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied
     ]
-    rival = f" (or there is {' or '.join(alike)}, which looks alike)" if alike else ""
+    if alike:
+        rival = f" (or there is {' or '.join(alike)}, which looks alike)"
+    else:
+        rival = ""
     return warning(
         "phantom_strained",
         f"the phantom is not as its file says: {said}{rival}. Its shape was fitted along; how "

@@ -107,7 +107,9 @@ class _Explanations:
 
     def __init__(self, fit: FitResult) -> None:
         """Prepare the table of a fit."""
-        problem, x, use = fit.problem, fit.solution.x, fit.solution.use
+        problem = fit.problem
+        x = fit.solution.x
+        use = fit.solution.use
         kept = np.repeat(use.ravel(), 2)
         rows = np.column_stack([problem.jacobian(x, use), _pitch_column(problem, x)])
         self._noise = fit.certificate.noise
@@ -141,7 +143,8 @@ def _pitch_column(problem: FitProblem, x: FloatArray) -> FloatArray:
     """Compute whitened shifts (2 n k,) of the positions by a unit of the pitch's logarithm."""
     predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
     w = problem.whiten
-    across, down = predicted[..., 0], predicted[..., 1]
+    across = predicted[..., 0]
+    down = predicted[..., 1]
     shifts = np.stack([w[..., 0] * across + w[..., 1] * down, w[..., 2] * down], axis=-1)
     return np.asarray(-shifts.ravel())
 

@@ -54,11 +54,13 @@ def likely_border(
     # Rows of a shift by a column, and by a row.
     across = np.stack([whiten[:, 0], np.zeros(m)], axis=1).ravel()
     down = np.stack([whiten[:, 1], whiten[:, 2]], axis=1).ravel()
-    best, most = None, -math.inf
+    best = None
+    most = -math.inf
     for axis in (0, 1):
         order = np.argsort(-places[:, axis], kind="stable")
         both = (2 * order[:, None] + [0, 1]).ravel()
-        push, inside = [], []
+        push = []
+        inside = []
         for shift in (across, down):
             push.append(np.cumsum((shift * left)[both])[1::2])
             inside.append(np.cumsum(shift[both, None] * basis[both], axis=0)[1::2])
@@ -84,9 +86,12 @@ def likely_border(
         gain = np.where(usable, gain, -math.inf)
         top = int(np.argmax(gain))
         if gain[top] > most:
-            best, most = Border(axis, float(between[top])), float(gain[top])
+            best = Border(axis, float(between[top]))
+            most = float(gain[top])
     places_tried = math.log(sum(shape))
-    return best if 0.5 * most / noise**2 > places_tried else None
+    if 0.5 * most / noise**2 > places_tried:
+        return best
+    return None
 
 
 def _allowed(at: FloatArray, side: int, known: Sequence[float]) -> npt.NDArray[np.bool_]:

@@ -141,11 +141,19 @@ def spectrum(
     covariance[touched, :] = np.nan
     covariance[:, touched] = np.nan
     covariance[touched, touched] = np.inf
-    null = list(null_directions(basis, scale, names, beads)) if basis.size else []
+    if basis.size:
+        null = list(null_directions(basis, scale, names, beads))
+    else:
+        null = []
     weak: list[Direction] = []
     sigma = noise * np.sqrt(np.diag(covariance))
     tolerance = np.array([tolerance_of(n) for n in names])
-    condition = math.inf if rank < p else top / float(s[-1]) if p else 1.0
+    if rank < p:
+        condition = math.inf
+    elif p:
+        condition = top / float(s[-1])
+    else:
+        condition = 1.0
     for i in range(rank - 1, -1, -1):
         direction = weak_direction(vt[i], scale, names, noise / s[i], beads)
         size = direction.sigma / tolerance_of(direction.names[0])
@@ -405,7 +413,10 @@ def certify(
     predicted = problem.residuals(x, use)[0]
     residual = problem.pixels - predicted
     enlargement = correlation_length(residual, use, problem.group)
-    effective = max(dof / enlargement, 1.0) if dof else 1.0
+    if dof:
+        effective = max(dof / enlargement, 1.0)
+    else:
+        effective = 1.0
     asked = problem.layout.asked
     judge = partial(
         spectrum,
@@ -624,7 +635,10 @@ def _widened(
             # first, or, of a drift that may not be one, the middle.
             steady = drift.score <= SIGNIFICANT and drift.step_at is None
             covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
-    certain = moving if any(d.score > SIGNIFICANT for d in moving) else ()
+    if any(d.score > SIGNIFICANT for d in moving):
+        certain = moving
+    else:
+        certain = ()
     return covariance, (together is not None, turning is not None), certain
 
 

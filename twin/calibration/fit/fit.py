@@ -236,7 +236,10 @@ def _levenberg(
         return cost + 0.5 * float(weight @ off**2), norms, hess, grad + weight * off
 
     def threshold(norms: FloatArray) -> float:
-        spread = float(np.median(norms[use])) / RAYLEIGH_MEDIAN if use.any() else 0.0
+        if use.any():
+            spread = float(np.median(norms[use])) / RAYLEIGH_MEDIAN
+        else:
+            spread = 0.0
         return how.huber * max(how.floor_px, spread)
 
     robust = math.isfinite(how.huber)
@@ -245,7 +248,10 @@ def _levenberg(
     cost, norms, hess, grad = at(x)
     if not cost < math.inf:
         return x, 0, huber, False
-    damping, iterations, converged, small = 1e-9, 0, len(x) == 0, False
+    damping = 1e-9
+    iterations = 0
+    converged = len(x) == 0
+    small = False
     while iterations < how.max_iterations and not converged:
         iterations += 1
         accepted = False
@@ -269,7 +275,8 @@ def _levenberg(
         converged = small
         if not accepted:
             break
-        gain, promised = cost - trial[0], 0.5 * change + damped
+        gain = cost - trial[0]
+        promised = 0.5 * change + damped
         if gain > 0.5 * promised:
             damping = max(damping * 0.02, 1e-14)
         elif gain < 0.1 * promised:
@@ -378,12 +385,11 @@ class FitResult:
     @property
     def panel(self) -> Panel | None:
         """The panel's distortion; None if it was not estimated."""
-        model, first = self.problem.panel, self.problem.layout.panel_column
-        return (
-            None
-            if model is None
-            else Panel(model, tuple(self.solution.x[first:].tolist()))
-        )
+        model = self.problem.panel
+        first = self.problem.layout.panel_column
+        if model is None:
+            return None
+        return Panel(model, tuple(self.solution.x[first:].tolist()))
 
     @property
     def values(self) -> dict[str, float]:
@@ -488,7 +494,10 @@ def estimate_geometry(
         UnknownNameError: a name that is no parameter.
     """
     model = bead_model(phantom)
-    tolerance = model.tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
+    if bead_tolerance_mm is None:
+        tolerance = model.tolerance_mm
+    else:
+        tolerance = bead_tolerance_mm
     if free_beads and not tolerance > 0:
         raise TwinError(
             "free beads need a tolerance as prior (phantom's, or bead_tolerance_mm > 0): "
@@ -631,12 +640,14 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
     if not weighed or 2 * problem.seen.sum() > FEW_VALUES * len(problem.layout.names):
         return found
     solution, noise = found
-    best, likelihood = found, _log_likelihood(problem, *found) + QUIET_LOG_ODDS
+    best = found
+    likelihood = _log_likelihood(problem, *found) + QUIET_LOG_ODDS
     for share in QUIET_SHARES:
         quiet = _weighted(problem, solver, solution.x, max(share * noise, LEAST_NOISE))
         gained = _log_likelihood(problem, *quiet)
         if gained > likelihood:
-            best, likelihood = quiet, gained
+            best = quiet
+            likelihood = gained
     return best
 
 
@@ -673,7 +684,8 @@ def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> fl
             TRIMMED_SPREADS times the noise.
         noise: spread of the whitened residuals.
     """
-    use, x = solution.use, solution.x
+    use = solution.use
+    x = solution.x
     told = problem.evaluate(x, use, 1)[4]
     precision = 1.0 / problem.prior_sigma**2
     with_prior = precision > 0.0
@@ -685,7 +697,10 @@ def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> fl
     moved = float(precision @ np.square(x - problem.prior_mean))
     left_out = 2.0 * float(problem.seen.sum() - use.sum())
     outliers = left_out * math.log(TRIMMED_SPREADS * max(noise, 1.0))
-    expected = SPREAD_FREEDOM if problem.expected_spread > 0.0 else 0.0
+    if problem.expected_spread > 0.0:
+        expected = SPREAD_FREEDOM
+    else:
+        expected = 0.0
     square = 2.0 * solution.cost + expected * problem.expected_spread**2
     count = 2.0 * float(use.sum()) + expected
     spread = count * math.log(noise) + 0.5 * square / noise**2

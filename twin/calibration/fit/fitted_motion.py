@@ -103,7 +103,8 @@ def estimate_motion(
         TwinError: fewer than three frames in a scan, or tracks without information.
     """
     require_movable(names)
-    problem, x = fit.problem, fit.solution.x
+    problem = fit.problem
+    x = fit.solution.x
     group = problem.group
     sizes = np.bincount(group)
     if sizes.min() < 3:
@@ -140,7 +141,8 @@ def estimate_motion(
         if search or known is None:
             choice, evidence = _most_likely(model)
         else:
-            choice, evidence = known.choice, list(known.motions[0].evidence)
+            choice = known.choice
+            evidence = list(known.motions[0].evidence)
         values, sigma, added, inflation = model.solved(choice)
     except np.linalg.LinAlgError:
         raise TwinError(
@@ -206,7 +208,8 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
         fit: to the poses with the motion.
         held: the motion in them.
     """
-    problem, x = fit.problem, fit.solution.x
+    problem = fit.problem
+    x = fit.solution.x
     count = problem.layout.parameter_count
     names = held.motions[0].names
     if "dO_z" not in names:
@@ -311,16 +314,19 @@ class _Mixed:
             weight: (g,) of the priors.
             off: (g,) distance of their means.
         """
-        n, p, g = sum(sizes), motion.shape[1], rows.shape[1]
-        self.sizes, self.column = sizes, column
+        n = sum(sizes)
+        p = motion.shape[1]
+        g = rows.shape[1]
+        self.sizes = sizes
+        self.column = column
         self.scale = np.sqrt(np.einsum("mg,mg->g", rows, rows) + weight)
         self.scale[self.scale == 0.0] = 1.0
-        rows, weight, off = rows / self.scale, weight / self.scale**2, off * self.scale
-        self.pairs, self.mixed, self.pull = (
-            np.zeros((n, p, p)),
-            np.zeros((n, g, p)),
-            np.zeros((n, p)),
-        )
+        rows = rows / self.scale
+        weight = weight / self.scale**2
+        off = off * self.scale
+        self.pairs = np.zeros((n, p, p))
+        self.mixed = np.zeros((n, g, p))
+        self.pull = np.zeros((n, p))
         np.add.at(self.pairs, frame, motion[:, :, None] * motion[:, None, :])
         np.add.at(self.mixed, frame, rows[:, :, None] * motion[:, None, :])
         np.add.at(self.pull, frame, motion * residual[:, None])
@@ -381,7 +387,8 @@ class _Mixed:
         Returns:
             (2 p + 1, n p) lower Cholesky factor as `scipy.linalg.cho_solve_banded` takes it.
         """
-        n, p = len(self.pull), len(moving)
+        n = len(self.pull)
+        p = len(moving)
         band = np.zeros((2 * p + 1, n, p))
         for a, i in enumerate(moving):
             for b in range(a + 1):
@@ -415,7 +422,8 @@ class _Mixed:
         across = self.mixed[:, :, moving].transpose(0, 2, 1).reshape(-1, len(self.scale))
         pull = self.pull[:, moving].ravel()
         both = linalg.cho_solve_banded((band, True), np.column_stack([across, pull]))
-        inner, alone = both[:, :-1], both[:, -1]
+        inner = both[:, :-1]
+        alone = both[:, -1]
         return _Eliminated(
             tuple(moving),
             band,
@@ -451,10 +459,12 @@ class _Mixed:
         part = self._eliminated(choice)
         inverse = linalg.inv(part.left)
         fixed = inverse @ part.push
-        n, p = len(self.pull), len(part.moving)
+        n = len(self.pull)
+        p = len(part.moving)
         rest = max(self.total - part.explained - float(fixed @ part.push), 0.0)
         noise2 = rest / self.freedom
-        values, sigma = np.zeros((n, len(choice))), np.full((n, len(choice)), np.nan)
+        values = np.zeros((n, len(choice)))
+        sigma = np.full((n, len(choice)), np.nan)
         taken = 0.0
         fixed_covariance = inverse
         if p:
@@ -522,9 +532,9 @@ class _Eliminated:
 
 def _stiffness(size: int, waves: float) -> float:
     """Return the eigenvalue of the second differences at which amplitudes fall."""
-    return (
-        (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2 if waves < size else math.inf
-    )
+    if waves < size:
+        return (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2
+    return math.inf
 
 
 def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
@@ -536,7 +546,8 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
     parameters do too.
     """
     p = model.pairs.shape[1]
-    middle, starts = (WIDTHS[3], WAVES[2]), ((3, 1), (3, len(WAVES) - 1))
+    middle = (WIDTHS[3], WAVES[2])
+    starts = ((3, 1), (3, len(WAVES) - 1))
     choice: list[tuple[float, float] | None] = [middle] * p
     known: dict[_Choice, float] = {}
 

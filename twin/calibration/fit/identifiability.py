@@ -182,7 +182,8 @@ def identifiability(
 
     sizes = frame_shapes(shape, len(poses))
     told, visible = predict(model, poses, sizes)
-    spec, sigmas = told.spectrum, told.sigmas
+    spec = told.spectrum
+    sigmas = told.sigmas
     suggestions: list[Suggestion] = []
     before = _worst(sigmas)
     if spec.null or spec.weak or before > 1.0:
@@ -229,7 +230,8 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
         problem: the planned data, with priors.
         bound: as of `identifiability`.
     """
-    names, count = problem.layout.names, problem.layout.asked
+    names = problem.layout.names
+    count = problem.layout.asked
     reported = problem.layout.parameter_count
     seen = int(problem.seen.any(axis=0).sum())
     rows = np.concatenate(

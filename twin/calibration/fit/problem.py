@@ -70,7 +70,9 @@ class Reading(enum.Enum):
     @property
     def pivot(self) -> float:
         """Weight of tau in the axis's position."""
-        return 1.0 if self is Reading.AXIS_AT_O_PLUS_TAU else 0.0
+        if self is Reading.AXIS_AT_O_PLUS_TAU:
+            return 1.0
+        return 0.0
 
 
 class Centre(enum.Enum):
@@ -117,7 +119,10 @@ class ColumnLayout:
         """Columns of the beads' coordinates."""
         if self.bead_column < 0:
             return slice(self.parameter_count, self.parameter_count)
-        last = self.shift_column if self.strain_column < 0 else self.strain_column
+        if self.strain_column < 0:
+            last = self.shift_column
+        else:
+            last = self.strain_column
         return slice(self.bead_column, last)
 
     @property
@@ -129,7 +134,9 @@ class ColumnLayout:
     @property
     def shift_column(self) -> int:
         """First of the columns whose coefficients shift the positions: arc and panel."""
-        return self.panel_column if self.arc_column < 0 else self.arc_column
+        if self.arc_column < 0:
+            return self.panel_column
+        return self.arc_column
 
 
 def require_names(names: Iterable[str]) -> None:
@@ -221,7 +228,8 @@ def layout(
         else:
             colmap[:, index] = len(names)
             names.append(name)
-        asked = len(names) if name in wanted else asked
+        if name in wanted:
+            asked = len(names)
     count = len(names)
     bead_column = strain_column = arc_column = -1
     if free_beads:
@@ -346,7 +354,8 @@ class FitProblem:
         """
         if self.layout.strain_column < 0:
             return None
-        count, own = self.layout.parameter_count, 3 * len(self.model)
+        count = self.layout.parameter_count
+        own = 3 * len(self.model)
         shifts = len(self.layout.names) - self.layout.shift_column
         out = np.zeros((count + own + shifts, len(self.layout.names)))
         out[:count, :count] = np.eye(count)
@@ -358,11 +367,13 @@ class FitProblem:
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
-        columns, own = self.layout.colmap, self.layout.bead_column
+        columns = self.layout.colmap
+        own = self.layout.bead_column
         params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])
-        beads = (
-            self.model.beads if own < 0 else x[self.layout.bead_columns].reshape(-1, 3)
-        )
+        if own < 0:
+            beads = self.model.beads
+        else:
+            beads = x[self.layout.bead_columns].reshape(-1, 3)
         if self.layout.strain_column >= 0:
             beads = beads + (self.strain_basis @ x[self.layout.strain_columns]).reshape(
                 -1, 3
@@ -557,7 +568,8 @@ def build_problem(
     """
     poses = as_poses(geometry)
     t = np.array(tracks, dtype=np.float64)
-    n, k = len(poses), len(model)
+    n = len(poses)
+    k = len(model)
     if t.shape != (n, k, 2):
         raise TwinError.of_shape(
             "tracks", t.shape, (n, k, 2), f" for {n} frames and {k} beads"
@@ -572,7 +584,10 @@ def build_problem(
             raise TwinError.of_shape("groups", labels.shape, (n,))
         group = np.unique(labels, return_inverse=True)[1].astype(np.int64).reshape(n)
     count = int(group.max()) + 1 if n else 1
-    starts = [start] * count if isinstance(start, Offsets) else list(start)
+    if isinstance(start, Offsets):
+        starts = [start] * count
+    else:
+        starts = list(start)
     if len(starts) != count:
         raise TwinError(f"{len(starts)} starts for {count} groups of frames")
     base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
@@ -586,7 +601,10 @@ def build_problem(
         centres = values_in(from_printed_reading(prior_centre, reading))
     bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
     beads = 3 * k if free_beads else 0
-    strains = strain_widths(strain) if max(strain) > 0 else np.zeros(0)
+    if max(strain) > 0:
+        strains = strain_widths(strain)
+    else:
+        strains = np.zeros(0)
     mean = [centres[NAMES.index(n)] for n in bases]
     sigma = [widths.get(n, math.inf) for n in bases]
     return FitProblem(
@@ -687,7 +705,9 @@ def as_poses(geometry: Poses | ConeVec) -> Poses:
     Raises:
         GeometryError: `Poses.from_cone_vec` cannot read the stage angles from the rows.
     """
-    return geometry if isinstance(geometry, Poses) else Poses.from_cone_vec(geometry)
+    if isinstance(geometry, Poses):
+        return geometry
+    return Poses.from_cone_vec(geometry)
 
 
 def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
@@ -726,7 +746,9 @@ def whitening(
     c = np.asarray(covariances, dtype=np.float64)
     if c.shape != (*seen.shape, 2, 2):
         raise TwinError.of_shape("covariances", c.shape, (*seen.shape, 2, 2))
-    cc, cr, rr = c[..., 0, 0], c[..., 0, 1], c[..., 1, 1]
+    cc = c[..., 0, 0]
+    cr = c[..., 0, 1]
+    rr = c[..., 1, 1]
     bad = seen & ~((rr > 0) & (cc * rr - cr * cr > 0))
     if bad.any():
         frame, bead = (int(i[0]) for i in np.nonzero(bad))
@@ -751,19 +773,21 @@ def values_in(p: Offsets) -> FloatArray:
 
 def to_printed_reading(p: Offsets, reading: Reading) -> Offsets:
     """Convert values in `reading` to the reading of `Poses.cone_vec` (the axis at O + tau)."""
-    return (
-        p if reading.pivot else replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
-    )
+    if reading.pivot:
+        return p
+    return replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
 
 
 def from_printed_reading(p: Offsets, reading: Reading) -> Offsets:
     """Convert values in the reading of `Poses.cone_vec` to `reading`."""
-    return (
-        p if reading.pivot else replace(p, dO_x=p.dO_x + p.tau_x, dO_z=p.dO_z + p.tau_z)
-    )
+    if reading.pivot:
+        return p
+    return replace(p, dO_x=p.dO_x + p.tau_x, dO_z=p.dO_z + p.tau_z)
 
 
 def edge_factor(column: str) -> float:
     """Return the edge units per internal unit of a column (deg per rad, else 1)."""
     name = column.split("@")[0]
-    return to_edge(name, 1.0) if name in NAMES else 1.0
+    if name in NAMES:
+        return to_edge(name, 1.0)
+    return 1.0

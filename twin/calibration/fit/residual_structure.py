@@ -99,13 +99,12 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
     Returns:
         The certain ones; if none is certain, the possible ones.
     """
-    problem, jacobian, residual, frame = (
-        left.problem,
-        left.jacobian,
-        left.values,
-        left.frame,
-    )
-    unit_covariance, noise = left.unit_covariance, left.noise
+    problem = left.problem
+    jacobian = left.jacobian
+    residual = left.values
+    frame = left.frame
+    unit_covariance = left.unit_covariance
+    noise = left.noise
     found: list[Drift] = []
     suspects: list[Drift] = []
     names = problem.layout.names
@@ -143,14 +142,16 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
             part = slice(i * len(shapes), (i + 1) * len(shapes))
             each = np.abs(score[part])
             best = int(np.argmax(each))
-            suspect = (
-                best
-                if each[best] > SUSPECT_STEP
-                else 0
-                if each[0] > SUSPECT_SIGMAS
-                else None
-            )
-            hint = best if each[best] > HINT_SIGMAS else None
+            if each[best] > SUSPECT_STEP:
+                suspect = best
+            elif each[0] > SUSPECT_SIGMAS:
+                suspect = 0
+            else:
+                suspect = None
+            if each[best] > HINT_SIGMAS:
+                hint = best
+            else:
+                hint = None
             for at, among in ((suspect, suspects), (hint, found)):
                 if at is not None:
                     size = float(push[part][at] / power[part][at])
@@ -173,15 +174,15 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
     Returns:
         (p, p); None if beads of a frame do not err together, or for few frames.
     """
-    problem, jacobian, residual, frame = (
-        left.problem,
-        left.jacobian,
-        left.values,
-        left.frame,
-    )
-    unit_covariance, noise = left.unit_covariance, left.noise
+    problem = left.problem
+    jacobian = left.jacobian
+    residual = left.values
+    frame = left.frame
+    unit_covariance = left.unit_covariance
+    noise = left.noise
     frames, member = np.unique(frame, return_inverse=True)
-    n, p = len(frames), jacobian.shape[1]
+    n = len(frames)
+    p = jacobian.shape[1]
     fitted = int(
         np.isinf(problem.prior_sigma).sum()
     )  # a prior leaves hardly a degree of freedom
@@ -223,13 +224,12 @@ def turning_errors(left: Residuals) -> FloatArray | None:
     Returns:
         (p, p); None if there are no such errors, or for few frames.
     """
-    problem, jacobian, residual, keep = (
-        left.problem,
-        left.jacobian,
-        left.values,
-        left.keep,
-    )
-    unit_covariance, noise = left.unit_covariance, left.noise
+    problem = left.problem
+    jacobian = left.jacobian
+    residual = left.values
+    keep = left.keep
+    unit_covariance = left.unit_covariance
+    noise = left.noise
     n, k = problem.seen.shape
     if n < 16 or noise <= 0:
         return None
@@ -320,11 +320,10 @@ def _excess(
     if rough < len(power) + math.sqrt(2.0 * len(power)):
         return None  # nothing there: the exact test need not be made
     values, directions = np.linalg.eigh(part)
-    free = (
-        values > 1e-6 * max(float(values[-1]), 1e-30)
-        if len(values)
-        else np.zeros(0, bool)
-    )
+    if len(values):
+        free = values > 1e-6 * max(float(values[-1]), 1e-30)
+    else:
+        free = np.zeros(0, bool)
     rank = int(free.sum())
     if rank == 0 or len(residual) < 3 * rank:
         return None

@@ -58,13 +58,18 @@ class Direction:
         against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:MAX_SHOWN])
         if len(rest) > MAX_SHOWN:
             against += f" and {len(rest) - MAX_SHOWN} more"
-        head = f"{first[0]} against {against}" if rest else first[0]
-        size = (
-            "not determined at all"
-            if not np.isfinite(self.sigma)
-            else f"sigma {self.sigma:.3g} {unit_of(first[0])}"
-        )
-        per = f" per 1 {unit_of(first[0])}" if rest else ""
+        if rest:
+            head = f"{first[0]} against {against}"
+        else:
+            head = first[0]
+        if not np.isfinite(self.sigma):
+            size = "not determined at all"
+        else:
+            size = f"sigma {self.sigma:.3g} {unit_of(first[0])}"
+        if rest:
+            per = f" per 1 {unit_of(first[0])}"
+        else:
+            per = ""
         return f"{head}{per}: {size}: {self.advice}"
 
 
@@ -171,7 +176,10 @@ def weak_direction(
         (names[lead], 1.0),
         *((names[i], float(change[i] / change[lead])) for i in rest),
     )
-    size = float(abs(change[lead]) * sigma) if np.isfinite(sigma) else np.inf
+    if np.isfinite(sigma):
+        size = float(abs(change[lead]) * sigma)
+    else:
+        size = np.inf
     return Direction(parts, size, advise([n for n, _ in parts], beads))
 
 

@@ -155,10 +155,8 @@ def _plane_parameters(
             value = math.degrees(plane.values[1 + i])
             parameters[name] = AlignEstimate(value, widths[i], "deg")
         else:
-            images, prior = (
-                math.degrees(plane.images_rad[i]),
-                math.degrees(plane.priors_rad[i]),
-            )
+            images = math.degrees(plane.images_rad[i])
+            prior = math.degrees(plane.priors_rad[i])
             refused[name] = (
                 f"the images tell it to +- {images:.2g} deg, its prior to +- {prior:.2g} "
                 "deg: that "

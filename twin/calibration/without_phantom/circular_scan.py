@@ -133,7 +133,8 @@ class CircularScan:
     def scales(self) -> FloatArray:
         """Change of each parameter that moves the ends of the image by about a pixel, (5,)."""
         rows, cols = self.shape
-        pitch, sdd = self.pitch_mm, self.sdd_mm
+        pitch = self.pitch_mm
+        sdd = self.sdd_mm
         ends = 2 * sdd / cols
         return np.array(
             [

@@ -42,7 +42,8 @@ MAX_VIEWS_RATIO: Final = 4.0
 """Columns times the step between views [rad] over the smoothing's sigma, at most."""
 EDGE_VIEWS: Final = 8
 """Views repeated at both ends for the splines over the angle."""
-ROUNDS, NEAR = 4, 0.05
+ROUNDS = 4
+NEAR = 0.05
 """Steps towards the axis column at most, and part of a sigma that is none."""
 PER_SIGMA: Final = 3.0
 """Distances from the axis that are read in a sigma of the smoothing, at least a column
@@ -61,7 +62,8 @@ MIN_BINS: Final = 4
 MOST_MOVED: Final = 0.1
 """Part of the innermost bin that a step may move, at most: without a bin inside, it is a
 shift."""
-BEYOND, BESIDE = 3, 2
+BEYOND = 3
+BESIDE = 2
 """Whole bins beyond a step, at least, and beside it that are not left out."""
 MAX_WIDTH_PX: Final = 5.0
 """Largest width of a gap [px]."""
@@ -139,7 +141,8 @@ class Profile:
         """Return the step that is least likely by chance; up to a part of the bins, which
         fit it worst, is left out, and `least` contains the effect of that choice.
         """
-        sigma, found = self.sigma, [NO_STEP]
+        sigma = self.sigma
+        found = [NO_STEP]
         border = np.abs(self.basis[:, :, 2] - 0.5).argmin(axis=1)
         for _ in range(1 + len(self.shift) // LEAST_BINS):
             chi_square = np.square(self._fit(sigma)[2]).sum(axis=1)
@@ -163,11 +166,9 @@ class Profile:
         """Return the step at the radius next to one; its sigma is inf without a bin inside."""
         place = int(np.abs(self.radii - radius).argmin())
         step = self.beside_axis(radius)
-        return (
-            step
-            if self._has_inside[place]
-            else step._replace(sigma=math.inf, least=math.inf)
-        )
+        if self._has_inside[place]:
+            return step
+        return step._replace(sigma=math.inf, least=math.inf)
 
     def beside_axis(self, radius: float) -> Step:
         """Return the step at the radius next to one, also if only the innermost bin
@@ -184,7 +185,8 @@ class Profile:
 
     def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fit steps: values (r, 3), their covariances, and residuals in sigmas, (r, m)."""
-        scaled, aim = self.basis / sigma[:, None], self.shift / sigma
+        scaled = self.basis / sigma[:, None]
+        aim = self.shift / sigma
         across = scaled.transpose(0, 2, 1)
         inverse = np.linalg.inv(across @ scaled + np.diag([1e-9, 1.0, 1e-9]))
         values = (inverse @ (across @ aim)[:, :, None])[:, :, 0]
@@ -201,7 +203,8 @@ class Profile:
             The steps (r of them), and the fits' residuals in sigmas, (r, m).
         """
         values, inverse, rest = self._fit(sigma)
-        count, dropped = len(sigma), int(np.isinf(sigma).sum())
+        count = len(sigma)
+        dropped = int(np.isinf(sigma).sum())
         chances = 2.0 * count * math.comb(count, dropped)
         times = float(student.isf(CHANCE / chances, max(count - dropped - 2, 1)))
         own = np.sqrt(inverse[:, 2, 2])
@@ -226,7 +229,8 @@ class Profile:
 
         if explained(0.0):
             return sigma
-        low, high = 0.0, float(np.abs(self.shift).max()) + 1.0
+        low = 0.0
+        high = float(np.abs(self.shift).max()) + 1.0
         for _ in range(20):
             middle = (low + high) / 2
             low, high = (low, middle) if explained(middle) else (middle, high)
@@ -297,8 +301,12 @@ class ConjugateRays:
             rows: (groups,) the groups' middle rows [px].
             step: angle between views [rad].
         """
-        self.scan, self.band, self.rows, self.step = scan, band, rows, step
-        self.views, self.cols = len(band), band.shape[2]
+        self.scan = scan
+        self.band = band
+        self.rows = rows
+        self.step = step
+        self.views = len(band)
+        self.cols = band.shape[2]
         self.smoothing = max(
             1.0, self.cols / SMOOTHING, step * self.cols / MAX_VIEWS_RATIO
         )
@@ -370,23 +378,24 @@ class ConjugateRays:
         ).astype(np.intp)
         count = int(place[-1]) + 1
         of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
-        moved, told = moved @ of_bin, told @ of_bin
+        moved = moved @ of_bin
+        told = told @ of_bin
         good = np.bincount(place, weight) > MIN_CORRELATION * np.bincount(place, power)
         shift, sigma = np.ones((2, count))
         for i in np.flatnonzero(good).tolist():
             ways = [
                 _left_out(*(t[..., i].sum(axis=a) for t in (moved, told))) for a in (1, 0)
             ]
-            shift[i], sigma[i] = ways[0][0], max(way[1] for way in ways)
+            shift[i] = ways[0][0]
+            sigma[i] = max(way[1] for way in ways)
         good &= np.isfinite(sigma)
         if good.sum() < MIN_BINS:
             return None
-        kept, renumbered = good[place], np.cumsum(good) - 1
-        radius, weight, place = (
-            radius[kept],
-            weight[kept].clip(1e-30),
-            renumbered[place[kept]],
-        )
+        kept = good[place]
+        renumbered = np.cumsum(good) - 1
+        radius = radius[kept]
+        weight = weight[kept].clip(1e-30)
+        place = renumbered[place[kept]]
         return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
 
     def _sums(
@@ -510,7 +519,8 @@ def _evenly(band: FloatArray, azimuth: FloatArray) -> tuple[FloatArray, float]:
     """
     around = azimuth % (2 * math.pi)
     order = np.argsort(around, kind="stable")
-    around, band = around[order], band[order]
+    around = around[order]
+    band = band[order]
     gaps = np.diff(around, append=around[0] + 2 * math.pi)
     usual = float(np.median(gaps[gaps > 1e-6]))
     if np.abs(gaps / usual - 1.0).max() < 0.02:

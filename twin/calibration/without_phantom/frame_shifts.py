@@ -72,11 +72,18 @@ def find_shifts(
     # A face along the beam is sampled alike in all pairs of a frame: more than they tell.
     scatter *= ERROR_FACTOR**2 * max(1.0, system.power(system.rest) / system.power(noise))
     found = values.var(axis=0)
-    sigmas, evidence = np.zeros((n, 2)), []
+    sigmas = np.zeros((n, 2))
+    evidence = []
     for i, (s, v) in enumerate(zip(scatter.tolist(), found.tolist(), strict=True)):
-        gain = n / 2 * (v / s - 1.0 - math.log(v / s)) if v > s else 0.0
+        if v > s:
+            gain = n / 2 * (v / s - 1.0 - math.log(v / s))
+        else:
+            gain = 0.0
         evidence.append(gain)
-        share = 1.0 - s / v if gain > MIN_EVIDENCE and v > MIN_SQUARE_RATIO * s else 0.0
+        if gain > MIN_EVIDENCE and v > MIN_SQUARE_RATIO * s:
+            share = 1.0 - s / v
+        else:
+            share = 0.0
         values[:, i] *= share
         sigmas[:, i] = math.sqrt(share * s) if share else math.nan
     return Shifts(values, sigmas, (evidence[0], evidence[1]))
@@ -93,9 +100,11 @@ class _System:
             at: parameters of the geometry.
             shifts: (frames, 2) right and down, about which the equations are linear [px].
         """
-        self.pairs, self.at = pairs, at
+        self.pairs = pairs
+        self.at = at
         self.views = pairs.rows(at).copy()
-        u, v = self.views[:, 6:9], self.views[:, 9:12]
+        u = self.views[:, 6:9]
+        v = self.views[:, 9:12]
         self.views[:, 3:6] -= shifts[:, :1] * u + shifts[:, 1:] * v
         found, self.ones = pairs.integrals(at, self.views)
         self.rest = self._difference(found)

@@ -65,9 +65,15 @@ def find_gap(
         NotIdentifiableError: there are two gaps.
     """
     values, sigma = rays.column(values)
-    profile = rays.profile(values) if np.isfinite(sigma) else None
+    if np.isfinite(sigma):
+        profile = rays.profile(values)
+    else:
+        profile = None
     axis = rays.scan.column(values, rays.row)
-    hidden = None if closed else hidden_gap(frames, axis, profile, rays.smoothing)
+    if closed:
+        hidden = None
+    else:
+        hidden = hidden_gap(frames, axis, profile, rays.smoothing)
     if profile is None:
         return GapFound(None, hidden)
     seen = local_gaps(frames, axis, closed)
@@ -77,7 +83,10 @@ def find_gap(
     step = profile.best()
     if not certified and not step.significant:
         return GapFound(None, hidden)
-    first = certified[0] if certified else _from_step(step, axis)
+    if certified:
+        first = certified[0]
+    else:
+        first = _from_step(step, axis)
     gap = _refined(rays, values, first)
     if not certified:  # the column is not known to the pixel
         gap = gap._replace(sigma=max(gap.sigma, first.sigma))
@@ -147,7 +156,10 @@ def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
         closed, again = _closed(rays, values, gap.column, gap.width)
         beside = gap.column - 0.5 - rays.scan.column(again, rays.row)
         profile = closed.profile(again)
-        left = profile.at(abs(beside)) if profile else None
+        if profile:
+            left = profile.at(abs(beside))
+        else:
+            left = None
         if left is None or left.sigma > gap.sigma:
             return gap
         width = max(gap.width + float(np.sign(beside)) * left.width, 0.0)

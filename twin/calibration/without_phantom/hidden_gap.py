@@ -52,7 +52,8 @@ LEAST_COLUMNS: Final = 14
 """Columns on each side of the axis whose borders are compared, at least."""
 EDGE_SHARE: Final = 0.2
 """Part of all places there that is compared, those with most change."""
-NOISE_QUANTILE, NOISE_QUANTILE_POWER = 0.2, 0.546
+NOISE_QUANTILE = 0.2
+NOISE_QUANTILE_POWER = 0.546
 """Quantile of the changes at a border in a row, of all frames, and its share of their mean
 where they are noise (chi square of 7)."""
 EDGE_NOISE: Final = 4.0
@@ -141,7 +142,10 @@ def hidden_gap(
             turns.
         smoothing: sigma of the columns' smoothing in the profile [px].
     """
-    reach = _hidden_radius(profile, smoothing) if profile else math.inf
+    if profile:
+        reach = _hidden_radius(profile, smoothing)
+    else:
+        reach = math.inf
     stack = np.asarray(frames, dtype=np.float64)
     half = max(float(LEAST_COLUMNS), reach) + SIDE
     low = math.floor(max(axis - half, 0.0))
@@ -264,13 +268,17 @@ def _evidence_of(
         evenly: a gap would be as visible at each border; else by the number that counts.
     """
     row, border = np.nonzero(seen)
-    places, of_frame = power.shape[1], row * frames // len(power)
+    places = power.shape[1]
+    of_frame = row * frames // len(power)
     shape = len(BLURS_PX), len(WIDTHS_PX), places
     if not len(row):
         return Evidence(np.zeros(shape[1:]), np.zeros(shape[1:]))
     edges = around[row, border] / np.sqrt(power[row, border])[:, None]
     count = np.bincount(border, minlength=places).astype(np.float64)
-    passed = np.full(places, count.mean()) if evenly else count
+    if evenly:
+        passed = np.full(places, count.mean())
+    else:
+        passed = count
     of_distance = squares_by_distance(edges)
     without = likelihood(edges, of_distance, 0.0)
     judged = []

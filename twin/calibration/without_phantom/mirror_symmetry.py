@@ -102,7 +102,8 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
         a = np.arange(max(0, k - cols + 1), min(cols, k + 1))
         if len(a) < MIN_OVERLAP * cols:
             continue
-        left, right = bands[:, a], bands[:, k - a]
+        left = bands[:, a]
+        right = bands[:, k - a]
         spread = np.square(left - left.mean(axis=1, keepdims=True)).sum()
         cost[i] = np.square(left - right).sum() / max(spread, 1e-30)
     best, ratio = best_dip(cost, cols / LEVELS[0])
@@ -120,7 +121,8 @@ def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
         Index of the least cost, and the next minimum's cost over it: inf without another, 0 if
         the least cost is at an end.
     """
-    best, inner = int(cost.argmin()), cost[1:-1]
+    best = int(cost.argmin())
+    inner = cost[1:-1]
     dips = (
         np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner))
         + 1
@@ -165,7 +167,9 @@ def find_symmetry(
             break
         values = found[-1].values
     good = [f for f in found if f.converged]
-    return min(good, key=lambda f: f.images[0] * f.images[1]) if good else found[0]
+    if good:
+        return min(good, key=lambda f: f.images[0] * f.images[1])
+    return found[0]
 
 
 class _Level:
@@ -194,9 +198,13 @@ class _Level:
             border: column of a gap in the panel; None without.
             held_px: width of that gap if it is fixed.
         """
-        self.view, self.scales, self.sigma, self.border = view, scales, sigma, border
+        self.view = view
+        self.scales = scales
+        self.sigma = sigma
+        self.border = border
         self.held_px = held_px
-        self.start, self.priors = mean, priors
+        self.start = mean
+        self.priors = priors
         rows, cols = self.shape = turn.mean.shape
         images = [
             gaussian_filter(i, sigma, mode="nearest") for i in (turn.mean, *turn.doubts)
@@ -226,7 +234,8 @@ class _Level:
         Returns:
             The plane; not converged if the pixels with a mirror image are too few.
         """
-        values, k = start.copy(), len(start)
+        values = start.copy()
+        k = len(start)
         found = Symmetry(
             values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False
         )
@@ -254,7 +263,10 @@ class _Level:
             longest = float(np.abs(step / self.scales).max())
             values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
             sigmas = np.sqrt(np.abs(np.diag(covariance)))
-            near = 0.02 if self.border is None else 0.1
+            if self.border is None:
+                near = 0.02
+            else:
+                near = 0.1
             done = bool((np.abs(step) <= near * sigmas + 1e-5 * self.scales).all())
             found = Symmetry(
                 values, covariance, np.sqrt(np.diag(raw)), pairs.asymmetry(), done
@@ -271,7 +283,8 @@ class _Level:
             at: (2, k) columns and rows.
         """
         middle = (np.array(self.shape[::-1]) - 1)[:, None] / 2
-        begins, gap = math.inf, 0.0
+        begins = math.inf
+        gap = 0.0
         if self.border is not None:
             begins = self.border - 0.5
             if self.held_px is not None:
@@ -317,7 +330,9 @@ class _MirrorPairs:
             here: (p,) parameters of the geometry.
             at: (2, m) column and row of the places [px].
         """
-        self.level, self.here, self.at = level, here, at
+        self.level = level
+        self.here = here
+        self.at = at
         image = self.image = level._mirrored(here, at)
         variance = sum(
             map_coordinates(level.relative, p[::-1], order=1) for p in (at, image)
@@ -509,7 +524,8 @@ def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
         wave = np.exp(1j * turn * np.arange(len(mean)))[:, None]
         return np.asarray(np.abs(gaussian_filter(change * wave, NEAR_PX, mode="nearest")))
 
-    half, quarter = at(np.pi), at(np.pi / 2)
+    half = at(np.pi)
+    quarter = at(np.pi / 2)
     seen = np.square(quarter) > MIN_EDGE_SIGMAS**2 * noise / (2.0 * math.pi * NEAR_PX**2)
     left = min(1.0, half[seen].sum() / max(quarter[seen].sum(), 1e-30))
     return np.where(seen, quarter, 0.0), left

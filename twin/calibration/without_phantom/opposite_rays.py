@@ -47,7 +47,8 @@ MAX_LIFT_PX: Final = 0.25
 for rows outside the source's plane to count [px]."""
 EDGE_ROWS: Final = 2
 """Rows around each view's that a cubic spline needs."""
-PATCH, SECTORS = 6.0, 24
+PATCH = 6.0
+SECTORS = 24
 """Sigmas of the smoothing that a patch of like differences is wide, in columns of both ends,
 and sectors of the views that are as many patches."""
 MIN_SIGNAL_RATIO: Final = 0.5
@@ -97,12 +98,13 @@ class OppositeRays:
         Raises:
             NotIdentifiableError: too few pairs; the message says which turn would do.
         """
-        self.frames, self.top, self.shape, self.views = frames, top, shape, views
-        self.start, self.scales, self.known = (
-            start,
-            scales,
-            np.diag(1.0 / np.square(priors)),
-        )
+        self.frames = frames
+        self.top = top
+        self.shape = shape
+        self.views = views
+        self.start = start
+        self.scales = scales
+        self.known = np.diag(1.0 / np.square(priors))
         self.noise = noise_like(frames.transpose(0, 2, 1), random).transpose(0, 2, 1)
         rows = views(start)
         depth = np.linalg.norm(rows[0, 3:6] - rows[0, :3])
@@ -158,11 +160,14 @@ class OppositeRays:
         Returns:
             Columns and rows (2, 2, q), and whether both panels contain them (q,).
         """
-        rows, out = self.views(values), np.empty((2, 2, len(pairs)))
+        rows = self.views(values)
+        out = np.empty((2, 2, len(pairs)))
         middle = (np.array(self.shape[::-1]) - 1) / 2
         for side in (0, 1):
-            v, other = rows[pairs[:, side]], rows[pairs[:, 1 - side]]
-            normal, panel = np.cross(v[:, 6:9], v[:, 9:12]), v[:, 3:6] - v[:, :3]
+            v = rows[pairs[:, side]]
+            other = rows[pairs[:, 1 - side]]
+            normal = np.cross(v[:, 6:9], v[:, 9:12])
+            panel = v[:, 3:6] - v[:, :3]
             ray = other[:, :3] - v[:, :3]
             ray *= ((panel * normal).sum(axis=1) / (ray * normal).sum(axis=1))[:, None]
             for i, axis in enumerate((v[:, 6:9], v[:, 9:12])):
@@ -178,7 +183,8 @@ class _Level:
     """One smoothing of the frames."""
 
     def __init__(self, rays: OppositeRays, sigma: float) -> None:
-        self.rays, self.sigma = rays, sigma
+        self.rays = rays
+        self.sigma = sigma
         self.images, self.alone = (self._soft(i) for i in (rays.frames, rays.noise))
 
     def _soft(self, images: Float32Array) -> FloatArray:
@@ -231,7 +237,9 @@ class _Level:
         Returns:
             The estimate; not converged with few pairs.
         """
-        rays, values, k = self.rays, start.copy(), len(start)
+        rays = self.rays
+        values = start.copy()
+        k = len(start)
         found = Symmetry(
             values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False
         )
@@ -303,7 +311,8 @@ class _Level:
         self.structure = max(
             float((w * np.square(both - np.average(both))).sum()) / 2, 1e-30
         )
-        rest, noise = freed(both[0] - both[1]), freed(difference(self.alone, places))
+        rest = freed(both[0] - both[1])
+        noise = freed(difference(self.alone, places))
         return rest, freed(slopes[0]), noise, freed(slopes[1]), w
 
     def _mismatch(
@@ -351,7 +360,8 @@ class _Level:
             pairs: of views, (q, 2).
             values: parameters, (k,).
         """
-        rays, of_pairs = self.rays, (len(slopes), len(pairs), -1)
+        rays = self.rays
+        of_pairs = (len(slopes), len(pairs), -1)
         columns = rays._places(values, pairs)[0][:, 0]
         sums = (slopes * rest).reshape(of_pairs).sum(axis=2)
         own = sums - sums.mean(axis=1, keepdims=True)
@@ -363,7 +373,8 @@ class _Level:
         change = np.square(np.diff(rays.frames.mean(axis=0), 2, axis=1)) / 6
         power = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE
         power /= max(1.0, 2.0 * math.sqrt(math.pi) * self.sigma * (len(change) > 1))
-        ends, size = columns.round().astype(np.intp), rays.shape[1]
+        ends = columns.round().astype(np.intp)
+        size = rays.shape[1]
         of_columns = [
             np.bincount(ends[0], part, size) - np.bincount(ends[1], part, size)
             for part in slopes.reshape(of_pairs).sum(axis=2)

@@ -85,7 +85,10 @@ class PlanePairs:
         Raises:
             NotIdentifiableError: the object reaches so far that too few pairs are clear of it.
         """
-        self.shape, self.factor, self.views, self.start = mean.shape, factor, views, start
+        self.shape = mean.shape
+        self.factor = factor
+        self.views = views
+        self.start = start
         n, rows, cols = frames.shape
         self.sums = np.zeros((n, cols, rows + 1), dtype=np.float32)
         np.cumsum(frames.transpose(0, 2, 1), axis=2, out=self.sums[:, :, 1:])
@@ -107,7 +110,9 @@ class PlanePairs:
                 f"{np.hypot(*sources[0]):.4g} mm away: hardly two views have sources whose "
                 "connection is clear of it"
             )
-        self.pairs, kind, self.away = table[clear], kind[clear], np.abs(away[clear])
+        self.pairs = table[clear]
+        kind = kind[clear]
+        self.away = np.abs(away[clear])
         self.inwards = inwards[clear] * np.sign(away[clear])[:, None]
         # First pair of each distance, and every pair's place behind it.
         self.starts = np.flatnonzero(np.diff(kind, prepend=-1))
@@ -151,7 +156,10 @@ class PlanePairs:
         """
         edges = (self.heights + self.rise * (at[0] - self.start[0])) / self.away[:, None]
         found, ones = np.zeros((2, len(self.pairs), 2, edges.shape[1] - 1))
-        given = self.rows(at) if rows is None else np.ascontiguousarray(rows)
+        if rows is None:
+            given = self.rows(at)
+        else:
+            given = np.ascontiguousarray(rows)
         images = self.sums if sums is None else sums
         sum_planes(
             images, given, self.pairs, self.inwards, edges, self.columns, found, ones
@@ -243,7 +251,8 @@ class PlanePairs:
             here: (n, 12) views.
             border: places at the object's upper end, lower end and sides, see `_support`.
         """
-        edges, step = self.heights, float(np.diff(self.heights).mean())
+        edges = self.heights
+        step = float(np.diff(self.heights).mean())
         valid = np.ones((len(self.pairs), len(edges) - 1), dtype=bool)
         upper, lower, sides = border
         upwards = -float(np.sign(here[0, 11]))
@@ -316,7 +325,8 @@ def without(
     """
     if used is not None:
         used = used & (used.sum(axis=-1) >= FEWEST_BINS)[..., None]
-        part, whole = part * used, whole * used
+        part = part * used
+        whole = whole * used
     share = (whole * part).sum(axis=-1) / np.maximum((part * part).sum(axis=-1), 1e-300)
     return np.asarray(whole - share[..., None] * part)
 
@@ -382,6 +392,7 @@ def _support(
         at = np.concatenate([at - 0.5, at + 0.5])
         return np.roll(np.column_stack([at, np.full(len(at), beside)]), turned, axis=1)
 
-    upper, lower = ends(full[0], -rows / 2, 0), ends(full[-1], rows / 2, 0)
+    upper = ends(full[0], -rows / 2, 0)
+    lower = ends(full[-1], rows / 2, 0)
     sides = np.vstack([ends(full[:, 0], -cols / 2, 1), ends(full[:, -1], cols / 2, 1)])
     return radius, (upper, lower, sides)

@@ -69,12 +69,14 @@ def find_height(
     places = at + h * np.arange(-NOISE_STEPS, NOISE_STEPS + 1)
     costs = [fine.costs(fine.start + y * up, alone) * bowl.scale for y in places]
     noise = np.stack([fine.total(c) for c in costs])
-    slopes, bends = (noise[2:] - noise[:-2]) / (2 * h), np.diff(noise, 2, axis=0) / h**2
+    slopes = (noise[2:] - noise[:-2]) / (2 * h)
+    bends = np.diff(noise, 2, axis=0) / h**2
     blurred = np.sqrt(np.square(slopes).mean(axis=0)) / bowl.bends
     flat = bowl.bends < MIN_BEND_SIGMAS * np.sqrt(np.square(bends).mean(axis=0))
     sigmas = np.where(flat | (bowl.bends <= 0), np.inf, np.maximum(bowl.sigmas, blurred))
     level = int(sigmas.argmin())
-    sigma, at = float(sigmas[level]), float(bowl.aims[level])
+    sigma = float(sigmas[level])
+    at = float(bowl.aims[level])
     if not math.isfinite(sigma):
         raise NotIdentifiableError(NO_MINIMUM)
     others = bowl.aims[sigmas < 2 * sigma]
@@ -111,7 +113,8 @@ def _settle(
     Raises:
         NotIdentifiableError: as `find_height`.
     """
-    at, h = _first(coarse, grid, up, random), float(grid[1] - grid[0])
+    at = _first(coarse, grid, up, random)
+    h = float(grid[1] - grid[0])
     level = -1
     for n in range(ROUNDS):
         bowl = _bowl(coarse if n == 0 else fine, at, h, up)
@@ -123,7 +126,8 @@ def _settle(
         step = float(np.clip(bowl.aims[level] - at, -2 * h, 2 * h))
         if n > 0 and abs(step) < 0.2 * sigma + 0.01:
             return bowl, at, h
-        at, h = at + step, max(min(h, 4 * sigma), 0.5)
+        at = at + step
+        h = max(min(h, 4 * sigma), 0.5)
     raise NotIdentifiableError(NO_MINIMUM)
 
 
@@ -185,8 +189,10 @@ def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
     """
     low, mid, high = (pairs.costs(pairs.start + (at + s * h) * up) for s in (-1, 0, 1))
     scale = pairs.scales(mid)
-    slopes, bends = (high - low) * scale / (2 * h), (high + low - 2 * mid) * scale / h**2
-    slope, bend = pairs.total(slopes), pairs.total(bends)
+    slopes = (high - low) * scale / (2 * h)
+    bends = (high + low - 2 * mid) * scale / h**2
+    slope = pairs.total(slopes)
+    bend = pairs.total(bends)
     steps = slope / np.where(bend > 0, bend, np.inf)
     left = pairs.spread(slopes - steps[:, None] * bends, blocks=True)
     sure = bend / np.maximum(pairs.spread(bends), 1e-300)

@@ -179,10 +179,13 @@ def find_plane(
     first = _first_column(scan, random)
     _require_one_column(scan, first)
     gap, hidden = _gap(scan, first, panel)
-    whole, first = first, first if gap is None else _with_gap(first, gap)
+    whole = first
+    if gap is not None:
+        first = _with_gap(first, gap)
     found = _fit(scan, first, gap)
     if gap is not None and _closes(found, gap):
-        gap, first = None, whole
+        gap = None
+        first = whole
         found = _fit(scan, first, gap)
     _require_symmetric(found, first.preface)
     plane = _plane(scan, first, found, GapFound(gap, hidden), panel)
@@ -212,7 +215,8 @@ def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColum
 def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
     """Search for the axis' column in the mean image of a turn, and set the start to it."""
     nominal = scan.column(scan.start)
-    values, scales = scan.start[:OF_TURN], scan.scales[:OF_TURN]
+    values = scan.start[:OF_TURN]
+    scales = scan.scales[:OF_TURN]
     column, ratio = first_column(turn.mean, nominal)
     values[0] += (column - nominal) / scan.slopes(values, scales)[0]
     priors = np.array([math.inf, math.inf, scan.yaw_prior_rad])
@@ -229,7 +233,8 @@ def _first_in_rays(
         no_turn: why there is no turn; the messages of errors begin with it.
         random: for images of noise.
     """
-    scales, given = scan.scales, scan.priors
+    scales = scan.scales
+    given = scan.priors
     scales[1] = 2 / scan.shape[1]
     priors = np.array(
         [
@@ -363,22 +368,30 @@ def _plane(
         gap_found: the gap, and what is hidden.
         panel: the distortion that was undone, or None.
     """
-    turn, scales = first.turn, first.scales
+    turn = first.turn
+    scales = first.scales
     gap, hidden = gap_found
-    values, covariance = found.values.copy(), found.covariance.copy()
+    values = found.values.copy()
+    covariance = found.covariance.copy()
     if gap is not None and turn is not None:
         if not gap.beside_axis:
             sigma = float(np.sqrt(covariance[-1, -1]))
             gap = gap._replace(width=float(values[-1]), sigma=sigma)
-        values, covariance = values[:OF_TURN], covariance[:OF_TURN, :OF_TURN]
+        values = values[:OF_TURN]
+        covariance = covariance[:OF_TURN, :OF_TURN]
         scales = scales[:OF_TURN]
         scan, turn = _closed(scan, turn, gap)
         panel = gap.panel(scan.shape, panel)
-    told, beside = found.images[1:3] < first.priors[1:3] / 2, 0.0
+    told = found.images[1:3] < first.priors[1:3] / 2
+    beside = 0.0
     if first.rays is not None:
-        told[:], beside = False, _beside_rows(scan, first.rays, first.priors[1])
+        told[:] = False
+        beside = _beside_rows(scan, first.rays, first.priors[1])
         _keep_roll(values, covariance, scan.base.det_roll, first.priors[1])
-    step = (0.0, 0.0) if turn is None else turn.step_px
+    if turn is None:
+        step = (0.0, 0.0)
+    else:
+        step = turn.step_px
     opposite = _opposite_column(scan, first, values, covariance, gap)
     floor = opposite.floor_px if opposite else 0.0
     unseen = hidden.column_px if hidden else 0.0
@@ -436,7 +449,8 @@ def _opposite_column(
 
 def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Turn]:
     """Close a gap in the images and in their mean."""
-    own, image = gap.panel(scan.shape), scan.image
+    own = gap.panel(scan.shape)
+    image = scan.image
     mean = own.undistorted(turn.mean.astype(np.float32)).astype(float)
     closed = replace(scan, image=lambda i: own.undistorted(image(i)))
     return closed, replace(turn, mean=mean)
@@ -454,7 +468,9 @@ def _keep_roll(
     values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
 ) -> None:
     """Replace the roll by the one in force, since few rows gave values up to six sigma off."""
-    values[1], covariance[1], covariance[:, 1] = roll_rad, 0.0, 0.0
+    values[1] = roll_rad
+    covariance[1] = 0.0
+    covariance[:, 1] = 0.0
     covariance[1, 1] = sigma_rad**2
 
 
@@ -464,7 +480,8 @@ def _require_precise(plane: SymmetryPlane, preface: str) -> None:
     Raises:
         NotIdentifiableError: it is too large.
     """
-    sigma, (roll, _) = plane.column_sigma_px, plane.sigmas_deg
+    sigma = plane.column_sigma_px
+    (roll, _) = plane.sigmas_deg
     refuse_if(
         sigma > MOST_COLUMN or (bool(plane.told[0]) and roll > MOST_ROLL),
         f"{preface}the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; "

@@ -34,7 +34,8 @@ SIDE: Final = 4
 """Number of columns on each side of a border that are compared."""
 WIDTHS: Final = np.arange(0.0, 4.01, 0.1)
 """Trial widths of gaps [px]."""
-ROWS, FRAMES = 48, 96
+ROWS = 48
+FRAMES = 96
 """Rows that a frame is averaged to, and frames that are looked at, where there are more."""
 EDGE_SHARE: Final = 0.05
 """Part of all places that is compared, those with most change: edges. Noise has no
@@ -42,7 +43,8 @@ information."""
 LEAST_VARIANCE: Final = 0.02
 """Least variance of differences, as a share of the largest: possible error of the normal
 model."""
-EVIDENCE, STANDS_OUT = 24.0, 5.0
+EVIDENCE = 24.0
+STANDS_OUT = 5.0
 """Gain in log likelihood from which on there is a gap, and times the gain at any other border.
 Of 93 drawn scans without a gap one had both, of 69 with one of 0.5 to 2 px 65
 (`align_faults.py`)."""
@@ -112,7 +114,8 @@ def local_gaps(
     if not len(row):
         return []
     edges = around[row, border] / np.sqrt(power[row, border])[:, None]
-    places, of_frame = power.shape[1], row // stack.shape[1]
+    places = power.shape[1]
+    of_frame = row // stack.shape[1]
     gains = _gains(edges, of_frame * places + border, (len(stack), places))
     place = np.arange(places)
     mirror = np.rint(2 * axis - place - 2 * SIDE + 1).astype(np.intp)
@@ -127,9 +130,10 @@ def local_gaps(
     standing = [best]
     if gain[best] < max(EVIDENCE, STANDS_OUT * others[second]):
         third = float(others[np.abs(place - second) > SIDE].max())
-        standing = (
-            [best, second] if others[second] >= max(EVIDENCE, STANDS_OUT * third) else []
-        )
+        if others[second] >= max(EVIDENCE, STANDS_OUT * third):
+            standing = [best, second]
+        else:
+            standing = []
     found = []
     for one in standing:
         width = float(WIDTHS[gains[:, one].argmax()])
@@ -157,7 +161,8 @@ def _gains(
         shape: of that table.
     """
     of_distance = squares_by_distance(edges)
-    without, out = likelihood(edges, of_distance, 0.0), []
+    without = likelihood(edges, of_distance, 0.0)
+    out = []
     for width in WIDTHS.tolist():
         gain = likelihood(edges, of_distance, width) - without
         of_frames = np.bincount(place, gain, math.prod(shape)).reshape(shape)
@@ -197,7 +202,10 @@ def likelihood(
     """
     columns = np.arange(2 * SIDE)
     beyond = columns - SIDE + 0.5
-    share = ndtr(beyond / blur) if blur > 0.0 else (beyond > 0.0).astype(np.float64)
+    if blur > 0.0:
+        share = ndtr(beyond / blur)
+    else:
+        share = (beyond > 0.0).astype(np.float64)
     at = columns + width * share
     distance = np.abs(at[:, None] - at)
     squares = np.where(distance > 0.0, of_distance(np.maximum(distance, 1.0)), 0.0)

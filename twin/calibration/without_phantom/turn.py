@@ -48,7 +48,9 @@ MAX_RETURN_SHARE: Final = 0.3
 """Sum of two steps relative to one below which they are one to and fro (assumed)."""
 WIDEST_GAP: Final = 4.5
 """Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
-BAND, BAND_PART, GROUPS = 12, 20, 7
+BAND = 12
+BAND_PART = 20
+GROUPS = 7
 """Rows above and below the plane of the source that are kept, at least; columns over these
 rows; groups of rows. Rays further off lean too much to be each other's."""
 MOST_BANDS: Final = 1440
@@ -128,7 +130,10 @@ def read_turn(
             weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
     total: FloatArray | float = 0.0
     noise: FloatArray | float = 0.0
-    used, thumbs, samples, bands = tuple(sorted(kept)), [], [], []
+    used = tuple(sorted(kept))
+    thumbs = []
+    samples = []
+    bands = []
     sampled = set(used[:: -(-len(used) // FRAMES)])
     stride = -(-len(index) // MOST_BANDS)
     for weight, i in zip(weights.T, index.tolist(), strict=True):
@@ -148,7 +153,8 @@ def read_turn(
             return read_turn(
                 image, angle, present, tuple(sorted(again)), tuple(jumps), source_row
             )
-    images, (rows, cols) = np.asarray(total), np.shape(noise)
+    images = np.asarray(total)
+    (rows, cols) = np.shape(noise)
     (right, down), after = _step(views, gaps, int(index.argmin()))
     step = right * cols / views.shape[2], down * rows / views.shape[1]
     return Turn(
@@ -172,7 +178,8 @@ def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
     centre = min(
         max(round(middle), min(half, rows // 2)), rows - 1 - min(half, (rows - 1) // 2)
     )
-    top, end = max(0, centre - half), min(rows, centre + half + 1)
+    top = max(0, centre - half)
+    end = min(rows, centre + half + 1)
     edges = np.linspace(top, end, min(GROUPS, end - top) + 1).round().astype(int).tolist()
     return list(pairwise(edges))
 
@@ -196,7 +203,8 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
         raise NotIdentifiableError(
             f"{len(own)} directions; the mean over a turn needs {MIN_DIRECTIONS} at least",
         )
-    usual, widest = float(np.median(own)), float(own.max())
+    usual = float(np.median(own))
+    widest = float(own.max())
     if widest > WIDEST_GAP * usual:
         raise NotIdentifiableError(
             f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a "
@@ -348,7 +356,10 @@ def _step(
     worst = int(score.argmax())
     others = np.where(_far(n, worst), score, 0.0)
     # What steps and stays has to step back between the last frame and the first.
-    back = int(others.argmax()) if worst == first else first
+    if worst == first:
+        back = int(others.argmax())
+    else:
+        back = first
     if np.linalg.norm(shifts[back] + shifts[worst]) < MAX_RETURN_SHARE * np.linalg.norm(
         shifts[worst]
     ):

@@ -70,8 +70,12 @@ class TurnPlanes:
             covariance: (p, p) of them.
             priors: standard deviation of each offset.
         """
-        self.image, self.poses, self.turn, self.offsets = image, poses, turn, offsets
-        self.values, self.priors = values, priors
+        self.image = image
+        self.poses = poses
+        self.turn = turn
+        self.offsets = offsets
+        self.values = values
+        self.priors = priors
         self.doubts = np.linalg.cholesky(covariance)
         self.pitch = float(np.linalg.norm(poses.v[turn.used[0]]))
         self.factor = max(1, round(turn.mean.shape[1] / COLUMNS))
@@ -102,7 +106,8 @@ class TurnPlanes:
         if self.stack is None or len(self.stack) != len(frames):
             images = [binned_mean(self.image(i), self.factor) for i in frames.tolist()]
             self.stack = np.stack(images)
-        poses, stack = self.poses[frames], binned_mean(self.stack, coarser)
+        poses = self.poses[frames]
+        stack = binned_mean(self.stack, coarser)
 
         def views(at: FloatArray) -> ConeVec:
             return about_axis(poses, self._of(at))
@@ -169,7 +174,8 @@ class TurnPlanes:
         sigmas[:] = np.sqrt(
             np.square(shifts.values).mean(axis=0)
         )  # of frames that are not used
-        across, upwards = scale * float(pose.u[0, 0]), scale * float(pose.v[0, 2])
+        across = scale * float(pose.u[0, 0])
+        upwards = scale * float(pose.v[0, 2])
         values[self.sorted] = shifts.values * [across, upwards]
         sigmas[self.sorted] = shifts.sigmas
         return Motion(
