@@ -76,11 +76,13 @@ def _numbered(names: list[str]) -> Ordered | None:
     """
     if len(names) < 2 or len({*map(len, names)}) != 1:
         return None
-    first, last = names[0], names[-1]
+    first = names[0]
+    last = names[-1]
     at = next(i for i, (a, b) in enumerate(zip(first, last, strict=True)) if a != b)
     start = len(first[:at].rstrip("0123456789"))
     end = start + len(first[start:]) - len(first[start:].lstrip("0123456789"))
-    before, after = first[:start], first[end:]
+    before = first[:start]
+    after = first[end:]
     if (
         end == start
         or before.endswith(("-", "+", "."))
@@ -141,7 +143,9 @@ def _keys(names: Sequence[str]) -> dict[str, Key]:
     decimal = {
         name: _key(stem, signed=signed, decimals=True) for name, stem in stems.items()
     }
-    return decimal if _decimal(decimal, whole, stems) else whole
+    if _decimal(decimal, whole, stems):
+        return decimal
+    return whole
 
 
 def _texts(keys: dict[str, Key]) -> set[str]:
@@ -167,10 +171,18 @@ def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
     parts: list[str | float] = []
     at = 0
     for match in NUMBER.finditer(stem):
-        before = stem[match.start() - 1] if match.start() else ""
-        sign, whole, part = match["sign"], match["whole"], match["part"] or ""
+        if match.start():
+            before = stem[match.start() - 1]
+        else:
+            before = ""
+        sign = match["sign"]
+        whole = match["whole"]
+        part = match["part"] or ""
         minus = sign and (signed or not before or before in SIGNED_AFTER)
-        value = float(whole + part) if decimals else float(whole)
+        if decimals:
+            value = float(whole + part)
+        else:
+            value = float(whole)
         parts.append(stem[at : match.start()] + ("" if minus else sign))
         parts.append(-value if minus and sign == "-" else value)
         if part and not decimals:
@@ -237,9 +249,10 @@ def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
     steps = np.diff(table[:, varying[0]])
     usual = float(np.median(steps))
     wide = np.flatnonzero(steps > 1.5 * usual)
-    alike = (
-        np.abs(steps / usual - np.round(steps / usual)) < 1e-3 if usual > 0 else steps < 0
-    )
+    if usual > 0:
+        alike = np.abs(steps / usual - np.round(steps / usual)) < 1e-3
+    else:
+        alike = steps < 0
     if (
         len(wide)
         and alike.all()

@@ -110,10 +110,17 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
             )
             remedy = "give them a value first, such as np.nan_to_num(volume.data)"
             yield Finding("not finite", cause, remedy, Severity.WARNING, share)
-        low = float(np.nanmin(np.where(bad, np.nan, data))) if not bad.all() else 0.0
-        high = float(np.nanmax(np.where(bad, np.nan, data))) if not bad.all() else 0.0
+        if not bad.all():
+            low = float(np.nanmin(np.where(bad, np.nan, data)))
+        else:
+            low = 0.0
+        if not bad.all():
+            high = float(np.nanmax(np.where(bad, np.nan, data)))
+        else:
+            high = 0.0
     else:
-        low, high = float(data.min()), float(data.max())
+        low = float(data.min())
+        high = float(data.max())
     if low < MIN_ATTENUATION:
         cause = f"attenuation from {low:.5g} to {high:.5g} /mm, as Hounsfield units are"
         remedy = "attenuation is mu_water * (1 + HU / 1000), some 0.02 /mm of water"

@@ -66,7 +66,8 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
     if len(found) < max(2.0, MIN_OPEN_VIEWS_SHARE * len(levels_seen)):
         return
     levels = np.array(found)
-    high, apart = float(levels.max()), float(np.ptp(levels))
+    high = float(levels.max())
+    apart = float(np.ptp(levels))
     if high <= 1.0 + MAX_BEAM_DIFFERENCE and not (
         apart > MAX_BEAM_DIFFERENCE and _drifts(levels)
     ):
@@ -106,7 +107,8 @@ def open_beam(
     levels = []
     for some in (slice(2 * wide), slice(-1, -2 * wide - 1, -1)):
         turned = (counts[:, some] - dark[:, some]) / opened[:, some]
-        outer, inner = _blocks(turned[:, :wide]), _blocks(turned[:, wide : 2 * wide])
+        outer = _blocks(turned[:, :wide])
+        inner = _blocks(turned[:, wide : 2 * wide])
         both = np.concatenate([outer, inner])
         if not np.isfinite(both).all():
             return None
@@ -122,11 +124,9 @@ def open_beam(
             return None
         levels.append(float(both.mean()))
     left, right = levels
-    return (
-        0.5 * (left + right)
-        if abs(left - right) <= 2.5 * MAX_STRIP_DIFFERENCE * max(left, right)
-        else None
-    )
+    if abs(left - right) <= 2.5 * MAX_STRIP_DIFFERENCE * max(left, right):
+        return 0.5 * (left + right)
+    return None
 
 
 def _blocks(strip: npt.NDArray[Any]) -> FloatArray:

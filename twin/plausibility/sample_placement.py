@@ -48,7 +48,8 @@ def placement_findings(
     parts = np.asarray(boxes, dtype=np.float64)
     if not len(parts) or not len(cone_vec):
         return
-    low, high = parts[:, 0].min(axis=0), parts[:, 1].max(axis=0)
+    low = parts[:, 0].min(axis=0)
+    high = parts[:, 1].max(axis=0)
     inside = np.zeros(len(cone_vec), bool)
     for part in parts:
         inside |= ((cone_vec.source > part[0]) & (cone_vec.source < part[1])).all(axis=1)

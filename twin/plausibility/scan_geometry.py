@@ -265,5 +265,8 @@ def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[F
             "(laminography), where FDK is wrong"
         )
         refused = inclined > INCLINED_DEG[1]
-        severity = Severity.REFUSAL if refused else Severity.WARNING
+        if refused:
+            severity = Severity.REFUSAL
+        else:
+            severity = Severity.WARNING
         yield Finding("laminography", cause, FDK_TOO, severity, inclined)

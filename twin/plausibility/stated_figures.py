@@ -49,7 +49,10 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
                 f"the file's angles span {span:.4g} rad and are the geometry's as {words}"
             )
             remedy = "does the file state the right unit?"
-            kind = "angles in degrees" if words == "degrees" else "angles in radians"
+            if words == "degrees":
+                kind = "angles in degrees"
+            else:
+                kind = "angles in radians"
             yield Finding(kind, cause, remedy, Severity.WARNING, figure)
             return
     if _same_set(own, stated, allowed):

@@ -55,13 +55,14 @@ def grid_findings(
         at = views.project_points(points, shape)
         toward = views.normal * np.sign(views.source_detector_distance)[:, None]
         depth = np.einsum("nki,ni->nk", points - views.source[:, None], toward)
-        ahead, before = (
-            depth > 0.0,
-            depth <= np.abs(views.source_detector_distance)[:, None],
-        )
+        ahead = depth > 0.0
+        before = depth <= np.abs(views.source_detector_distance)[:, None]
         on = (at > -0.5) & (at < np.array(shape[::-1]) - 0.5)
     on_side = np.abs(views.u[:, 2]).mean() > np.abs(views.v[:, 2]).mean()
-    beside = on.all(axis=2) if layers else on[..., int(on_side)]
+    if layers:
+        beside = on.all(axis=2)
+    else:
+        beside = on[..., int(on_side)]
     shown = beside & ahead
     if (shown & before).any():
         shown = shown & before

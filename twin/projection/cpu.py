@@ -161,7 +161,10 @@ def _spread(
     counts = (box.nx, box.ny, box.nz)
     plan = plan_fans(views if fans else views[:0], counts, shape)
     workers = threads()
-    alone = plan.alone if fans else np.arange(len(views))
+    if fans:
+        alone = plan.alone
+    else:
+        alone = np.arange(len(views))
     turns = plan_turns(plan, views, counts, shape, workers)
     slices = z_slices(box.nz, turns.slices)
     marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)

@@ -81,7 +81,10 @@ class TorchOperator:
             wanted = self.like.shape
         if tuple(values.shape[-3:]) != wanted:
             raise GeometryError.of_shape("values", values.shape, ("...", *wanted))
-        function = _Spread if self.transposed else _Project
+        if self.transposed:
+            function = _Spread
+        else:
+            function = _Project
         return function.apply(values, rows, self)
 
 

@@ -185,4 +185,6 @@ def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
             f"choose at most {max(bias.found.voxel_xyz):.2g} mm"
         ]
     accuracy = bias.accuracy(grid)
-    return [] if accuracy is None else accuracy.warnings
+    if accuracy is None:
+        return []
+    return accuracy.warnings

@@ -333,7 +333,10 @@ class CoarseScan:
         """
         rows, cols = self.images.shape[1:]
         low, high = self.ends
-        turn = None if self.circle.rise else self.angles
+        if self.circle.rise:
+            turn = None
+        else:
+            turn = self.angles
         rungs = [self.parallel("", (max(low, high),) * 2, turn)]
         # Rays that climb less than a row across the object are a fan, whose flaw are its
         # angles.

@@ -74,7 +74,10 @@ class Minimised:
         return len(self.costs) - 1
 
     def __repr__(self) -> str:
-        end = "converged" if self.converged else "stopped"
+        if self.converged:
+            end = "converged"
+        else:
+            end = "stopped"
         return (
             f"<Minimised: {end} after {self.iterations} iterations, cost "
             f"{self.costs[0]:.6g} to "

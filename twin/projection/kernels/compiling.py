@@ -137,7 +137,8 @@ def _linking(codegen: Any) -> Iterator[None]:
         if codegen._engine.get_global_value_address(name):
             type(codegen).set_env(codegen, name, env)
 
-    codegen._library_class, codegen.set_env = _LinkedLibrary, set_env
+    codegen._library_class = _LinkedLibrary
+    codegen.set_env = set_env
     try:
         yield
     finally:

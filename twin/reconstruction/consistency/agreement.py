@@ -130,15 +130,16 @@ class Comparison:
         trial = self._trial
         if not self._tried or trial.excess < MIN_DOUBTFUL_MISFIT:
             return None
-        better = (
-            MAX_BETTER_MISFIT
-            if trial.whole and trial.even and trial.telling.all()
-            else MAX_MUCH_BETTER_MISFIT
-        )
+        if trial.whole and trial.even and trial.telling.all():
+            better = MAX_BETTER_MISFIT
+        else:
+            better = MAX_MUCH_BETTER_MISFIT
         best = min(self._tried, key=lambda one: one.score)
         if best.score < better and trial.excess_of(best) <= MAX_MISFIT:
             return self._named(self._as_good_as(best), best.score)
-        return Contradiction(trial.excess) if self._unfit else None
+        if self._unfit:
+            return Contradiction(trial.excess)
+        return None
 
     def undecided(self, claimed: float) -> Contradiction | None:
         """Find an explanation that fits as well and would change the volume.
@@ -160,7 +161,10 @@ class Comparison:
         as_good = [one for one in self._as_good_as(best) if one in rivals]
         better = best.evidence < -MIN_EVIDENCE_SIGMAS
         decided = better and trial.excess >= MIN_DOUBTFUL_MISFIT
-        change = None if decided else max(one.change for one in as_good)
+        if decided:
+            change = None
+        else:
+            change = max(one.change for one in as_good)
         return self._named(as_good, best.score, change)
 
     def _as_good_as(self, best: Tried) -> list[Tried]:
@@ -172,5 +176,6 @@ class Comparison:
     ) -> Contradiction:
         """Make the contradiction that names some explanations."""
         figures = {one.suspect.kind: one.suspect.figure for one in as_good}
-        kinds, told = tuple(figures), tuple(figures.values())
+        kinds = tuple(figures)
+        told = tuple(figures.values())
         return Contradiction(self._trial.excess, kinds, score, told, change)

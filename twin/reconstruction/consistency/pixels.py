@@ -74,7 +74,10 @@ class BadPixels:
         return int((self.mask.mean(axis=0) > 0.5).sum())
 
     def __str__(self) -> str:
-        columns = f", {self.columns} whole columns among them" if self.columns else ""
+        if self.columns:
+            columns = f", {self.columns} whole columns among them"
+        else:
+            columns = ""
         return (
             f"{self.count} pixels do not respond as their neighbours do (dead, hot or "
             f"flickering{columns}): they are interpolated"
@@ -105,7 +108,9 @@ def bad_pixels(
     mask = _lasting_or_flickering(views(), worst | second)
     if not mask.any():
         return None
-    return BadPixels(mask) if mask.mean() <= MAX_BAD_SHARE else None
+    if mask.mean() <= MAX_BAD_SHARE:
+        return BadPixels(mask)
+    return None
 
 
 def _outliers(
@@ -123,7 +128,9 @@ def _outliers(
         The outliers, and the excess of all pixels over their neighbours, (rows, cols) each; one
         pixel without views or of too small ones.
     """
-    along, down, near = _Usual(), _Usual(), slice(0, 0)
+    along = _Usual()
+    down = _Usual()
+    near = slice(0, 0)
     for view in views:
         if min(view.shape) <= 2 * NEIGHBOURS:
             break
@@ -213,7 +220,10 @@ class _Usual:
         pixel apart.
         """
         self.count += 1
-        self._total = square.copy() if self._total is None else self._total + square
+        if self._total is None:
+            self._total = square.copy()
+        else:
+            self._total = self._total + square
         if self.count % VIEWS_AN_OUTLIER == 0:
             self._largest.append(np.zeros_like(square))
         rest = square
@@ -234,9 +244,11 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
     """Find where a response is far above the usual one about it, (rows, cols)."""
     from scipy.ndimage import maximum_filter
 
-    (rows, cols), (tall, wide) = response.shape, BLOCK
+    (rows, cols) = response.shape
+    (tall, wide) = BLOCK
     padded = np.pad(response, ((0, -rows % tall), (0, -cols % wide)), "reflect")
-    down, across = padded.shape[0] // tall, padded.shape[1] // wide
+    down = padded.shape[0] // tall
+    across = padded.shape[1] // wide
     blocks = padded.reshape(down, tall, across, wide).transpose(0, 2, 1, 3)
     usual = maximum_filter(
         np.median(blocks.reshape(down, across, -1), axis=2), 3, mode="nearest"
@@ -257,7 +269,8 @@ def _beyond_neighbours(view: Float32Array) -> Float32Array:
     first, second, third, fourth = (wide[:, k : k + cols] for k in (0, 1, 3, 4))
     one = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
     other = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
-    low, high = np.minimum(one, other), np.maximum(one, other)
+    low = np.minimum(one, other)
+    high = np.maximum(one, other)
     for ends in (slice(NEIGHBOURS), slice(-NEIGHBOURS, None)):
         span = EDGE_SLOPE_FACTOR * (
             high[:, ends] - low[:, ends]

@@ -126,9 +126,11 @@ def _noise_of(images: Float32Array) -> float:
     whichever show less of the object.
     """
     if images.shape[1] > 1:
-        mixed, terms = np.diff(np.diff(images, axis=2), axis=1), 4.0
+        mixed = np.diff(np.diff(images, axis=2), axis=1)
+        terms = 4.0
     else:
-        mixed, terms = np.diff(images, n=2, axis=2), 6.0
+        mixed = np.diff(images, n=2, axis=2)
+        terms = 6.0
     beside = float(np.median(np.square(mixed), axis=0).mean()) / terms
     between = (
         float(np.median(np.square(np.diff(images, n=2, axis=0)), axis=0).mean()) / 6.0

@@ -67,7 +67,8 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
         whole: the panel sees the complete object; if not, only panels on the wrong side
             and mirrored images are suspected, which make an object seem cut off.
     """
-    images, cone_vec = scan.images, scan.cone_vec
+    images = scan.images
+    cone_vec = scan.cone_vec
     aside, above = _axis_from_middle(scan)
     offset = abs(aside) > CENTRE_TOLERANCE
     if whole or offset:
@@ -91,7 +92,9 @@ def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
         scan: n views.
         turn: (n,) [rad].
     """
-    cos, sin, centre = np.cos(turn), np.sin(turn), np.append(scan.circle.centre, 0.0)
+    cos = np.cos(turn)
+    sin = np.sin(turn)
+    centre = np.append(scan.circle.centre, 0.0)
 
     def about(vectors: FloatArray) -> FloatArray:
         x, y, z = vectors.T
@@ -131,7 +134,8 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
     """Yield kinds of orders, the view whose angle each image has, (n,), and a
     description.
     """
-    count, listed = len(angle), np.arange(len(angle))
+    count = len(angle)
+    listed = np.arange(len(angle))
     steps = np.diff(np.unwrap(angle))
     if (steps > 0.0).all() or (steps < 0.0).all():
         for passes in INTERLACED_PASSES:

@@ -140,7 +140,9 @@ class Trial:
         (2,).
         """
         again = Reprojection.of(self.scan, shown.again, cone_vec, None)
-        return np.full(2, np.inf) if again is None else again.misfit()
+        if again is None:
+            return np.full(2, np.inf)
+        return again.misfit()
 
     def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
         """Compute the misfit relative to the expected one: by edges, if the coarse volume

@@ -62,7 +62,8 @@ class OnProcessor:
         nz, ny, nx = like.shape
         self._first, self._size = first_and_steps(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
-        self._sizes, self._columns = (0, 0, 0, 0), self._data
+        self._sizes = (0, 0, 0, 0)
+        self._columns = self._data
         self.meter: NoiseMeter | None = None
 
     def add(self, views: Views) -> None:
@@ -73,10 +74,8 @@ class OnProcessor:
 
         n, wide, cols, rows = views.sizes
         if views.sizes != self._sizes:  # new memory costs as much as filtering
-            self._sizes, self._columns = (
-                views.sizes,
-                fdk_kernels.room(n, cols, rows, views.few),
-            )
+            self._sizes = views.sizes
+            self._columns = fdk_kernels.room(n, cols, rows, views.few)
         views = replace(views, images=np.ascontiguousarray(views.images))
         fitting = min(GROUP, 2 * GROUP * views.images.shape[2] // wide)
         group = max(1, fitting, PIXELS // (wide * rows))
@@ -153,7 +152,8 @@ class OnDevice:
             self._grid = [
                 cuda.to_device(np.array(numbers)) for numbers in first_and_steps(like)
             ]
-            self._flat, self._stream = gpu.zeros(ny * nx * nz), cuda.stream()
+            self._flat = gpu.zeros(ny * nx * nz)
+            self._stream = cuda.stream()
             self._upload = ImageUpload(self._stream)
 
         gpu.demand(prepare)
@@ -213,7 +213,8 @@ class OnDevice:
             gpu_reconstruction_kernels as kernels,
         )
 
-        upload, on = self._upload, views.beyond
+        upload = self._upload
+        on = views.beyond
         shown = views.shown
         there = upload.images(views.images, order, shown)
         tables = [
@@ -252,7 +253,8 @@ class OnDevice:
         """
         from numba import cuda
 
-        on, turn = views.beyond, 2.0 * np.pi * np.arange(length // 2) / length
+        on = views.beyond
+        turn = 2.0 * np.pi * np.arange(length // 2) / length
         response = response_of_length(views.response, length) / length
         response = np.concatenate([response, response[-2:0:-1]])[bits_reversed(length)]
         tables = (on.share, on.cut, on.fade, response, np.cos(turn), np.sin(turn))
@@ -270,7 +272,8 @@ class OnDevice:
         )
 
         n, wide, cols, rows = views.sizes
-        upload, stream = self._upload, self._stream
+        upload = self._upload
+        stream = self._stream
         lines = np.empty((n, rows, wide), np.float32)
         views.widen(lines)
         there = upload.images(lines, np.arange(n), slice(0, rows))

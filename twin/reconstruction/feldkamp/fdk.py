@@ -154,7 +154,8 @@ def _on_device(
     data = np.empty((ny, nx, nz), np.float32).transpose(2, 0, 1)
     noises: list[Noise] = []
     for k, (first, last) in enumerate(slabs):
-        slab, tell = layers(like, first, last), _share(progress, k, len(slabs))
+        slab = layers(like, first, last)
+        tell = _share(progress, k, len(slabs))
         data[first:last], noise = task.onto(OnDevice(slab), slab, tell)
         noises += [] if noise is None else [noise]
     volume = replace(like, data=data)
@@ -195,7 +196,8 @@ def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
     """List layers (first, last) of slabs that fit the device one by one; empty without a
     device.
     """
-    count, most = 1, like.shape[0]
+    count = 1
+    most = like.shape[0]
     while not device_takes(layers(like, 0, -(-most // count)), shape):
         if count >= most or not gpu.availability().present:
             return []
@@ -205,4 +207,6 @@ def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
 
 def _share(progress: Progress | None, k: int, count: int) -> Progress | None:
     """Map progress of the k-th of several equal parts to progress of all."""
-    return None if progress is None else lambda part: progress((k + part) / count)
+    if progress is None:
+        return None
+    return lambda part: progress((k + part) / count)

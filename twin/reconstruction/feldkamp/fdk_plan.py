@@ -157,8 +157,13 @@ class FdkPlan:
         Raises:
             GeometryError: images of another shape, or more than there are views.
         """
-        panels, widths, views = self.panels, self.widths, slice(done, done + len(part))
-        images = part.transpose(0, 2, 1) if panels.turned else part
+        panels = self.panels
+        widths = self.widths
+        views = slice(done, done + len(part))
+        if panels.turned:
+            images = part.transpose(0, 2, 1)
+        else:
+            images = part
         if images.shape[1:] != panels.seen or views.stop > self.count:
             said = f"projections of shape {images.shape} after {done} views"
             allowed = f"{self.count} views of {panels.seen}"
@@ -166,7 +171,8 @@ class FdkPlan:
         if panels.upright is not panels.recorded:
             both = panels.recorded[views], panels.upright[views]
             images = rectified(images, *both, panels.shape[1])
-        shape, level = (widths.rows, widths.wide), self.level[views]
+        shape = (widths.rows, widths.wide)
+        level = self.level[views]
         if self.truncation is None:
             beyond = Continuation.empty(len(part), *shape)
         else:
@@ -245,16 +251,21 @@ def plan_fdk(
     """
     circle = circle_of(cone_vec)
     panels = _panels(circle, cone_vec, cone_vec.of_shape(shape))
-    whole, cols = panels.upright, panels.shape[1]
+    whole = panels.upright
+    cols = panels.shape[1]
     widths = _widths(circle, panels, like, truncation)
     beyond = truncation is not None and truncation.beyond
     weights = redundancy(circle, whole, cols, beyond=beyond)
     weights = np.pad(weights, ((0, 0), (widths.before, widths.after)), "edge")
-    rows, near = (widths.first, widths.last), widths.near
+    rows = (widths.first, widths.last)
+    near = widths.near
     backed = window_of(whole, panels.shape, rows, (-near[0], cols + near[1]))
     level = window_of(whole, panels.shape, rows, (-widths.before, cols + widths.after))
     table = view_table(backed, (widths.rows, cols + sum(near)))
-    sharing = Sharing.of(circle, whole, panels.shape, like) if circle.rise else None
+    if circle.rise:
+        sharing = Sharing.of(circle, whole, panels.shape, like)
+    else:
+        sharing = None
     if sharing is not None:
         table = np.hstack([table, sharing.columns()])
     # Pitches may change from view to view: one filter, and factors for what it scales with.
@@ -283,12 +294,14 @@ def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels
     """
     turned = on_its_side(cone_vec)
     if turned:
-        cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+        cone_vec = swapped(cone_vec)
+        shape = (shape[1], shape[0])
     if shape[1] < 2:
         raise GeometryError.instead(
             "rows of 1 pixel, which cannot be filtered", 1, "2 or more"
         )
-    seen, level = shape, cone_vec
+    seen = shape
+    level = cone_vec
     if leans(cone_vec):
         shape = (shape[0], round(FINER * shape[1]))
     if not is_upright(cone_vec):
@@ -324,9 +337,13 @@ def _widths(
         like: the grid.
         truncation: of the object, None without.
     """
-    level, cols = panels.upright, panels.shape[1]
+    level = panels.upright
+    cols = panels.shape[1]
     near = columns_beyond(circle, level, cols)
-    far = (0, 0) if truncation is None else truncation.columns(level, cols)
+    if truncation is None:
+        far = (0, 0)
+    else:
+        far = truncation.columns(level, cols)
     before, after = (max(pair) for pair in zip(near, far, strict=True))
     # Only rows in the grid's shadow matter: the filter runs along rows.
     first, last = rows_needed(level, panels.shape, like)
@@ -356,12 +373,15 @@ def weighing(
         Factors (n, cols), across (n, cols) and up (n, rows) of `Views`.
     """
     rows, cols = shape
-    source, u, v = cone_vec.source, cone_vec.u, cone_vec.v
+    source = cone_vec.source
+    u = cone_vec.u
+    v = cone_vec.v
     panel = cone_vec.detector - source
     inward = circle.centre - source[:, :2]
     radius = np.linalg.norm(inward, axis=1)
     depth = np.abs((panel * cone_vec.normal).sum(axis=1))
-    c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
+    c = np.arange(cols) - (cols - 1) / 2
+    r = np.arange(rows) - (rows - 1) / 2
     x = panel[:, None, :2] + c[:, None] * u[:, None, :2]
     z = panel[:, 2, None] + r * v[:, 2, None]
     along = (x * (inward / radius[:, None])[:, None]).sum(axis=2)

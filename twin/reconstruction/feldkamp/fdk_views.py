@@ -93,7 +93,8 @@ class Views:
         """
         from flexdt.twin.reconstruction.kernels import truncation_kernels
 
-        on, cols = self.beyond, self.images.shape[2]
+        on = self.beyond
+        cols = self.images.shape[2]
         n, wide = self.factors.shape
         out = np.empty((n, len(on.prisms), wide), np.float32)
         truncation_kernels.prism_lengths(

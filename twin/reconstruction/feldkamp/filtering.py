@@ -63,7 +63,8 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
 
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
-    cols, length = rows.shape[-1], padded_length(response)
+    cols = rows.shape[-1]
+    length = padded_length(response)
     spectrum = fft.rfft(rows, length, axis=-1, workers=-1)
     fdk_kernels.respond(spectrum.view(np.float32).reshape(-1, len(response), 2), response)
     back: Float32Array = fft.irfft(spectrum, length, axis=-1, workers=-1)[..., :cols]

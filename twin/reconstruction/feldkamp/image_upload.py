@@ -28,7 +28,8 @@ class ImageUpload:
         """Begin uploads for kernels that run in `stream`."""
         from numba import cuda
 
-        self._reader, self._writer = stream, cuda.stream()
+        self._reader = stream
+        self._writer = cuda.stream()
         self._turn = 0
         self._portions: list[Any] = [None, None]
         self._fetched: list[Any] = [None, None]
@@ -55,7 +56,8 @@ class ImageUpload:
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         images = np.ascontiguousarray(images)
-        n, cols = len(order), images.shape[2]
+        n = len(order)
+        cols = images.shape[2]
         count = rows.stop - rows.start
         there = self._room("images", n * count * cols).reshape(n, count, cols)
         each = max(1, PORTION_BYTES // max(1, 4 * count * cols))

@@ -107,7 +107,8 @@ class NoiseMeter:
             circle: of the sources.
             table: (n, 11) of `view_table`.
         """
-        self._circle, self._table = circle, table
+        self._circle = circle
+        self._table = table
         rows_per_mm = float(table[:, 9].mean()) / circle.radius
         size = np.array(like.voxel_xyz)
         steps = np.maximum(2, -(-np.array(like.shape[::-1]) // NODES))
@@ -152,7 +153,8 @@ class NoiseMeter:
         lost."""
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
-        signs, rows = self.note(views), views.sizes[3]
+        signs = self.note(views)
+        rows = views.sizes[3]
         columns[: len(signs)] *= signs[:, None, None]
         first, size = first_and_steps(self.grid)
         fdk_kernels.backproject(
@@ -187,7 +189,8 @@ class NoiseMeter:
         """
         points = self._points()[1]
         g = views.table[:, :, None]
-        x, y = points[:, 0] - g[:, 0], points[:, 1] - g[:, 1]
+        x = points[:, 0] - g[:, 0]
+        y = points[:, 1] - g[:, 1]
         depth = x * g[:, 3] + y * g[:, 4]
         column = (
             g[:, 8] + (x * g[:, 5] + y * g[:, 6]) / depth * g[:, 7] + views.kept.start
@@ -226,7 +229,8 @@ class NoiseMeter:
         column = np.concatenate([columns for columns, _ in self._hits])
         counts = np.concatenate([factors for _, factors in self._hits])
         first = np.floor(column).astype(int)
-        part, row = column - first, np.arange(column.shape[1]) * length
+        part = column - first
+        row = np.arange(column.shape[1]) * length
         hits = np.bincount(
             (row + first).ravel(), (counts * (1.0 - part)).ravel(), row[-1] + length
         )
