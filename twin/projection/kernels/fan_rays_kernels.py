@@ -44,23 +44,51 @@ def oriented(box, g, lines, line, rows):
     dy = g[4] + c * g[7] + r * g[10]
     # t is the axis along which the central ray goes faster, so that slopes dl / dt are at most
     # 1.
-    sx, sy, sz = box.size_x**2, box.size_y**2, box.size_z**2
+    sx = box.size_x**2
+    sy = box.size_y**2
+    sz = box.size_z**2
     if abs(dy) >= abs(dx):
-        axis, dl, dt, sl, st, square_l, square_t = 1, dx, dy, g[0], g[1], sx, sy
-        nl, nt, hop_l, hop_t = box.nx, box.ny, box.hop_x, box.hop_y
+        axis = 1
+        dl = dx
+        dt = dy
+        sl = g[0]
+        st = g[1]
+        square_l = sx
+        square_t = sy
+        nl = box.nx
+        nt = box.ny
+        hop_l = box.hop_x
+        hop_t = box.hop_y
     else:
-        axis, dl, dt, sl, st, square_l, square_t = 0, dy, dx, g[1], g[0], sy, sx
-        nl, nt, hop_l, hop_t = box.ny, box.nx, box.hop_y, box.hop_x
-    base, span_base = box.base, 0
+        axis = 0
+        dl = dy
+        dt = dx
+        sl = g[1]
+        st = g[0]
+        square_l = sy
+        square_t = sx
+        nl = box.ny
+        nt = box.nx
+        hop_l = box.hop_y
+        hop_t = box.hop_x
+    base = box.base
+    span_base = 0
     span_l, span_t = (1, box.nx) if axis == 1 else (box.nx, 1)
     # Mirroring is done by steps in memory of the other sign, from the last voxel.
-    sign_l, sign_t = math.copysign(1.0, dl), math.copysign(1.0, dt)
+    sign_l = math.copysign(1.0, dl)
+    sign_t = math.copysign(1.0, dt)
     if sign_l < 0:
-        sl, base, hop_l = nl - sl, base + (nl - 1) * hop_l, -hop_l
-        span_base, span_l = span_base + (nl - 1) * span_l, -span_l
+        sl = nl - sl
+        base = base + (nl - 1) * hop_l
+        hop_l = -hop_l
+        span_base = span_base + (nl - 1) * span_l
+        span_l = -span_l
     if sign_t < 0:
-        st, base, hop_t = nt - st, base + (nt - 1) * hop_t, -hop_t
-        span_base, span_t = span_base + (nt - 1) * span_t, -span_t
+        st = nt - st
+        base = base + (nt - 1) * hop_t
+        hop_t = -hop_t
+        span_base = span_base + (nt - 1) * span_t
+        span_t = -span_t
     return Grid(
         axis,
         sign_l,
@@ -98,7 +126,8 @@ def columns_of(lines, first, last, cols, starts, ends):
     Returns:
         The largest number of columns in a row, 1 at least.
     """
-    a, b = lines[first], lines[last]
+    a = lines[first]
+    b = lines[last]
     width = 1
     for r in range(starts.size):
         starts[r] = min(max(math.ceil(a[0] + a[1] * r), 0), cols)
@@ -122,9 +151,13 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
         width: its columns.
         shadow: rows and columns that the box can reach, the first of them the buffer's first.
     """
-    row, column, slot = found.row, found.column, found.slot
-    low, high = lines[line], lines[line + 1]
-    top, bottom = shadow[0], shadow[1]
+    row = found.row
+    column = found.column
+    slot = found.slot
+    low = lines[line]
+    high = lines[line + 1]
+    top = shadow[0]
+    bottom = shadow[1]
     n = 0
     if low[1] == 0.0 and high[1] == 0.0:
         # Whole columns: the same range in every row.
@@ -133,7 +166,8 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
         for c in range(c0, c1):
             at = c - starts[top]
             for i in range(bottom - top):
-                row[n + i], column[n + i] = top + i, c
+                row[n + i] = top + i
+                column[n + i] = c
                 slot[n + i] = i * width + at
             n += bottom - top
     else:
@@ -142,16 +176,27 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
             c1 = min(math.ceil(high[0] + high[1] * r), shadow[3])
             at = (r - top) * width - starts[r]
             for c in range(c0, c1):
-                row[n], column[n] = r, c
+                row[n] = r
+                column[n] = c
                 slot[n] = at + c
                 n += 1
-    t, el = grid.axis, 1 - grid.axis
-    t0, tc, tr = grid.sign_t * g[3 + t], grid.sign_t * g[6 + t], grid.sign_t * g[9 + t]
-    l0, lc, lr = grid.sign_l * g[3 + el], grid.sign_l * g[6 + el], grid.sign_l * g[9 + el]
-    z0, zc, zr = g[5], g[8], g[11]
-    slope, rise, span = found.slope, found.rise, found.span
+    t = grid.axis
+    el = 1 - grid.axis
+    t0 = grid.sign_t * g[3 + t]
+    tc = grid.sign_t * g[6 + t]
+    tr = grid.sign_t * g[9 + t]
+    l0 = grid.sign_l * g[3 + el]
+    lc = grid.sign_l * g[6 + el]
+    lr = grid.sign_l * g[9 + el]
+    z0 = g[5]
+    zc = g[8]
+    zr = g[11]
+    slope = found.slope
+    rise = found.rise
+    span = found.span
     for q in range(n):
-        r, c = row[q], column[q]
+        r = row[q]
+        c = column[q]
         dt = t0 + c * tc + r * tr
         inverse = 1.0 / dt
         slope[q] = (l0 + c * lc + r * lr) * inverse
@@ -165,16 +210,24 @@ def describe(grid, found, n):
     """Compute the `Fan` of n collected rays: its reference line, slabs, and whether its rays
     can be walked together.
     """
-    slope, rise, span = found.slope[:n], found.rise[:n], found.span[:n]
-    m_low, m_high, rise_low, rise_high = slope[0], slope[0], rise[0], rise[0]
+    slope = found.slope[:n]
+    rise = found.rise[:n]
+    span = found.span[:n]
+    m_low = slope[0]
+    m_high = slope[0]
+    rise_low = rise[0]
+    rise_high = rise[0]
     nearest = span[0]
     for q in range(n):
-        m_low, m_high = min(m_low, slope[q]), max(m_high, slope[q])
-        rise_low, rise_high = min(rise_low, rise[q]), max(rise_high, rise[q])
+        m_low = min(m_low, slope[q])
+        m_high = max(m_high, slope[q])
+        rise_low = min(rise_low, rise[q])
+        rise_high = max(rise_high, rise[q])
         nearest = min(nearest, span[q])
     m0 = 0.5 * (m_low + m_high)
     # Where the reference line is within one column of the box, in front of the source.
-    begin, stop = max(0.0, grid.st), float(grid.nt)
+    begin = max(0.0, grid.st)
+    stop = float(grid.nt)
     if m0 > 0.0:
         begin = max(begin, grid.st + (-1.0 - grid.sl) / m0)
         stop = min(stop, grid.st + (grid.nl + 1.0 - grid.sl) / m0)
@@ -191,7 +244,8 @@ def describe(grid, found, n):
     too_short = nearest <= 0.0 or nearest < far
     on_axis = spread and m_low * grid.nt < ON_AXIS
     together = not (inside or too_short or on_axis or drift > DRIFT)
-    low, width = m_low - m0, m_high - m_low
+    low = m_low - m0
+    width = m_high - m_low
     return Fan(m0, low, width, rise_low, rise_high, j0, j1, begin, spread, together)
 
 
@@ -208,8 +262,12 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
         bins: (BINS + 1,) filled with the first place of each bin.
         n: number of collected rays.
     """
-    slope, rise, slot, part = found.slope, found.rise, found.slot, found.bin
-    reach0, reach1 = fan.begin - grid.st, fan.j1 - grid.st
+    slope = found.slope
+    rise = found.rise
+    slot = found.slot
+    part = found.bin
+    reach0 = fan.begin - grid.st
+    reach1 = fan.j1 - grid.st
     # A counting sort: count the rays of each bin, turn counts into first places, deal out.
     bins[:] = 0
     scale = BINS / fan.width if fan.spread else 0.0
@@ -226,13 +284,17 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
             bins[np.uint64(part[q]) + np.uint64(1)] += 1
     for b in range(BINS):
         bins[b + 1] += bins[b]
-    to_slope, to_rise, to_slot = rays.slope, rays.rise, rays.slot
+    to_slope = rays.slope
+    to_rise = rays.rise
+    to_slot = rays.slot
     for q in range(n):
         if part[q] >= 0.0:
             b = np.uint64(part[q])
             at = np.uint64(bins[b])
             bins[b] += 1
-            to_slope[at], to_rise[at], to_slot[at] = slope[q], rise[q], slot[q]
+            to_slope[at] = slope[q]
+            to_rise[at] = rise[q]
+            to_slot[at] = slot[q]
     # Dealing out has moved each bin's first place to the next bin's: shift them back.
     for b in range(BINS, 0, -1):
         bins[b] = bins[b - 1]
@@ -251,19 +313,28 @@ def start(grid, fan, rays, work, n):
         work: lists of crossings are filled in, sums set to zero.
         n: number of rays.
     """
-    slope, rise = rays.slope[:n], rays.rise[:n]
-    weight, tilt, ratio, length = (
-        rays.weight[:n],
-        rays.tilt[:n],
-        rays.ratio[:n],
-        rays.length[:n],
-    )
-    cross, pace, level, acc = rays.cross[:n], rays.pace[:n], rays.level[:n], rays.acc[:n]
-    m0, sz, st, nz = fan.m0, grid.sz, grid.st, float(grid.nz)
-    square_l, square_t, square_z = grid.square_l, grid.square_t, grid.square_z
-    reach, begin = fan.begin - st, fan.begin
+    slope = rays.slope[:n]
+    rise = rays.rise[:n]
+    weight = rays.weight[:n]
+    tilt = rays.tilt[:n]
+    ratio = rays.ratio[:n]
+    length = rays.length[:n]
+    cross = rays.cross[:n]
+    pace = rays.pace[:n]
+    level = rays.level[:n]
+    acc = rays.acc[:n]
+    m0 = fan.m0
+    sz = grid.sz
+    st = grid.st
+    nz = float(grid.nz)
+    square_l = grid.square_l
+    square_t = grid.square_t
+    square_z = grid.square_z
+    reach = fan.begin - st
+    begin = fan.begin
     for q in range(n):
-        m, up = slope[q], rise[q]
+        m = slope[q]
+        up = rise[q]
         inverse = 1.0 / m
         weight[q] = np.float32(inverse)
         tilt[q] = np.float32(m - m0)
@@ -282,7 +353,8 @@ def start(grid, fan, rays, work, n):
         acc[q] = ZERO
     if not fan.spread:
         ratio[:] = ZERO
-    head, following = work.head, rays.following
+    head = work.head
+    following = rays.following
     for j in range(fan.j0, fan.j1):
         head[j] = NONE
     stop = float(fan.j1)
@@ -313,7 +385,8 @@ def make_found(room):
 @maker
 def make_rays(room):
     """Create arrays for fans of up to `room` rays."""
-    f32, u32 = np.float32, np.uint32
+    f32 = np.float32
+    u32 = np.uint32
     return Rays(
         slope=np.empty(room),
         rise=np.empty(room),

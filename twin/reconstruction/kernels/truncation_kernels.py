@@ -23,7 +23,9 @@ MAX_STEPS = 100
 """Largest number of evaluations of a fit: usually a dozen is enough."""
 MIN_GAIN = 1e-10
 """Relative fall of the cost below which a fit ends."""
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1.0, 1e-9, 1e9
+FIRST_DAMPING = 1.0
+LEAST_DAMPING = 1e-9
+MOST_DAMPING = 1e9
 MIN_CHORD_SHARE = 1e-3
 """Share of the longest chord, squared, below which its slope is limited: at the rim
 itself it is infinite."""
@@ -164,7 +166,8 @@ def continue_rows(
         upper = lengths[view, min(band[r] + 1, bands - 1)]
         flat = across[view]
         high = up[view, r]
-        part, other = share[r], cols - edge
+        part = share[r]
+        other = cols - edge
         low = _edge_mean(line, before, 0, edge, lower, upper, part, flat, high)
         top = _edge_mean(line, before, other, cols, lower, upper, part, flat, high)
         row = out[view, r]
@@ -203,7 +206,8 @@ def _cost(x, source, rays, length, seen, scale):
         seen: (n, k) line integrals in the plane.
         scale: deviation from which on rays count less.
     """
-    e, f = math.exp(x[2]), math.exp(x[3])
+    e = math.exp(x[2])
+    f = math.exp(x[3])
     attenuation = math.exp(x[5])
     total = 0.0
     for i in range(len(seen)):
@@ -237,7 +241,8 @@ def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradi
         matrix: (6, 6) lower triangle filled.
         gradient: (6,) filled.
     """
-    e, f = math.exp(x[2]), math.exp(x[3])
+    e = math.exp(x[2])
+    f = math.exp(x[3])
     attenuation = math.exp(x[5])
     matrix[:] = 0.0
     gradient[:] = 0.0
@@ -327,14 +332,13 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
     scale: deviation from which on rays count less.
     x: (6,) of `Prism.of`; the first guess, then the result.
     """
-    slope, gradient, step = (
-        np.empty(PARAMETERS),
-        np.empty(PARAMETERS),
-        np.empty(PARAMETERS),
-    )
+    slope = np.empty(PARAMETERS)
+    gradient = np.empty(PARAMETERS)
+    step = np.empty(PARAMETERS)
     matrix = np.empty((PARAMETERS, PARAMETERS))
     factor = np.empty((PARAMETERS, PARAMETERS))
-    free, trial = np.empty(PARAMETERS, np.bool_), np.empty(PARAMETERS)
+    free = np.empty(PARAMETERS, np.bool_)
+    trial = np.empty(PARAMETERS)
     for a in range(PARAMETERS):
         x[a] = min(max(x[a], least[a]), most[a])
     cost = _cost(x, source, rays, length, seen, scale)
