@@ -39,7 +39,9 @@ def newest_frame(folder: Path) -> tuple[Path, float] | None:
             if not path.name.startswith(("di", "io")):
                 found.append((path.stat().st_mtime, path))
     written, newest = max(found, default=(0.0, None))
-    return None if newest is None else (newest, written)
+    if newest is None:
+        return None
+    return (newest, written)
 
 
 @dataclass(frozen=True)

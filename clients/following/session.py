@@ -88,7 +88,8 @@ class FollowSession:
             at: time by the session's clock [s]; now without.
             late_s: how long it may have waited.
         """
-        at = self.clock() if at is None else at
+        if at is None:
+            at = self.clock()
         self._keep(data, at, late_s)
         try:
             said = heard(data, self._axes, self.time_of_day(at), late_s)

@@ -143,7 +143,9 @@ class ConnectedTwin:
         if not path.is_file() or path.stat().st_size > MAX_SCRIPT:
             return None
         script = path.read_bytes()
-        return None if script == self.sequence else script
+        if script == self.sequence:
+            return None
+        return script
 
     async def ask(
         self, method: str, params: Mapping[str, object] | None = None

@@ -218,7 +218,10 @@ class Echoes:
                 line.command.command.startswith("set ")
                 and line.command.component != "scanner"
             )
-            reply = line.command.arg1 if echoed else ""
+            if echoed:
+                reply = line.command.arg1
+            else:
+                reply = ""
             if line.command.command.startswith("REPEAT UNTIL"):
                 reply = "TRUE"
             if moved and axis:

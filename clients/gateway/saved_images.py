@@ -277,7 +277,9 @@ def kind_of_file(file: str) -> FrameKind:
     """Determine the kind of an image from its file name; a preview counts as a
     projection."""
     kind = kind_of(file)
-    return "projection" if kind == "preview" else kind
+    if kind == "preview":
+        return "projection"
+    return kind
 
 
 def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:

@@ -76,7 +76,9 @@ def component_type(component: str, axes: Collection[str]) -> ComponentType | Non
         return _FIXED[name]
     if name in axes or grammar.is_reserved(name):
         return "motor"
-    return "other" if name.lower() == "sc" else None
+    if name.lower() == "sc":
+        return "other"
+    return None
 
 
 def known_commands(component: str) -> tuple[str, ...]:

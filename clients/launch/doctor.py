@@ -198,7 +198,10 @@ def listening(what: str, port: int) -> CheckOutcome:
             taken = error
         else:
             return CheckOutcome(name, "ok", f"free for the {what}")
-    answer = _greeting(port) if what == "twin" else ""
+    if what == "twin":
+        answer = _greeting(port)
+    else:
+        answer = ""
     if answer:
         return CheckOutcome(name, "ok", f"{answer} listens")
     advice = f"fine if that is your {what}; else choose another port"

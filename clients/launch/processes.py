@@ -224,7 +224,10 @@ class LocalTwin:
             name: value for name, value in options.items() if value is not None
         }
         self._viewer = viewer
-        self._folder = None if data is None else Path(data)
+        if data is None:
+            self._folder = None
+        else:
+            self._folder = Path(data)
         self._running: tuple[ExitStack, Servers, TwinClient, Path] | None = None
 
     def __enter__(self) -> TwinClient:

@@ -75,7 +75,10 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         }
         # A restarted twin continues from its stored state, even if the first start was
         # `fresh`.
-        again = {"fresh": False} if "twin" in known else {}
+        if "twin" in known:
+            again = {"fresh": False}
+        else:
+            again = {}
         return (
             "flexdt.server.twin.main",
             *words(shared(options, TwinSettings) | own | again),
@@ -118,7 +121,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
 
 def port_of(name: str, asked: int, known: Addresses) -> int:
     """Return the port of a service: the one it had before, else `asked`."""
-    return known[name].port if name in known else asked
+    if name in known:
+        return known[name].port
+    return asked
 
 
 def port_problem(option: str, host: str, port: int) -> str | None:

@@ -86,7 +86,10 @@ def blurred(
     Raises:
         LimitError: a blur wider than `MAX_SIGMA_PX`.
     """
-    across = sigma_px if across_px is None else across_px
+    if across_px is None:
+        across = sigma_px
+    else:
+        across = across_px
     if not (widest := max(sigma_px, across)) <= MAX_SIGMA_PX:
         message = f"a blur of {widest:.3g} pixels (standard deviation)"
         cure = "a smaller focal spot, less power, less magnification or larger pixels"

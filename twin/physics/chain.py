@@ -115,7 +115,10 @@ def expected_signal(
         dark = np.zeros(shape, np.float32)
         return Expected(dark, dark)
     row = np.asarray(view, dtype=np.float64)
-    count = paths_mm.shape[1] if paths_mm.ndim == 4 else 1
+    if paths_mm.ndim == 4:
+        count = paths_mm.shape[1]
+    else:
+        count = 1
     moments = paths_mm.reshape(len(chain.substances), count, *shape)
     mean, variance = beam_of(chain, exposure.kV).transmit(moments)
     one = mean.mean(axis=0)

@@ -244,7 +244,10 @@ class Tube:
             >>> Tube(filters=(), spot_mm=0.02).model().smallest_spot_mm
             0.02
         """
-        given = TubeModel() if design is None else design
+        if design is None:
+            given = TubeModel()
+        else:
+            given = design
         if self.filters is None:
             layers = given.filters
         else:

@@ -97,7 +97,9 @@ def _numbered(names: list[str]) -> Ordered | None:
     numbers = [*map(int, parts)]
     step, rest = divmod(numbers[-1] - numbers[0], len(names) - 1)
     even = not rest and numbers == [*range(numbers[0], numbers[-1] + 1, step)]
-    return Ordered(tuple(names)) if even else None
+    if even:
+        return Ordered(tuple(names))
+    return None
 
 
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
@@ -118,7 +120,9 @@ def duplicate(one: str, other: str) -> Finding:
 
 
 def _is(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"
+    if len(names) == 1:
+        return "is"
+    return "are"
 
 
 def _keys(names: Sequence[str]) -> dict[str, Key]:
