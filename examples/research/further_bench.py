@@ -137,32 +137,46 @@ def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
 
 
 FDK_SHAPE = (380, 478)
-FDK_WHAT = "360 views of 478 x 380 into 256^3"
+FDK_SIZES: Mapping[str, tuple[int, int]] = {"FDK": (360, 256), "FDK-small": (180, 192)}
+"""Name -> views, and voxels along an edge of a grid of 51.2 mm; the small one ends soon on
+a busy machine, too."""
 
 
-def fdk_scan() -> tuple[ConeVec, Volume]:
-    """360 views of 478 x 380 pixels, and a grid of 256^3."""
-    return circle(360, FDK_SHAPE, pitch=0.3), Volume(np.zeros((256,) * 3), 0.2)
+def fdk_what(size: str) -> str:
+    """Describe one of `FDK_SIZES`."""
+    views, edge = FDK_SIZES[size]
+    return f"{views} views of {FDK_SHAPE[1]} x {FDK_SHAPE[0]} into {edge}^3"
 
 
-def fdk_names() -> list[str]:
-    """Names of what `fdk_entries` measures: `FDK` is of an object that is seen whole."""
-    return ["FDK" if kind == FIRST else f"FDK-{kind}" for kind in KINDS]
+def fdk_scan(size: str = "FDK") -> tuple[ConeVec, Volume]:
+    """Make the views and the grid of one of `FDK_SIZES`."""
+    views, edge = FDK_SIZES[size]
+    grid = Volume(np.zeros((edge,) * 3), 51.2 / edge)
+    return circle(views, FDK_SHAPE, pitch=0.3), grid
 
 
-def fdk_entries(wanted: Callable[[str], bool], part: frozenset[str]) -> list[Entry]:
+def fdk_names(size: str) -> list[str]:
+    """Names of what `fdk_entries` measures; the size's own is of an object that is seen
+    whole."""
+    return [size if kind == FIRST else f"{size}-{kind}" for kind in KINDS]
+
+
+def fdk_entries(
+    size: str, wanted: Callable[[str], bool], part: frozenset[str]
+) -> list[Entry]:
     """FDK of four kinds of images, against RTK's, without and with `errors`.
 
     Processor seconds and the most memory that arrays take beside the images come from calls of
     their own, and are also told as multiples of those of the object seen whole.
     """
-    geometry, grid = fdk_scan()
+    geometry, grid = fdk_scan(size)
     entries: list[Entry] = []
-    for name, kind in zip(fdk_names(), KINDS, strict=True):
+    for name, kind in zip(fdk_names(size), KINDS, strict=True):
         if wanted(name):
             images = KINDS[kind](geometry, FDK_SHAPE)
-            entries.append(fdk_entry(name, kind, images, geometry, grid, part))
-    first = next((entry for entry in entries if entry["name"] == "FDK"), None)
+            what = f"{fdk_what(size)}, {kind}; error: of the middle's mean"
+            entries.append(fdk_entry(name, kind, what, images, geometry, grid, part))
+    first = next((entry for entry in entries if entry["name"] == size), None)
     for entry in entries if first is not None else ():
         entry["times_whole"] = entry["cpu_ms"] / first["cpu_ms"]
         entry["memory_times_whole"] = entry["peak_MB"] / first["peak_MB"]
@@ -172,6 +186,7 @@ def fdk_entries(wanted: Callable[[str], bool], part: frozenset[str]) -> list[Ent
 def fdk_entry(
     name: str,
     kind: str,
+    what: str,
     images: Float32Array,
     geometry: ConeVec,
     grid: Volume,
@@ -195,7 +210,6 @@ def fdk_entry(
         other = rtk.Rtk(rtk_fdk, images, geometry.rows, *place, pad)
         calls["itk-rtk"] = other.run
     try:
-        what = f"{FDK_WHAT}, {kind}; error: of the middle's mean"
         entry = timed(name, 1, calls, what, frozenset({"itk-rtk"}))
         if kind != "noise":
             entry["mean_error"] = _middle_error(made["flexdt"])
@@ -454,7 +468,9 @@ def _fdk_bound(rate: float) -> Entry:
         asked += float((4 * (np.ptp(corners, axis=0) + 2) * high).sum())
     call = partial(fdk, images, geometry, grid)
     least = images.nbytes + grid.data.nbytes
-    entry = _bound(BOUNDS[-1], FDK_WHAT, call, rate, least, asked + grid.data.nbytes, 1)
+    entry = _bound(
+        BOUNDS[-1], fdk_what("FDK"), call, rate, least, asked + grid.data.nbytes, 1
+    )
     with contextlib.ExitStack() as stack:
         for name in ("weigh", "stand_up", "backproject"):
             stack.enter_context(mock.patch.object(kernels, name))
@@ -767,7 +783,7 @@ GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Entry]]
     ("scene-C1", "scene-C3"): lambda wanted, part: scenes(),
     ("mesh",): lambda wanted, part: meshes(part),
     tuple(adjoint_names()): lambda wanted, part: adjoint(wanted),
-    tuple(fdk_names()): fdk_entries,
+    **{tuple(fdk_names(size)): partial(fdk_entries, size) for size in FDK_SIZES},
     ("cold-cached", "cold-uncached"): lambda wanted, part: cold_start(),
     ("server-C1",): lambda wanted, part: through_server(),
     BOUNDS: lambda wanted, part: bounds(wanted),
