@@ -13,7 +13,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
@@ -46,6 +46,8 @@ class _Work:
         inner: name of the work within it, "" if there is none.
         shown: the bar; None before it is drawn.
         lock: held while it is drawn or ended.
+        ended: whether it has ended.
+        covered: whether other work is shown in its place.
     """
 
     what: str
@@ -57,6 +59,7 @@ class _Work:
     shown: Shown | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
     ended: bool = False
+    covered: Callable[[], bool] = lambda: False
 
     def advance(self, done: float) -> None:
         """Note the fraction that is done."""
@@ -89,7 +92,7 @@ class _Work:
         when to show it next.
         """
         with self.lock:
-            if self.ended or not LOG.isEnabledFor(logging.WARNING):
+            if self.ended or self.covered() or not LOG.isEnabledFor(logging.WARNING):
                 return
             if self.shown is None:
                 self.shown = shown_on(LOG)
@@ -298,3 +301,32 @@ def _renamed(outer: _Work | None, what: str) -> Iterator[None]:
         yield
     finally:
         outer.inner = before
+
+
+@contextmanager
+def silence_shown(what: str) -> Iterator[Callable[[], None]]:
+    """Show that a program works, from two seconds on until it has said something.
+
+    Work that this thread shows meanwhile is shown in its place.
+
+    Args:
+        what: name of what the program does.
+
+    Yields:
+        A function that ends this, for the program's first words.
+    """
+    works, now = _threads.works, time.monotonic()
+    work = _Work(what, now, now + SILENT_S, covered=lambda: bool(works))
+    left = [work]
+
+    def end() -> None:
+        """Show it no longer; a second call does nothing."""
+        if left:
+            _progress_thread.remove(left.pop())
+            work.end()
+
+    _progress_thread.add(work)
+    try:
+        yield end
+    finally:
+        end()

@@ -14,6 +14,11 @@ __all__ = ["main"]
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line; leaves with the exit codes of docs/command-line.md."""
-    from flexdt.clients.cli.command_tree import run
+    from flexdt.clients.cli.console import waited_for
 
-    sys.exit(run(sys.argv[1:] if argv is None else list(argv)))
+    words = sys.argv[1:] if argv is None else list(argv)
+    with waited_for(words):
+        from flexdt.clients.cli.command_tree import run
+
+        code = run(words)
+    sys.exit(code)

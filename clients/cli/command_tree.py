@@ -36,7 +36,7 @@ from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scanner_commands as scanner
 from flexdt.clients.cli.commands import script_commands as scripts
 from flexdt.clients.cli.completed_commands import completed
-from flexdt.clients.cli.console import hush, note, printable, speak
+from flexdt.clients.cli.console import COMPLETION_VARIABLE, hush, note, printable, speak
 from flexdt.clients.cli.options import Json, Server, TokenFile, Verbose, argument, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
@@ -351,7 +351,6 @@ def _version(asked: bool) -> None:
 
 
 REMOVED_COMMANDS = ("backup", "restore")
-COMPLETION_VARIABLE = "_FLEXDT_COMPLETE"
 
 
 def run(argv: Sequence[str]) -> int:

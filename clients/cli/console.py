@@ -13,9 +13,9 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, TextIO
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from flexdt.twin import long_work
 
@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 
+COMPLETION_VARIABLE: Final = "_FLEXDT_COMPLETE"
+"""Variable of the environment by which a shell requests completions."""
+QUIET: Final = frozenset({"-q", "--quiet"})
+"""Options that show no progress."""
+SERVERS: Final = ("up", "twin", "projector", "viewer", "gateway")
+"""Commands that run until they are stopped."""
 _quiet = False
 """Whether progress is not shown."""
 
@@ -59,8 +65,40 @@ def hush(stream: TextIO) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+_silences: list[Callable[[], None]] = []
+"""Called once, with the first words of a command."""
+
+
+def _end_silence() -> None:
+    """Show no longer that a command has said nothing."""
+    while _silences:
+        _silences.pop()()
+
+
+@contextmanager
+def waited_for(words: Sequence[str]) -> Iterator[None]:
+    """Show on a terminal that a command works, until it prints something.
+
+    Args:
+        words: of the command line; nothing is shown of help, completion, servers and
+            quiet commands.
+    """
+    if not (words and sys.stderr.isatty()) or COMPLETION_VARIABLE in os.environ:
+        yield
+        return
+    if words[0].startswith("-") or words[0] in SERVERS or QUIET & {*words}:
+        yield
+        return
+    from flexdt.runtime.progress_lines import silence_shown
+
+    with silence_shown(f"at flexdt {words[0]}") as end:
+        _silences.append(end)
+        yield
+
+
 def say(text: str = "", end: str = "\n") -> None:
     """Print a line of the result to standard output."""
+    _end_silence()
     try:
         print(text, end=end, flush=True)
     except BrokenPipeError:
@@ -69,6 +107,7 @@ def say(text: str = "", end: str = "\n") -> None:
 
 def note(text: str) -> None:
     """Write a line of progress or a warning to standard error."""
+    _end_silence()
     try:
         print(text, file=sys.stderr, flush=True)
     except BrokenPipeError:
@@ -188,6 +227,7 @@ class ProgressBar:
         is quiet."""
         if _quiet:
             return self
+        _end_silence()
         if self._terminal:
             from rich.console import Console
             from rich.progress import MofNCompleteColumn, Progress, TextColumn

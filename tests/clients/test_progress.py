@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
+from flexdt.clients.cli import console
 from flexdt.runtime import progress_bars, progress_lines
 from flexdt.twin import long_work
 
@@ -78,6 +79,47 @@ def test_a_bar_is_drawn_after_a_while_and_goes(screen: Terminal) -> None:
     drawn = screen.getvalue()
     time.sleep(0.1)
     assert screen.getvalue() == drawn
+
+
+def test_a_program_is_shown_until_its_first_words(screen: Terminal) -> None:
+    """Imports and plans of a command are no silence; its own work is shown in its place."""
+    with progress_lines.silence_shown("at flexdt check") as first_words:
+        until(lambda: "at flexdt check" in screen.getvalue())
+        with long_work.during("measuring") as advance:
+            advance(0.25)
+            until(lambda: "25 %" in screen.getvalue())
+            drawn = screen.getvalue().rindex("measuring")
+            time.sleep(0.1)
+            assert "at flexdt check" not in screen.getvalue()[drawn:]
+        first_words()
+        drawn = len(screen.getvalue())
+        time.sleep(0.1)
+        assert screen.getvalue()[drawn:] == ""
+        first_words()
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ("check a.txt", True),
+        ("", False),
+        ("--help", False),
+        ("up", False),
+        ("check a.txt -q", False),
+        ("twin --port 1", False),
+    ],
+)
+def test_commands_show_their_silence_but_for_servers_help_and_quiet_ones(
+    words: str, shown: bool, screen: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", screen)
+    with console.waited_for(words.split()):
+        if shown:
+            until(lambda: "at flexdt check" in screen.getvalue())
+            console.note("words")
+            drawn = len(screen.getvalue())
+        time.sleep(0.1)
+    assert screen.getvalue()[drawn if shown else 0 :] == ""
 
 
 def test_short_work_shows_nothing(
