@@ -70,6 +70,7 @@ class Bias:
         causes: angles, aside, cone, rows, beyond or drift -> its largest change [1/mm],
             (nz, ny, nx).
         contradiction: between images and geometry, with which nothing is bounded.
+        widening: factor of all causes, of images that fit less well than usual.
     """
 
     found: Volume
@@ -77,11 +78,12 @@ class Bias:
     inside: npt.NDArray[np.bool_]
     causes: dict[str, FloatArray]
     contradiction: Contradiction | None = None
+    widening: float = 1.0
 
     @cached_property
     def total(self) -> Float32Array:
         """Bound at the nodes [1/mm]."""
-        flaws = np.sum(list(self.causes.values()), axis=0)
+        flaws = self.widening * np.sum(list(self.causes.values()), axis=0)
         return np.asarray(FDK_ERROR_SHARE * np.abs(self.found.data) + flaws, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
@@ -122,7 +124,8 @@ class Bias:
             inside &= self.even > MIN_EVENNESS
         if not inside.any():
             return None
-        off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
+        share = self.widening / value[inside]
+        off = {cause: share * flaw[inside] for cause, flaw in self.causes.items()}
         most = float(np.percentile(self.total[inside] / value[inside], 90.0))
         usual = USUAL_FLOOR + sum(
             USUAL_SHARE[cause] * part for cause, part in off.items()
@@ -179,8 +182,10 @@ def _bias_of(scan: CoarseScan) -> Bias:
     causes: dict[str, FloatArray] = {}
     bias = Bias(scan.grid.like(found), nodes.even, nodes.inside, causes)
     comparison = compared(scan)
-    if comparison is not None and (seen := comparison.contradiction()) is not None:
-        return replace(bias, contradiction=seen)
+    if comparison is not None:
+        if (seen := comparison.contradiction()) is not None:
+            return replace(bias, contradiction=seen)
+        bias = replace(bias, widening=comparison.widening)
 
     def add(cause: str, share: float, change: Float32Array) -> None:
         causes[cause] = causes.get(cause, 0.0) + share * _about(change, nodes.even)

@@ -43,6 +43,9 @@ def fdk(
 ) -> Volume:
     """Reconstruct attenuation from line integrals of a circular or helical scan.
 
+    Line integrals are taken as they are: dead, hot and flickering pixels are interpolated by
+    `DataSet.reconstruct` alone, which knows counts and flat images.
+
     Args:
         projections: (n, rows, cols) line integrals.
         cone_vec: ConeVec or (n, 12) [mm].

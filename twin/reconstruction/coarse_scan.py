@@ -43,7 +43,7 @@ VIEWS: Final = 180
 """Largest number of views: enough for the nodes and a panel moved aside."""
 COMPARED_VIEWS: Final = 2.0
 """Views per column, about, of a scan whose images are compared with its volume."""
-COMPARED_ROWS: Final = 6
+COMPARED_ROWS: Final = 16
 """Least rows of that scan, if the panel has so many."""
 PARALLEL_SOURCE_RADII: Final = 50.0
 """Distance of the source for parallel rays, in radii of the scan."""
@@ -136,19 +136,22 @@ class CoarseScan:
             images, scan, circle, circle.angle[numbers], truncation, numbers, binned
         )
 
-    def thinned(self, *, all_views: bool = False) -> CoarseScan:
+    def thinned(
+        self, *, all_views: bool = False, least_rows: int = COMPARED_ROWS
+    ) -> CoarseScan:
         """Take fewer views and rows of a circle: enough to compare images with the
         projections of a volume of them gives when it is projected again.
 
         Args:
             all_views: take fewer rows alone.
+            least_rows: that are left, if the panel has so many.
         """
         count, rows, cols = self.images.shape
         if all_views:
             each = 1
         else:
             each = max(1, round(count / (COMPARED_VIEWS * cols)))
-        down = max(1, rows // COMPARED_ROWS)
+        down = max(1, rows // least_rows)
         rows -= rows % down
         chosen = slice(None, None, each)
         part = window(self.cone_vec[chosen], self.images.shape[1:], (0, rows), (0, cols))

@@ -32,7 +32,13 @@ MAX_MUCH_BETTER_MISFIT: Final = 0.7
 where the coarse volume shows no edges."""
 MIN_DOUBTFUL_MISFIT: Final = 1.4
 """Residual over that of the second reconstruction, below which an explanation counts
-only if its volume differs: more than half of right scans."""
+only if its volume differs: more than half of right scans. Above it bounds grow in
+proportion."""
+MIN_CHANGE: Final = 0.01
+"""Least relative change of uniform regions by an explanation that is named: a tilted
+panel's images may fit mirrored rows better, whose volume is the same."""
+RIVALS_ROWS: Final = 6
+"""Least rows of a scan whose images fit, in which explanations are compared with it."""
 MIN_VIEWS: Final = 12
 """Least number of views and coarse columns; with fewer a volume fits anything and no
 result is given."""
@@ -97,7 +103,8 @@ def compared(scan: CoarseScan) -> Comparison | None:
         scan: coarse; some of its views and rows are compared.
 
     Returns:
-        None for helices, and for scans of too few views or columns.
+        None for helices, for scans of too few views or columns, and where images fit of
+        which the panel cuts a part off.
     """
     if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < MIN_VIEWS:
         return None
@@ -105,7 +112,11 @@ def compared(scan: CoarseScan) -> Comparison | None:
     trial = Trial(thin)
     if not trial.telling.all() and len(thin.images) < len(scan.images):
         trial = Trial(scan.thinned(all_views=True))
-    return Comparison(trial)
+    if trial.excess >= MIN_DOUBTFUL_MISFIT:
+        return Comparison(trial, doubtful=True)
+    if not trial.whole:
+        return None
+    return Comparison(Trial(scan.thinned(least_rows=RIVALS_ROWS)), doubtful=False)
 
 
 class Comparison:
@@ -113,29 +124,43 @@ class Comparison:
 
     Args:
         trial: of the scan's stated geometry.
+        doubtful: the residual is larger than of most scans, so that explanations are
+            named; else only those are that fit as well and change the volume.
     """
 
-    def __init__(self, trial: Trial) -> None:
+    def __init__(self, trial: Trial, *, doubtful: bool) -> None:
         self._trial = trial
-        self._unfit = trial.whole and trial.even and trial.excess > MAX_MISFIT
+        self._doubtful = doubtful
+        fits = not doubtful or trial.excess <= MAX_MISFIT
+        self._unfit = trial.whole and trial.even and not fits
         self._tried: list[Tried] = []
-        doubtful = trial.excess >= MIN_DOUBTFUL_MISFIT
-        if not trial.telling.any() or not (doubtful or trial.whole):
-            return
-        others = trial.others(far=self._unfit, mirrored=doubtful)
-        self._tried = [trial.opposite(), *others]
+        if trial.telling.any():
+            others = trial.others(far=self._unfit, mirrored=doubtful)
+            self._tried = [trial.opposite(), *others]
+
+    @property
+    def widening(self) -> float:
+        """Factor of a bound where the images fit less well than those of most scans."""
+        if not self._tried or not self._doubtful or not self._trial.whole:
+            return 1.0
+        return self._trial.excess / MIN_DOUBTFUL_MISFIT
 
     def contradiction(self) -> Contradiction | None:
         """Find the error of the scan's geometry; None if there is none."""
         trial = self._trial
-        if not self._tried or trial.excess < MIN_DOUBTFUL_MISFIT:
+        if not self._tried or not self._doubtful:
             return None
         if trial.whole and trial.even and trial.telling.all():
             better = MAX_BETTER_MISFIT
         else:
             better = MAX_MUCH_BETTER_MISFIT
-        best = min(self._tried, key=lambda one: one.score)
-        if best.score < better and trial.excess_of(best) <= MAX_MISFIT:
+        other = [one for one in self._tried if one.change > MIN_CHANGE]
+        best = min(other, key=lambda one: one.score, default=None)
+        if (
+            best is not None
+            and best.score < better
+            and trial.excess_of(best) <= MAX_MISFIT
+        ):
             return self._named(self._as_good_as(best), best.score)
         if self._unfit:
             return Contradiction(trial.excess)
@@ -159,8 +184,11 @@ class Comparison:
             return None
         best = min(rivals, key=lambda one: one.score)
         as_good = [one for one in self._as_good_as(best) if one in rivals]
-        better = best.evidence < -MIN_EVIDENCE_SIGMAS
-        decided = better and trial.excess >= MIN_DOUBTFUL_MISFIT
+        decided = (
+            best.evidence < -MIN_EVIDENCE_SIGMAS
+            and best.score < MAX_BETTER_MISFIT
+            and self._doubtful
+        )
         if decided:
             change = None
         else:

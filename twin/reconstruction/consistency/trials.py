@@ -113,7 +113,7 @@ class Trial:
             mirrored: images mirrored or turned, too; a panel in the middle sees the
                 opposite rotation so.
         """
-        listed = suspects(self.scan, whole=self.whole and self.even)
+        listed = suspects(self.scan, whole=self.whole)
         chosen = [one for one in listed if mirrored or one.kind not in MIRRORED]
         return [*self._beside(far), *map(self._tried, chosen)]
 
