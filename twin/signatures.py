@@ -345,7 +345,7 @@ class Known:
         hint = ""
         if swapped:
             hint = f"; are {label} and {swapped[-1]} in the wrong order?"
-        elif name in dir(value) and not isinstance(value, type):
+        elif type(value).__module__.startswith("flexdt") and name in dir(value):
             hint = f"; its .{name} may be meant"
         described = re.search(
             rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M

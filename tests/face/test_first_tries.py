@@ -115,6 +115,9 @@ def test_a_result_in_place_of_its_correction_names_it() -> None:
     data = fx.DataSet.from_arrays(COUNTS, SCAN, flat=np.full((12, 16), 1000))
     with pytest.raises(fx.TwinError, match=r"its \.correction may be meant"):
         data.with_correction(data.align())  # type: ignore[arg-type]
+    with pytest.raises(fx.TwinError) as told:
+        data.counts("abc")  # type: ignore[arg-type]
+    assert "may be meant" not in str(told.value)
 
 
 def test_a_misspelt_name_of_the_library_has_a_suggestion() -> None:
