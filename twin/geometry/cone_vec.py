@@ -935,8 +935,7 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
             one.
 
     Example:
-        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96),
-        pixel=0.15)
+        >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
         >>> check_cone_vec(scan, 0.15) is scan
         True
     """
