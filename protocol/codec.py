@@ -130,7 +130,7 @@ def read_msgpack(data: bytes | bytearray | memoryview) -> object:
 
     Raises:
         ValueError: incomplete, followed by more bytes, nested deeper than `MAX_DEPTH`, no
-            UTF-8, an extension type or a timestamp; the message says which.
+            UTF-8, an extension type or a timestamp; the message names it.
     """
     size = len(data)
     # A first pass that builds nothing: every declared member must be there, or else a few bytes

@@ -550,7 +550,7 @@ def _require_text_names(value: object, where: str) -> None:
         where: path of `value`, for the message.
 
     Raises:
-        TypeError: a name of another type; says where.
+        TypeError: a name of another type; names the place.
     """
     if isinstance(value, Mapping):
         for name, inner in value.items():

@@ -160,7 +160,7 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 
 
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
-    """Read the settings that a scan's script asks for.
+    """Read the settings that a scan's script requests.
 
     Args:
         scan: with the commands of its script.

@@ -342,7 +342,7 @@ def _add(
 
 
 def _version(asked: bool) -> None:
-    """Print the version and exit, if asked for."""
+    """Print the version and exit, if requested."""
     if asked:
         from importlib.metadata import version
 

@@ -122,7 +122,7 @@ class KeptConnection:
         """Keep the connection until cancelled: connect again after each loss, with growing
         pauses; may be called again after that.
 
-        `problem` says why there is none, and `on_change` is called when that changes.
+        `problem` is the reason why there is none, and `on_change` is called when that changes.
         """
         core = self._client.core
         pauses = back_off(FIRST_PAUSE_S)

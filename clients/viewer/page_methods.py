@@ -796,7 +796,7 @@ async def serve(
     Args:
         name: of METHODS.
         viewer: the viewer.
-        page: that asks.
+        page: that calls.
         given: parameters.
 
     Raises:

@@ -256,7 +256,7 @@ def load(
 
 
 def _json(path: Path, given: Given) -> ScanGeometry:
-    """Read our own document, or a CTSimU scenario: the document tells which.
+    """Read our own document, or a CTSimU scenario, by its content.
 
     Args:
         path: file.

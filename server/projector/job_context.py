@@ -133,7 +133,7 @@ class Context:
         each is written.
 
         Args:
-            client: that asked.
+            client: that called.
             id: of its request.
             array: values, sent flat in C order.
             start: index of the array's first value in the whole result.

@@ -45,7 +45,7 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
 
     Args:
         context: of the server.
-        client: that says hello.
+        client: that connects.
         id: of the request.
         p: token.
 
@@ -116,7 +116,7 @@ async def volume_get(
 
     Args:
         context: of the server.
-        client: that asks.
+        client: that calls.
         id: of the request.
         p: name of the volume.
 
@@ -162,7 +162,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 
     Args:
         context: of the server.
-        client: that asks.
+        client: that calls.
         id: of the request.
         p: parameters.
 
@@ -210,7 +210,7 @@ async def backproject(
 
     Args:
         context: of the server.
-        client: that asks.
+        client: that calls.
         id: of the request.
         p: projections, cone_vec, grid, and perhaps the name of the volume.
 
@@ -242,7 +242,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 
     Args:
         context: of the server.
-        client: that asks.
+        client: that calls.
         id: of the request.
         p: none.
     """

@@ -222,7 +222,7 @@ class ProjectorServer(ListeningServer):
         """Check token, parameters and place of a call, and answer it.
 
         Args:
-            client: that asks.
+            client: that calls.
             id: of the request; None for a notification.
             name: of the method.
             given: parameters, or the error in them.

@@ -40,7 +40,7 @@ Phase = Literal["running", "paused", "done"]
 
 
 def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
-    """Set tube, camera or an axis's rates as `command` says; motion and images are not
+    """Set tube, camera or an axis's rates as `command` has them; motion and images are not
     commands here.
 
     Rates are limited to those that the axis allows now. Commands for components of other

@@ -98,7 +98,7 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
     """Restore a job of an earlier server from its record.
 
     One that had not ended is done if its data set is complete, else incomplete with an
-    error that says how to go on.
+    error with the way to go on.
 
     Args:
         memory: its record.

@@ -23,7 +23,7 @@ PHANTOM_SUFFIXES: Final = (".toml", ".json")
 
 
 def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
-    """Calibrate from data sets as `calibration.fit` asks; blocks, for a worker process.
+    """Calibrate from data sets for `calibration.fit`; blocks, for a worker process.
 
     Args:
         root: the data directory, against which names of data sets and phantom files are
@@ -32,7 +32,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
 
     Returns:
         The calibration's document, with residuals [px], covariances by step and bead
-        tracks where asked for; paths are relative to the data directory.
+        tracks where requested; paths are relative to the data directory.
 
     Raises:
         TwinError: there is no such data set or phantom, or nothing can be fitted.
@@ -83,7 +83,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
 def align(
     root: Directory, asked: p.CalibrationAlign, *_: object
 ) -> p.CalibrationAlignResult:
-    """Align a data set as `calibration.align` asks; blocks, for a worker process.
+    """Align a data set for `calibration.align`; blocks, for a worker process.
 
     Args:
         root: the data directory.

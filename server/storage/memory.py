@@ -270,7 +270,7 @@ class StateStore:
         """Write state and changed jobs now, so that everything answered later survives a
         kill.
 
-        The outcome is kept in `problem`, and told by `noticed`.
+        The outcome is kept in `problem`, and passed to `noticed`.
 
         Raises:
             DatasetWriteError: the system cannot write.

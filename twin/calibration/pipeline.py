@@ -165,9 +165,9 @@ def _detected(
 
 def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
     """Fit to the detected spots: with all six main parameters free if they are identifiable,
-    else with those asked for.
+    else with the requested ones.
 
-    Adds the motion of single frames if asked for, and findings on bead sizes.
+    Adds the motion of single frames if requested, and findings on bead sizes.
 
     Args:
         state: scans with identified spots.

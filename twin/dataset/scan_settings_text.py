@@ -212,7 +212,7 @@ def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
 def _read_line(
     line: str, rest: list[str], values: dict[str, Any], motors: dict[str, MotorLine]
 ) -> None:
-    """Read one line into `values` or `motors`; lines that say nothing known are skipped.
+    """Read one line into `values` or `motors`; lines without anything known are skipped.
 
     Args:
         line: without its end.

@@ -90,7 +90,7 @@ class PredictedExposure:
             None where the physics has no spectrum for the voltage.
         shares: of the pixels behind the sample; None where that is not known.
         doubts: objections to the setting, each with a setting that would do.
-        unpredicted: reason why `shares` is None, in words; empty if nothing was asked.
+        unpredicted: reason why `shares` is None, in words; empty if nothing was requested.
     """
 
     kV: float

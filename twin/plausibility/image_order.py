@@ -129,7 +129,7 @@ def _keys(names: Sequence[str]) -> dict[str, Key]:
     """Compute sort keys of names: their text without the numbers, and the numbers.
 
     Hyphens count as signs where only some names have them, points as decimal points where
-    `_decimal` says so.
+    `_decimal` decides so.
 
     Returns:
         Name -> key.

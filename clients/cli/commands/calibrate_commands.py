@@ -323,7 +323,7 @@ def _require_answer(twin: Twin) -> None:
 def _push(
     twin: Twin, correction: NamedCorrection, source: str, document: Mapping[str, object]
 ) -> None:
-    """Put a correction in force on the twin, and say so on standard error.
+    """Put a correction in force on the twin, with a note on standard error.
 
     Args:
         twin: connects to it.

@@ -300,7 +300,7 @@ def scan_of(
 def _workers(
     scheduler: str | None, slurm: Path | None
 ) -> AbstractContextManager[Executor] | None:
-    """Make the workers that --scheduler or --slurm asks for; None without either.
+    """Make the workers for --scheduler or --slurm; None without either.
 
     Raises:
         TwinError: flexdt-extensions is not installed.

@@ -48,7 +48,7 @@ class Aligned(Generic[Images_co]):
 
     @property
     def verdict(self) -> str:
-        """What was found, with its standard deviations, or why nothing can be told."""
+        """What was found, with its standard deviations, or why nothing was."""
         told = [
             f"{name} {e.value:.6g} +- {e.sigma:.2g} {e.unit}"
             for name, e in self.alignment.parameters.items()

@@ -201,7 +201,7 @@ def _reference(
 
     Args:
         file: its streams.
-        code: type of the pixels where the file does not say it for these.
+        code: type of the pixels where the file does not state it for these.
         shape: (rows, cols).
 
     Returns:

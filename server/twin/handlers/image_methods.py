@@ -39,7 +39,7 @@ async def get_projection(
     truth and noise are in the image.
 
     Returns:
-        The image, encoded for the connection, with marks of its pixels where asked for.
+        The image, encoded for the connection, with marks of its pixels where requested.
 
     Raises:
         RpcError: -32008, it would be larger than an answer may be.

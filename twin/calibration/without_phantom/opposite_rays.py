@@ -96,7 +96,7 @@ class OppositeRays:
             random: for images of noise.
 
         Raises:
-            NotIdentifiableError: too few pairs; the message says which turn would do.
+            NotIdentifiableError: too few pairs; the message names a turn that would do.
         """
         self.frames = frames
         self.top = top

@@ -99,7 +99,7 @@ def lathe(
 def _standing(
     mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str
 ) -> PaintedMesh:
-    """Paint a mesh that was made about z, turned to y if `axis` says so, and moved to its
+    """Paint a mesh that was made about z, turned to y if that is its `axis`, and moved to its
     centre.
     """
     if axis == "y":
