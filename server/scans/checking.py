@@ -310,7 +310,7 @@ def packed_probes(check_input: CheckInput) -> list[bytes]:
 
 
 def _encoded(
-    check_input: CheckInput, codec: Codec, seen: SampleForecast | None
+    check_input: CheckInput, codec: Codec, seen: SampleForecast | None = None
 ) -> list[bytes]:
     """Compute a dry-run report and encode it in pieces of `ANSWER_PIECE` bytes; runs in a
     worker.

@@ -42,8 +42,7 @@ def placement_findings(
         >>> scan = ConeVec.circular(sod=0.6, sdd=1.06, angles=4, pixel=1.5e-4)
         >>> found = placement_findings(scan, (760, 956), [[[-5, -5, -5], [5, 5, 5]]])
         >>> [one.said for one in found]
-        ['the source is inside the box around the sample in 4 of 4 views; are all lengths in
-        mm?']
+        ['the source is inside the box around the sample in 4 of 4 views; are all lengths in mm?']
     """
     parts = np.asarray(boxes, dtype=np.float64)
     if not len(parts) or not len(cone_vec):

@@ -37,6 +37,8 @@ CONTROL_BYTES: Final = bytes(k for k in range(32) if k not in b"\t\n\r")
 """Control characters that separate neither columns nor lines."""
 FEW_PROBLEMS: Final = 20
 """Number of problems that are listed of a text without any command."""
+FOREIGN_CODES: Final = ("syntax", "unknown_component", "unknown_command")
+"""Codes of the problems of a text that is no script at all."""
 LIGHT_BYTES: Final = 8 << 10
 """Longest script, or list of poses, that any thread may plan [bytes]."""
 _MANY_IMAGES = re.compile(rb"(?<!\d)[1-9]\d{4}|\d[eE]\+?\d")
@@ -312,9 +314,6 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     if is_utf16(text):
         what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
         return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
-    if is_binary(text):
-        what = "the file holds binary data; allowed: the text of a scan script"
-        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
     problems: list[ScriptProblem] = []
     if is_log(text):
         what = (
@@ -324,12 +323,16 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
             "columns"
         )
         return c.Script((), (), 0), (ScriptProblem("error", "executed_log", 0, 1, what),)
+    if is_binary(text):  # a log, above, holds binary replies
+        what = "the file holds binary data; allowed: the text of a scan script"
+        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
     commands: list[c.Command] = []
     for row in rows(text):
         command = read_row(row, problems)
         if command is not None:
             commands.append(command)
-    if not commands and len(problems) > FEW_PROBLEMS:
+    foreign = all(p.code in FOREIGN_CODES for p in problems)
+    if foreign and not commands and len(problems) > FEW_PROBLEMS:
         what = (
             f"no line is a command of a scan script; {FEW_PROBLEMS} of {len(problems)} "
             "problems are listed"
