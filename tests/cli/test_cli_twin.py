@@ -18,6 +18,7 @@ import tifffile
 import trimesh
 
 from flexdt.clients.cli.command_tree import run
+from flexdt.clients.client.twin_methods import FINAL_STATES
 from flexdt.clients.launch.processes import Servers
 from tests.support.phantom_texts import BEAD_FILE, SCENE_FILE
 
@@ -245,6 +246,11 @@ def test_detached_run_can_be_watched_and_aborted(
     document(
         "job", "abort", job
     )  # an aborted scan can be taken up again, so end it for good
+    while document("job", "status", job)["state"] not in FINAL_STATES:
+        assert time.monotonic() < deadline
+    for verb in ("abort", "pause"):
+        refused = f"flexdt: nothing to {verb}: no job is queued, running or paused\n"
+        assert flexdt("job", verb) == (4, "", refused)
 
 
 @pytest.mark.slow

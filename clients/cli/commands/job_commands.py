@@ -10,6 +10,7 @@ import typer
 from flexdt.clients.cli.boundary import (
     INTERRUPTED,
     INVALID,
+    REFUSED,
     WIRE_EXIT_CODES,
     positions,
     wire_code,
@@ -153,17 +154,20 @@ def list_jobs(twin: Twin) -> Answer:
     yield table(rows, ("job", "state", "frames", "data set")) if rows else "no jobs yet"
 
 
-def _on_job(does: str, method: str) -> Callable[..., Answer]:
+def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., Answer]:
     """Make a command that acts on one job and shows its new status.
 
     Args:
         does: help of the command.
         method: of the client, called with the job.
+        steers: verb of a command that needs a job that has not ended; None: any job.
     """
 
     def command(twin: Twin, job: Job = None) -> Answer:
         """Call the method for a job of the twin; yield its status as a document and as a line."""
         with twin() as client:
+            if job is None and steers is not None:
+                _require_current(client, steers)
             status: JobStatus = getattr(client, method)(job)
         warn(status.warnings)
         yield status
@@ -171,6 +175,24 @@ def _on_job(does: str, method: str) -> Callable[..., Answer]:
 
     command.__doc__ = does
     return command
+
+
+def _require_current(client: TwinClient, verb: str) -> None:
+    """Check that there is a current job: of a command that names none.
+
+    Args:
+        client: connected to the twin.
+        verb: of the command, for the error.
+
+    Raises:
+        CommandError: no job is queued, running or paused.
+    """
+    from flexdt.clients.client.twin_methods import FINAL_STATES
+
+    if all(job.state in FINAL_STATES for job in client.jobs().jobs):
+        raise CommandError(
+            f"nothing to {verb}: no job is queued, running or paused", REFUSED
+        )
 
 
 def forget(
@@ -208,10 +230,14 @@ def describe(status: JobStatus) -> str:
 JOB_COMMANDS: Final = {
     "list": list_jobs,
     "status": _on_job("Show how far a job is.", "job_status"),
-    "pause": _on_job("Pause a job; a frame under exposure is taken again.", "pause_job"),
+    "pause": _on_job(
+        "Pause a job; a frame under exposure is taken again.", "pause_job", "pause"
+    ),
     "resume": _on_job("Return to the pose of the pause and go on.", "resume_job"),
     "step": _on_job("Run a paused job for one step.", "step_job"),
-    "abort": _on_job("End a job; its data set stays, marked incomplete.", "abort_job"),
+    "abort": _on_job(
+        "End a job; its data set stays, marked incomplete.", "abort_job", "abort"
+    ),
     "forget": forget,
 }
 """Commands of the group by name."""
