@@ -336,13 +336,26 @@ def test_the_sample_is_out_of_the_beam_for_the_flat() -> None:
             ScanRequest(kind="helical", rise_mm=3000, turns=1),
             "raise frames, exposure or averages",
         ),
-        (ScanRequest(kind="helical", turns=30, frames=20_000), "rot_obj target"),
+        (
+            ScanRequest(kind="helical", turns=30, frames=20_000),
+            "rot_obj target .* fewer degrees .* more time",
+        ),
         (ScanRequest(exposure_ms=float("nan")), "exposure_ms"),
     ],
 )
 def test_impossible_wishes_say_why(wish: ScanRequest, says: str) -> None:
     with pytest.raises(LimitError, match=says):
         compose_script(wish, MACHINE, PROFILE)
+
+
+def test_a_turntable_of_one_turn_has_no_room_for_the_run_up() -> None:
+    text = 'base = "flexray"\nname = "one"\n[axes.rot_obj]\nlower = 0.0\nupper = 360.0\n'
+    machine = parse_machine(text, "one.toml")
+    with pytest.raises(
+        LimitError, match=r"rot_obj target -.* step scan has no run-up.* more time"
+    ) as refused:
+        compose_script(ScanRequest(kind="fly"), machine, PROFILE)
+    assert refused.value.data["allowed"] == [0.0, 360.0]
 
 
 def shared_machine(rng: np.random.Generator) -> Machine:

@@ -320,8 +320,9 @@ class _Writer(MotorTargets):
         """Yield the move to the start of the run-up, the scan's speed and its
         numbers of images."""
         name, rotation = self.rotation
+        begin = self.turned_to(-self.run_up_deg(total, frames), total)
         yield from self.drive(name, rotation.speed, rotation.acceleration)
-        yield _row(name, "move absolute", _decimal(-self.run_up_deg(total, frames)))
+        yield _row(name, "move absolute", _decimal(begin))
         yield from self.drive(name, self.turn_speed(total, frames), rotation.acceleration)
         yield _row("camera", "set number of frames", str(frames))
         yield _row("camera", "set number of averages", str(self.request.averages))
@@ -336,7 +337,7 @@ class _Writer(MotorTargets):
             first: number in the first image's file name.
         """
         name = self.rotation[0]
-        end = check_target(self.machine, name, total + self.run_up_deg(total, frames))
+        end = self.turned_to(total + self.run_up_deg(total, frames), total)
         yield _row(name, "move absolute", _decimal(end), "0.000000", "POS")
         yield _row(
             "camera",
@@ -344,6 +345,29 @@ class _Writer(MotorTargets):
             f"{self.request.folder}\\scan_",
             str(first),
         )
+
+    def turned_to(self, angle: float, total: float) -> float:
+        """Check an end of a turn's motion, run-up included, against the rotation's travel.
+
+        Args:
+            angle: target of the rotation [deg].
+            total: angle from first to last image [deg].
+
+        Returns:
+            The target, within the travel.
+
+        Raises:
+            LimitError: beyond the travel; the message names what makes the motion shorter.
+        """
+        try:
+            return check_target(self.machine, self.rotation[0], angle)
+        except LimitError as error:
+            raise LimitError(
+                f"{error}, which {total:g} deg of images and their run-up need; turn by "
+                "fewer degrees (fewer turns; a step scan has no run-up), or give each "
+                "view more time (raise frames, exposure or averages) for a shorter run-up",
+                error.data,
+            ) from None
 
     def turn_speed(self, total: float, frames: int) -> float:
         """Compute the rotation's speed for `frames` images over `total` degrees [deg/s].
