@@ -19,13 +19,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 from flexdt.clients.client.client import TwinClient
+from flexdt.clients.launch.start_checks import require_startable
 from flexdt.library.failure import CommandError
 from flexdt.runtime.process_settings import Physics, Scatter
 from flexdt.runtime.settings import words
 from flexdt.twin import long_work
+from flexdt.twin.errors import TwinError
 from flexdt.twin.long_work import Progress
 from flexdt.twin.signatures import public
 
@@ -188,7 +190,8 @@ class LocalTwin:
         progress: show that the servers start, after two seconds; False for silence.
 
     Raises:
-        ServersError: on entering, they did not start; carries the end of their log.
+        ServersError: on entering: an argument does not hold, which is found before a process
+            starts, or they did not start; carries the end of their log.
 
     Example:
         >>> with LocalTwin(sample="lego") as twin:  # doctest: +SKIP
@@ -220,7 +223,7 @@ class LocalTwin:
             "speed-up": speed_up,
             "truth": truth,
         }
-        self._options = {
+        self._options: dict[str, Any] = {
             name: value for name, value in options.items() if value is not None
         }
         self._viewer = viewer
@@ -243,6 +246,7 @@ class LocalTwin:
             ServersError: they did not start; carries the end of their log.
         """
         if self._running is None:
+            self._check()
             with ExitStack() as stack:
                 own = stack.enter_context(
                     tempfile.TemporaryDirectory(prefix="flexdt-twin-")
@@ -261,6 +265,25 @@ class LocalTwin:
                 atexit.register(self.stop)
                 self._running = stack.pop_all(), servers, client, data
         return self._running[2]
+
+    def _check(self) -> None:
+        """Check machine, profile, sample and data folder.
+
+        Raises:
+            ServersError: one of them does not hold.
+        """
+        given = self._options
+        try:
+            require_startable(
+                given.get("machine"),
+                given.get("profile"),
+                given.get("sample"),
+                self._folder,
+            )
+        except TwinError as error:
+            raise ServersError(str(error)) from None
+        except OSError as error:
+            raise ServersError(f"data: {error.filename}: {error.strerror}") from None
 
     def stop(self) -> None:
         """End the client and the servers, and delete a temporary data folder."""

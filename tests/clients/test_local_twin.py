@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 import flexdt as fx
+from flexdt.clients.cli.command_tree import run
+from flexdt.clients.cli.commands import process_commands
 from flexdt.clients.launch import processes as local_twin
 
 
@@ -77,3 +79,29 @@ def test_a_client_that_cannot_connect_leaves_no_server(
     assert Fake.ended == 1
     local.stop()
     assert Fake.ended == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"machine": "flexrai"}, "'flexrai'.*did you mean 'flexray'"),
+        ({"profile": "nothing"}, "'nothing'"),
+        ({"sample": "leggo"}, "'leggo'.*did you mean 'lego'"),
+        ({"data": "file"}, "file: Not a directory"),
+        ({"data": "file/below"}, "below: Not a directory"),
+    ],
+)
+def test_what_does_not_hold_is_refused_before_a_process_starts(
+    given: dict[str, str], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    monkeypatch.setattr(local_twin.subprocess, "Popen", None)
+    with pytest.raises(local_twin.ServersError, match=says) as refused:
+        fx.LocalTwin(**given).start()  # type: ignore[arg-type]
+    assert len(refused.value.lines) == 1
+    begun: list[object] = []
+    monkeypatch.setattr(process_commands, "become", lambda *words: begun.append(words))
+    [[option, value]] = given.items()
+    assert run(["up", f"--{option}", value]) == 1
+    assert not begun

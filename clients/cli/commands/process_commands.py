@@ -33,6 +33,8 @@ COMPLETED: Final = {
     "sample": value_completion.sample_names,
 }
 """Option of `up` -> function that gives the values that a shell completes."""
+CHECKED_BEFORE_START: Final = ("machine", "profile", "sample", "data")
+"""Options whose values are checked before any process starts."""
 Only = Annotated[
     Literal["twin", "projector", "viewer", "gateway"] | None,
     typer.Option(
@@ -108,19 +110,22 @@ def start(name: str, more: Sequence[str]) -> None:
 
 
 def _check(given: Mapping[str, Any]) -> None:
-    """Check options against each other, and that the machine can be read.
+    """Check options against each other, and machine, profile, sample and data folder.
 
     Raises:
         typer.BadParameter: options that do not go together.
+        TwinError: an unknown name, or a file that does not hold.
+        OSError: the data folder cannot be written.
     """
     if (given.get("tls_cert") is None) != (given.get("tls_key") is None):
         raise typer.BadParameter("--tls-cert and --tls-key go together")
     if given.get("projector") is not None and given["projector_port"] is not None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
-    if given.get("machine") is not None:  # found before any process starts
-        from flexdt.library.machines import machine
+    from flexdt.clients.launch.start_checks import require_startable
 
-        machine(given["machine"])
+    require_startable(
+        **{name: given[name] for name in CHECKED_BEFORE_START if name in given}
+    )
 
 
 def become(

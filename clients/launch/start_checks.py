@@ -1,0 +1,73 @@
+"""What servers are started with, checked before any process is started."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+EMPTY_STAGE: Final = "empty"
+"""Name of the sample that is none."""
+
+
+def require_startable(
+    machine: str | PathLike[str] | None = None,
+    profile: str | PathLike[str] | None = None,
+    sample: str | None = None,
+    data: Path | None = None,
+) -> None:
+    """Check the words that a twin server is started with.
+
+    Args:
+        machine: shipped name or file; None for the FleX-ray.
+        profile: of zero offsets; None for the machine's.
+        sample: on the stage at the start; None for the twin's own.
+        data: the twin's folder, made by the twin if it is missing; None for one of its own.
+
+    Raises:
+        TwinError: an unknown name, or a file that does not hold.
+        OSError: the folder cannot be written.
+    """
+    from flexdt.library import machines
+
+    if machine is not None or profile is not None:
+        machines.profile(profile, machines.machine(machine), _text(machine))
+    if data is not None:
+        _require_folder(data)
+    if sample is not None and not _may_keep_samples(data):
+        _require_sample(sample)
+
+
+def _text(word: str | PathLike[str] | None) -> str | None:
+    """Return a name or path as text."""
+    return None if word is None else str(word)
+
+
+def _require_folder(folder: Path) -> None:
+    """Check that a folder can be written, or made.
+
+    Raises:
+        OSError: it cannot; names the folder.
+    """
+    from flexdt.runtime.files.writable import require_writable
+
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(20, "Not a directory", str(folder))
+    require_writable(folder)
+
+
+def _may_keep_samples(data: Path | None) -> bool:
+    """Check whether a data folder may hold uploads, whose names the twin alone knows."""
+    return data is not None and data.is_dir() and any(data.iterdir())
+
+
+def _require_sample(name: str) -> None:
+    """Check that a sample ships.
+
+    Raises:
+        UnknownNameError: it does not; lists those that do.
+    """
+    from flexdt.phantoms import load_phantom
+
+    if name not in ("", EMPTY_STAGE):
+        load_phantom(name)
