@@ -426,6 +426,11 @@ class _Layers:
     """
 
     def __init__(self, parts: Sequence[Channel], machine: Machine, asked: str) -> None:
+        """Compute the chain of tube, filter, sample and panel for `asked` and for each of
+        `FILTERS`.
+
+        An empty filter name stands for no added filter. `chains`: filter -> chain.
+        """
         panel = detector_of(machine.detector)
         tube = tube_of(machine.tube)
         self.panel = panel

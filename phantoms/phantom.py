@@ -85,6 +85,12 @@ class Phantom(ArrayValue):
     voxels: Voxels | None = None
 
     def __post_init__(self) -> None:
+        """Copy beads (k, 3) and their radii (k,) [mm] as read-only float64.
+
+        Raises:
+            PhantomError: their numbers differ, or a position or size is not finite (radii
+                are not checked for that).
+        """
         beads = np.array(self.beads, dtype=np.float64).reshape(-1, 3)
         radii = np.array(self.bead_radius_mm, dtype=np.float64).reshape(-1)
         if len(radii) != len(beads):

@@ -48,6 +48,9 @@ class Surface(ArrayValue):
     mu_per_mm: Number
 
     def __post_init__(self) -> None:
+        """Copy vertices (n, 3) and faces (m, 3) read-only; raise PhantomError for an unknown
+        vertex.
+        """
         vertices = np.array(self.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.array(self.faces, dtype=np.int32).reshape(-1, 3)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
@@ -77,6 +80,12 @@ class Voxels(ArrayValue):
     materials: tuple[Text, ...] = ()
 
     def __post_init__(self) -> None:
+        """Copy the values (z, y, x) as read-only float32, and the labels, if given, as uint8.
+
+        Raises:
+            PhantomError: they are not 3-D, empty or not finite, or if labels have another
+                shape or a number without a material.
+        """
         data = np.array(self.data, dtype=np.float32)
         if data.ndim != 3 or data.size == 0:
             message = f"voxels have shape {data.shape}"

@@ -53,7 +53,7 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
 
 
 def _unique(pairs: list[tuple[str, object]]) -> None:
-    """Raise ValueError if an object has one name twice."""
+    """Raise ValueError if an object has one name twice; `pairs` are its members, in order."""
     seen: set[str] = set()
     for name, _ in pairs:
         if name in seen:

@@ -82,7 +82,11 @@ class Prepared:
         self._pieces: dict[Codec, list[bytes]] = {}
 
     def encoded(self, codec: Codec) -> list[bytes]:
-        """Return the message's bytes, framing included, in pieces; encode at most once."""
+        """Return the message's bytes, framing included; encoded at the first call for each
+        codec.
+
+        One piece up to `MAX_OVERTAKING_BYTES`, several for a larger message.
+        """
         if codec not in self._pieces:
             pieces = _framed(codec, _body(codec, self.message))
             small = sum(map(len, pieces)) <= MAX_OVERTAKING_BYTES
@@ -106,6 +110,11 @@ class Connection:
         max_message: int = MAX_FRAME,
         max_batch: int = 1000,
     ) -> None:
+        """Make an open connection that has received nothing.
+
+        Without `codec` the first bytes received decide it. `max_message` limits a message
+        in bytes, `max_batch` the number of items of a batch.
+        """
         self.codec = codec
         self.max_message = max_message
         self.max_batch = max_batch
@@ -150,7 +159,11 @@ class Connection:
         return bool(self._begun) or self._skip > 0
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> list[Message]:
-        """Receive bytes from the peer and decode the messages that they complete, in order."""
+        """Receive bytes and decode the messages that they complete, in order.
+
+        Malformed ones are in the list as `Malformed`; an incomplete message waits for
+        more bytes.
+        """
         self.feed(data)
         out: list[Message] = []
         while (raw := self.next_raw()) is not None:
@@ -300,7 +313,12 @@ class Connection:
         return raw
 
     def decode(self, raw: bytes) -> Message:
-        """Decode the bytes that `next_raw` returned; malformed ones become `Malformed`."""
+        """Decode bytes from `next_raw` with the connection's codec; never raises.
+
+        Bytes that cannot be parsed, nest too deep or need too much memory become
+        `Malformed` with a parse error, other invalid messages `Malformed` as `from_plain`
+        makes it.
+        """
         if self.codec is Codec.MSGPACK:
             read = codecs.read_msgpack
         else:
@@ -359,7 +377,7 @@ class Connection:
         return name in _joined(islice(self._new, self._fed, None))
 
     def _end(self) -> None:
-        """Close the connection and discard everything received."""
+        """Mark the connection as closed and discard all bytes and messages not taken out yet."""
         self.closed = True
         self._ready.clear()
         self._new.clear()
@@ -464,7 +482,7 @@ def _body(codec: Codec, message: Message) -> list[bytes]:
 
 
 def _pieces(codec: Codec, document: object) -> list[bytes]:
-    """Encode a document in pieces."""
+    """Encode a document: JSON in pieces, MessagePack as one piece; no framing."""
     json = codec is Codec.JSON
     if json:
         return codecs.json_pieces(document)
@@ -530,7 +548,11 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
 
 
 def unpack(body: memoryview) -> Message:
-    """Decode a frame's body; a large last `data` becomes a view into `body`."""
+    """Decode a frame's body; `Malformed` with a parse error if that fails with ValueError.
+
+    In a body above `MAX_COPIED_BYTES` whose last member is a large `data`, the data
+    becomes a view into `body`, without a copy.
+    """
     try:
         document = None
         if len(body) > MAX_COPIED_BYTES:
@@ -604,7 +626,9 @@ def _with_payload(head: bytes, payload: memoryview) -> object | None:
 
 
 def _innermost(document: object) -> dict[str, Any] | None:
-    """Return the last nested map whose last member is `data`, or None."""
+    """Follow the last members of nested maps; return the map whose last member is `data`, or
+    None.
+    """
     while isinstance(document, dict) and document:
         key = next(reversed(document))
         if key == "data":

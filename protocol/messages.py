@@ -267,7 +267,10 @@ def _request(document: dict[object, object], id: Id) -> Single:
 
 
 def _failure(id: Id, error: object) -> Single:
-    """Convert the answer to a failed request; `Malformed` if it has no code or message."""
+    """Convert the answer to a failed request to `Failure`; `data` may be missing.
+
+    Returns `Malformed` unless `error` has a whole `code` and a text `message`.
+    """
     if isinstance(error, dict):
         code = error.get("code")
         message = error.get("message")
@@ -339,6 +342,11 @@ class Correlation(Generic[_W]):
     """
 
     def __init__(self, role: Role) -> None:
+        """Make the book-keeping of one side of a connection, with no request open.
+
+        Ids of own requests count from 1; `reason` and `violation`, why it ended, are
+        None.
+        """
         self.role = role
         self.reason: RpcError | None = None
         self.violation: ProtocolError | None = None

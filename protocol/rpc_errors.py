@@ -20,7 +20,7 @@ class Code(IntEnum):
     meaning: str
 
     def __new__(cls, code: int, meaning: str) -> Code:
-        """Make a code with its meaning."""
+        """Make an enum member whose value is `code`, with the attribute `meaning`."""
         member = int.__new__(cls, code)
         member._value_ = code
         member.meaning = meaning
@@ -165,7 +165,10 @@ def cancelled(request: object) -> RpcError:
 
 
 def clip(value: object, limit: int = 200) -> str:
-    """Convert `value` to text of at most `limit` characters, without formatting more of it."""
+    """Convert `value` to text, cut after `limit` characters with "..." appended.
+
+    No more of it than needed is formatted; lone surrogates are escaped (before the cut).
+    """
     if isinstance(value, str):
         text = value[: limit + 1]
     else:

@@ -86,6 +86,9 @@ class Requests:
     """Counts and durations of requests, by method."""
 
     def __init__(self) -> None:
+        """Make the empty metrics of requests: counts by method and code, durations by method
+        [s].
+        """
         what = "Requests answered, by method and error code."
         self._counts = Counter("flexdt_requests", what, ["method", "code"], registry=None)
         what = "Time from a request's turn to its answer."
@@ -150,6 +153,7 @@ class _Server(ThreadingWSGIServer):
     request_queue_size = BACKLOG
 
     def __init__(self, *given: Any, **more: Any) -> None:
+        """Make the server, with places for unadmitted and for answered connections."""
         self._strangers = WaitingList[_Visitor](MAX_UNADMITTED)
         self._answered = WaitingList[_Visitor](MAX_ANSWERED)
         self._here: dict[object, _Visitor] = {}

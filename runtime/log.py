@@ -88,6 +88,10 @@ class Apart(QueueHandler):
     """
 
     def __init__(self, target: logging.Handler, room: int = 10_000) -> None:
+        """Write records to `target` from a thread of its own, by a queue of `room` records.
+
+        The thread starts now and is closed when the process exits.
+        """
         super().__init__(queue.Queue(room))
         self.dropped = 0
         self._listener = _Listener(self.queue, target)
@@ -162,6 +166,7 @@ class Sparing:
     def __init__(
         self, burst: int = BURST, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        """Allow `burst` lines of each kind at first; `clock` gives seconds."""
         self._burst = burst
         self._clock = clock
         self._kinds: dict[

@@ -119,6 +119,9 @@ class ServerLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
+        """Make a loop that measures its turns, and logs what asyncio reports instead of
+        printing it.
+        """
         self.holds = Holds()
         super().__init__(_Watched(self.holds))
         lines = Sparing(burst=1)

@@ -46,6 +46,10 @@ class Worker:
     """
 
     def __init__(self, memory_bytes: int) -> None:
+        """Start a worker process with a memory limit [bytes], connected by a socket pair.
+
+        It inherits the environment without the token; its standard streams are closed.
+        """
         self._memory = memory_bytes
         ours, theirs = socket.socketpair()
         environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
@@ -186,6 +190,10 @@ class Workers:
     """
 
     def __init__(self, count: int, memory_bytes: int, seconds: float) -> None:
+        """Set up `count` places for work at a time; no process starts before the first work.
+
+        A process has `memory_bytes`, a piece of work `seconds`.
+        """
         self.memory_bytes = memory_bytes
         self.seconds = seconds
         self._turn = asyncio.Semaphore(count)

@@ -247,7 +247,11 @@ def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
 
 
 def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
-    """Count the motors whose limits are those of a machine file."""
+    """Count the motors whose two limits are those of a machine file.
+
+    They agree to `RELATIVE_TOLERANCE`; names are translated to the machine's own, unknown
+    ones do not count.
+    """
     own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
         axis is not None
@@ -418,7 +422,7 @@ def _common_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, 
 
 
 def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
-    """Yield the same facts of a machine file."""
+    """Yield a machine's facts: its unbinned pixel [mm], then rates and limits of each motor."""
     yield "original_pixel_mm", machine.detector.pitch_mm
     for name, axis in machine.axes.items():
         yield f"rates of {name}", (axis.speed, axis.acceleration)

@@ -171,6 +171,11 @@ class UnknownNameError(TwinError):
     """
 
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
+        """Make the error; append "did you mean" the allowed name nearest to the asked one.
+
+        Nothing is appended unless `data` has a text `asked` and a list `allowed` with a
+        near name, or if the message has a suggestion already.
+        """
         facts = dict(data or {})
         asked = facts.get("asked")
         allowed = facts.get("allowed")

@@ -59,6 +59,9 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self, rng: random.Random | None = None, start: float = 0.0) -> None:
+        """Make a loop whose clock starts at `start` [s] and jumps; `rng` draws delays of
+        thread work.
+        """
         self._now = start
         self._rng = rng
         self.alone = False
@@ -124,6 +127,10 @@ class _Jumps(selectors.DefaultSelector):
         self._loop = loop
 
     def select(self, timeout: float | None = None) -> list[Any]:
+        """Look for events without waiting; if there are none, let the clock jump by `timeout`.
+
+        Without a time-out it waits for real if the loop is shared, else raises Deadlock.
+        """
         if timeout is None and not self._loop.alone:
             return super().select()
         found = super().select(0.0)
@@ -261,6 +268,7 @@ class InProcessTwin:
     client: TwinClient
 
     def __init__(self, loop: SimulatedLoop, server: TwinServer) -> None:
+        """Take a loop and a server; connections use the server's own shell, without sockets."""
         self.loop, self.server, self.data = loop, server, server.root
         self._shell = TcpServer(
             partial(TwinSession, server), ConnectionLimits(), None, METHODS

@@ -102,6 +102,14 @@ class Directory:
         write: Write = write_some,
         above: Directory | None = None,
     ) -> None:
+        """Name a folder; the topmost one (`above` None) is opened now where the system can.
+
+        `sync` waits for the disk at each write, `write` is the function that writes some
+        bytes.
+
+        Raises:
+            DatasetError: it cannot be opened.
+        """
         self.path = path
         self._above = above
         self._sync = sync

@@ -160,6 +160,9 @@ class Changes:
     def __exit__(
         self, _kind: object, error: BaseException | None, _trace: object
     ) -> None:
+        """Confirm the changes at the end of the context, or undo them if it raised (and
+        re-raise).
+        """
         if error is None:
             self.done()
         else:

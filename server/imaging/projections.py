@@ -192,6 +192,7 @@ class Imaging:
     room: Callable[[], Awaitable[int | None]] | None = None
 
     def __post_init__(self) -> None:
+        """Begin without divided samples, without a scatterer, and with nothing sent."""
         self._divided: dict[_Key, _DividedSample] = {}
         """Divided samples, the least recently used first."""
         self._versions: dict[str, list[str]] = {}

@@ -49,6 +49,7 @@ class ProjectorClient:
     ssl: tls.SSLContext | None = None
 
     def __post_init__(self) -> None:
+        """Begin unconnected; the first request connects."""
         self._sent: dict[str, Body] = {}
         self._instance: object = None
         self._evicts = False

@@ -66,6 +66,10 @@ class ProjectorPool:
     def __init__(
         self, clients: Sequence[ProjectorClient], patience_s: float = 5.0
     ) -> None:
+        """Take one member for each client; nothing is connected or sent yet.
+
+        `patience_s` is how long a call goes on while every projector fails [s].
+        """
         self._members = [_Member(client) for client in clients]
         self.patience_s = patience_s
         self._values: dict[str, Body] = {}

@@ -26,6 +26,7 @@ class TokenCheck:
     def __init__(
         self, token: str | None, close: Callable[[], object], lines: Sparing
     ) -> None:
+        """Begin without a wrong token."""
         self._token = token
         self._close = close
         self._lines = lines

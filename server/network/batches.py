@@ -30,6 +30,9 @@ class Batch:
     """
 
     def __init__(self, items: Sequence[Item], lane: Lane, most: int) -> None:
+        """Queue a batch's items by lane, in their order within a lane; answers may have
+        `most` bytes.
+        """
         by_lane = sorted(enumerate(items), key=lambda each: lane(each[1]))
         self._left = deque(by_lane)
         self._lane = lane

@@ -52,6 +52,7 @@ class Outbox:
     value of each slot."""
 
     def __init__(self, link: SendTarget) -> None:
+        """Make an empty queue to a connection that takes bytes."""
         self.link = link
         self.ready = asyncio.Event()
         self.ready.set()

@@ -87,6 +87,7 @@ class TcpServer(ListeningServer):
     read: parts.Read | None = None
 
     def __post_init__(self) -> None:
+        """Begin without connections and with empty waiting rooms; nothing listens yet."""
         self.links: set[_Link] = set()
         self.waiting = WaitingList[_Link](waiting_room.MAX_WAITING)
         self.reserved = WaitingList[_Link](RESERVED_PLACES)
@@ -179,6 +180,9 @@ class _Link(asyncio.BufferedProtocol):
     """One connection."""
 
     def __init__(self, server: TcpServer) -> None:
+        """Make the state of a connection that is not made yet; admitted already if no token
+        is needed.
+        """
         self.server = server
         self.limits = server.limits
         self.wire = Connection(

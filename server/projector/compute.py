@@ -131,6 +131,7 @@ class ComputeThread:
     """
 
     def __init__(self, begin: Callable[[], None]) -> None:
+        """Start the thread, with `begin` as its first step; `ready` ends when that is done."""
         self._steps: SimpleQueue[tuple[Future[object], Step] | None] = SimpleQueue()
         self.ready = asyncio.wrap_future(self.put(begin))
         self._thread = threading.Thread(

@@ -40,6 +40,9 @@ class JobClient:
     """One connection, its jobs and its requests under way."""
 
     def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
+        """Make the state of a connected client, with two lanes; admitted already if no token
+        is needed.
+        """
         self.link = link
         self.let_in = token is None
         self.lanes = Lane(), Lane()

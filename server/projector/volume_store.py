@@ -60,6 +60,7 @@ class VolumeStore:
     """
 
     def __init__(self, limit: int) -> None:
+        """Make an empty store that may hold `limit` bytes."""
         self.limit = limit
         self._held: dict[str, Body] = {}
         """Name -> volume, the least recently used first."""

@@ -77,6 +77,9 @@ class FrameLink(asyncio.BufferedProtocol):
     frame_timeout_s: float | None = None
 
     def __post_init__(self) -> None:
+        """Begin at the head of a frame, unconnected; a deadline that passes aborts the
+        connection.
+        """
         self._head = memoryview(bytearray(4))
         self._body: memoryview | None = None
         self._filled = 0
@@ -261,6 +264,7 @@ class ProjectorLink:
     """An open connection; made by `connect`."""
 
     def __init__(self) -> None:
+        """Make an unconnected link without open calls."""
         self._calls: Correlation[_Pending] = Correlation(Role.CLIENT)
         self._notes: set[asyncio.Future[Any]] = set()
         self._closed = False

@@ -183,6 +183,7 @@ class Checks:
     """
 
     def __init__(self, apart: bool = True) -> None:
+        """Set up checks in worker processes, or (`apart` False) all in this process."""
         self._apart = apart
         self._workers = Workers(MAX_PARALLEL_CHECKS, MEMORY_BYTES, MAX_CHECK_S)
         self._last: Checked | None = None

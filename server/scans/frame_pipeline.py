@@ -38,6 +38,7 @@ class FramePipeline(Generic[T]):
     room: int = 16
 
     def __post_init__(self) -> None:
+        """Begin empty, with retries allowed; no task runs yet."""
         self._waiting: deque[T] = deque()
         self._busy = 0
         self._changed = asyncio.Condition()

@@ -34,6 +34,9 @@ class Retry:
     """
 
     def __init__(self, first_s: float = FIRST_S, longest_s: float = LONGEST_S) -> None:
+        """Begin without an attempt; the first retry comes after `first_s`, none waits over
+        `longest_s`.
+        """
         self._first = first_s
         self._longest = longest_s
         self._attempts = 0

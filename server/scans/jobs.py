@@ -64,6 +64,12 @@ class Jobs:
         max_age: timedelta = timedelta(days=365),
         today: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
+        """Make an empty queue of scans; nothing runs before `run`.
+
+        `changed` is called after each change of a job; `max_waiting` jobs may wait,
+        `max_ended` ended ones are kept for `max_age`; `projectors` scales how many frames
+        are made at a time.
+        """
         self._root = root
         self._max_ended = max_ended
         self._max_age = max_age

@@ -129,6 +129,7 @@ class ScanRunner:
     projectors: int = 1
 
     def __post_init__(self) -> None:
+        """Prepare the run: events of the frames not in `done`, progress from those that are."""
         plan = self.plan
         done = frozenset(self.done)
         self._frames = [e for e in plan.exposures if e.file is not None]

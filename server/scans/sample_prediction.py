@@ -55,6 +55,7 @@ async def predict_counts(
     forecast = await forecast_sample(chosen, begin.sample, sample_probes(plan))
 
     def judged() -> Prediction:
+        """Return predicted exposures, and problems of the sample beyond those of the open beam."""
         known = open_beam_problems(plan, begin.physics)
         return Prediction(
             predicted_exposures(plan, forecast, begin.physics),

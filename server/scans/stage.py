@@ -56,6 +56,7 @@ class Stage:
     """
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
+        """Begin with empty caches of scenes and of convex pieces."""
         self._machine = machine
         self._profile = profile
         self._samples = samples

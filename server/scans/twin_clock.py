@@ -65,6 +65,7 @@ class TwinClock:
     def __init__(
         self, speed_up: SpeedUp = 1.0, wall: Callable[[], float] = time.monotonic
     ) -> None:
+        """Start at twin time 0, flowing at `speed_up` times the seconds of `wall`."""
         self._wall = wall
         self._speed_up = check_speed_up(speed_up)
         self._base = 0.0

@@ -57,6 +57,13 @@ class Corrections:
     def __init__(
         self, folder: Directory, in_force: Sequence[str | None] = (), most: int = 10_000
     ) -> None:
+        """Read the corrections and their history from a folder; unreadable files are set
+        aside, logged.
+
+        `in_force` is the state's: a whole history, which replaces the file's, or the one
+        name in force, which is joined to it. `most` limits how many are kept. A lost
+        correction that was in force is named in `lost`, and none is in force then.
+        """
         self._folder = folder
         self._most = most
         self._all: dict[str, NamedCorrection] = {}

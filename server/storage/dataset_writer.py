@@ -59,6 +59,12 @@ class DatasetWriter:
         sync: bool = True,
         write: Write = write_some,
     ) -> None:
+        """Make the data set's folder, or (`resume`) go on in it, and write script and texts.
+
+        The record is written as incomplete. The folder stays locked until `close`; at an
+        error it is released. Raises: DatasetError if a name is bad, the folder has files
+        (or another scan's), or the disk is full.
+        """
         for file in record.files:
             plain_name(file)
         self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)

@@ -215,6 +215,11 @@ class StateStore:
         job_files: JobFiles,
         changed_jobs: Callable[[], ChangedJobs],
     ) -> None:
+        """Name where the state is written and what makes it; nothing is read or written yet.
+
+        `make(ended)` returns the state to write, `changed_jobs` the jobs changed since
+        its last call.
+        """
         self._root = root
         self._make = make
         self._job_files = job_files

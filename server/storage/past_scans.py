@@ -88,6 +88,9 @@ class PastScans:
     """
 
     def __init__(self, root: Path, machine: Machine, profile: Profile) -> None:
+        """Set up the listing of data sets below `root`, with worker processes that start on
+        demand.
+        """
         self._root = root
         self._machine = machine.model_dump(mode="json", by_alias=True)
         self._profile = profile.model_dump(mode="json")

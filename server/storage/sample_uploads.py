@@ -71,6 +71,9 @@ class Incoming:
     def __init__(
         self, folder: Directory, limit: int, room: DiskRoom | None = None
     ) -> None:
+        """Begin without uploads; all unfinished ones together may take `limit` bytes, and
+        `room`.
+        """
         self._folder = folder
         self._limit = limit
         self._disk = room

@@ -86,6 +86,12 @@ class SampleStore:
         room: DiskRoom | None = None,
         memory_limit: int | None = None,
     ) -> None:
+        """List the stored uploads of a folder; those that cannot be read are set aside.
+
+        `limit` is for one upload [bytes], `most` for their number, `memory_limit` for
+        loaded phantoms [bytes] (None: no limit). Phantoms are loaded when used; replaced
+        files are deleted.
+        """
         if memory_limit is None:
             self._memory_limit = math.inf
         else:

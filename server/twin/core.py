@@ -88,6 +88,9 @@ class ControlLease:
     def __init__(
         self, idle_s: float = math.inf, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        """Begin without a holder; one that is silent for `idle_s` seconds of `clock` may
+        lose control.
+        """
         self.holder: str | None = None
         self._idle_s = idle_s
         self._clock = clock
@@ -188,6 +191,12 @@ class TwinServer:
         projector_room: Callable[[], Awaitable[int | None]] | None = None,
         projector_watch: ProjectorWatch | None = None,
     ) -> None:
+        """Build all parts of a server, and restore corrections and state from the folder `root`.
+
+        Nothing runs and no job is restored before `start`. `wall` gives real seconds,
+        `seed` the noise's seed of a scan, `truth` the scanner's true geometry (None: it
+        is nominal).
+        """
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
         self.instance = secrets.token_hex(8)

@@ -49,6 +49,11 @@ class _Event:
         data: object | Render,
         slot: str | None,
     ) -> None:
+        """Make an event of number `seq` at twin time `time` [s].
+
+        `data` may be a function from a view to the data. A newer event of the same slot
+        replaces a pending one; without a slot every event is delivered.
+        """
         self.topic = topic
         self.seq = seq
         self.time = time
@@ -97,6 +102,11 @@ class Hub:
         most: int = 2048,
         most_views: int = 16,
     ) -> None:
+        """Make a hub without subscriptions; `now` gives the twin's time [s].
+
+        `kept`: topic -> how many past events it keeps; at most `most` subscriptions, and
+        `most_views` different image views.
+        """
         self._now = now
         self._most = most
         self._most_views = most_views

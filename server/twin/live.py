@@ -173,6 +173,7 @@ class LiveView:
     turn: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
 
     def __post_init__(self) -> None:
+        """Begin without an image and without a task."""
         self._changed = asyncio.Event()
         self._last: Shot | None = None
         self._count = 0

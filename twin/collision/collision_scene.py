@@ -106,7 +106,11 @@ class CollisionScene:
     """
 
     def separation(self, pair: tuple[int, int]) -> Separate:
-        """Return the certified clearance of a pair as a function; made on first use."""
+        """Return the function that certifies how far two bodies are apart, from a pair of
+        indices.
+
+        It is made at the first call for a pair and kept.
+        """
         if pair not in self._separations:
             a, b = (self.bodies[i].solid for i in pair)
             self._separations[pair] = separation_of(a, b)
@@ -146,7 +150,9 @@ class CollisionScene:
         return path_of(self.axes, tables, start, end)
 
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
-        """Convert positions to (axes,) [mm, deg]; motors left out are at home."""
+        """Convert positions to (axes,) [mm, deg]; motors left out are at home, other names
+        ignored.
+        """
         return np.array(
             [
                 positions.get(n, h)
@@ -320,7 +326,11 @@ def _one_stage(a: Body, b: Body) -> bool:
 
 
 def _levels_apart(a: Body, b: Body) -> bool:
-    """Return whether a gap separates them along a direction in which no motor moves them."""
+    """Return whether a coordinate that no motor changes between the bodies separates their
+    boxes.
+
+    Touching boxes are not separated.
+    """
     fixed = ~(a.slides - b.slides).any(axis=0)
     offset = a.origin - b.origin
     above = offset + a.bounds[0] - b.bounds[1] > 0.0

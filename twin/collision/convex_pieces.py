@@ -91,6 +91,7 @@ class _Piece:
     """Triangles whose hull holds a part of the solid."""
 
     def __init__(self, triangles: FloatArray) -> None:
+        """Compute the convex hull of triangles (n, 3, 3) [mm], and the hull's volume [mm³]."""
         self.triangles = triangles
         self.hull = hull(triangles.reshape(-1, 3))
         corners = self.hull.vertices[self.hull.faces]
@@ -171,7 +172,12 @@ def _led_by(triangles: FloatArray, height: FloatArray, sign: float) -> FloatArra
 
 
 def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> FloatArray:
-    """Compute where edges cross the plane, (n, 3)."""
+    """Compute where edges `start` to `end` (n, 3) cross the plane of coordinate `axis` at
+    `at` [mm].
+
+    Returns (n, 3); that coordinate is `at` exactly. Edges parallel to the plane are not
+    allowed.
+    """
     share = (at - start[:, axis]) / (end[:, axis] - start[:, axis])
     points = start + share[:, None] * (end - start)
     points[:, axis] = at

@@ -73,6 +73,10 @@ class Polytope(ConvexSolid):
     faces: IntArray
 
     def __post_init__(self) -> None:
+        """Copy the vertices as read-only float64; raise ValueError unless finite and (k, 3).
+
+        The faces are not checked.
+        """
         vertices = np.array(self.vertices, dtype=np.float64)
         if (
             vertices.ndim != 2
@@ -86,7 +90,7 @@ class Polytope(ConvexSolid):
         object.__setattr__(self, "vertices", vertices)
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """See `ConvexSolid`."""
+        """Find the vertex farthest along each of `directions` (..., 3), (..., 3) [mm]."""
         corner: FloatArray = self.vertices[
             np.argmax(directions @ self.vertices.T, axis=-1)
         ]
@@ -116,7 +120,10 @@ class UprightCylinder(ConvexSolid):
     height: float
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """See `ConvexSolid`."""
+        """Find the point farthest along each of `directions` (..., 3), (..., 3) [mm]: on a rim.
+
+        For a vertical direction it is the middle of the end face.
+        """
         across = np.hypot(directions[..., 0], directions[..., 1])
         out = directions * (self.radius / np.where(across > 0.0, across, 1.0))[..., None]
         out[..., 2] = np.copysign(0.5 * self.height, directions[..., 2])
@@ -128,7 +135,10 @@ class UprightCylinder(ConvexSolid):
         return np.array(self.center) - half, np.array(self.center) + half
 
     def radius_about(self, axis: FloatArray) -> float:
-        """See `ConvexSolid`."""
+        """Compute the largest distance from a line through the origin along `axis` (3,) [mm].
+
+        Exact for an upright axis; else that of the bounding box, an upper bound.
+        """
         if self._upright(axis):
             return self.radius + math.hypot(*self.center[:2])
         # The farthest point of the two rims' bounding squares: never too small.
@@ -140,7 +150,10 @@ class UprightCylinder(ConvexSolid):
         return self._upright(axis) and self.center[0] == 0.0 and self.center[1] == 0.0
 
     def prism(self, sides: int = 48) -> Polytope:
-        """Make a prism around the cylinder; 48 sides add 0.2 % of the radius at the edges."""
+        """Make a prism that contains the cylinder, with `sides` sides that touch it.
+
+        Its edges are 0.2 % of the radius outside for 48 sides.
+        """
         angle = 2.0 * math.pi * np.arange(sides) / sides
         rim = (
             self.radius

@@ -95,7 +95,9 @@ class PathSearch:
         return self._nearest_first[1]
 
     def motion(self, k: int) -> RelativeMotion:
-        """Return the relative motion of pair k, made on first use."""
+        """Return the motion of the first body of pair k relative to the second; made once,
+        then kept.
+        """
         if k not in self._motions:
             a, b = (self.scene.bodies[i] for i in self.pairs[k])
             self._motions[k] = RelativeMotion(a, b, self.path)

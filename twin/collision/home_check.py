@@ -60,7 +60,7 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
 
 
 def _pairs(found: Iterable[tuple[tuple[str, str], float]]) -> str:
-    """Describe pairs that are too close."""
+    """Describe pairs and their gaps [mm]: "apart" by a positive gap, else "touch"."""
     return ", ".join(
         f"{a} and {b} {f'are {gap:.3g} mm apart' if gap > 0.0 else 'touch'}"
         for (a, b), gap in found

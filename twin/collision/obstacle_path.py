@@ -188,7 +188,9 @@ class _Planner:
         end: Station = tuple(goal.get(axis, self.at(axis)) for axis in axes)
 
         def left(station: Station) -> float:
-            """Estimate the remaining time from below [s]."""
+            """Estimate the remaining time from below [s]: each axis directly to its end, one
+            by one.
+            """
             return sum(
                 self.duration(axis, x, y)
                 for axis, x, y in zip(axes, station, end, strict=True)
@@ -255,7 +257,7 @@ class _Planner:
         return way
 
     def _all_free(self, way: Sequence[tuple[str, float]]) -> bool:
-        """Return whether every move of a path is free."""
+        """Return whether every move of a path (axis, target) is free, made one after the other."""
         moved: dict[str, float] = {}
         for axis, value in way:
             if not self.free(moved, axis, value):

@@ -95,7 +95,10 @@ def _planes(solid: Polytope) -> FloatArray:
 
 
 def _corners(planes: list[FloatArray], inside: FloatArray) -> FloatArray:
-    """Compute the corners (k, 3) of the body that planes bound around a point `inside`."""
+    """Compute the corners (k, 3) of the body that planes (n, 4) bound around a point `inside`.
+
+    Corners equal to 1e-6 are returned once.
+    """
     from scipy.spatial import HalfspaceIntersection
 
     found = HalfspaceIntersection(np.array(planes), inside).intersections

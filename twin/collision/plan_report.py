@@ -53,7 +53,11 @@ def collision_check(
     def check(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
-        """Sweep a plan with the machine's bodies and the sample; see `collision_report`."""
+        """Sweep a plan with the machine's bodies and a sample; see `collision_report`.
+
+        The sample given to `collision_check` counts; `size` is used (as a cylinder) only
+        without one.
+        """
         if sample is None:
             pieces = _from_size(size)
         else:
@@ -104,7 +108,10 @@ def _least(
 
 
 def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
-    """Make the cylinder of a sample's size; no body without one."""
+    """Make an upright cylinder of a sample's size on the stage's origin, or no body.
+
+    No body without a size or diameter; without a height it is as high as wide.
+    """
     if size is None or size.diameter_mm <= 0.0:
         return ()
     height = size.height_mm or size.diameter_mm
@@ -112,7 +119,10 @@ def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
 
 
 def _contacts(search: PathSearch) -> list[Contact]:
-    """Find all contacts, in the order of time; of several pieces of a sample, the first."""
+    """Find all contacts of a path, by time; of one pair only the first in each segment.
+
+    Pairs whose bound is beyond margin plus tolerance are skipped.
+    """
     limits = search.scene.limits
     found = []
     for k, bound in enumerate(search.bounds):
@@ -185,7 +195,10 @@ def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
 
 
 def _trace_times(path: Path, count: int) -> FloatArray:
-    """Choose `count` times for a plot: spread over the motion, not over the pauses between."""
+    """Choose about `count` times for a plot: half evenly by travel, half evenly by time.
+
+    Sorted, without repeats. Only start and end if nothing moves or `count` is below 2.
+    """
     travelled = np.abs(np.diff(path.q, axis=0)).sum(axis=1)
     along = np.concatenate([[0.0], np.cumsum(travelled)])
     if along[-1] == 0.0 or count < 2:

@@ -68,7 +68,7 @@ class Path:
     a: FloatArray
 
     def vectors(self, times: FloatArray) -> FloatArray:
-        """Compute positions at `times` (n,) within the path, (n, axes)."""
+        """Compute positions at `times` (n,) [s], (n, axes); times outside the path get its ends."""
         i = np.clip(
             np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1
         )
@@ -85,7 +85,7 @@ class Path:
         )
 
     def after(self, time: float) -> Path:
-        """Return the rest of the path from `time` on, which is before its end."""
+        """Return the rest of the path from `time` on; `time` must be before the end."""
         later = self.times > time
         first = max(0, int(np.argmax(later)) - 1)
         dt = time - self.times[first]
@@ -97,7 +97,7 @@ class Path:
 
     @property
     def moving(self) -> npt.NDArray[np.bool_]:
-        """(axes,) whether each motor ever moves."""
+        """(axes,) whether each motor has a velocity or acceleration in any segment."""
         moving: npt.NDArray[np.bool_] = (
             np.abs(self.v).sum(axis=0) + np.abs(self.a).sum(axis=0) > 0
         )
@@ -172,7 +172,10 @@ def _stands(table: AxisPath) -> bool:
 def _state(
     table: AxisPath, times: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute position, velocity, acceleration in force from each of `times` (in order) on."""
+    """Compute position, velocity and acceleration from each of `times` on, (n,) each.
+
+    Before the table's beginning the motor rests at its first position.
+    """
     i = table.times.searchsorted(times, side="right") - 1
     before, i = i < 0, np.maximum(i, 0)  # it is at rest there
     dt, v0, a0 = np.where(before, 0.0, (times - table.times[i], table.v[i], table.a[i]))
@@ -181,7 +184,7 @@ def _state(
 
 
 def _turning_times(table: AxisPath) -> FloatArray:
-    """Find the times at which the motor reverses within a piece."""
+    """Find the times at which the motor reverses inside a piece, not at its end."""
     turning = table.v * table.a < 0.0
     if not turning.any():
         return table.times[:0]
@@ -331,7 +334,7 @@ class _Turn:
         return cls(body, side, angle[kept], rate[kept], growth[kept], nearing, sense)
 
     def orientation(self, at: Moment) -> FloatArray:
-        """Compute the body's orientation at a moment, (3, 3)."""
+        """Compute the body's rotation matrix at a moment, (3, 3)."""
         i = at.segment
         dt = at.dt
         angle = self.angle[i] + dt * (self.rate[i] + 0.5 * dt * self.acceleration[i])
@@ -377,6 +380,12 @@ class RelativeMotion:
     """
 
     def __init__(self, a: Body, b: Body, path: Path) -> None:
+        """Compute the motion of body `a` relative to body `b` along a path.
+
+        Segments in which neither moves relative to the other are left out; if all are
+        such, the first one is kept. Whole turns that repeat the same relative motion are
+        taken out, too.
+        """
         slides = a.slides - b.slides
         velocity = path.v @ slides
         acceleration = path.a @ slides

@@ -130,7 +130,7 @@ def _free_from(
 
 
 def _without(scene: CollisionScene, pairs: list[Pair]) -> CollisionScene:
-    """Remove pairs from a scene."""
+    """Copy a scene without some pairs, among those tested and among the distant ones."""
     left_out = set(pairs)
     return replace(
         scene,
@@ -244,7 +244,10 @@ class _Overlap:
         (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
 
         def gaps(directions: FloatArray) -> FloatArray:
-            """Compute the gaps between the bodies along directions (k, 3), (k,) [mm]."""
+            """Compute the signed gap between the bodies along unit directions (k, 3), (k,) [mm].
+
+            Negative where they overlap along that direction.
+            """
             reach = self._reach_of(0, directions, self.turned)
             return (
                 directions @ (at_a - at_b)
@@ -264,7 +267,7 @@ class _Overlap:
 
 
 def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Compute a body's orientation (3, 3) and origin (3,) [mm] with the motors at `q`."""
+    """Compute a body's orientation (3, 3) and origin (3,) [mm] with the motors at `q` (axes,)."""
     if body.spins:
         turn = body.rotation(float(q @ body.turns))
     else:
@@ -278,7 +281,11 @@ def _many(solid: ConvexSolid) -> bool:
 
 
 def _corners(solid: ConvexSolid) -> FloatArray:
-    """Return corners of a body (k, 3), of one with very many only some."""
+    """Return the corners of a body (k, 3) [mm]; of a cylinder those of a prism around it.
+
+    A body with too many gives only those farthest along `MAX_EXACT_CORNERS` fixed
+    directions.
+    """
     if _many(solid):
         ways = np.random.default_rng(0).normal(size=(MAX_EXACT_CORNERS, 3))
         return np.unique(solid.farthest(ways), axis=0)

@@ -89,7 +89,10 @@ class Body:
 
     @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Corners of a box about the origin that holds the solid at every angle, (3,) each."""
+        """Corners of a box about the body's origin that holds the solid, (3,) each [mm].
+
+        A spinning body's box holds it at every angle.
+        """
         lower, upper = self.solid.bounds()
         if not self.spins:
             return lower, upper
@@ -142,7 +145,9 @@ class Body:
 
     @cached_property
     def _rodrigues(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Matrices of Rodrigues' formula: along the axis, across it, cross product."""
+        """Compute three (3, 3) matrices of the spin axis: projection on it, across it, cross
+        product.
+        """
         x, y, z = self.spin_axis
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         along = np.outer(self.spin_axis, self.spin_axis)
@@ -333,7 +338,11 @@ def _chain(
 
 
 def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | Polytope:
-    """Make the solid of a component, in its own frame [mm]; a panel follows its tilts."""
+    """Make the solid of a component in its own frame [mm]: cylinder, hull of points, or box.
+
+    Only a panel is turned, by the profile's roll and the offsets' tilts; its solid is
+    then a polytope.
+    """
     if part.shape == "cylinder":
         return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
     if part.points_mm:
@@ -347,7 +356,7 @@ def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | P
 
 
 def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
-    """Compute the panel's orientation (3, 3) from the directions of its columns and rows."""
+    """Compute the rotation (3, 3) of a panel: the profile's roll, then the offsets' tilts."""
     u, v = turn_detector(
         COLUMN_DIRECTION, ROW_DIRECTION, 0, 0, math.radians(profile.det_roll_deg)
     )
@@ -362,7 +371,10 @@ def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
 def _placed(
     piece: ConvexSolid, place: FloatArray, tau: FloatArray
 ) -> UprightCylinder | Polytope:
-    """Move a piece by p -> place (p - tau)."""
+    """Move a piece by p -> place (p - tau); returned as it is if that changes nothing.
+
+    A moved cylinder becomes a prism around it. Raises: TypeError for another solid.
+    """
     if not isinstance(piece, (UprightCylinder, Polytope)):
         raise TypeError(f"cannot place a {type(piece).__name__}")
     if not tau.any() and np.array_equal(place, np.eye(3)):
@@ -373,7 +385,10 @@ def _placed(
 
 
 def _group(machine: Machine, part: Component) -> str:
-    """Return the topmost part that `part` is rigidly mounted on; "" for the world."""
+    """Return the name of the part with a motor that carries `part` rigidly (maybe itself).
+
+    "" if no motor carries it.
+    """
     named = {c.name: c for c in machine.components}
     while part.axis is None and part.parent is not None:
         part = named[part.parent]

@@ -50,7 +50,11 @@ def plain_name(name: str, what: str = "file") -> str:
 
 
 def _reason(name: str) -> str | None:
-    """Return the rule that a name breaks, in words, or None if it is allowed."""
+    """Return the first rule that a name breaks, in words, or None if it is allowed.
+
+    Rules: not empty; at most `MAX_NAME` characters and 255 bytes; no forbidden character;
+    no dot at either end, no space around it; no device name of Windows.
+    """
     if not name:
         return "is empty"
     if len(name) > MAX_NAME or len(name.encode("utf-8", "surrogatepass")) > 255:

@@ -102,6 +102,7 @@ class FrameBlock(ArrayValue):
         return len(self.files)
 
     def __repr__(self) -> str:
+        """Format as one line: number of images, their kind, first and last file."""
         span = ""
         if self.files:
             span = f", {self.files[0]} to {self.files[-1]}"
@@ -159,6 +160,9 @@ class ScanRecord(ArrayValue):
     predicted: tuple[PredictedExposure, ...] = ()
 
     def __repr__(self) -> str:
+        """Format as one line: name, machine, number of images, start, and whether it is
+        complete.
+        """
         return (
             f"<ScanRecord {self.name!r} on {self.machine.name}: {len(self.files)} images, "
             f"{self.started:%Y-%m-%d %H:%M}, {'complete' if self.complete else 'incomplete'}>"
@@ -262,7 +266,9 @@ class ScanRecord(ArrayValue):
         return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
-        """Compute the nominal geometry of all images, or of some blocks."""
+        """Compute the nominal geometry of all images, or of `blocks`, in order; no
+        correction applied.
+        """
         if blocks is None:
             chosen = self.blocks
         else:
@@ -272,7 +278,7 @@ class ScanRecord(ArrayValue):
         )
 
     def angles_deg(self) -> FloatArray:
-        """Stage angle of every projection [deg], accumulated."""
+        """Stage angle of every projection [deg], not wrapped at 360; empty without projections."""
         parts = [np.degrees(self.poses_of(b).angle) for b in self.projections if len(b)]
         if parts:
             return np.concatenate(parts)
@@ -419,7 +425,7 @@ class CorrectionEntry(_Model):
 
     @classmethod
     def of(cls, correction: NamedCorrection | None) -> CorrectionEntry | None:
-        """Convert a correction to its entry; None for None."""
+        """Convert a correction to its document entry, in mm and deg; None for None."""
         c = correction
         if c is None:
             return None
@@ -447,7 +453,10 @@ class PredictedEntry(_Model):
 
     @classmethod
     def of(cls, predicted: PredictedExposure) -> PredictedEntry:
-        """Make the document's entry of a predicted exposure; figures are rounded."""
+        """Make the document's entry of a predicted exposure; figures are rounded.
+
+        The shares of saturated and starved pixels are None if they were not predicted.
+        """
         shares = predicted.shares
         return cls(
             kV=predicted.kV,
@@ -499,7 +508,12 @@ class DatasetDocument(_Model):
 
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
-        """Make the document of a scan, with an entry for every image."""
+        """Make the document of a scan: machine, profile, settings, sample, correction,
+        predictions.
+
+        It has an entry for every planned image, saved yet or not; `detector` is the
+        record's camera.
+        """
         camera = record.camera
         rows, cols = camera.shape
         return cls(
@@ -536,7 +550,7 @@ class DatasetDocument(_Model):
         )
 
     def to_json(self) -> str:
-        """Write the document as text, one line a frame, for people and diffs."""
+        """Format the document as indented JSON, one line a frame, with a final newline."""
         head = self.model_dump(mode="json", by_alias=True, exclude={"frames"})
         text = json.dumps(head, indent=1, ensure_ascii=False)
         lines = [
@@ -551,7 +565,10 @@ class DatasetDocument(_Model):
         return ConeVec(np.array(rows, dtype=np.float64).reshape(-1, 12))
 
     def positions(self, kind: FrameKind = "projection") -> dict[str, FloatArray]:
-        """Read motor positions of the frames of one kind: motor -> (n,) [mm, deg]."""
+        """List the motor positions of the frames of one kind: motor -> (n,) [mm, deg].
+
+        The motors are those of the first such frame; {} if there is none.
+        """
         chosen = [f.positions for f in self.frames if f.kind == kind]
         return {
             n: np.array([p[n] for p in chosen]) for n in (chosen[0] if chosen else {})
@@ -574,7 +591,10 @@ class DatasetDocument(_Model):
         return self._camera(frame).shape
 
     def _camera(self, entry: FrameEntry | DetectorEntry) -> CameraSettings:
-        """Make the camera settings of an entry, with the modes of the document's machine."""
+        """Make camera settings of an entry: mode, region, exposure, averages.
+
+        The known modes are those of the document's machine, or none if it states none.
+        """
         detector = self.machine.get("detector")
         named = None
         if isinstance(detector, dict):
@@ -619,7 +639,7 @@ class DatasetDocument(_Model):
         return Poses.concatenate(parts)
 
     def correction_in_force(self) -> NamedCorrection | None:
-        """Return the applied correction in internal units, or None."""
+        """Return the correction that was applied, in internal units (mm, rad), or None."""
         c = self.correction
         if c is None:
             return None

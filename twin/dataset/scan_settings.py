@@ -149,7 +149,9 @@ class ScanSettings:
 
     @property
     def figures(self) -> Figures | None:
-        """SOD, SDD, HC, VC, COR and pixel, if all are stated, else None."""
+        """SOD, SDD, HC, VC, COR and binned pixel as `Figures`; None if any of them is not
+        stated.
+        """
         values = (
             self.sod_mm,
             self.sdd_mm,

@@ -157,7 +157,7 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
 
 
 def _date(moment: datetime) -> str:
-    """Format a date line as the scanner does, with AM and PM."""
+    """Format a moment as the scanner does: month/day/year, 12-hour time with AM or PM; no zone."""
     hour = 12
     if moment.hour % 12:
         hour = moment.hour % 12
@@ -169,7 +169,7 @@ def _date(moment: datetime) -> str:
 
 
 def _motor(name: str, motor: MotorLine) -> str:
-    """Format a motor's line: position and, if known, speed and acceleration."""
+    """Format a motor's line: position and, each if known, speed and acceleration; six decimals."""
     numbers = {
         name: motor.value,
         "speed": motor.speed,
@@ -288,7 +288,7 @@ def _is_motor(key: str, value: str) -> bool:
 
 
 def _read_motor(value: str) -> MotorLine:
-    """Parse a motor's line: position and, where given, speed and acceleration."""
+    """Parse a motor's line: position and, where given, speed and acceleration (else None)."""
     first, *others = value.split(";")
     named = dict(_split(part.strip()) for part in others)
     return MotorLine(
@@ -299,7 +299,9 @@ def _read_motor(value: str) -> MotorLine:
 
 
 def _moment(line: str) -> datetime | None:
-    """Read a date line; None for another form (dates never decide anything)."""
+    """Parse a date line by the first form of `_DATE_FORMATS` that fits, without a zone; else
+    None.
+    """
     found = _DATE.match(line)
     if found is None:
         return None

@@ -46,7 +46,7 @@ class Figures:
 
     @property
     def stated(self) -> dict[str, Any]:
-        """The corresponding members of `ScanSettings`."""
+        """Values by `ScanSettings` field, voxel size [um] and magnification included."""
         numbers = {
             name: value for name, value in vars(self).items() if name != "pixel_mm"
         }
@@ -64,7 +64,11 @@ class Figures:
 
 
 def figures_of(pose: Poses, shape: tuple[int, int]) -> Figures:
-    """Compute the figures of one pose (n = 1) on an image of `shape` (rows, cols)."""
+    """Compute SOD, SDD [mm], HC, VC, COR [px, from the edge] and pixel of one pose (n = 1).
+
+    `shape` is (rows, cols). COR is the column of the rotation axis at the source's
+    height; the pixel is the pitch from column to column.
+    """
     cone = pose.cone_vec()
     hc, vc = (cone.piercing_points(shape)[0] + EDGE).tolist()
     height = float(pose.source[0, 2] - pose.axis[0, 2])

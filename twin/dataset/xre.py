@@ -96,7 +96,7 @@ class _Filled(string.Formatter):
     """Formatter of values for this file; mappings become lines."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Format a value by its type."""
+        """Format a value: by its format, if given; a mapping as lines; else by its type."""
         if format_spec:
             return format(value, format_spec)
         if isinstance(value, Mapping):
@@ -105,7 +105,9 @@ class _Filled(string.Formatter):
 
 
 def format_settings(settings: ScanSettings) -> str:
-    """Write as much of `data settings XRE.txt` as `XreSettings.settings` would read."""
+    """Write the fields of settings that `data settings XRE.txt` has a place for; None are
+    left out.
+    """
     sections: dict[str, dict[str, Value]] = {}
     for field, entry in ENTRIES.items():
         value = getattr(settings, field)
@@ -116,7 +118,10 @@ def format_settings(settings: ScanSettings) -> str:
 
 
 def format_sections(sections: Sections) -> str:
-    """Write sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
+    """Format sections as text: `[name]` and one line an entry, a blank line between sections.
+
+    Texts are quoted, truth values TRUE and FALSE, numbers `%d` and `%f`.
+    """
     blocks = [
         f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()
     ]
@@ -128,7 +133,7 @@ def _lines(entries: Mapping[str, Value]) -> str:
 
 
 def _utc(moment: datetime) -> str:
-    """Format a moment in UTC as the XRE file has it; one without a zone is taken for UTC."""
+    """Format a moment in UTC with seven decimals of seconds; without a zone it is taken as UTC."""
     if moment.tzinfo is None:
         utc = moment
     else:
@@ -195,7 +200,10 @@ def _entry(
     track: bool = False,
     safe: bool = True,
 ) -> str:
-    """Write one position of source, detector or object with its axes."""
+    """Format one position of source, detector or object with its three axes as one text.
+
+    The movable range is always infinite.
+    """
     return (
         f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[{radius:f}]"
         f"height[{height:f}]track[{str(track).upper()}]safe range?[{str(safe).upper()}]"

@@ -95,7 +95,7 @@ class XreSettings:
         return sections is None or sections <= 1.0
 
     def _entries(self, section: str) -> list[tuple[str, str]]:
-        """List the (key, value) entries of a section, whatever the case of its name."""
+        """List the (key, value) entries of all sections of that name; case does not count."""
         return [
             entry
             for name, entries in self.sections.items()
@@ -137,7 +137,7 @@ def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
 
 
 def _unquoted(text: str) -> str:
-    """Remove quotes and escapes from a value, or a semicolon at its end."""
+    """Strip a value; remove its quotes and escapes, or, if unquoted, semicolons at its end."""
     value = text.strip()
     if len(value) >= 2 and value[0] == '"' and value[-1] == '"':
         return re.sub(r'\\([\\"])', r"\1", value[1:-1])

@@ -53,6 +53,11 @@ class ScanGeometry:
     full_scale: int | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
+        """Check the lengths of `real` and of `files`, where given, and the detector's shape.
+
+        Raises:
+            ExchangeError: one has not an entry for each view, or the shape has no pixel.
+        """
         for what, count in (("real rows", self.real), ("files", self.files or None)):
             if count is not None and len(count) != len(self):
                 problem = f"{len(self)} views but {len(count)} {what}"
@@ -102,7 +107,9 @@ class CircularScan:
     v: FloatArray
 
     def cone_vec(self) -> ConeVec:
-        """Compute the views of the circle."""
+        """Compute one view for each angle: the standing geometry, turned about the circle's
+        centre.
+        """
         standing = np.concatenate([self.source, self.detector, self.u, self.v])
         return ConeVec(np.tile(standing, (len(self.angle), 1))).moved(
             rotation_z(self.angle), np.array([*self.center, 0.0])

@@ -255,7 +255,11 @@ class _Document(BaseModel):
 
 
 def geometry_text(geometry: ScanGeometry) -> str:
-    """Format a geometry as the project's JSON file, one line a view."""
+    """Format a geometry as this project's JSON file, one line a view, with a final newline.
+
+    It has kind, schema, name, detector size (null if unknown), notes, files, `cone_vec`,
+    and `full_scale` and `real_cone_vec` where known.
+    """
     if geometry.shape is not None:
         rows, cols = geometry.shape
     else:

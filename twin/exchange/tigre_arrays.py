@@ -99,7 +99,11 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def _once(values: FloatArray) -> FloatArray:
-    """Return one value if all views have the same, else the value of each view."""
+    """Return one value, (1,) or (k,), if all views agree to `CONSTANT_TOLERANCE`, else all
+    values.
+
+    The first view's value stands for all; negative zeros become 0.
+    """
     still = np.ptp(values, axis=0).max() <= CONSTANT_TOLERANCE
     if values.ndim == 1:
         one: FloatArray = values[:1]
@@ -172,7 +176,11 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
 
 
 def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatArray:
-    """Return the value of each view from an array that holds one or all."""
+    """Return the value of each view, (views,) or (views, size), from an array of one or of all.
+
+    `size` 0 is a single number a view. Raises: ExchangeError for another shape, as
+    `numbers_of`.
+    """
     own: tuple[int, ...] = (size,) if size else ()
     single: tuple[int, ...] = (size,) if size else (1,)
     if np.shape(arrays[name]) == single:

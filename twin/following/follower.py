@@ -446,14 +446,18 @@ class Follower:
 
     @cached_property
     def _steps(self) -> tuple[PlanStep, ...]:
-        """Predicted steps of the script, from the machine's home."""
+        """Steps of the script simulated from the machine's home and default settings; ()
+        without one.
+        """
         if self.script is None:
             return ()
         start = Mirror.of(self.machine).start
         return tuple(simulated(tuple(self.script.commands), self.machine, start).steps)
 
     def _next(self, mirror: Mirror) -> str:
-        """Describe the script's next command."""
+        """Describe the script's next command by line and text; "the script's end" if there
+        is none.
+        """
         if self.script is None or mirror.next_line >= len(self.script.commands):
             return "the script's end"
         command = self.script.commands[mirror.next_line]
@@ -667,7 +671,11 @@ class Follower:
         return here.with_axis(name, behind_s=promptest, passed_s=passes)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
-        """Return the motor that a reading of `axis` is of, and its position."""
+        """Return the motor that a reading of `axis` is of, and its position.
+
+        The reading of a virtual axis is converted to its motor; any other name is
+        returned as it is.
+        """
         virtual = self.machine.virtual_axes.get(axis)
         if virtual is None:
             return axis, at
@@ -676,7 +684,7 @@ class Follower:
     def _outside(
         self, mirror: Mirror, waiting: Waiting, took: float, now: float
     ) -> Mirror:
-        """Return the mirror, with a warning about a command's time outside its range."""
+        """Return the mirror with the warning that a command took less or more than its range."""
         longer = "less"
         if took > waiting.most_s:
             longer = "more"

@@ -200,7 +200,10 @@ class Mirror:
 
     @classmethod
     def of(cls, machine: Machine) -> Mirror:
-        """Make the mirror before any message: homes and defaults, all of them assumed."""
+        """Make the mirror before any message: motors at home, the machine's default settings.
+
+        All of it is assumed; whether X-rays are on is unknown.
+        """
         axes = {
             n: SeenAxis(a.home, a.home, a.speed, a.acceleration)
             for n, a in machine.axes.items()
@@ -219,7 +222,7 @@ class Mirror:
 
     @property
     def start(self) -> StartState:
-        """The machine as the start of a plan."""
+        """The mirrored state as the start of a plan: positions, rates, camera, tube, X-rays."""
         return StartState(
             self.positions,
             {n: a.speed for n, a in self.axes.items()},
@@ -272,7 +275,10 @@ class Mirror:
         return replace(self, axes=axes)
 
     def alarmed(self, alarm: Alarm) -> Mirror:
-        """Add an alarm, unless its condition is known already."""
+        """Add an alarm, unless one of its kind about the same thing is active already.
+
+        Only the last `MAX_ALARMS` are kept; `raised` counts all.
+        """
         key = (alarm.kind, alarm.about)
         if key in self.active:
             return self
@@ -282,7 +288,10 @@ class Mirror:
         )
 
     def cleared(self, about: str, *kinds: str) -> Mirror:
-        """End the conditions about something, of these kinds or of all."""
+        """End the active conditions about something, of `kinds` or (none given) of all kinds.
+
+        The list of past alarms stays.
+        """
         ended = {k for k in self.active if k[1] == about and (not kinds or k[0] in kinds)}
         if ended:
             return replace(self, active=self.active - ended)

@@ -69,6 +69,12 @@ class ConeVec:
     detector_shape: Shape2 | None = None
 
     def __post_init__(self) -> None:
+        """Copy the rows as read-only float64, (n, 12); one row (12,) becomes (1, 12).
+
+        Raises:
+            GeometryError: another shape, a row that is not finite (the first is named),
+                or a detector shape that is not positive.
+        """
         rows = np.array(as_numbers("cone_vec", self.rows), ndmin=2)
         if rows.ndim != 2 or rows.shape[1] != ROW_LENGTH:
             raise GeometryError(
@@ -452,6 +458,7 @@ class ConeVec:
         return np.asarray(self.rows, dtype=dtype)
 
     def __eq__(self, other: object) -> bool:
+        """Compare type, detector shape and rows, exactly (no tolerance)."""
         return (
             isinstance(other, ConeVec)
             and self.detector_shape == other.detector_shape

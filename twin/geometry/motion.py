@@ -53,6 +53,9 @@ class Motion:
     evidence: tuple[float, ...]
 
     def __repr__(self) -> str:
+        """Format as one line: number of frames, and the range (maximum less minimum) of each
+        offset.
+        """
         sizes = ", ".join(
             f"{n} {to_edge(n, float(np.ptp(self.values[:, i]))):.3g} {UNITS[n]}"
             for i, n in enumerate(self.names)

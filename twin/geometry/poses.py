@@ -54,6 +54,11 @@ class Poses:
     mount: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
+        """Broadcast each field to the number of angles, (n,) or (n, 3), as read-only float64
+        copies.
+
+        Shapes that do not broadcast raise numpy's ValueError; values are not checked.
+        """
         n = np.size(self.angle)
         for f in fields(self):
             given = np.asarray(getattr(self, f.name), dtype=np.float64)
@@ -68,6 +73,7 @@ class Poses:
         return Poses(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def __eq__(self, other: object) -> bool:
+        """Compare all fields with those of other poses, exactly (no tolerance)."""
         return isinstance(other, Poses) and all(
             np.array_equal(getattr(self, f.name), getattr(other, f.name))
             for f in fields(self)

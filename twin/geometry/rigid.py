@@ -52,6 +52,13 @@ class Rigid:
     shift: FloatArray
 
     def __post_init__(self) -> None:
+        """Copy `turn` and `shift` as read-only float64 after checking them.
+
+        Raises:
+            GeometryError: shapes other than (3, 3) and (3,), a shift that is not finite,
+                or a `turn` that is not orthogonal within `ORTHOGONAL_TOLERANCE` or
+                mirrors.
+        """
         turn, shift = (
             np.array(part, dtype=np.float64) for part in (self.turn, self.shift)
         )
@@ -142,6 +149,7 @@ class Rigid:
         return points @ self.turn.T + self.shift
 
     def __eq__(self, other: object) -> bool:
+        """Compare type, rotation and shift, exactly (no tolerance)."""
         return (
             isinstance(other, Rigid)
             and np.array_equal(self.turn, other.turn)

@@ -433,6 +433,7 @@ class _Builder:
     """Collects pieces; used only while a trajectory is being made."""
 
     def __init__(self, time: float, position: float, velocity: float) -> None:
+        """Begin a trajectory without pieces at `time` [s], with position and velocity."""
         self.begin = (time, position, velocity)
         self.time = time
         self.position = position

@@ -83,6 +83,12 @@ class ScannerTwin:
         guard: Guard | None = None,
         last_stop: int = 0,
     ) -> None:
+        """Make the scanner at rest at home at twin time `now` [s], X-rays off, stage empty.
+
+        Tube and camera have the machine's settings; no correction is applied. `guard`
+        finds collisions of a motion (None: none are looked for); safety counts stops from
+        `last_stop` on.
+        """
         self.machine = machine
         self.profile = profile
         self.guard = guard

@@ -102,6 +102,9 @@ class StagePlacement:
     rz: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check that every offset is finite; raise LimitError, which names the first that is
+        not.
+        """
         for f in fields(self):
             if not math.isfinite(getattr(self, f.name)):
                 what = f"sample offset {f.name} is {getattr(self, f.name)}; it must be finite"

@@ -387,6 +387,10 @@ class _Line:
     """Reads one row and reports its problems."""
 
     def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
+        """Take one row to be parsed; problems found in it are appended to `problems`.
+
+        The component is the first column, in a row without tabs the first word.
+        """
         self.row = row
         self.problems = problems
         if row.columns:

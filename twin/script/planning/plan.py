@@ -83,6 +83,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     duration_s: float
 
     def __repr__(self) -> str:
+        """Format as one line: machine, steps, projections, duration [s], errors and warnings."""
         return (
             f"<ScanPlan on {self.machine.name}: {len(self.steps)} steps, {self.frames} "
             "projections,"

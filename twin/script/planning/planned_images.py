@@ -174,6 +174,11 @@ class ImageCollector:
         findings: Findings,
         averages: int | None,
     ) -> None:
+        """Begin to collect a script's images; findings are added to `findings`.
+
+        `averages` is a hint from outside; unless None, the camera takes it as assumed
+        setting.
+        """
         self.machine = machine
         self.motors = motors
         self.tube = tube

@@ -61,6 +61,7 @@ class Motor:
     """One motor: settings for moves to come and all motion so far."""
 
     def __init__(self, position: float, speed: float, acceleration: float) -> None:
+        """Make a motor at rest at `position` that has never moved [mm, deg; per s; per s²]."""
         self.home = position
         self.speed = speed
         self.acceleration = acceleration
@@ -98,6 +99,7 @@ class Motors:
     """All motors of a machine, virtual axes resolved."""
 
     def __init__(self, machine: Machine, start: StartState) -> None:
+        """Make a motor for each axis of the machine, with the position and rates of `start`."""
         self.machine = machine
         self.all = {
             n: Motor(start.positions[n], start.speeds[n], start.accelerations[n])
