@@ -59,7 +59,11 @@ def lego_data() -> dict[str, Any]:
 
 
 def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
-    """Compute the bead centres of the LEGO phantom (k, 3) [mm]."""
+    """Compute the bead centres of the LEGO phantom (k, 3) [mm], one a brick, bottom first.
+
+    They are on an elliptic spiral, inside the walls by the clearance and the bead's
+    `radius`.
+    """
     v = stack.measures
     k = np.arange(stack.bricks)
     width, breadth, height = stack.size_mm
@@ -153,7 +157,9 @@ class Brickwork:
 
     @property
     def size_mm(self) -> analytic.Vector:
-        """Width, breadth, height with the top studs [mm]."""
+        """Width, breadth, height [mm]; only the height includes the studs, those of the top
+        brick.
+        """
         v = self.measures
         return (
             self.studs[0] * v["stud_pitch_mm"],

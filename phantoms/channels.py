@@ -320,7 +320,10 @@ def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
 
 
 def _overlaps(fine: Volume, coarse: Volume, axis: int) -> FloatArray:
-    """Compute the length of each coarse voxel in each fine one over its own, (coarse, fine)."""
+    """Compute which part of a coarse voxel's edge each fine one covers along `axis` (x, y, z).
+
+    (coarse, fine), shares of the coarse voxel's edge, 0 to 1.
+    """
 
     def planes(volume: Volume) -> FloatArray:
         """Compute the planes between the voxels of a volume [mm]."""

@@ -70,7 +70,9 @@ def mapping(value: object, where: str) -> Mapping[str, object]:
 
 
 def get(document: object, key: str, where: str) -> object:
-    """Return field `key` of `document`; raise PhantomError if it is missing."""
+    """Return field `key` of `document`; raise PhantomError if that is no mapping or has no
+    `key`.
+    """
     given = mapping(document, where)
     if key not in given:
         raise PhantomError(f"{where}.{key} is missing", {"path": f"{where}.{key}"})
@@ -157,7 +159,7 @@ def lengths(value: object, where: str) -> analytic.Vector:
 
 
 def unit(value: object, where: str) -> analytic.Vector:
-    """Return `value` as a unit vector (3,); raise PhantomError otherwise."""
+    """Return `value` as a vector (3,); raise PhantomError unless its length is 1 within 1e-6."""
     found = vector(value, where)
     if abs(math.hypot(*found) - 1.0) > 1e-6:
         raise wrong(value, where, "a unit vector")
@@ -165,7 +167,11 @@ def unit(value: object, where: str) -> analytic.Vector:
 
 
 def axes(value: object, where: str) -> analytic.Matrix:
-    """Return `value` as three orthogonal unit vectors; raise PhantomError otherwise."""
+    """Return `value` as three unit vectors, orthogonal within 1e-6; raise PhantomError
+    otherwise.
+
+    Mirrored axes are allowed.
+    """
     rows = each(value, where, unit)
     if len(rows) != 3 or not np.allclose(
         np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6
@@ -233,7 +239,7 @@ def _count(value: object, where: str) -> int:
 def _three(
     value: object, where: str, read: Callable[[object, str], float]
 ) -> analytic.Vector:
-    """Read three numbers, each by `read`."""
+    """Read three numbers, each by `read`; raise PhantomError for another count."""
     numbers = each(value, where, read)
     if len(numbers) != 3:
         raise wrong(value, where, "three numbers")
@@ -301,7 +307,11 @@ def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
 
 
 def _solid(document: object, where: str) -> analytic.Solid:
-    """Read a solid."""
+    """Read a solid from its fields shape, material (any name) and mu_per_mm.
+
+    Raises:
+        PhantomError: one is missing or wrong, with its key path.
+    """
     return analytic.Solid(
         shape_from_dict(get(document, "shape", where), f"{where}.shape"),
         string(get(document, "material", where), f"{where}.material"),
@@ -310,7 +320,10 @@ def _solid(document: object, where: str) -> analytic.Solid:
 
 
 def shape_from_dict(document: object, where: str) -> analytic.Shape:
-    """Make a shape from `{kind, ...}`; raise PhantomError naming the key path."""
+    """Make a shape from `{kind, ...}`; raise PhantomError, naming the key path.
+
+    An unknown kind, missing or unknown fields and wrong values are errors.
+    """
     kind = get(document, "kind", where)
     if not isinstance(kind, str) or kind not in _KINDS:
         raise wrong(kind, f"{where}.kind", ", ".join(_KINDS))

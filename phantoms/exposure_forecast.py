@@ -162,7 +162,7 @@ class Forecast:
     assumed: tuple[str, ...]
 
     def __repr__(self) -> str:
-        """One line."""
+        """Format as one line: images, time [s], least transmission, pixel shares, best kV."""
         return (
             f"<Forecast: {self.images} images in {self.seconds:.0f} s, "
             f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} "
@@ -522,7 +522,7 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, 
 
 
 def _shares(parts: Sequence[Channel], chain: Chain, probe: SampleProbe) -> CountShares:
-    """Project the sample along the rays of a probe, and count the pixels."""
+    """Project the sample's materials along the rays of a probe, and count the pixels by share."""
     cone = probe.cone_vec
     shape = cone.of_shape(None)
     paths = np.zeros((len(parts), len(cone), *shape), np.float32)

@@ -83,7 +83,11 @@ def gear_phantom() -> Phantom:
 
 
 def _holes(plastic: Material) -> list[Solid]:
-    """Make the holes of the gear as solids of negative attenuation: windows, then pores."""
+    """Make the gear's holes as solids of the plastic's negative attenuation: windows, then
+    pores.
+
+    Windows are cylinders through the whole height, pores are balls.
+    """
     bottom, top, _ = LEVELS_MM
     shapes: list[Cylinder | Ellipsoid] = []
     for k in range(WINDOWS):
@@ -108,7 +112,7 @@ def _angles() -> FloatArray:
 
 
 def _circle(level_mm: float) -> Ring:
-    """Return a ring of the bore (n, 3)."""
+    """Return the points of a ring of the bore at a height, (n, 3) [mm]."""
     angle = _angles()
     flat = np.full(len(angle), level_mm)
     return np.stack(

@@ -95,7 +95,7 @@ class Material:
 
 @lru_cache
 def materials() -> Mapping[str, Material]:
-    """Load all bundled materials, name -> material; read once."""
+    """Load all bundled materials, name -> material; the file is read once."""
     text = (resources.files("flexdt.phantoms") / "data" / "materials.toml").read_text(
         "utf-8"
     )
@@ -148,7 +148,12 @@ def material(name: str) -> Material:
 
 @lru_cache(maxsize=64)
 def _by_formula(name: str) -> Material:
-    """Make the material of FORMULA@DENSITY; the last 64 are cached."""
+    """Make the material of FORMULA@DENSITY [g/cm3], without measured points; the last 64 are
+    cached.
+
+    Raises:
+        LimitError: it cannot be parsed.
+    """
     substance = Substance.parse(name)
     return Material(
         name,
@@ -162,7 +167,7 @@ def _by_formula(name: str) -> Material:
 
 
 def _fractions(entry: Mapping[str, object]) -> tuple[tuple[str, float], ...]:
-    """Read mass fractions, or compute them from a formula."""
+    """Read mass fractions (element, fraction) if stated, else compute them from the formula."""
     formula = entry.get("formula")
     fractions = entry.get("fractions")
     if isinstance(fractions, Mapping):

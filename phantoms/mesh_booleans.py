@@ -164,7 +164,10 @@ def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
 
 
 def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
-    """Find the faces of each connected surface of a mesh, as arrays of indices."""
+    """Find the connected surfaces of a mesh: arrays of face indices, one for each.
+
+    Faces are connected by shared vertices.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -179,7 +182,10 @@ def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
 
 
 def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
-    """Return whether the boxes around any two of the bodies overlap."""
+    """Return whether the bounding boxes of any two bodies overlap (touching does not count).
+
+    True without a look for more than `MAX_COMPARED_BODIES`.
+    """
     if len(bodies) > MAX_COMPARED_BODIES:
         return True
     low = np.array([corners.min(axis=0) for corners in bodies])

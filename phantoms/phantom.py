@@ -172,7 +172,10 @@ class Phantom(ArrayValue):
         return voxelise(self.scene, self.surfaces, self.size_mm, voxel, oversample)
 
     def to_dict(self) -> dict[str, object]:
-        """Convert to a JSON-able document; `from_dict` makes an equal phantom of it."""
+        """Convert to a JSON-able document with its schema; `from_dict` makes an equal phantom.
+
+        Values that are None, and empty surfaces and materials, are left out.
+        """
         document = adapter_of(Phantom).dump_python(self, mode="json", exclude_none=True)
         for place, name in (
             (document, "surfaces"),

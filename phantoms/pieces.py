@@ -115,7 +115,10 @@ def freeze(target: object, **arrays: npt.NDArray[np.generic]) -> None:
 def boxes(
     scene: analytic.Scene, surfaces: Sequence[Surface] = (), voxels: Voxels | None = None
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Compute the low and high corner of the box around each part, (3,) each [mm]."""
+    """Compute the low and high corner of the box around each part, (3,) each [mm].
+
+    In order: solids, surfaces, then the voxels (whole grid, empty ones included).
+    """
     found = [bounds(solid.shape) for solid in scene.solids]
     found += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]
     if voxels is not None:

@@ -375,7 +375,10 @@ def _labelled(
 
 
 def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
-    """Make the phantom of an object with vertices and faces."""
+    """Make the phantom of an object with vertices [mm] and faces, filled with one material.
+
+    `material` None is `abs`; it is centred unless `keep`.
+    """
     import trimesh
 
     vertices: FloatArray = np.array(mesh.vertices, dtype=np.float64)
@@ -394,7 +397,7 @@ def _solids(scene: Scene) -> Phantom:
 
 
 def _shown(sample: object) -> str:
-    """Format a sample briefly, for error messages."""
+    """Format a sample for error messages: type, and its text if that has at most 60 characters."""
     text = repr(sample)
     if len(text) <= 60:
         return f"{type(sample).__name__} {text}"

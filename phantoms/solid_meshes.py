@@ -138,7 +138,7 @@ def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
 
 @lru_cache
 def _unit_ball() -> trimesh.Trimesh:
-    """Make the polyhedron inscribed in a ball of radius 1; once, as it takes milliseconds."""
+    """Make the polyhedron inscribed in a ball of radius 1; cached, as it takes milliseconds."""
     import trimesh
 
     ball: trimesh.Trimesh = trimesh.creation.icosphere(SPHERE_SUBDIVISIONS, radius=1.0)
@@ -185,7 +185,7 @@ def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
 
 
 def _placed(linear: FloatArray, center: tuple[float, float, float]) -> FloatArray:
-    """Make the (4, 4) matrix of a linear map (3, 3) and a shift to `center` [mm]."""
+    """Make the (4, 4) matrix of a linear map (3, 3) followed by a shift to `center` [mm]."""
     transform = np.eye(4)
     transform[:3, :3] = linear
     transform[:3, 3] = center

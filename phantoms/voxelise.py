@@ -162,7 +162,10 @@ def _add_surface(
 
 
 def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
-    """Return the first and last + 1 voxel of an extent along one axis."""
+    """Return the first voxel, and the last plus one, that an extent [mm] touches along one axis.
+
+    The grid of `n` voxels is centred on 0; the range is cut to it.
+    """
     return (
         max(math.floor(low / voxel_mm + n / 2.0 - 1e-9), 0),
         min(math.ceil(high / voxel_mm + n / 2.0 + 1e-9), n),

@@ -9,7 +9,14 @@ BYTE_ORDER_MARK: Final = "\ufeff"
 
 
 def parse_json(text: str, kind: type[dict[str, Any]] = dict) -> Any:
-    """Parse a JSON document to plain Python values."""
+    """Parse a JSON document, after an optional byte order mark; objects become `kind`.
+
+    `kind` is called with a list of pairs.
+
+    Raises:
+        ValueError: with the reason: no JSON (JSONDecodeError), nested too deep, or too
+            long a whole number.
+    """
     try:
         return json.loads(text.removeprefix(BYTE_ORDER_MARK), object_pairs_hook=kind)
     except json.JSONDecodeError:

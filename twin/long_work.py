@@ -67,7 +67,7 @@ class Passes:
         self.advance(1.0 - 1.0 / (1.0 + passes))
 
     def counting(self, read: Callable[[int], Part]) -> Callable[[int], Part]:
-        """Count the parts that a function reads."""
+        """Wrap a function that reads a part by index: each call counts one step first."""
 
         def one(index: int) -> Part:
             self.step()

@@ -81,7 +81,10 @@ def with_arguments_of(
     checkers."""
 
     def typed(function: Callable[..., Result]) -> Callable[P, Result]:
-        """Give the function the other's parameters, with its own result, and return it."""
+        """Give the function the other's parameters, with its own result, and return it itself.
+
+        Only the signature that is shown changes; calls are not checked.
+        """
         result = inspect.signature(function).return_annotation
         shown = inspect.signature(other).replace(return_annotation=result)
         function.__signature__ = shown  # type: ignore[attr-defined]
@@ -171,7 +174,10 @@ def _checked(function: Thing, text: str) -> Thing:
 
     @wraps(function)
     def call(*given: Any, **named: Any) -> Any:
-        """Check the arguments of a call, then call the function."""
+        """Check the arguments of a call (converted where allowed), then call the function.
+
+        Types that were allowed together before are not checked again.
+        """
         # Types that have been allowed together once are not looked at again.
         types_of = (*map(_type, given), *named, *map(_type, named.values()))
         if None in types_of or types_of not in known.allowed:
@@ -217,7 +223,7 @@ class Known:
 
     @cached_property
     def kinds(self) -> dict[str, Kind]:
-        """What is allowed for each argument whose annotation says it."""
+        """What is allowed for each argument whose annotation states it; others are left out."""
         names = Names(
             self.function.__globals__,
             npt=types.SimpleNamespace(ArrayLike=Array, NDArray=Array),
@@ -265,7 +271,10 @@ class Known:
         return named
 
     def _name_for(self, given: tuple[Any, ...]) -> str:
-        """Name the function as the caller does: a method by the class that it was called on."""
+        """Name the function as its caller does: a method by the class that it was called on.
+
+        Without a known class the name it was defined with; `__init__` is left out.
+        """
         owner, dot, method = self.qualname.rpartition(".")
         if given and isinstance(given[0], type):
             called = given[0]

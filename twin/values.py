@@ -99,7 +99,7 @@ def adapter_of(cls: type[Any]) -> TypeAdapter[Any]:
 
 
 def _same(a: object, b: object) -> bool:
-    """Compare two values by content, arrays and mappings included."""
+    """Compare two values by content: arrays, and mappings of them, at every level."""
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return np.array_equal(a, b)  # type: ignore[arg-type]
     if isinstance(a, Mapping) and isinstance(b, Mapping):

@@ -310,7 +310,10 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
 
 def _body(value: object, where: str) -> tuple[Vector, str]:
-    """Read the body of a bead file: size [mm] and material (abs if left out)."""
+    """Read the body of a bead file: size [mm] and material (`abs` if left out).
+
+    Other keys are an error.
+    """
     given = reading.fields(
         value, where, {"size_mm": reading.lengths}, {"material": reading.string}
     )

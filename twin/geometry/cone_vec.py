@@ -469,7 +469,10 @@ class ConeVec:
         return hash((self.detector_shape, self.rows.shape, self.rows.tobytes()))
 
     def __repr__(self) -> str:
-        """One line; for up to two views it evaluates back to an equal value."""
+        """Format as one line; up to `MAX_PRINTED_VIEWS` views it evaluates to an equal value.
+
+        Above that it has number of views, detector, and distance of source and detector.
+        """
         if len(self) <= MAX_PRINTED_VIEWS:
             shape = ""
             if self.detector_shape is not None:
@@ -482,7 +485,7 @@ class ConeVec:
         )
 
     def _repr_html_(self) -> str:
-        """Format the facts as an HTML table, for notebooks."""
+        """Format the facts (views, detector, distances) as an HTML table, for notebooks."""
         cells = "".join(
             f"<tr><th>{k}</th><td>{v}</td></tr>" for k, v in self._facts().items()
         )
@@ -821,7 +824,10 @@ class ConeVec:
 
 
 def check_shape(shape: Shape2) -> Shape2:
-    """Return (rows, cols) as integers; raise GeometryError unless both are positive."""
+    """Return (rows, cols) as ints; raise GeometryError unless both are positive.
+
+    Numbers that are not whole raise TypeError.
+    """
     rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
         what = f"detector shape {shape!r}; allowed: (rows, cols), both positive"

@@ -62,7 +62,10 @@ class PanelModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coefficients, in order."""
+        """Names of the coefficients, in order: affine terms, bending terms, then panel gaps.
+
+        A term of bending or gap has one coefficient for the column and one for the row.
+        """
         bent = [f"{way}_x{i}y{j}" for way in ("column", "row") for i, j in TERM_POWERS]
         gaps = [
             f"{way}_from_{('column', 'row')[b.axis]}_{b.at:.0f}"
@@ -73,7 +76,11 @@ class PanelModel:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of the priors, (m,) [px]; their means are zero."""
+        """Standard deviations of the coefficients' priors, (m,) [px]; the priors' means are
+        zero.
+
+        `width_px` for affine and bending terms, `GAP_SIGMA_PX` for gaps between tiles.
+        """
         m = len(self.names)
         out = np.full(m, self.width_px)
         out[m - 2 * len(self.borders) :] = GAP_SIGMA_PX

@@ -82,7 +82,10 @@ class Poses:
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        """One line; for up to two views it evaluates back to an equal value."""
+        """Format as one line; up to `MAX_PRINTED_VIEWS` views it evaluates to an equal value.
+
+        Above that it has the number of views, and the first and last angle [deg].
+        """
         if len(self) > MAX_PRINTED_VIEWS:
             turn = np.degrees(self.angle)
             return f"<Poses: {len(self)} views, {turn[0]:.6g} to {turn[-1]:.6g} deg>"

@@ -53,7 +53,7 @@ class PixelGrid:
 
     @property
     def edges_mm(self) -> tuple[float, float]:
-        """Pitch from column to column and from row to row [mm]."""
+        """Unbinned pitch from column to column and from row to row [mm]; equal unless stated."""
         return (
             self.pitch_mm,
             self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm,
@@ -95,7 +95,7 @@ class CameraSettings:
 
     @property
     def of_image(self) -> dict[str, Any]:
-        """Settings of an image, by name: mode, exposure_ms, roi (its edges), averages."""
+        """Settings of an image, by name: mode, exposure_ms, roi (its edges), averages; no gain."""
         return {
             "mode": self.mode,
             "exposure_ms": self.exposure_ms,

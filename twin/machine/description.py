@@ -326,7 +326,9 @@ class FilterSpec(_Frozen):
     @field_validator("material")
     @classmethod
     def _known(cls, text: str) -> str:
-        """Check that the material is known."""
+        """Return the text unchanged; raise UnknownNameError or LimitError for an unknown
+        material.
+        """
         from flexdt.twin.attenuation.substances import Substance
 
         Substance.called(text)
@@ -363,7 +365,9 @@ class TubeSpec(_Frozen):
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
-        """Check that the settings at start are within the tube's limits."""
+        """Check the initial kV (both limits), the power (upper limit), and that spot_points
+        is not 2.
+        """
         allowed = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
         _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, allowed)
         allowed = f"at most max_W, {self.max_W:g}"
@@ -484,7 +488,7 @@ class Timing(_Frozen):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of commands that have a time here."""
+        """Kinds of commands that have a time here, assumed or measured, without the "_s"."""
         return tuple(
             name[:-2]
             for name in Timing.model_fields
@@ -505,7 +509,7 @@ class Timing(_Frozen):
 
     @model_validator(mode="after")
     def _spreads_hold(self) -> Timing:
-        """Check that each measured kind has a time, between p5_s and p95_s."""
+        """Check that each kind with a spread has a time, and that it is from p5_s to p95_s."""
         _require(self.spread, self.kinds, "spread", "kind of command")
         for kind, found in self.spread.items():
             middle = self.seconds(kind)
@@ -527,7 +531,7 @@ class EStop(_Frozen):
 
 
 def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
-    """Return priors if they name offsets; raise PydanticCustomError otherwise."""
+    """Return priors unchanged if all name offsets; raise PydanticCustomError otherwise."""
     for name in priors:
         if name not in NAMES:
             raise _refused(name, priors[name], f"a known offset: {', '.join(NAMES)}")
@@ -796,7 +800,7 @@ class Machine(_Frozen):
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
 
     def chain(self, component: Component) -> tuple[str, ...]:
-        """List the motors that carry `component`, from itself up to the fixed parts."""
+        """List the motors that carry `component`, from its own to the outermost; () for none."""
         parents = {c.name: c for c in self.components}
         motors: list[str] = []
         part: Component | None = component
@@ -848,7 +852,10 @@ def _refuse_if(wrong: bool, at: str, value: object, allowed: str) -> None:
 
 
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
-    """Make the error for an axis that `machine` does not have; returned, not raised."""
+    """Make the error for a name that is no axis of `machine`; returned, not raised.
+
+    Motors and virtual axes are listed as allowed.
+    """
     allowed = [*machine.axes, *machine.virtual_axes]
     return UnknownNameError.among(
         f"unknown axis {name!r}; {machine.name} has", name, allowed
@@ -961,7 +968,10 @@ def builtin_machines() -> tuple[str, ...]:
 
 
 def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
-    """List the names of the shipped profiles, of one machine or of all."""
+    """List the names of the shipped profiles, sorted, of `machine` or (None) of all machines.
+
+    For a machine the profiles are read; an unknown machine gives ().
+    """
     names = _names("profiles")
     return tuple(
         n for n in names if machine is None or builtin_profile(n).machine == machine
@@ -969,7 +979,7 @@ def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
 
 
 def _names(kind: str) -> tuple[str, ...]:
-    """List the names of the shipped files of a kind, machines or profiles."""
+    """List the names of the shipped files of a kind ("machines" or "profiles"), sorted."""
     folder = resources.files("flexdt.twin") / "data" / kind
     return tuple(
         sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
@@ -977,7 +987,7 @@ def _names(kind: str) -> tuple[str, ...]:
 
 
 def _data(kind: str, name: str) -> str:
-    """Read a shipped file; raise UnknownNameError if there is none."""
+    """Read the text of a shipped file; raise UnknownNameError, with the allowed names, if none."""
     if name not in _names(kind):
         what = f"no {kind[:-1]} called {name!r} ships with flexdt; there are"
         raise UnknownNameError.among(what, name, _names(kind))
@@ -1225,7 +1235,10 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
 
 
 def _limit(path: str) -> str:
-    """Return the limitation by docs/limits.md of a key, to end an error with, or ""."""
+    """Return the limitation that a key (by the beginning of its last part) comes from, or "".
+
+    The text refers to docs/limits.md and ends an error message.
+    """
     last = path.rpartition(".")[2].lower()
     limit = next(
         (text for key, text in _KEY_LIMITS.items() if last.startswith(key)), None
@@ -1238,7 +1251,10 @@ def _limit(path: str) -> str:
 def _require(
     names: Iterable[str], allowed: Iterable[str], where: str, what: str, more: str = ""
 ) -> None:
-    """Raise `_refused` unless all `names` are in `allowed`."""
+    """Raise `_refused` for the first of `names` that is not in `allowed`.
+
+    `where` is the key, `what` the noun of the message, `more` its end.
+    """
     valid = list(allowed)
     for name in names:
         if name not in valid:

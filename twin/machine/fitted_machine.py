@@ -113,7 +113,7 @@ def _timing_table(timing: Timing) -> str:
 
 
 def _keys(model: BaseModel, beside: set[str] | None = None) -> list[str]:
-    """Format a model's values that are not defaults as TOML lines."""
+    """Format a model's values as TOML lines, without defaults, None, and the fields `beside`."""
     values = model.model_dump(exclude_defaults=True, exclude=beside)
     return [
         f"{key} = {json.dumps(value, ensure_ascii=False)}"

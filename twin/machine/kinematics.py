@@ -93,7 +93,10 @@ def motor_poses(
     values = dict(zip(machine.axes, columns, strict=True))
 
     def total(quantity: str) -> FloatArray:
-        """Sum up a quantity over its motors, (n,) [mm, deg]."""
+        """Sum up a quantity over its motors and its fixed part, (n,) [mm, deg].
+
+        A quantity that no motor moves is its fixed part, or zero.
+        """
         out = np.full_like(columns[0], machine.fixed.get(quantity, 0.0))
         for motor, factor in machine.geometry.get(quantity, {}).items():
             out = out + factor * values[motor]

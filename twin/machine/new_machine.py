@@ -206,7 +206,7 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
 
 
 def _lines(values: Mapping[str, object]) -> str:
-    """Format values that are not None as TOML lines."""
+    """Format values as TOML lines, each with its newline; None are left out."""
     return "".join(
         f"{key} = {json.dumps(value, ensure_ascii=False)}\n".replace("\x7f", "\\u007f")
         for key, value in values.items()

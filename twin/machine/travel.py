@@ -127,7 +127,11 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
 
 
 def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
-    """Move the targets into the travel; motors of a virtual axis give up the same share."""
+    """Move the targets of an axis's motors into their travel.
+
+    If a motor of a virtual axis is cut short, all its motors give up the same share, and
+    are then limited once more.
+    """
     bounded = _bounded(machine, targets)
     if axis in machine.axes or bounded == targets:
         return bounded

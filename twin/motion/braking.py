@@ -163,7 +163,10 @@ def coasting(
 
 
 def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
-    """Compute the programme time [s] at which a stop along the path, begun at `at`, ends."""
+    """Compute the programme time [s] at which a stop along the path, begun at `at`, ends.
+
+    Returns `at` if nothing moves then or later.
+    """
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
     if cells:
@@ -193,7 +196,7 @@ def braked_at(
 
 
 def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
-    """Yield the motors of each virtual axis that run in step now and must stop in step."""
+    """Yield the motors of each virtual axis that move in step now, within `STEP_TOLERANCE`."""
     for virtual in machine.virtual_axes.values():
         rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
         fastest = max(map(abs, rates))
@@ -299,7 +302,11 @@ class _State:
 
 
 def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
-    """Evaluate a motor's velocity, acceleration and limit at programme time `s`."""
+    """Evaluate a motor at programme time `s`: velocity, acceleration, limit of its acceleration.
+
+    It also has until when that law holds: the end of the piece or the next trajectory's
+    start.
+    """
     leg = drive.at(s)
     velocity, acceleration, until = leg.law(s)
     return _State(

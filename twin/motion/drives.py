@@ -55,7 +55,11 @@ class Drive:
         return max(0, bisect_right(self._starts, now) - 1)
 
     def at(self, now: float) -> Trajectory:
-        """Return the trajectory in force at `now`, on the twin's clock [s]."""
+        """Return the trajectory in force at `now`, in the twin's time [s].
+
+        If the drive's programme has another origin, the trajectory is shifted; the last
+        one is kept.
+        """
         index = self._index(now)
         if not self.origin:
             return self.trajectories[index]
@@ -90,7 +94,9 @@ class Drive:
         return self.trajectories[-1].target
 
     def ahead(self, now: float) -> Trajectory:
-        """Join all trajectories from `now` on into one."""
+        """Join the trajectory in force at `now` and all later ones into one, in the twin's
+        time [s].
+        """
         left = self.trajectories[self._index(now) :]
         if self.origin:
             left = tuple(leg.shifted(self.origin) for leg in left)
@@ -107,7 +113,7 @@ Drives = Mapping[str, Drive]
 
 
 def home(machine: Machine, now: float) -> dict[str, Drive]:
-    """Make drives at rest at home, with the machine's speeds and accelerations."""
+    """Make a drive for each axis, at rest at home since `now` [s], with the axis's rates."""
     return {
         name: Drive(a.speed, a.acceleration, (motion.at_rest(a.home, now),))
         for name, a in machine.axes.items()
@@ -198,7 +204,11 @@ def plan_jog(
         raise LimitError.of_axis(message, axis, str(velocity), limit, f"{unit}/s")
 
     def run(name: str, lease: float) -> Trajectory:
-        """Plan a motor's share: it runs for `lease` [s], or as far as its limit."""
+        """Plan a motor's share of a jog: it runs for `lease` [s], then brakes.
+
+        If it would end beyond a limit, it goes to that limit instead and stops there.
+        Braking is at least as strong as the current acceleration.
+        """
         axis = machine.axes[name]
         current = drives[name].at(now)
         wanted = velocity * moves[name]
@@ -283,7 +293,7 @@ def with_settings(
 
 
 def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
-    """Raise LimitError if two targets move the same motor."""
+    """Raise LimitError if two targets move the same motor (a motor and a virtual axis of it)."""
     seen: dict[str, str] = {}
     for name in targets:
         for motor in machine.moves(name):
@@ -296,7 +306,10 @@ def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
 def _paces(
     machine: Machine, drives: Drives, targets: Mapping[str, float]
 ) -> dict[str, tuple[float, float]]:
-    """Compute motor -> (speed, acceleration); motors of one axis run in step."""
+    """Compute motor -> (speed, acceleration) for the axes of `targets`.
+
+    Motors of a virtual axis run in step: its slowest motor determines all.
+    """
     out: dict[str, tuple[float, float]] = {}
     for name in targets:
         moves = {m: abs(f) for m, f in machine.moves(name).items()}
@@ -307,7 +320,10 @@ def _paces(
 
 
 def _shortest(axis: Axis, position: float, target: float) -> float:
-    """Find the angle equivalent to `target` nearest to `position` and within travel."""
+    """Find the angle equivalent to `target` nearest to `position` and within travel [deg].
+
+    `target` unchanged for a linear axis, or if no equivalent angle is within travel.
+    """
     if axis.kind != "rotation":
         return target
     turns = round((position - target) / 360.0)

@@ -67,7 +67,7 @@ class Trajectory:
 
     @cached_property
     def knots(self) -> tuple[float, ...]:
-        """Times at which the acceleration changes, the end included if finite."""
+        """Times at which the acceleration changes [s]: starts of the pieces, and a finite end."""
         times = [p.start for p in self.pieces]
         if math.isfinite(self.end) and self.end > times[-1]:
             times.append(self.end)
@@ -80,7 +80,7 @@ class Trajectory:
         return self.pieces[bisect_right(self.knots, time, hi=len(self.pieces)) - 1]
 
     def position(self, time: float) -> float:
-        """Compute the position at `time` [s]."""
+        """Compute the position at `time` [s]: before the motion its start, after it the target."""
         piece = self._piece(time)
         if piece is None:
             if time >= self.end:
@@ -90,7 +90,7 @@ class Trajectory:
         return piece.position + dt * (piece.velocity + 0.5 * piece.acceleration * dt)
 
     def velocity(self, time: float) -> float:
-        """Compute the velocity at `time` [s]."""
+        """Compute the velocity at `time` [s]; 0 before and after the motion."""
         piece = self._piece(time)
         if piece is None:
             return 0.0
@@ -144,7 +144,7 @@ class Trajectory:
 
     @property
     def top_speed(self) -> float:
-        """Largest speed of the motion, >= 0: a piece has it at one of its ends."""
+        """Largest absolute speed of the motion; each piece has it at one of its ends."""
         ends = zip(
             self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True
         )
@@ -164,7 +164,7 @@ class Trajectory:
         )
 
     def shifted(self, dt: float) -> Trajectory:
-        """Return the same motion `dt` seconds later."""
+        """Return the same motion `dt` seconds later; positions and target are unchanged."""
         pieces = tuple(
             Piece(p.start + dt, p.position, p.velocity, p.acceleration)
             for p in self.pieces
@@ -222,7 +222,7 @@ class AxisPath(ArrayValue):
 
     @classmethod
     def along(cls, trajectory: Trajectory) -> AxisPath:
-        """Convert one trajectory, with the rest after it."""
+        """Convert one trajectory to a table of pieces; rest at the target follows a finite end."""
         rows = [
             (p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces
         ]
@@ -441,7 +441,10 @@ class _Builder:
         self.pieces: list[Piece] = []
 
     def _add(self, dt: float, acceleration: float) -> None:
-        """Add a piece of `dt` seconds, unless that is none."""
+        """Add a piece of `dt` seconds and move time and position to its end; none for `dt` <= 0.
+
+        The velocity is left for the caller to change.
+        """
         if dt <= 0.0:
             return
         self.pieces.append(Piece(self.time, self.position, self.velocity, acceleration))

@@ -87,7 +87,9 @@ class JogMotion:
 
     @property
     def warnings(self) -> list[str]:
-        """Message about a jog that was cut short, if it was."""
+        """Message naming the pair that a jog would hit and where it ends before; [] if not
+        cut short.
+        """
         if self.cut_short is None:
             return []
         where = ", ".join(f"{name}={value:g}" for name, value in self.rests.items())
@@ -123,7 +125,11 @@ class StopMotion:
         now: float,
         would_hit: Contact | None = None,
     ) -> StopMotion:
-        """Make the value from trajectories that begin at `now` or earlier."""
+        """Make the value: seconds until the last motor rests, and distances of those moving
+        at `now`.
+
+        The trajectories have begun at `now` [s] or earlier; without motion it takes 0 s.
+        """
         distances = {
             n: abs(t.target - t.position(now))
             for n, t in trajectories.items()
@@ -509,7 +515,10 @@ class UnsweptProgramme:
     guard: Guard | None = field(repr=False)
 
     def certified(self) -> CertifiedProgramme:
-        """Sweep the programme to its end; takes about 60 ms for 1440 steps."""
+        """Sweep the whole programme for its first contact; takes about 60 ms for 1440 steps.
+
+        Without a guard nothing is swept, and the programme counts as free.
+        """
         standing = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
         legs = {name: motion.joined(legs) for name, legs in self.legs.items()}
         contact = None
@@ -519,7 +528,10 @@ class UnsweptProgramme:
 
     @property
     def legs(self) -> dict[str, tuple[Trajectory, ...]]:
-        """Motor -> trajectories, the wait for a first one that begins later included."""
+        """Motor -> its trajectories, with a wait at rest first if they begin after 0.
+
+        Motors without a trajectory are left out.
+        """
         out = {}
         for name, legs in self.programme.items():
             if legs and legs[0].start > 0.0:

@@ -738,7 +738,7 @@ class ScannerTwin:
     def _set_stage(
         self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None
     ) -> None:
-        """Set sample, correction and guard, and count the change."""
+        """Set sample, correction and guard, and count a change: certificates of before are void."""
         self.sample = sample
         self.correction = correction
         self.guard = guard
@@ -851,7 +851,11 @@ class ScannerTwin:
         )
 
     def _virtual_state(self, name: str, other: AxisReading, now: float) -> AxisReading:
-        """Read a virtual axis from the one motor it is defined by."""
+        """Make the reading of a virtual axis from that of the motor it is defined by.
+
+        Position, target, velocity, limits, speed and acceleration are converted; the rest
+        is kept. `now` is ignored.
+        """
         virtual = self.machine.virtual_axes[name]
         lower, upper = sorted(virtual.constant + virtual.factor * x for x in other.limits)
         return replace(

@@ -385,7 +385,7 @@ def changed_camera(
 def _require_within(
     device: str, name: str, value: float, lower: float, upper: float
 ) -> None:
-    """Raise LimitError unless a setting is within its range."""
+    """Raise LimitError unless `lower` <= `value` <= `upper`; a value that is not a number fails."""
     if not lower <= value <= upper:
         unit = UNITS_OF_SETTINGS.get(name, "")
         what = f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]{unit}"
@@ -431,7 +431,10 @@ def require_applicable(
 
 
 def _nearest(machine: Machine) -> dict[str, float]:
-    """Compute the motor positions that bring sample and detector nearest to the source."""
+    """Compute the motor positions that bring sample and detector nearest to the source.
+
+    Motors that move neither along the beam stay at home; returns every axis.
+    """
     along = {
         name: machine.geometry.get("object_y", {}).get(name, 0.0)
         + machine.geometry.get("detector_y", {}).get(name, 0.0)

@@ -151,7 +151,9 @@ class _Writer(MotorTargets):
     request: _Request
 
     def rows(self) -> Iterator[str]:
-        """Yield all rows: output path, settings, dark and flat images, the scan, X-rays off."""
+        """Yield the rows: pause, output path, settings, moves, dark and flat images, scan,
+        X-rays off.
+        """
         w = self.request
         out = self.out_of_beam()
         yield _row("scanner", "pause", "0.000000")
@@ -187,7 +189,10 @@ class _Writer(MotorTargets):
         yield _row("camera", "set ROI", str(camera.roi))
 
     def references(self) -> Iterator[str]:
-        """Yield dark and flat images with the sample out of the beam; X-rays stay on."""
+        """Yield dark images (X-rays off), then flat images, from where the motors stand.
+
+        X-rays stay on afterwards.
+        """
         w = self.request
         yield _row("camera", "set number of frames", "1")
         yield _row("tube", "xrayoff")
@@ -219,7 +224,12 @@ class _Writer(MotorTargets):
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
     def tiled(self) -> Iterator[str]:
-        """Yield smooth turns with the detector side by side; neighbours share a tenth."""
+        """Yield one smooth turn for each tile, the detector moved by 0.9 of its width
+        between them.
+
+        The tiles are centred; image numbers go on. Refused for a machine without
+        `detector_x`.
+        """
         w = self.request
         camera = self.camera
         self.need("a tiled scan", "detector_x")
@@ -230,7 +240,7 @@ class _Writer(MotorTargets):
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def calibration(self) -> Iterator[str]:
-        """Yield a smooth turn for each placement of the sample."""
+        """Yield a smooth turn for each placement of the sample; image numbers go on."""
         w = self.request
         for k, place in enumerate(w.placements):
             moved = ("object_y",) if "object_y" in self.drivers else ()
@@ -490,7 +500,9 @@ class _Writer(MotorTargets):
         yield _row("camera", "save image", f"{self.request.folder}\\{file}")
 
     def moves(self, targets: dict[str, float]) -> Iterator[str]:
-        """Yield moves that start together; the second request of each waits for its arrival."""
+        """Yield moves: several start together without waiting, then each is repeated to wait
+        for it.
+        """
         if len(targets) > 1:
             for name, value in targets.items():
                 yield _row(name, "move absolute", _decimal(value), wait="no wait")
@@ -504,7 +516,7 @@ class _Writer(MotorTargets):
 
     @property
     def camera(self) -> CameraSettings:
-        """Camera settings of the request, else the machine's."""
+        """The machine's camera settings, with the request's mode and region where given."""
         w = self.request
         camera = self.machine.detector.camera
         if w.mode is not None:

@@ -213,7 +213,10 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
 
 
 def _dose(plan: ScanPlan) -> Dose:
-    """Sum up a plan's beam time [s], charge [mAs] and exposing time [s]."""
+    """Sum up a plan's beam time [s], charge [mAs] and exposing time [s].
+
+    Exposing counts images with X-rays on, all averages; beam below 1e-3 kV has no charge.
+    """
     exposing = sum(
         len(g) * g.camera.exposure_ms * g.camera.averages / 1000.0
         for g in plan.groups

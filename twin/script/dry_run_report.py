@@ -130,7 +130,10 @@ def _collisions(report: CheckReport) -> str:
 
 
 def _sources(report: CheckReport) -> str:
-    """Describe how much of the commands' time is measured and how much assumed."""
+    """Describe how much of the steps' time is measured and how much assumed, and the source.
+
+    A kind with a spread counts as measured.
+    """
     timing = report.plan.machine.timing
     parts = {"measured": 0.0, "assumed": 0.0}
     for s in report.plan.steps:
@@ -147,7 +150,10 @@ def between(found: Range | None) -> str:
 
 
 def _total(report: CheckReport) -> str:
-    """Describe the 90 % range of the duration."""
+    """Describe the 90 % range of the duration, with a condition if the start is assumed.
+
+    "unknown" if no time of the machine is measured.
+    """
     plan = report.plan
     text = between(total_range(plan.steps, plan.duration_s, plan.machine.timing))
     start = ", if axes and X-rays start as assumed below"
@@ -159,7 +165,7 @@ def _total(report: CheckReport) -> str:
 
 
 def _time(seconds: float) -> str:
-    """Format a duration in h, min and s."""
+    """Format a duration, rounded to seconds, in (hours if any,) min and s."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

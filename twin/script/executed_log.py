@@ -173,7 +173,10 @@ def _line(
 
 
 def _arrived(motor: MotorReply, target: float) -> bool:
-    """Return whether a reply is about a move to `target`, or to the limit before it."""
+    """Return whether a reply is about a move to `target`, or to the limit before it.
+
+    The motor's target must agree to 1e-3 (relative above 1), its position to 1 more.
+    """
     allowed = min(max(target, motor.lower), motor.upper)
     near = 1e-3 * (1.0 + abs(allowed))
     return (
@@ -205,7 +208,10 @@ def log_line(
 
 
 def reply_bytes(text: str) -> bytes:
-    """Encode a text as Latin-1 (one byte a character, as replies have), else as UTF-8."""
+    """Encode a text as Latin-1 (one byte a character), or if it does not fit, as UTF-8.
+
+    In UTF-8 lone surrogates become "?".
+    """
     try:
         return text.encode("latin-1")
     except UnicodeEncodeError:

@@ -72,7 +72,10 @@ class Spec:
 
 
 def encode(text: str) -> bytes:
-    """Encode a script's text; the inverse of `decode` of `parse`."""
+    """Encode a script's text as UTF-8; the inverse of `decode` of `parse`.
+
+    Bytes that were not UTF-8 come back; surrogates that never were bytes become "?".
+    """
     try:
         return text.encode("utf-8", "surrogateescape")
     except UnicodeEncodeError:  # a str with lone surrogates that never came from bytes
@@ -179,7 +182,10 @@ def _nothing(_a: str, _b: str) -> dict[str, object]:
 
 
 def _text(field: str, what: str) -> Read:
-    """Make the reader of one required text; `what` is its name for the message."""
+    """Make the reader of one required text for `field`; the second argument is ignored.
+
+    An empty text raises ArgumentError; `what` is its name in the message.
+    """
 
     def read(a: str, _b: str) -> dict[str, object]:
         if not a:
@@ -219,7 +225,7 @@ def _roi(a: str, _b: str) -> dict[str, object]:
 
 
 def _sequence(a: str, b: str) -> dict[str, object]:
-    """Read the prefix and the first number of a sequence."""
+    """Read the prefix and the first number (0 to 999 999; 0 if empty) of a sequence."""
     first = 0
     if b:
         first = whole(b, "first number of the sequence", 0, 999_999, 1)
@@ -227,7 +233,7 @@ def _sequence(a: str, b: str) -> dict[str, object]:
 
 
 def _move(a: str, b: str) -> dict[str, object]:
-    """Read the target and the trigger position of a move."""
+    """Read the target and the trigger position (None if empty) of a move."""
     trigger = None
     if b:
         trigger = number(b, "trigger position", 1)
@@ -345,7 +351,10 @@ def bare_name(path: str) -> str:
 
 
 def image_name(path: str) -> str | None:
-    """Return the file name of one image, with `.tif`; None if the path ends without a name."""
+    """Return the file name of one image without its folder, ending in `.tif` or its own suffix.
+
+    None if the path ends without a name, or the name is only "tif" or "tiff".
+    """
     name = bare_name(path)
     if not name or name.lower() in ("tif", "tiff"):
         return None
@@ -355,7 +364,10 @@ def image_name(path: str) -> str | None:
 
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
-    """List the file names of a sequence: prefix, six digits, `.tif`."""
+    """List `count` file names from number `first`: prefix without folder, six digits, `.tif`.
+
+    A prefix that ends with a slash is only a folder: names are numbers.
+    """
     name = ""
     if not prefix.endswith(("\\", "/")):
         name = bare_name(prefix)
@@ -363,7 +375,11 @@ def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
 
 
 def kind_of(name: str) -> ImageKind:
-    """Determine an image's kind by its name: di* dark, io* flat, else projection."""
+    """Determine an image's kind by its name: di and digits dark, io and digits flat, else
+    projection.
+
+    Case, one `_` or `-` before the digits, and `.tif` do not count.
+    """
     if _DARK.fullmatch(name):
         return "dark"
     if _FLAT.fullmatch(name):
@@ -372,7 +388,7 @@ def kind_of(name: str) -> ImageKind:
 
 
 def _move_line(k: c.MoveAbsolute) -> str:
-    """Describe a move."""
+    """Describe a move: axis, target, and the trigger position if it waits for that."""
     until = ""
     if k.wait is c.Wait.POS and k.trigger is not None:
         until = f", goes on at {k.trigger:g}"

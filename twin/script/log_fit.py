@@ -78,7 +78,10 @@ class Fit:
 
     @property
     def cross_validated_s(self) -> float:
-        """Sum of absolute errors with each time predicted from the others of its kind [s]."""
+        """Sum of absolute errors [s], each line of a fitted kind predicted without itself.
+
+        Lines of other kinds count with their fitted error.
+        """
         total = self.lines.sum_abs_error_s
         for kind, times in self.samples.items():
             middle = self.machine.timing.seconds(kind)
@@ -202,7 +205,11 @@ class LogComparison:
         return sorted(self.rows, key=lambda row: -abs(row.error_s))
 
     def table(self) -> list[tuple[str, ...]]:
-        """Format the lines as rows of text below `HEADER`, greatest error first."""
+        """Format the lines as rows of text below `HEADER`, greatest error first.
+
+        Line, real, predicted, range (empty if unknown), error ("!" outside the range),
+        command.
+        """
         return [
             (
                 str(r.line),
@@ -301,7 +308,11 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
 
 
 def against_log(log: Log, machine: Machine) -> list[LogRow]:
-    """Compare each line of an executed script with its prediction, in the log's order."""
+    """Compare each line of an executed script with its prediction, in the log's order.
+
+    A row has real and predicted time [s] of the line itself; the 5 % to 95 % range is
+    None where unmeasured.
+    """
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):
         low, high = step_range(step, machine.timing) or (None, None)

@@ -66,7 +66,9 @@ class MotorTargets:
         return round(self.value(quantity, {}), 6)
 
     def value(self, quantity: str, positions: Mapping[str, float]) -> float:
-        """Compute a quantity with motors at `positions`, the others at home [mm]."""
+        """Compute a quantity with motors at `positions`, the others at home [mm]; linear in
+        each.
+        """
         factors = self.machine.geometry.get(quantity, {})
         moved = (
             f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items()

@@ -105,7 +105,11 @@ def decode(data: str | bytes) -> str:
 
 
 def is_utf16(data: str | bytes) -> bool:
-    """Return whether the text was saved in two bytes a character, which no scanner does."""
+    """Return whether a text seems saved as UTF-16, which no scanner writes.
+
+    By its byte order mark, or (4 bytes or more) zero bytes at all even or all odd places
+    of the first 40.
+    """
     if isinstance(data, bytes):
         head = data[:40]
     else:
@@ -146,7 +150,11 @@ def is_log(text: str | bytes) -> bool:
 
 
 def rows(data: str | bytes) -> Iterator[CodeLine]:
-    """Yield the rows of a script without blank lines and comment lines."""
+    """Yield the rows of a script, without blank, wordless and comment lines.
+
+    Rows without tabs have no columns (None); rows of binary data are divided in their own
+    way.
+    """
     for number, text in _lines(decode(data)):
         if _BLOB.match(text) and "\t" in text:
             yield CodeLine(number, text, _blob_columns(text))
@@ -355,7 +363,7 @@ def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
 
 
 def content(text: Source) -> str | bytes:
-    """Return the text or bytes of a script, read from its file if a path is given."""
+    """Return the text or bytes of a script as given; a path is read, as bytes."""
     if isinstance(text, str | bytes):
         return text
     read: bytes = backend("scripts").read(text)
@@ -715,7 +723,7 @@ def _split(field: Field) -> list[Field]:
 
 
 def _meant(asked: str, allowed: Sequence[str]) -> str:
-    """Suggest the nearest allowed name, or return ""."""
+    """Suggest the nearest allowed name, as " (did you mean ...?)"; "" if none is near."""
     near = nearest_name(asked, allowed)
     if near is None:
         return ""

@@ -51,7 +51,10 @@ class View:
 
     @property
     def outside(self) -> BoolArray:
-        """Whether no part of the sample is projected onto the image, (n,) bool."""
+        """Whether no part of the sample is projected onto the image, (n,) bool.
+
+        An unknown top or bottom is taken as the rotation axis's row.
+        """
         rows, cols = self.camera.shape
         middle = _project(self.poses, self.poses.axis, (rows, cols))[:, 1]
         top, bottom = (np.where(np.isnan(y), middle, y) for y in (self.top, self.bottom))
@@ -105,7 +108,10 @@ def views(plan: ScanPlan) -> Iterator[View]:
 
 
 def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
-    """Warn of projections with the sample outside the beam, and of flats with it inside."""
+    """Warn of projections with the sample wholly outside the image, and of flats that show it.
+
+    At most one warning of each kind for a view; the line is the first one's.
+    """
     found: list[ScriptProblem] = []
     for view in views(plan):
         outside = view.outside
@@ -119,7 +125,10 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
 
 
 def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
-    """Make one warning for all images of a view that are `bad`."""
+    """Make one warning for all `bad` images of a view, at the first of their lines.
+
+    The text ends with the number of further lines.
+    """
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = ""
     if len(lines) > 1:
@@ -149,7 +158,7 @@ def _outside_text(view: View) -> str:
 
 
 def _inside_text(view: View) -> str:
-    """Describe the first flat image that shows the sample."""
+    """Describe where the first flat image that shows the sample has its shadow [columns]."""
     i = int(np.argmin(view.outside))
     if view.left[i] == view.right[i]:
         where = f"the shadow of its axis lies at column {view.axis[i]:.0f}"

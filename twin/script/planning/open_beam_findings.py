@@ -110,7 +110,9 @@ def brightest_beam(
 def _views(
     plan: ScanPlan, camera: CameraSettings, indices: list[int]
 ) -> Iterator[FloatArray]:
-    """Yield cone_vec rows (12,) of some images."""
+    """Yield cone_vec rows (12,) of at most `SAMPLED_IMAGES` images, evenly spread over
+    `indices`.
+    """
     chosen = np.unique(np.linspace(0, len(indices) - 1, SAMPLED_IMAGES).astype(int))
     index = [indices[i] for i in chosen]
     positions = {name: x[index] for name, x in plan.image_positions.items()}

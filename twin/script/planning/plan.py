@@ -118,7 +118,10 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     @cached_property
     def poses(self) -> Poses:
-        """Nominal poses of the projections that are saved, with the profile's zero offsets."""
+        """Nominal poses of the projections that are saved, with the profile's zero offsets.
+
+        Dark and flat images have none; empty without projections.
+        """
         nowhere = motor_poses(self.machine, self.profile, self.start.camera, {})[:0]
         parts = [
             motor_poses(self.machine, self.profile, group.camera, positions)
@@ -164,7 +167,9 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     @cached_property
     def paths(self) -> Mapping[str, AxisPath]:
-        """Every axis's position as a function of time."""
+        """Axis -> its position as a function of time; at its start position where it never
+        moves.
+        """
         return {
             axis: AxisPath.of(self.start.positions[axis], self.trajectories.get(axis, ()))
             for axis in self.machine.axes
@@ -181,7 +186,10 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     @cached_property
     def image_positions(self) -> Mapping[str, FloatArray]:
-        """Axis -> (n,) position at the nominal moment of every image."""
+        """Axis -> (n,) position [mm, deg] at the nominal moment of every image, saved or not.
+
+        Positions that a trigger determines are the exact ones.
+        """
         out = self.positions(self.starts)
         first = 0
         for group in self.groups:
@@ -250,7 +258,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
 
 def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, FloatArray]]]:
-    """Yield the groups of saved images with the motors' positions, axis -> (n,)."""
+    """Yield each group that saves images, with its motors' positions, axis -> (n,) [mm, deg]."""
     first = 0
     for group in plan.groups:
         rows = slice(first, first + len(group))
@@ -273,7 +281,10 @@ class CheckReport(WithProblems):
     """Whether the start was given; otherwise the machine's home positions are assumed."""
 
     def __repr__(self) -> str:
-        """One line."""
+        """Format as one line: ok or not, number of collisions, and the plan.
+
+        0 collisions if they were not checked.
+        """
         hits = 0
         if self.clearance:
             hits = len(self.clearance.collisions)
@@ -289,7 +300,7 @@ class CheckReport(WithProblems):
 
     @property
     def start(self) -> str:
-        """Positions of the motors at the start, in words."""
+        """Positions of the motors at the start, as text; assumed homes are named so."""
         at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
         if self.start_known:
             return at
@@ -297,7 +308,10 @@ class CheckReport(WithProblems):
 
     @property
     def sample(self) -> str:
-        """The sample on the stage, in words."""
+        """The sample on the stage, as text: diameter, height if known, and source.
+
+        Without one the stage is empty, or assumed empty if the start is not known.
+        """
         size = self.plan.sample
         if size is None:
             if self.start_known:
@@ -309,7 +323,11 @@ class CheckReport(WithProblems):
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON document of `flexdt check --json`; times in s, lengths in mm."""
+        """Return the JSON document of `flexdt check --json`; times in s, lengths in mm.
+
+        Without a collision check, `collisions_checked` is false and the clearance is
+        empty.
+        """
         plan = self.plan
         clearance = self.clearance
         size = plan.sample

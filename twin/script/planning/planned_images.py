@@ -117,7 +117,10 @@ def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
 
 
 def _length(trigger: planned.Trigger) -> float:
-    """Compute the length of a scan without its run-ups, rounded to whole turns."""
+    """Compute the length of a triggered scan without its run-ups [mm, deg].
+
+    An angle within 1 deg of whole turns (one or more) is rounded to them.
+    """
     length = abs(trigger.trajectory.target - trigger.position) - trigger.run_up
     turns = round(length / FULL_TURN_DEG)
     if trigger.unit == "deg" and turns >= 1 and abs(length - turns * FULL_TURN_DEG) < 1.0:
@@ -359,7 +362,10 @@ class ImageCollector:
     # fly scans -----------------------------------------------------------------------------
 
     def _active(self, start: float) -> planned.Trigger | None:
-        """Return the trigger whose motion is still under way at `start`, or None."""
+        """Return the trigger whose motion is still under way at `start` [s], else None.
+
+        None also if its motor has begun another move since.
+        """
         t = self.trigger
         if t is None or t.trajectory.end <= start:
             return None

@@ -83,7 +83,10 @@ class Motor:
     def move(
         self, target: float, time: float, speed: float, acceleration: float
     ) -> Trajectory:
-        """Start a move to `target` at `time`, from the current position and velocity."""
+        """Start a move to `target` at `time` [s], from the position and velocity of that moment.
+
+        The trajectory is returned, and recorded unless it takes no time.
+        """
         v = 0.0
         if self.moves:
             v = self.moves[-1][1].velocity(time)
@@ -116,7 +119,10 @@ class Motors:
         return motor_targets(self.machine, axis, value, here)
 
     def rates(self, axis: str) -> dict[str, tuple[float, float]]:
-        """Compute motor -> (speed, acceleration); motors of a virtual axis keep in step."""
+        """Compute motor -> (speed, acceleration) for a move of `axis`.
+
+        Motors of a virtual axis keep in step: the slowest determines all.
+        """
         moves = self.machine.moves(axis)
         speed = min(self.all[n].speed / abs(f) for n, f in moves.items())
         acceleration = min(self.all[n].acceleration / abs(f) for n, f in moves.items())
@@ -156,7 +162,9 @@ class PlannedTube:
         self.since = time
 
     def switch(self, on: bool, time: float) -> None:
-        """Turn X-rays on or off at `time`."""
+        """Turn X-rays on or off at `time` [s]; the beam until then is recorded, the state
+        now known.
+        """
         self._close(time)
         self.on = on
         self.known = True

@@ -143,7 +143,7 @@ def _image(file: str, line: int = 0) -> list[c.Command]:
 
 
 def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
-    """Make moves that start together; the second request of each waits for its arrival."""
+    """Make the moves to a pose; several start together, then each is repeated to wait for it."""
     moves = [
         c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()
     ]
@@ -153,7 +153,10 @@ def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
 def _arrival(
     positions: Pose, pose: Pose, machine: Machine, start: StartState
 ) -> dict[str, float]:
-    """Compute the positions of all motors at a pose reached from `positions`, within travel."""
+    """Compute the positions of all motors at a pose reached from `positions`, within travel.
+
+    Axes that the pose does not name stay.
+    """
     motors = Motors(machine, replace(start, positions=positions))
     out = dict(positions)
     for axis, value in pose.items():

@@ -198,7 +198,7 @@ def sample_problems(
 
 
 def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:
-    """List the shares of pixels that need a warning: (name, sentence) each."""
+    """List (name, sentence) for each share of pixels of `WARNING_SHARE` or more; [] for None."""
     if seen is None:
         return []
     shares = [(name, getattr(seen, name)) for name in SHARE_NAMES]

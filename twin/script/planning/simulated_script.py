@@ -158,7 +158,7 @@ class Simulation:
     # scanner -------------------------------------------------------------------------------
 
     def _custom(self, command: c.Custom) -> planned.Span:
-        """Warn if the component is an axis, which has no such command; no effect."""
+        """Count the time of an unknown command, which has no effect; warn if it is to an axis."""
         if command.component in self.machine.axes:
             self.findings.warn(
                 "custom_component",
@@ -213,14 +213,18 @@ class Simulation:
         return span
 
     def _xray_off(self, _command: c.XrayOff) -> planned.Span:
-        """Switch X-rays off, unless they are known to be off."""
+        """Switch X-rays off; if they are known to be off, only the time of asking counts."""
         if not self.tube.on and self.tube.known:
             return self.timed("xrayoff_again", note=" (already off)")
         self.tube.switch(False, self.now)
         return self.timed("xrayoff")
 
     def _ready(self, _command: c.WaitXrayReady) -> planned.Span:
-        """Wait until X-rays are ready; report a wait with X-rays off, which would hang."""
+        """Wait until X-rays are ready; at once if they are already.
+
+        With X-rays off it would wait for ever: an error is reported, and the script goes
+        on.
+        """
         if not self.tube.on:
             what = "waits until the X-rays are ready, but they are off: the script would hang here"
             self.findings.error("xray_never_ready", what)
@@ -326,7 +330,7 @@ class Simulation:
         return self.timed("set_motor", note=note)
 
     def _report(self, found: Arrival) -> None:
-        """Report a target beyond a limit, as `twin/machine/travel.py` judges it."""
+        """Report a target beyond a limit: a warning if the machine clamps it, else an error."""
         for message in found.messages:
             if found.is_clamped(self.machine):
                 self.findings.warn("limit_clamped", f"{message}; set to the limit")

@@ -62,7 +62,10 @@ def total_range(
 
 
 def _margins(kind: str, timing: Timing) -> Range:
-    """Return how far a time of a kind may be below and above its median [s]."""
+    """Return how far a time of a kind may be below and above its median [s].
+
+    Without a measured spread it may be from 0 to twice the assumed time.
+    """
     middle = timing.seconds(kind)
     spread = timing.spread.get(kind)
     if spread is None:
