@@ -147,7 +147,10 @@ def limit_names(limits: ConnectionLimits | TwinLimits | ViewerLimits) -> tuple[s
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address to listen on can be reached from this machine only."""
+    """Return whether an address to listen on can be reached from this machine only.
+
+    "localhost" is; other names, which are not looked up, are not.
+    """
     if host == "localhost":
         return True
     try:

@@ -32,7 +32,11 @@ def main() -> None:
 
 
 def _watch() -> None:
-    """Wait until standard input closes, then send SIGTERM, and kill after `STOP_GRACE_S`."""
+    """Wait until standard input closes, then send SIGTERM to this process.
+
+    `STOP_GRACE_S` later it ends at once with code 1. What arrives on standard input is
+    ignored.
+    """
     while os.read(0, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)

@@ -29,7 +29,7 @@ MODULE: Final = "flexdt.runtime.compile_ahead"
 
 
 def _detection() -> None:
-    """Compile the kernels of bead detection."""
+    """Compile the kernels of bead detection by calling them on a blank image."""
     from flexdt.twin.calibration.detect import spot_kernels
 
     image = np.zeros((9, 9), np.float32)
@@ -44,7 +44,7 @@ def _detection() -> None:
 
 
 def _fit() -> None:
-    """Compile the kernels of calibration, on no views."""
+    """Compile the kernel that evaluates calibrations, by calling it with no views."""
     from flexdt.twin.calibration.fit import fit_kernels
 
     ints, floats, views = (
@@ -85,7 +85,9 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
-    """Compile the kernels of FDK, on eight views."""
+    """Compile the kernels of FDK by reconstructing eight tiny views, and those of
+    truncation, part layout and warping by a call each.
+    """
     from flexdt.twin.projection.kernels import layout_kernels
     from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.kernels import fdk_kernels, truncation_kernels
@@ -117,7 +119,10 @@ ANALYSIS: Final = ("calibration", "bead detection", "FDK")
 
 
 def is_compiled(group: str) -> bool:
-    """Return whether numba's disk cache holds a group's last entry point for this processor."""
+    """Return whether numba's disk cache has a group's last kernel for this processor.
+
+    The cache is only read; nothing is compiled.
+    """
     from importlib import import_module
 
     module, _, name = GROUPS[group][1].partition(":")
@@ -166,7 +171,10 @@ def start(words: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
 
 
 def main() -> None:
-    """Compile the groups named on the command line, or all."""
+    """Compile the groups named on the command line, or all, each in another process.
+
+    After `--here` one group is compiled in this process, without output.
+    """
     match sys.argv[1:]:
         case ["--here", group]:
             GROUPS[group][0]()

@@ -177,7 +177,7 @@ class _Server(ThreadingWSGIServer):
             self._answered.enter(self._here[request])
 
     def shutdown_request(self, request: Any) -> None:
-        """Remove a connection that has ended, or whose thread could not start."""
+        """Close a connection and free its place: it has ended, or its thread could not start."""
         with self._lock:
             visitor = self._here.pop(request)
             self._strangers.leave(visitor)
@@ -197,7 +197,7 @@ class _Handler(WSGIRequestHandler):
     server: _Server
 
     def get_environ(self) -> dict[str, Any]:
-        """Add the function that admits the request to the environment."""
+        """Return the request's WSGI environment, with the function that admits it under `ADMIT`."""
         return {
             **super().get_environ(),
             ADMIT: partial(self.server.admit, self.connection),
@@ -208,7 +208,7 @@ class _Handler(WSGIRequestHandler):
 
 
 def _foreign(host: str) -> bool:
-    """Return whether a request's Host is that of another site, or unreadable."""
+    """Return whether a request's Host is that of another site, or cannot be parsed."""
     try:
         return is_rebound(host)
     except ValueError:
@@ -260,7 +260,7 @@ def _application(
         page: Future[HttpResponse] = Future()
 
         def make() -> None:
-            """Make the page in a turn of the loop."""
+            """Make the page in a turn of the loop; the result or the exception goes to `page`."""
             try:
                 page.set_result(pages[path]())
             except Exception as error:
@@ -354,7 +354,10 @@ def watching_pages(
     """
 
     def healthz() -> HttpResponse:
-        """Make `/healthz`: status and the server's facts."""
+        """Make `/healthz`: JSON of the status and the server's facts.
+
+        200 and "ok", or 503 and "failed" after a failure for good.
+        """
         dead = failed()
         document = {"status": "failed" if dead else "ok", **health()}
         if dead:
@@ -364,7 +367,11 @@ def watching_pages(
         return HttpResponse(json.dumps(document) + "\n", status)
 
     def metrics() -> HttpResponse:
-        """Make `/metrics`: requests, figures, lost log lines and turns of the loop."""
+        """Make `/metrics`: requests, the server's figures, dropped log lines, turns of the loop.
+
+        The longest turn is that since the last scrape; on another loop turns are left
+        out.
+        """
         page = [*(requests or Requests()).figures(), *figures()]
         page.append(
             counter(

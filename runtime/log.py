@@ -62,7 +62,11 @@ class JsonLines(logging.Formatter):
     traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Format a record as one line of JSON."""
+        """Format a record as one line of JSON: time (UTC, ms), level, event, facts, traceback.
+
+        A fact may replace time, level or event; values that JSON has not are written as
+        text.
+        """
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         line: dict[str, object] = {
             "time": f"{stamp}.{int(record.msecs):03d}Z",
@@ -105,7 +109,7 @@ class Apart(QueueHandler):
         return record
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Queue one record, or count it if there is no room."""
+        """Queue one record; with a full queue it is dropped, and counted in `dropped`."""
         try:
             self.queue.put_nowait(record)
         except queue.Full:
@@ -121,7 +125,10 @@ class _Listener(QueueListener):
     _thread: threading.Thread | None
 
     def stop(self) -> None:
-        """Stop like the library's, but without waiting forever for a blocked reader."""
+        """End the thread after what is queued, waiting at most 1 s for room and 2 s for its end.
+
+        A second call does nothing.
+        """
         thread = self._thread
         self._thread = None
         if thread is not None:

@@ -54,7 +54,10 @@ BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
 def durations(name: str, help: str, labels: Sequence[str] = ()) -> Histogram:
-    """Make a histogram of durations [s] for the metrics page."""
+    """Make a histogram of durations [s] for the metrics page, in `BUCKETS_S`, not registered.
+
+    Also switches off "created" series of all metrics of the process.
+    """
     from prometheus_client import Histogram, disable_created_metrics
 
     disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -68,14 +71,17 @@ class Holds:
         self.begin()
 
     def begin(self) -> None:
-        """Reset the counts."""
+        """Reset the counts; the turn that is under way is not counted."""
         what = "How long each turn held the event loop."
         self.turns = durations("flexdt_loop_hold_seconds", what)
         self._worst = 0.0
         self._begun = False
 
     def observe(self, seconds: float) -> None:
-        """Count a turn that has ended, except the one in which counting began."""
+        """Count a turn of `seconds` that has ended, and note the longest.
+
+        The first after `begin` is not counted.
+        """
         if not self._begun:
             self._begun = True
             return
@@ -98,7 +104,9 @@ class _Watched(selectors.DefaultSelector):
         self._woke: float | None = None
 
     def select(self, timeout: float | None = None) -> Any:
-        """Poll as the base class does."""
+        """Poll as the base class does, and report the time since the last poll returned as a
+        turn.
+        """
         now = perf_counter()
         if self._woke is not None:
             self._holds.observe(now - self._woke)
@@ -270,7 +278,9 @@ def stop_signal() -> asyncio.Event:
     watch = signal.set_wakeup_fd(-1)
 
     def begin_to_stop() -> None:
-        """Set the event, and wake the reader of the descriptor that was set before."""
+        """Set the event, and wake the reader of the wake-up descriptor that was set before,
+        if any.
+        """
         stop.set()
         if watch != -1:
             with contextlib.suppress(OSError):
@@ -282,7 +292,10 @@ def stop_signal() -> asyncio.Event:
 
 
 def leave(*_: object) -> None:
-    """End the process now, as a signal's handler; printed lines stay."""
+    """End the process now, as a signal's handler, with a line on standard error.
+
+    Buffers are not flushed and no clean-up runs; the exit code is `INTERRUPTED`.
+    """
     try:
         os.write(2, INTERRUPTED_LINE)
     finally:
@@ -290,7 +303,7 @@ def leave(*_: object) -> None:
 
 
 async def first_of(*events: asyncio.Event) -> None:
-    """Wait until one of the events is set."""
+    """Wait until one of the events is set; at once if one is."""
     waits = [asyncio.create_task(event.wait()) for event in events]
     try:
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -373,7 +386,10 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
 
 
 def _allow_descriptors() -> None:
-    """Raise the limit on descriptors: the usual 1024 are fewer than the places for clients."""
+    """Raise the process's limit on open descriptors towards `MAX_DESCRIPTORS`; never lowers it.
+
+    Nothing happens on Windows, or if the system refuses.
+    """
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -426,7 +442,7 @@ def session_seconds(session: int) -> float | None:
 
 
 def _words(pid: str) -> list[str]:
-    """Return the fields of a process's line after its name; none for one that has ended."""
+    """Return the fields of a process's `stat` line after its name; [] for one that has ended."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
             return file.read().rpartition(")")[2].split()

@@ -259,7 +259,10 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
 
     @property
     def places(self) -> tuple[Address, ...]:
-        """Addresses of the projectors, each once."""
+        """Addresses of the projectors, each once; `projector` (or else its port) comes first.
+
+        Without any, the standard port on this machine.
+        """
         port = None
         if self.projector_port is not None:
             port = Address(LOOPBACK, self.projector_port)

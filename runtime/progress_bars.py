@@ -128,7 +128,7 @@ class TerminalBar:
 
     @staticmethod
     def _write(text: str) -> None:
-        """Write to standard error, unless it has been closed."""
+        """Write to standard error and flush; errors (it is closed) are ignored."""
         try:
             sys.stderr.write(text)
             sys.stderr.flush()
@@ -147,7 +147,10 @@ class NotebookBar:
     def show(
         self, what: str, done: float | None, seconds: float, left_s: float | None
     ) -> None:
-        """Draw over what was drawn before."""
+        """Replace the bar shown before by its text and fraction.
+
+        `done` None is a bar without a value; seconds so far and left are in the text.
+        """
         value = ""
         if done is not None:
             value = f' value="{done:.3f}"'
@@ -162,7 +165,7 @@ class NotebookBar:
             self._draw("")
 
     def _draw(self, markup: str) -> None:
-        """Show HTML in one place."""
+        """Show HTML: as a new output the first time, later in its place."""
         from IPython.display import HTML, display
 
         if self._handle is None:

@@ -62,7 +62,10 @@ class _Work:
     covered: Callable[[], bool] = lambda: False
 
     def advance(self, done: float) -> None:
-        """Note the fraction that is done."""
+        """Set the fraction that is done; 0 or less changes nothing.
+
+        The first fraction begins the measurement of the rate.
+        """
         if self.done is None and done > 0.0:
             self.rated_from = done, time.monotonic()
         if done > 0.0:
@@ -105,7 +108,7 @@ class _Work:
             self.due = now + (DRAWN_S if self.shown.bar else SILENT_S)
 
     def end(self) -> None:
-        """End the work and close its bar; later calls of `tell` show nothing."""
+        """End the work and close its bar, if it is shown; later calls of `tell` show nothing."""
         with self.lock:
             self.ended = True
             if self.shown is not None:
@@ -121,7 +124,10 @@ class _ProgressThread:
         self._thread: threading.Thread | None = None
 
     def add(self, work: _Work) -> None:
-        """Add a work, to be shown from when it is due; start the thread that shows works."""
+        """Add a work, to be shown from when it is due; start the thread at the first.
+
+        The thread is woken only for a work due sooner than all others.
+        """
         with self._changed:
             sooner = all(work.due < other.due for other in self._works)
             self._works.append(work)
@@ -279,7 +285,7 @@ def _show_until_end(what: str) -> Iterator[_Work]:
 
 @contextmanager
 def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
-    """Register a work as the innermost one of this thread within the context."""
+    """Append a work to this thread's works within the context, as the innermost one."""
     works.append(one)
     try:
         yield

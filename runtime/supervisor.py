@@ -142,7 +142,11 @@ class Supervisor:
             await self._stop_all()
 
     async def _look_after(self) -> None:
-        """Start all services, announce their addresses, and keep them alive."""
+        """Start the services one after the other, each once the one before has its address.
+
+        When all are ready their addresses are announced; then they are kept alive until
+        one is given up, whose error is raised. At the end all keepers are cancelled.
+        """
         keepers: list[asyncio.Task[None]] = []
         try:
             starts = [_Start(service) for service in self.services]
@@ -299,14 +303,21 @@ class Supervisor:
                         return
 
     def _forget(self, service: Service) -> None:
-        """Kill the rest of a service's session: its children may hold its port or its files."""
+        """Kill what is left of a service's process group, and forget its process.
+
+        Its children may hold its port or its files. Nothing to do if it does not run.
+        """
         process = self._running.pop(service.name, None)
         if process is not None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
 
     async def _stop_all(self) -> None:
-        """Stop all services in reverse order; kill one that does not stop."""
+        """Stop all services in reverse order, one by one; kill one that takes over
+        `STOP_GRACE_S`.
+
+        The rest of each service's processes is killed, too.
+        """
         for service in reversed(self.services):
             process = self._running.get(service.name)
             if process is not None and process.returncode is None:
@@ -344,7 +355,7 @@ class _Start:
 async def _unless_one_ends(
     event: asyncio.Event, keepers: Sequence[asyncio.Task[None]]
 ) -> None:
-    """Wait for an event; a keeper's error ends the waiting and is raised."""
+    """Wait for an event, or until a keeper ends; the error of one that has ended is raised."""
     waiting = asyncio.create_task(event.wait())
     await asyncio.wait({waiting, *keepers}, return_when=FIRST_COMPLETED)
     waiting.cancel()
@@ -384,7 +395,7 @@ async def _ended(process: Process) -> int:
 
 
 def _how(code: int) -> str:
-    """Describe an exit code."""
+    """Describe an exit code; a negative one as the signal that killed the process."""
     if code >= 0:
         return f"exit code {code}"
     try:

@@ -47,7 +47,11 @@ class WaitingList(Generic[_G]):
         self.guests: dict[_G, None] = {}
 
     def enter(self, guest: _G) -> None:
-        """Admit a connection; displace another one if the room is full."""
+        """Admit a connection; if the room is then too full, displace another.
+
+        That is the oldest one of the address with the most connections; it may be the new
+        one.
+        """
         self.guests[guest] = None
         if len(self.guests) > self._most:
             [(crowd, _)] = Counter(g.address for g in self.guests).most_common(1)

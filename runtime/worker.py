@@ -50,7 +50,7 @@ def receive_parts(channel: socket.socket) -> list[bytes]:
 
 
 def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
-    """Read `size` bytes from a socket; raise EOFError if the other end is gone."""
+    """Read exactly `size` bytes from a socket; raise EOFError if the other end closes before."""
     data = bytearray(size)
     view = memoryview(data)
     at = 0
@@ -151,7 +151,10 @@ def main() -> int:
 
 
 def _end_with_parent(number: int) -> None:
-    """Wait until the parent closes the socket, then exit."""
+    """Wait until the parent closes its end of the socket, then exit at once with code 0.
+
+    On systems that cannot poll for that, return at once.
+    """
     if not hasattr(select, "POLLRDHUP"):
         return
     watch = select.poll()

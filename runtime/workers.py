@@ -156,7 +156,11 @@ class Worker:
                     raise TimeoutError
 
     def _end_error(self, work: Work, seconds: float) -> RpcError:
-        """Kill the process and make the error -32008 for its end; returned, not raised."""
+        """Kill the process and make the error -32008 that its work ended it; returned, not
+        raised.
+
+        It has the exit code and the allowed seconds and memory.
+        """
         self.kill()
         return RpcError(
             Code.TOO_LARGE,
@@ -173,7 +177,7 @@ class Worker:
         self._process.kill()
 
     def kill(self) -> None:
-        """End the process and wait for its end."""
+        """End the process, wait for its end, and close the channel; it may have ended already."""
         with suppress(OSError):
             self.stop()
         self._process.wait()
@@ -263,7 +267,7 @@ class Workers:
         self._timer = asyncio.get_running_loop().call_later(MAX_IDLE_S, self.rest)
 
     def rest(self) -> None:
-        """End the idle processes."""
+        """End the idle processes and the timer; those at work go on."""
         while self._idle:
             self._idle.pop().kill()
         if self._timer is not None:

@@ -89,7 +89,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
             self.alone = False
 
     def come_to_rest(self) -> None:
-        """End a thread that runs it."""
+        """Stop the loop if another thread runs it, and wait for that thread's end."""
         for thread in threading.enumerate():
             if thread.ident == self._thread_id:  # type: ignore[attr-defined]
                 self.call_soon_threadsafe(self.stop)
@@ -98,7 +98,10 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
-        """Run `func` here, soon."""
+        """Run `func` in the loop's thread, soon; `executor` is ignored.
+
+        With a generator after a drawn delay, else in the next turn.
+        """
         done: asyncio.Future[Any] = self.create_future()
         later = 0.0 if self._rng is None else self._rng.choice(LATER_S)
         self.call_later(later, _work, done, func, args)
@@ -108,7 +111,10 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 def _work(
     done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]
 ) -> None:
-    """Run a function as a thread would: to its end, even if its future was cancelled."""
+    """Run a function to its end, even if its future was cancelled, as a thread would.
+
+    The result or error then goes to the future, if it was not cancelled.
+    """
     try:
         result = func(*args)
     except Exception as error:
@@ -214,7 +220,9 @@ class InProcessTransport(asyncio.Transport):
         self._server.data_received(self._wire.send(message))
 
     async def receive(self) -> list[Message]:
-        """Return received messages, or an empty list at the end."""
+        """Wait for data and return the messages that it completes; [] once the connection
+        has ended.
+        """
         messages: list[Message] = []
         while not messages and (data := await self._inbox.get()):
             messages = self._wire.receive_data(data)
@@ -226,7 +234,10 @@ class InProcessTransport(asyncio.Transport):
             self._inbox.put_nowait(bytes(data))
 
     def close(self) -> None:
-        """End the connection, from either side."""
+        """End the connection, from either side; a second call does nothing.
+
+        A waiting `receive` returns [].
+        """
         server, self._server = self._server, None
         if server is not None:
             self._inbox.put_nowait(b"")

@@ -117,7 +117,9 @@ class Folder:
         return self.projections.get(index, f"scan_{index:06d}.tif")
 
     def frames(self, files: Sequence[str], shapes: Sequence[Shape]) -> tuple[Frame, ...]:
-        """List frames of these names and (rows, cols), in order."""
+        """Make frames with these names and (rows, cols), numbered from 0; each says if its
+        file is here.
+        """
         return tuple(
             Frame(i, name, self.path / name, name in self.names, shape)
             for i, (name, shape) in enumerate(zip(files, shapes, strict=True))
@@ -128,7 +130,9 @@ class Folder:
         return tuple(self.path / name for name in files if name in self.names)
 
     def lost(self, files: Sequence[str]) -> str:
-        """Describe which of `files` are missing; "" if none is."""
+        """Describe which of `files` are missing: the first five and how many more; "" if
+        none is.
+        """
         lost = [name for name in files if name not in self.names]
         if not lost:
             return ""
@@ -152,7 +156,11 @@ class Folder:
 
     @cached_property
     def _numbered(self) -> dict[str, tuple[dict[int, str], tuple[str, str] | None]]:
-        """Prefix -> (number -> name, in order; two names of one number, or None)."""
+        """Sort image names by prefix (di, io, scan) and number; other names are ignored.
+
+        Prefix -> (number -> first name of that number, ascending; two names with one
+        number, or None).
+        """
         found: dict[str, dict[int, str]] = {prefix: {} for prefix in ("di", "io", "scan")}
         twice: dict[str, tuple[str, str]] = {}
         for name in sorted(self.names):
@@ -463,7 +471,10 @@ def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _blank(path: Path) -> bool:
-    """Return whether all pixels of an image are zero; a sample of the file decides for most."""
+    """Return whether all pixels of an image are zero; False if it cannot be read.
+
+    A sample from the middle of a large file decides if it has any other byte.
+    """
     try:
         with opened(path) as file:
             size = os.fstat(file.fileno()).st_size
@@ -476,7 +487,7 @@ def _blank(path: Path) -> bool:
 
 
 def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
-    """Average several images, (rows, cols); raises as `read_image`."""
+    """Average one or more images, (rows, cols) float32; raises as `read_image`."""
     total = np.zeros(shape, dtype=np.float64)
     for path in paths:
         total += read_image(path, shape)

@@ -250,7 +250,10 @@ class Directory:
                 raise
 
     def nameless(self) -> BinaryIO:
-        """Make a file without a name: it is gone when it is closed, or its process ends."""
+        """Make an open file without a name, for reading and writing, unbuffered.
+
+        It is gone when it is closed or its process ends.
+        """
         with self._opened() as fd:
             name, file = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
             if _RELATIVE:
@@ -389,7 +392,10 @@ class Directory:
         return set()
 
     def sweep(self, left: Sequence[str] = (TEMPORARY, BEFORE)) -> None:
-        """Delete what killed writers left: names that begin with one of `left`."""
+        """Delete what killed writers left: names that begin with one of `left`.
+
+        Errors of the system are ignored, and the file stays.
+        """
         with suppress(OSError), self.entries() as entries:
             stale = [e.name for e in entries if e.name.startswith(tuple(left))]
             for name in stale:
@@ -480,7 +486,10 @@ class Directory:
         return str(self.path / name)
 
     def _temporary(self, fd: int | None, mode: int, flags: int = 0) -> tuple[str, int]:
-        """Make a file under an unused name; return the name and its descriptor."""
+        """Make a new file under an unused name; return the name and its open descriptor.
+
+        Names in use are skipped; other errors are raised as OSError.
+        """
         while True:
             # Processes in containers may share a number, and killed ones leave files behind.
             number = (
@@ -544,7 +553,10 @@ class Directory:
 
 
 def _allocate(file: int, size: int) -> None:
-    """Reserve `size` bytes for a new file, so that later writes need no room."""
+    """Reserve `size` bytes for a new file, so that later writes need no room.
+
+    By `posix_fallocate`, or, on systems without it, by writing zeros.
+    """
     allocate = getattr(os, "posix_fallocate", None)
     if allocate is not None:
         allocate(file, 0, size)
@@ -565,7 +577,10 @@ def free_bytes(path: Path) -> int | None:
 
 
 def memory_bytes() -> int:
-    """Return the machine's memory, or the container's limit if that is less [bytes]."""
+    """Return the machine's memory, or the container's limit if that is less [bytes].
+
+    `FALLBACK_MEMORY_BYTES` where the system does not report its memory.
+    """
     memory = FALLBACK_MEMORY_BYTES
     with suppress(AttributeError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -592,7 +607,7 @@ def free_memory_bytes() -> int:
 
 
 def _fields(file: Path) -> dict[str, int]:
-    """Parse the numbers of a file of lines "name number ..." by name."""
+    """Parse a file of lines "name number ...": name -> first number; other lines are skipped."""
     lines = (line.split() for line in file.read_text(encoding="ascii").splitlines())
     return {
         words[0]: int(words[1])

@@ -69,7 +69,10 @@ class _Change:
     keep: Keep | None = None
 
     def undo(self) -> None:
-        """Restore the earlier content, unless somebody else has changed it since."""
+        """Restore the earlier content, or delete a file that is new, and wait for the disk.
+
+        Nothing is done if the file has been changed since by another.
+        """
         if not self._is_still():
             return
         if self.before is not None:
@@ -81,7 +84,10 @@ class _Change:
         self.folder.sync()
 
     def _is_still(self) -> bool:
-        """Return whether the file is as this change left it."""
+        """Return whether the file is as this change left it: absent, or with the same bytes.
+
+        Spaces that a padded file has at its end do not count.
+        """
         if self.data is None:
             return self.folder.stat(self.name) is None
         found = self.folder.read(self.name, max(MAX_READ_BYTES, len(self.data)))
@@ -169,7 +175,9 @@ class Changes:
             self.undo()
 
     def done(self) -> None:
-        """Confirm the changes: delete the replaced files."""
+        """Confirm the changes: delete the saved earlier files (errors are ignored), forget
+        the changes.
+        """
         for change in self._made:
             if change.before is not None:
                 with suppress(OSError):
@@ -304,7 +312,7 @@ def ours(folder: Directory) -> list[str]:
 
 
 def _finite(text: str) -> float:
-    """Parse a finite number, or raise ValueError."""
+    """Parse a number; raise ValueError for NaN, infinity, or a text that is none."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is no finite number")

@@ -86,7 +86,10 @@ class SpareFiles:
         return False
 
     def _save(self, name: str) -> None:
-        """Make a spare file of a document of that size that is about to be replaced."""
+        """Keep a document that is about to be replaced as a spare file, by a second name.
+
+        Only if it is `SPARE_BYTES` long and a spare file is missing; one is made at most.
+        """
         about = self._folder.stat(name)
         free = [spare for spare in NAMES if spare not in self._there]
         if about is None or about.st_size != SPARE_BYTES:
@@ -103,7 +106,7 @@ class SpareFiles:
         return about is not None and (about.st_size, about.st_nlink) == (SPARE_BYTES, 1)
 
     def _refill(self) -> None:
-        """Make the missing spare files, as far as there is room."""
+        """Find or make the missing spare files; stop at the first for which there is no room."""
         for name in NAMES:
             if name in self._there:
                 continue

@@ -92,7 +92,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def nearest_there(path: Path) -> Path:
-    """Return `path` if it exists, else the nearest folder above it that does."""
+    """Return `path`, made absolute, if it exists, else the nearest folder above it that does."""
     place = path.absolute()
     while not place.exists():
         place = place.parent

@@ -321,7 +321,9 @@ class Imaging:
             return np.asarray(np.tensordot(factors, parts, axes=1), dtype=np.float32)
 
     async def _along(self, divided: _DividedSample, cone: ConeVec) -> Float32Array:
-        """Project each piece of a sample, float32 (pieces, n, rows, cols)."""
+        """Project each piece of a sample along `cone`, one after the other: (pieces, n,
+        rows, cols).
+        """
         views, *grid = cone.shape
         out = np.empty((len(divided.names), views, *grid), dtype=np.float32)
         for i, name in enumerate(divided.names):
@@ -452,7 +454,10 @@ class Imaging:
     async def _send_bodies(
         self, divided: _DividedSample, name: str, pieces: Pieces
     ) -> None:
-        """Send the pieces of a sample and record their names."""
+        """Send the pieces of a sample, unless they are there, and record their names.
+
+        A single part has the sample's name; others are numbered.
+        """
         single = pieces == "part" and len(divided.bodies) == 1
         divided.names = [
             await self._ensure_sent(name if single else f"{name}, {pieces} {i}", body)

@@ -91,7 +91,7 @@ class ProjectorPool:
         return {f"{m.client.host}:{m.client.port}": m.views for m in self._members}
 
     async def close(self) -> None:
-        """End the connections; open requests fail."""
+        """Cancel the open requests and close every client's connection."""
         for task in self._open:
             task.cancel()
         for member in self._members:
@@ -220,7 +220,10 @@ class ProjectorPool:
         """
 
         def ended(task: asyncio.Task[Float32Array | None]) -> None:
-            """Release the projector and wake a waiting request."""
+            """Release the projector of an ended request, and wake a waiting one.
+
+            The request's error is marked as seen, so that asyncio does not log it.
+            """
             self._open.discard(task)
             member.open -= 1
             if not task.cancelled():
@@ -289,7 +292,7 @@ class ProjectorPool:
         return images
 
     def _compare(self) -> None:
-        """Warn if projectors differ in version or backend."""
+        """Log a warning if known projectors differ in version or backend; at every call."""
         kinds = sorted({m.kind for m in self._members if m.kind is not None})
         if len(kinds) > 1:
             kept = "; ".join(" ".join(kind) for kind in kinds)

@@ -63,7 +63,7 @@ class ProjectorWatch:
                 group.create_task(self._watch(client))
 
     async def _watch(self, client: Watched) -> None:
-        """Ask one projector repeatedly, while somebody wants to know."""
+        """Check one projector every `every_s`, for ever; skipped while nobody asks."""
         while True:
             if self.asks():
                 await self._check(client)

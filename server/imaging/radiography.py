@@ -148,7 +148,11 @@ class Radiography:
         return self.physics != "ideal" and self.panel.long_lag_fraction > 0.0
 
     def record(self) -> Mapping[str, float]:
-        """List the figures of detector and tube by name, for data sets."""
+        """List the figures of the images' physics by name, for data sets.
+
+        "ideal": the noise model's, without its reference; else markers of physics and
+        scatter, and the figures of detector and tube.
+        """
         if self.physics == "ideal":
             return {
                 name: float(getattr(self.model, name))
@@ -161,7 +165,10 @@ class Radiography:
         return figures | self.tube.figures()
 
     async def require_room(self, sample: Sample) -> None:
-        """Check that a scan's sample fits into memory, as `Imaging.require_room`."""
+        """Check that a scan's sample, divided as the physics needs, fits into memory.
+
+        By parts for "ideal", else by materials; raises as `Imaging.require_room`.
+        """
         pieces: Pieces = "material"
         if self.physics == "ideal":
             pieces = "part"
@@ -284,7 +291,10 @@ class Radiography:
         return await asyncio.to_thread(shares_behind, chain, probe, paths, cone.rows)
 
     def dark(self, camera: CameraSettings) -> Radiograph:
-        """Make the radiograph of an image without X-rays."""
+        """Make the image without X-rays: zero line integrals.
+
+        With physics other than "ideal" also expected counts, all zero.
+        """
         nothing = np.zeros(camera.shape, dtype=np.float32)
         if self.physics == "ideal":
             return Radiograph(nothing)

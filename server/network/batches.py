@@ -50,7 +50,10 @@ class Batch:
         return self._size > self._most
 
     def next_item(self, *, urgent_alone: bool = False) -> Item | None:
-        """Take out the next item; None if none is left, or (`urgent_alone`) none is urgent."""
+        """Take out the next item, urgent ones first, and remember its place in the batch.
+
+        None if none is left, or, with `urgent_alone`, if the next is not urgent.
+        """
         if not self._left:
             return None
         index, item = self._left[0]

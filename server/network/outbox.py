@@ -66,7 +66,10 @@ class Outbox:
         self.send(self.encode(message))
 
     def send(self, body: Sequence[bytes]) -> None:
-        """Send or queue the body from `encode`, or several of them as a batch."""
+        """Send or queue the body from `encode`, or several of them as a batch.
+
+        A batch that is too large is replaced by one error without an id.
+        """
         wire = self.link.wire
         try:
             pieces = wire.framed(body)
@@ -75,7 +78,11 @@ class Outbox:
         self._put_all(pieces)
 
     def encode(self, message: m.Response | m.Failure) -> list[bytes]:
-        """Encode an answer; if it cannot be sent, encode the error instead."""
+        """Encode an answer; if that is impossible, encode an error with its id instead.
+
+        Too large: that error. Values that are not finite, or of a wrong type: an internal
+        error, and a log line that names the place.
+        """
         wire = self.link.wire
         try:
             body = wire.body(message)
@@ -110,14 +117,14 @@ class Outbox:
         self._put_event(message)
 
     def _put_event(self, message: m.Message | Prepared) -> None:
-        """Encode and send an event; log one that cannot be encoded."""
+        """Encode and send an event; one that cannot be encoded is logged and dropped."""
         try:
             self._put_all(self.link.wire.pieces(message))
         except (RpcError, ValueError, TypeError, OverflowError):
             self.link.log("event not sent", logging.ERROR, error=True)
 
     def _put_all(self, pieces: Sequence[bytes]) -> None:
-        """Send or queue pieces, large ones in writes of `WRITE_BYTES` bytes."""
+        """Send or queue pieces: joined in one write if small, else in writes of `WRITE_BYTES`."""
         if sum(map(len, pieces)) <= WRITE_BYTES:
             self._put(b"".join(pieces))
             return
@@ -126,7 +133,10 @@ class Outbox:
                 self._put(piece[at : at + WRITE_BYTES])
 
     def _put(self, data: bytes) -> None:
-        """Write bytes to the transport if it takes them, else queue them."""
+        """Write bytes to the transport if it takes them, else queue them.
+
+        Dropped if the connection has ended or is closing.
+        """
         if self.over or self.link.transport.is_closing():
             return  # asyncio would complain of every write to a connection that is gone
         if self.ready.is_set():
@@ -164,7 +174,7 @@ class Outbox:
             await self.ready.wait()
 
     def lost(self) -> None:
-        """Drop the queue: the connection has ended."""
+        """Drop everything queued, as the connection has ended, and wake who waits to send."""
         self.over = True
         self.queue.clear()
         self.slots.clear()

@@ -128,7 +128,7 @@ class TcpServer(ListeningServer):
                 asyncio.get_running_loop().call_soon(self._start_urgent)
 
     async def close(self) -> None:
-        """Stop listening, end every connection, wait until all are gone."""
+        """Stop listening, end every connection (waiting ones too), wait until all are gone."""
         if self.server is not None:
             self.server.close()
         links = {*self.links, *self.waiting.guests, *self.reserved.guests}
@@ -413,7 +413,10 @@ class _Link(asyncio.BufferedProtocol):
         self.transport.abort()
 
     def displace(self) -> None:
-        """End the connection for a newer one; a client gets the reason, a stranger does not."""
+        """End the connection for a newer one; an admitted client is sent the reason, others not.
+
+        The reason is not waited for if the client does not read what was sent before.
+        """
         if self.let_in:
             self.out.reply(m.Failure(None, self._no_place()))
         if self.let_in and not self.transport.get_write_buffer_size():
@@ -429,7 +432,10 @@ class _Link(asyncio.BufferedProtocol):
         error: bool = False,
         **facts: object,
     ) -> None:
-        """Write a line about this connection, unless there are too many of its kind."""
+        """Log a line about this connection, unless there have been too many of its kind.
+
+        Lines of connections that are not admitted are counted as a kind of their own.
+        """
         kind = event
         if not self.let_in:
             kind = f"{event}, no token"
@@ -445,7 +451,10 @@ class _Link(asyncio.BufferedProtocol):
     # -- requests ----------------------------------------------------------------------------
 
     def _admit(self) -> None:
-        """Admit the connection and open the application's session; abort if that fails."""
+        """Admit the connection and open the application's session; abort it if that fails.
+
+        The time limit for hello ends, and messages that came before are examined.
+        """
         self.let_in = True
         self.loop.call_soon(self.overtake)  # earlier messages were not examined
         self.deadlines.stop("hello")
@@ -520,7 +529,7 @@ class _Link(asyncio.BufferedProtocol):
             await self.arrived.wait()
 
     def _answer_the_end(self) -> None:
-        """Send an error if the client has ended its stream inside a message."""
+        """Send a parse error if the client has ended its stream inside a message."""
         try:
             self.wire.receive_end()
         except ProtocolError as error:
@@ -581,7 +590,10 @@ class _Link(asyncio.BufferedProtocol):
         return batches.Batch(items, self._lane, MAX_ANSWER[self.codec])
 
     async def _begin(self, split: batches.Split) -> None:
-        """Serve a batch's urgent items; the others follow when the batch's turn comes."""
+        """Serve a batch's urgent items, then set `urgent_done`, even after an error.
+
+        The others follow when the batch's turn comes.
+        """
         try:
             await self._serve_items(split.batch, waits=True, urgent_alone=True)
         finally:
@@ -732,7 +744,11 @@ class _Link(asyncio.BufferedProtocol):
             return m.Failure(id, errors.internal(trace))
 
     async def _check_token(self, hello: Hello) -> None:
-        """Check the token and the protocol version of a hello, and admit the connection."""
+        """Check token and protocol version of a hello, and admit the connection.
+
+        Nothing is checked (the version neither) if the server has no token. An admitted
+        one keeps its place. Raises as `TokenCheck.check` and `require_compatible`.
+        """
         if self.server.token is None:
             return
         await self.token_check.check(hello.token, self.name)
@@ -766,7 +782,11 @@ class _Link(asyncio.BufferedProtocol):
 
     @property
     def _full(self) -> bool:
-        """Whether so much waits that reading pauses; an incomplete message may be completed."""
+        """Whether so much waits that reading pauses: messages, or bytes received ahead.
+
+        An incomplete message of an admitted client may be completed. Others have a lower
+        limit.
+        """
         ahead = 0
         if self.wire.whole or not self.let_in:
             ahead = self.wire.pending
@@ -776,7 +796,7 @@ class _Link(asyncio.BufferedProtocol):
         return self._load >= self.limits.max_waiting or ahead > limit_bytes
 
     def _relax(self) -> None:
-        """Resume reading once enough messages have been served."""
+        """Resume reading once messages and bytes that wait are at most half of their limits."""
         ahead = 0
         if self.wire.whole:
             ahead = self.wire.pending
@@ -784,7 +804,7 @@ class _Link(asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        """Remove an ended task."""
+        """Remove an ended task, report its error if it crashed, and resume reading if possible."""
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():

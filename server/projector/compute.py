@@ -108,7 +108,11 @@ class ComputeJob:
             raise self.error from None
 
     async def _in_turn(self, compute: ComputeThread, step: Step) -> object:
-        """Wait for the lane, put the step into the thread's queue, and return its value."""
+        """Wait for the lane, put the step into the thread's queue, and return its value.
+
+        The job enters the lane's number of jobs in hand at its first step, and stays in
+        it.
+        """
         if not self._in_hand:
             self._in_hand = await self.lane.in_hand.acquire()
         async with self.lane:
@@ -151,7 +155,10 @@ class ComputeThread:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        """Compute steps until `close`."""
+        """Compute queued steps in order until `close`; results and errors go to their futures.
+
+        Steps cancelled before are skipped.
+        """
         while (put := self._steps.get()) is not None:
             future, step = put
             if future.set_running_or_notify_cancel():
@@ -208,7 +215,10 @@ def begin(threads: int) -> None:
 
 
 def _compile_back() -> None:
-    """Compile the back projection after `COMPILE_BACK_AFTER_S`, at low priority."""
+    """Wait `COMPILE_BACK_AFTER_S`, then compile the back projection in another process.
+
+    At low priority, and only unless it is compiled already.
+    """
     time.sleep(COMPILE_BACK_AFTER_S)
     os.nice(10)  # Linux: of this thread, and of the process that it starts
     if not compile_ahead.is_compiled("back projection"):
@@ -216,7 +226,7 @@ def _compile_back() -> None:
 
 
 def backend() -> str:
-    """Name what computes: "numba" on the processor, or the CUDA device before it."""
+    """Name what computes: "numba", or the name of the CUDA device followed by ", numba"."""
     found = gpu.availability()
     if found.present:
         return f"{found.reason} (CUDA), numba"

@@ -109,7 +109,7 @@ class Context:
         return await client.begin(id).run(self.compute, step)
 
     def supersede(self, client: JobClient, key: str) -> None:
-        """End this client's interactive jobs of that key that have not been computed."""
+        """End this client's jobs of that key that still wait, with an error; count them."""
         for job in client.jobs.values():
             if job.key == key and job.waits:
                 job.end(superseded(key))

@@ -94,7 +94,10 @@ class ProjectorServer(ListeningServer):
             link.deadlines.start("hello", self.limits.hello_timeout_s)
 
     def lost(self, link: FrameLink) -> None:
-        """Remove an ended connection, cancel its requests and drop its uploads."""
+        """Forget an ended connection: its place and its unfinished uploads; cancel its requests.
+
+        Volumes that are complete stay.
+        """
         client = self.context.clients.pop(link)
         self.waiting.leave(client)
         self.seated.discard(client)
@@ -123,7 +126,7 @@ class ProjectorServer(ListeningServer):
         return min(MAX_FRAME, self.limits.max_message)
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
-        """Log an error, send it, and end the connection."""
+        """Log an error as a warning, send it without an id, and end the connection."""
         self.context.lines.log(
             "refused", logging.WARNING, client=link.peer, reason=error.message
         )
@@ -206,7 +209,7 @@ class ProjectorServer(ListeningServer):
     async def _call(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
-        """Serve a call, and count and log it."""
+        """Serve a call, log it and observe its duration; an error becomes a `Failure`."""
         return await answered(
             self._handle(client, id, name, given),
             name,
@@ -347,7 +350,9 @@ def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
         return {"server": f"flexdt projector {version('flexdt')}"}
 
     def figures() -> list[Metric]:
-        """List the figures of `/metrics`."""
+        """List the figures of `/metrics`: clients, views, requests superseded and waiting,
+        volumes.
+        """
         store = context.store
         return [
             gauge("flexdt_connections", "Clients connected.", len(server.seated)),

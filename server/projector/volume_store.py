@@ -172,7 +172,11 @@ class VolumeStore:
         return end, upload.whole
 
     def remove(self, name: str) -> bool:
-        """Remove a volume; return whether there was one."""
+        """Remove a volume, evictable or not, with its memory count; return whether there was
+        one.
+
+        An upload of that name goes on.
+        """
         value = self._held.pop(name, None)
         if value is None:
             return False
@@ -223,7 +227,11 @@ class VolumeStore:
 
 
 def memory_of(value: Body) -> int:
-    """Compute the memory counted for a volume, mesh or scene [bytes]."""
+    """Estimate the memory that a volume, mesh or scene is counted with [bytes].
+
+    A volume `LAYOUT_COPIES` times its float32 voxels; a scene `SOLID_BYTES` a solid (at
+    least one).
+    """
     if isinstance(value, Volume):
         return LAYOUT_COPIES * 4 * math.prod(value.shape)
     if isinstance(value, TriangleMesh):
@@ -239,7 +247,7 @@ def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
 
 
 def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
-    """Make the error for a chunk at byte `asked` where `allowed` is expected."""
+    """Make the error for a chunk at byte `asked` where `allowed` is expected; returned."""
     return invalid_params(
         f"volume {name!r}: a chunk at or up to byte {asked} does not fit; expected {allowed}",
         [problem("start", "chunks must come in order", asked)],

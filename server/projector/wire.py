@@ -96,7 +96,9 @@ class FrameLink(asyncio.BufferedProtocol):
     # -- the transport's calls ---------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Tune the socket, note the peer's address, and call `on_made`."""
+        """Tune the socket, note the peer's address (TCP only; else it stays "?"), and call
+        `on_made`.
+        """
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(high=SLICE_BYTES // 2)
         sock = self.transport.get_extra_info("socket")
@@ -107,7 +109,10 @@ class FrameLink(asyncio.BufferedProtocol):
         self.on_made(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Return the memory for the next bytes: the length, or the frame's own memory."""
+        """Return the memory for the next bytes: rest of the length, or of the frame's body.
+
+        After the end of the stream it is memory to be ignored. `sizehint` is ignored.
+        """
         if self._over:
             return memoryview(bytearray(SLICE_BYTES))
         if self._body is None:
@@ -166,7 +171,10 @@ class FrameLink(asyncio.BufferedProtocol):
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Record that the connection has ended, and call `on_lost`."""
+        """Record that the connection has ended, wake who waits to write, and call `on_lost`.
+
+        `exc` is ignored.
+        """
         self.lost = True
         self.deadlines.clear()
         self._writable.set()
@@ -220,7 +228,10 @@ class FrameLink(asyncio.BufferedProtocol):
             self.transport.close()
 
     async def _send_payload(self, payload: memoryview) -> None:
-        """Send a payload slice by slice; abort if it is cancelled."""
+        """Send a payload in slices, each once the transport takes it.
+
+        If it is cancelled, the connection is aborted: half a frame has gone out.
+        """
         try:
             for start in range(0, len(payload), SLICE_BYTES):
                 await self._writable.wait()
@@ -249,7 +260,10 @@ class _Pending:
     parts: npt.NDArray[np.float32] | None = None
 
     def part(self, params: Mapping[str, object]) -> None:
-        """Copy a part into the array of the result."""
+        """Copy a part (float32, from index `start`) into the result's flat array.
+
+        Ignored before the shape is known, or without a whole `start`.
+        """
         start = params.get("start")
         data = params.get("data")
         if self.shape is None or not isinstance(start, int):
@@ -415,7 +429,11 @@ class ProjectorLink:
         link.transport.abort()
 
     def _lost(self, link: FrameLink) -> None:
-        """Fail all open requests with `LinkLost`; log a violation of the protocol."""
+        """Fail all open requests with `LinkLost`; log a violation of the protocol.
+
+        An end inside a frame is a violation, logged as a warning only, unless the link
+        was closed here.
+        """
         if link.mid_frame and not self._closed:
             self._calls.violate(ProtocolError("the stream ended inside a frame"))
         why = "the connection ended"

@@ -136,7 +136,7 @@ class Acquisition:
         return found
 
     async def _image(self, frame: Exposure) -> Radiograph:
-        """Return the image of a frame with X-rays on; it is projected again if not kept."""
+        """Return the image of a frame with X-rays on: a recent one, else it is projected again."""
         image = self._recent.get(frame.index)
         if image is None:
             return (await self._radiographs([frame]))[0]

@@ -90,7 +90,7 @@ class CheckInput:
 
     @property
     def light(self) -> bool:
-        """True if the check is too short to pay for another process."""
+        """True if the check is too short to pay for another process: small script or few poses."""
         script = self.source.script
         if self.source.poses is None:
             return is_light(script)
@@ -289,7 +289,7 @@ def in_pieces(check_input: CheckInput) -> list[bytes]:
 
 
 def _bare(check_input: CheckInput) -> CheckInput:
-    """Return the input without the listing of poses, which only people read."""
+    """Return the input without the listing of poses, which only people read; scripts unchanged."""
     source = check_input.source
     if source.poses is None:
         return check_input
@@ -355,7 +355,10 @@ def _refusing_large(
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
-        """Sweep a plan unless its report would be too large."""
+        """Sweep a plan, unless its report would be too large: then raise the error TOO_LARGE.
+
+        The size is estimated from the steps before the sweep.
+        """
         size_of = sum(STEP_BYTES + len(s.what) + len(s.assumed_from) for s in plan.steps)
         if most is not None and size_of > most:
             raise too_large("a report", f"more than {size_of}", most)

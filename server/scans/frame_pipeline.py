@@ -63,7 +63,7 @@ class FramePipeline(Generic[T]):
         return not self._waiting and self._busy == 0
 
     async def put(self, frame: T) -> None:
-        """Add a frame; waits for room."""
+        """Add a frame to the queue's end, once it has room."""
         async with self._changed:
             await self._changed.wait_for(lambda: not self.full)
             self._waiting.append(frame)

@@ -97,7 +97,10 @@ class Retry:
 
 
 def _has_room(error: DiskFullError) -> bool:
-    """Return whether the unwritten data would fit now, if the system reports it."""
+    """Return whether the data of a full-disk error would fit now.
+
+    True also if the error has no path and size, or the system does not report free space.
+    """
     data = error.data if isinstance(error.data, Mapping) else {}
     path = data.get("path")
     need = data.get("bytes")

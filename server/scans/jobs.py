@@ -131,7 +131,10 @@ class Jobs:
 
     @property
     def busy(self) -> bool:
-        """True while frames are being made, or time runs at maximum speed for a job."""
+        """True while the running job makes frames or is being opened, or runs at speed "max".
+
+        False for a paused one, and for one that waits between frames.
+        """
         job = self.current
         if job is None or job.phase != "running":
             return False
@@ -192,7 +195,7 @@ class Jobs:
         )
 
     def showing(self, sample: str) -> Job | None:
-        """Return a job that has not ended and uses the sample of that name, or None."""
+        """Return the first job that has not ended and uses the sample of that name, or None."""
         unended = (j for j in self._all.values() if j.phase not in ENDED_PHASES)
         return next(
             (j for j in unended if j.sample is not None and j.sample.name == sample), None
@@ -310,7 +313,10 @@ class Jobs:
         self._tell(job)
 
     def resume(self, job: Job) -> None:
-        """Let a paused job go on; nothing to do for one that runs."""
+        """Let a paused job go on; nothing to do for one that runs.
+
+        A planned retry is cancelled. Raises as `_runner` for a job in another state.
+        """
         runner = self._runner(job, "resume", ("running", "paused"))
         self.retry.cancel()
         self._manual = False
@@ -368,7 +374,10 @@ class Jobs:
         return self._count
 
     def changed(self) -> dict[str, JobMemory | None]:
-        """Return jobs changed since the last call by name; None for a forgotten one."""
+        """Return name -> job as it is now, for jobs changed since the last call, in their order.
+
+        None for a forgotten one; the list of changes is emptied.
+        """
         names = self._changed
         self._changed = set()
         known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
@@ -429,14 +438,21 @@ class Jobs:
         return [found]
 
     def forget(self, jobs: Iterable[Job]) -> None:
-        """Remove these jobs from the list; their data sets stay."""
+        """Remove these jobs from the list and note the change; their data sets stay.
+
+        Jobs that are not in it are skipped.
+        """
         for job in jobs:
             if self._all.get(job.id) is job:
                 del self._all[job.id]
                 self._changed.add(job.id)
 
     def _forget_old(self) -> None:
-        """Forget the ended jobs beyond those that are kept, and those that are too old."""
+        """Forget the oldest ended jobs beyond `max_ended`, and those that ended over
+        `max_age` ago.
+
+        The current job stays in the list.
+        """
         ended = [
             j
             for j in self._all.values()
@@ -446,7 +462,10 @@ class Jobs:
         self.forget(self._ended_before(self._today() - self._max_age))
 
     def _ended_before(self, than: datetime) -> list[Job]:
-        """List the jobs, except the current one, that ended before a moment."""
+        """List the ended jobs, except the current one, that ended at a moment or before.
+
+        A job without an end time counts as old.
+        """
         return [
             job
             for job in self._all.values()

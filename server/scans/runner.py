@@ -190,7 +190,10 @@ class ScanRunner:
         self._wake()
 
     def step(self) -> None:
-        """Run one frame, or one command that takes none, and pause again."""
+        """Run one frame, or one command that takes none, and pause again; clears a shown error.
+
+        Calls add up: two before the run obeys make two steps.
+        """
         self._pause = False
         self._single_step = True
         self._steps += 1
@@ -279,7 +282,10 @@ class ScanRunner:
             await self._pipeline.close()
 
     def _first_moment(self) -> float:
-        """Plan time at which to begin: 0, or shortly before the first frame that is missing."""
+        """Plan time at which to begin [s]: 0, or the event of the first frame that is missing.
+
+        With no frame missing, the plan's end.
+        """
         if not self.done:
             return 0.0
         frames = [moment for moment, event in self._events if isinstance(event, Exposure)]
@@ -426,7 +432,11 @@ class ScanRunner:
             raise self._end
 
     async def _rejoin_or_pause(self, tau: float) -> None:
-        """Move to the plan's beginning; an obstacle pauses the run."""
+        """Move to where the plan stands at `tau` [s]; an error pauses the run with it.
+
+        With a request waiting (pause, abort) it does not move. Requests are obeyed at the
+        end.
+        """
         if not self._has_request():
             try:
                 await self._rejoin(tau)
@@ -501,7 +511,7 @@ class ScanRunner:
     # Frames -------------------------------------------------------------------------------------
 
     async def _put(self, frame: Exposure) -> None:
-        """Hand a frame to the pipeline; the clock is held while there is no room."""
+        """Hand a frame to the pipeline; while that is full the twin's clock is held."""
         if not self._pipeline.full:
             await self._pipeline.put(frame)
             return
@@ -542,7 +552,7 @@ class ScanRunner:
             task.cancel()
 
     def _set_progress(self, **changes: object) -> None:
-        """Change fields of `progress`, and notify if any value is another one."""
+        """Change fields of `progress`; call `notify` only if a value differs."""
         new = replace(self.progress, **changes)  # type: ignore[arg-type]
         if new != self.progress:
             self.progress = new

@@ -135,7 +135,7 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
 
 
 def is_complete(folder: Directory) -> bool:
-    """Return whether a folder has a data set that is marked complete."""
+    """Return whether a folder's data set is marked complete; False if it cannot be read."""
     try:
         return read_document(folder).complete
     except (OSError, DatasetError):

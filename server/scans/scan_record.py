@@ -96,7 +96,10 @@ class ScanSource:
         seed: int | None = None,
         flat: bool | Mapping[str, float] = True,
     ) -> ScanSource:
-        """Make a scan from a trajectory; its `script.txt` has a comment for each pose."""
+        """Make a scan from a trajectory; its script is one comment for each pose.
+
+        `exposure_ms` None is the camera's; `flat` is whether flats are taken, or where.
+        """
         if not isinstance(poses, PoseList):
             poses = PoseList.of(poses)
         head = f"# trajectory, exposure_ms {exposure_ms}, flat {json.dumps(flat)}\r\n".encode()

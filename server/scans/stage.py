@@ -178,7 +178,7 @@ class Stage:
 
 
 def _convex_pieces_of(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
-    """Divide a phantom, placed as `offset` says, into convex pieces, object frame [mm]."""
+    """Divide a phantom's outer mesh, placed by `offset`, into convex pieces, object frame [mm]."""
     return convex_pieces(
         phantom.mesh(around=True),
         rotation=offset.rotation,

@@ -104,7 +104,10 @@ class Submissions:
     async def _sample_seen(
         self, check_input: CheckInput, sample: Sample
     ) -> SampleForecast | None:
-        """Predict the pixels behind the sample on the stage; None without a sample."""
+        """Predict the pixels behind the sample on the stage; None without a sample.
+
+        The rays are those of the checked scan.
+        """
         if not sample.name:
             return None
         probes = await self.checks.probes(check_input)
@@ -366,7 +369,10 @@ class Submissions:
         parameters = scanner.parameters
 
         def work() -> CheckInput:
-            """Compute the sample's shapes and put the input together, in a thread."""
+            """Compute the sample's shapes and put the check's input together, in a thread.
+
+            Convex pieces only for a machine with components to collide with.
+            """
             if scanner.machine.components:
                 pieces = stage.pieces(stands)
             else:
@@ -388,7 +394,9 @@ class Submissions:
         return await asyncio.to_thread(work)
 
     def start(self) -> StartState:
-        """Return the scanner's state at rest at the motors' targets."""
+        """Return the start of a plan: motors at rest at their targets, present rates and
+        settings.
+        """
         s = self.scanner
         return StartState(
             positions=s.final_positions(),
@@ -543,7 +551,10 @@ class Submissions:
         return kept.begin
 
     def _free_name(self) -> str:
-        """Choose the first free name of today as the scanner does: date and number."""
+        """Choose the first name of today (date and number) that no job and no folder has.
+
+        The next search begins at that number.
+        """
         used = {job.name for job in self.jobs.all()}
         now = self.now()
         if self._numbered[0] != dated_name(now, 0):

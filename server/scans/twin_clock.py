@@ -93,7 +93,7 @@ class TwinClock:
         self._set_timer()
 
     def now(self) -> float:
-        """Return the twin time [s]."""
+        """Return the twin time [s]; every `SAMPLE_S` of real time a sample for its rate is kept."""
         now = self._time()
         wall = self._wall()
         if wall - self._samples[-1][0] >= SAMPLE_S:
@@ -102,7 +102,10 @@ class TwinClock:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Measured twin seconds a real second over the last few; None before that."""
+        """Measured twin seconds a real second over the samples kept (the last few seconds).
+
+        None until they span more than `SAMPLE_S`.
+        """
         wall = self._wall()
         now = self._time()
         self._sample(wall, now)
@@ -136,7 +139,7 @@ class TwinClock:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Stop the time within the context; contexts nest."""
+        """Stop twin time within the context; contexts nest, and it goes on after the outermost."""
         self._rebase()
         self._hold_count += 1
         self._set_timer()
@@ -148,7 +151,11 @@ class TwinClock:
             self._set_timer()
 
     def _time(self) -> float:
-        """Compute the twin's time now [s]; from `LATE_S` on it runs at real time at most."""
+        """Compute the twin's time now [s]; it stands while held, and between events at speed
+        "max".
+
+        From twin time `LATE_S` on it runs at real time at most.
+        """
         if self._hold_count or self._speed_up == "max":
             return self._base
         passed = self._wall() - self._base_wall
@@ -214,7 +221,10 @@ class TwinClock:
         self._set_timer()
 
     def _wake_due(self) -> None:
-        """Wake the tasks that are due while time flows, and schedule the next wake-up."""
+        """Wake the tasks due within a microsecond of real time, and schedule the next wake-up.
+
+        Time is set forward to a woken task's moment if the timer was early.
+        """
         self._timer = None
         now = self._time()
         # The loop's timer may fire a hair early; what is due within a microsecond is due.

@@ -176,7 +176,11 @@ class Corrections:
         return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
 
     def after(self, correction: NamedCorrection | None) -> History:
-        """Return the history once `correction` is in force instead of the last."""
+        """Return the history once `correction` (None: none) is in force instead of the last.
+
+        Unchanged if none is in force before and after; the oldest beyond `MAX_HISTORY`
+        are dropped.
+        """
         name = None
         if correction is not None:
             name = correction.name
@@ -255,7 +259,7 @@ class Corrections:
         self.history = history
 
     def _free_name(self, date: str) -> str:
-        """Find an unused name for a correction of this date."""
+        """Find an unused name for a correction of this date (only its day counts)."""
         base = f"correction-{date[:10]}"
         taken = sum(name.startswith(base) for name in self._all)
         while (name := f"{base}-{taken + 1}") in self._all:

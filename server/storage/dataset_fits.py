@@ -102,7 +102,10 @@ def align(
 
 
 def _dataset_path(root: Directory, name: str) -> Path:
-    """Return the folder of a data set, or raise DatasetMissingError."""
+    """Return the folder of a data set, or raise DatasetMissingError if there is none.
+
+    A name that is no plain file name raises DatasetNameError.
+    """
     if not root.is_directory(plain_name(name, "data set")):
         raise DatasetMissingError(
             f"no data set {name!r} in the data directory", {"asked": name}

@@ -80,7 +80,7 @@ class JobFiles:
         self._folder = self._records.folder(FOLDER)
 
     def read(self) -> list[JobMemory]:
-        """Read every job in the order made; set aside files that cannot be read."""
+        """Read every job in the order made; files that cannot be read are set aside and logged."""
         found = []
         for file in documents.ours(self._folder):
             without = "a job cannot be read; without it (its data set stays)"
@@ -144,10 +144,10 @@ def _text(job: JobMemory) -> bytes:
 
 
 def _reader(file: str) -> Callable[[bytes], JobMemory]:
-    """Make the reader of a job's file, which must be about the job in its name."""
+    """Make the parser of a job's file; it raises ValueError if the job has another name."""
 
     def read(data: bytes) -> JobMemory:
-        """Parse a job and check its name."""
+        """Parse a job; raise ValueError if it is not the one in the file's name, or invalid."""
         found = JobFile.model_validate(documents.read_json(data))
         if file != _file(found.id):
             raise ValueError(f"it is about {found.id!r}")

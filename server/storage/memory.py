@@ -350,14 +350,19 @@ class StateStore:
             return taken
 
     def _note(self, problem: str | None) -> None:
-        """Report a problem with the disk when it begins or ends."""
+        """Set `problem`; call `noticed` only when a problem begins (with it) or ends (with
+        None).
+        """
         before = self.problem
         self.problem = problem
         if (before is None) != (problem is None):
             self.noticed(problem)
 
     def end(self) -> None:
-        """Write for the last time; a write still under way does not undo it."""
+        """Write state and all changed jobs for the last time; an error is logged, not raised.
+
+        Writes still under way can not undo it.
+        """
         try:
             self._put(self._make(True), self._unwritten_jobs(most=sys.maxsize))
         except (OSError, DatasetError) as error:
@@ -381,7 +386,10 @@ class StateStore:
         return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
-        """Write the document and jobs to the disk, unless the server has ended; blocks."""
+        """Write the document and jobs to the disk, one write at a time; blocks.
+
+        After the last write (of an ended server), others are skipped.
+        """
         # Ending cancels the task that waits for a worker thread, but not the thread.
         with self._file:
             if self._ended and not memory.ended:
@@ -436,7 +444,7 @@ def _text(memory: Memory) -> bytes:
 
 
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
-    """Move positions into the travel: a motion in mid-flight has rounding errors."""
+    """Move positions into the travel of their motors: rounding may have brought them out."""
     axes = machine.axes
     return {
         name: min(max(x, axes[name].lower), axes[name].upper)

@@ -152,7 +152,10 @@ class _LruCache:
         return key in self._made
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the value of `key`, made now if it is not known."""
+        """Return the value of `key`, made now if it is not known; it becomes the latest used.
+
+        The least recently used one is dropped beyond the limit.
+        """
         value = self._made[key] = self._made.pop(key) if key in self._made else make()
         if len(self._made) > self._most:
             del self._made[next(iter(self._made))]
@@ -209,7 +212,9 @@ class _Scan:
 
     @property
     def beam(self) -> tuple[float | None, float | None]:
-        """kV and W of the projections."""
+        """kV and W of the projections, by the document, else by the scanner's texts; else
+        None, None.
+        """
         if self.document:
             settings = self.document.tube
         else:
@@ -300,7 +305,10 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
 
 
 def _texts(folder: files.Folder) -> Any:
-    """Read the scanner's own texts of a folder without a document; None if there are none."""
+    """Read the scanner's own texts of a folder without a document.
+
+    None if it has a document, or no texts that can be read.
+    """
     from flexdt.library.reading.folders import load_dataset  # heavy: only workers need it
 
     if folder.document:
@@ -459,7 +467,10 @@ def _list(
 
 
 def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
-    """Set the state of a data set that is being written."""
+    """Set state "running", without a reason, for the data set that the twin writes now.
+
+    Others are returned unchanged.
+    """
     running = info.name == context.running
     if running:
         return info.model_copy(update={"state": "running", "reason": ""})
@@ -503,7 +514,12 @@ def _with_thumbnail(
     """
 
     def make() -> ImageValue | str:
-        """Read the middle projection and make its thumbnail, 8-bit; "" if there is none."""
+        """Read the middle projection and make its thumbnail, 8-bit, at most `side` pixels a
+        side.
+
+        Binned (a narrow image: sampled); grey from its 0.5 % to its 99.5 % value. "" if
+        there is no projection or it cannot be read.
+        """
         folder = files.list_folder(path)
         images = list(folder.projections.values())
         if not images:
@@ -603,7 +619,11 @@ def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:
 
 
 def _same_machine(scan: _Scan, context: TwinContext) -> bool:
-    """Return whether the twin has the machine and the profile that a data set states."""
+    """Return whether the twin has the machine and the profile that a data set states.
+
+    Compared are profile, axes, geometry, fixed parts, components and detector (not the
+    tube).
+    """
     document = scan.document
     texts = scan.texts
     if document:

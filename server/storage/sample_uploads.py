@@ -45,7 +45,9 @@ class UploadHead(SampleUpload):
 
     @classmethod
     def of(cls, chunk: SampleUpload) -> UploadHead:
-        """Make the description of the upload to which a chunk belongs."""
+        """Make the description of the upload that a chunk belongs to; a missing unit is the
+        format's.
+        """
         given = chunk.model_dump(exclude={"start", "data"})
         return cls.model_validate(
             given | {"unit": chunk.unit or default_unit(chunk.format)}
@@ -171,14 +173,14 @@ class Incoming:
         return upload
 
     def _make_room(self, name: str, more: int) -> None:
-        """Drop the oldest other uploads until `more` bytes fit."""
+        """Drop the oldest other uploads until `more` bytes fit; one that is alone always fits."""
         while sum(o.received for o in self._open.values()) + more > self._limit:
             if all(other == name for other in self._open):
                 break  # the largest upload alone always fits
             self._drop(but=name)
 
     def _drop(self, but: str | None = None) -> None:
-        """Drop the oldest upload but one, and log it."""
+        """Drop the oldest upload other than `but`, and log a warning; there must be one."""
         oldest = next(name for name in self._open if name != but)
         log(
             "an unfinished upload was dropped for newer ones",

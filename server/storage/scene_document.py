@@ -59,7 +59,7 @@ def save_scene(
 
 
 def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
-    """Convert a correction to the names and units of documents and the wire (mm, deg)."""
+    """Convert a correction to the names of the wire: name, date, parameters (mm, deg), comment."""
     return {
         "name": correction.name,
         "date": correction.date,
@@ -130,7 +130,7 @@ def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
 
 
 def sample_of(scene: p.Scene) -> Sample:
-    """Return the scene's sample."""
+    """Return the scene's sample: its name, offset on the stage, and material."""
     return Sample(
         scene.sample.name,
         StagePlacement(**scene.sample.offset.model_dump()),

@@ -181,7 +181,10 @@ class SampleStore:
     def _keep(
         self, key: tuple[str, str | None], phantom: Phantom, revision: str | None
     ) -> None:
-        """Cache a phantom; drop the oldest ones beyond the limits, except that on the stage."""
+        """Cache a phantom, and its revision if given; drop the oldest ones beyond the limits.
+
+        The limits are number and memory; the new one and that on the stage always stay.
+        """
         self._loaded[key] = phantom
         if revision is not None:
             self._revisions[key[0]] = revision
@@ -260,7 +263,10 @@ class SampleStore:
         changes.put_json(self._folder, f"{stem}.json", document)
 
     def know(self, upload: ReceivedSample) -> None:
-        """Make a stored upload the current one of its name; `tidy` removes the previous one."""
+        """Make a stored upload the current one of its name, and cache its phantoms.
+
+        The files of the previous one are deleted by `tidy`.
+        """
         name = upload.head.name
         new = upload.head.model_copy(update={"revision": upload.revision})
         with self._lock:
@@ -301,7 +307,7 @@ class SampleStore:
             del self._loaded[key]
 
     def tidy(self) -> None:
-        """Delete the bytes that an upload or `forget` has replaced."""
+        """Delete the files that an upload or `forget` has replaced; errors leave the file."""
         with self._lock:
             files = self._replaced
             self._replaced = set()
@@ -391,7 +397,7 @@ class SampleStore:
 
 
 def _bytes_of(phantom: Phantom) -> int:
-    """Return the memory that the arrays of a phantom take [bytes]."""
+    """Return the memory that voxels and surfaces of a phantom take [bytes]; labels not counted."""
     voxels = 0
     if phantom.voxels is not None:
         voxels = phantom.voxels.data.nbytes
@@ -465,7 +471,7 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
     was uploaded now."""
 
     def read(data: bytes) -> UploadHead:
-        """Parse a description and check its name."""
+        """Parse a description; raise ValueError if its sample is not the one in the file's name."""
         head = UploadHead.model_validate(documents.read_json(data))
         if file != f"{documents.file_stem(head.name)}.json":
             raise ValueError(f"it is about {head.name!r}")

@@ -73,7 +73,10 @@ class TwinSession:
             raise
 
     def close(self) -> None:
-        """Unsubscribe the ended connection, release its control and cancel its way."""
+        """Unsubscribe the ended connection and release its control.
+
+        If it was the controller, its way around obstacles ends with the leg under way.
+        """
         if self._twin.control.holder == self._client.name:
             self._twin.detours.cancel()  # the controller's way ends with the present leg
         self._twin.hub.drop(self._client.peer)
@@ -106,7 +109,9 @@ def twin_pages(
     """
 
     def health() -> dict[str, object]:
-        """Return the facts of `/healthz`: server, projector and job."""
+        """Return the facts of `/healthz`: server version, projector, and the current job or
+        None.
+        """
         job = twin.jobs.current
         return {
             "server": f"flexdt {twin.version}",

@@ -130,7 +130,7 @@ class ControlLease:
             self.holder = None
 
     def force(self, who: str) -> str | None:
-        """Give control to `who`; return the holder who loses it, or None."""
+        """Give control to `who` and renew its lease; return the holder who loses it, or None."""
         loser = None
         if self.holder != who:
             loser = self.holder
@@ -139,7 +139,9 @@ class ControlLease:
         return loser
 
     def _control_error(self, what: str) -> RpcError:
-        """Make the error -32003 that names the controller; returned, not raised."""
+        """Make the error -32003 that names the controller and how to take over; returned,
+        not raised.
+        """
         return busy(
             f"{what}: {self.holder} is the controller; session.control with action force takes "
             "control over",
@@ -538,7 +540,9 @@ class TwinServer:
         )
 
     def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
-        """Describe a correction and its source for the wire."""
+        """Describe a correction and the data set or file it came from, for the wire; None
+        for None.
+        """
         source = None
         if correction is not None:
             source = self.corrections.source(correction.name)
@@ -547,7 +551,9 @@ class TwinServer:
     # Changing -----------------------------------------------------------------------------------
 
     def changed(self) -> None:
-        """Notify watchers of a command."""
+        """Notify state feed, live view and state store of a change, and wake who awaits a
+        motion's end.
+        """
         self.feed.changed()
         self.live.changed()
         self.state_store.changed()

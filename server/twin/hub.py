@@ -62,7 +62,10 @@ class _Event:
         self._made: dict[ImageRequest, Prepared] = {}
 
     def prepared(self, view: ImageRequest) -> Prepared:
-        """Encode the event for a view; each view is encoded once."""
+        """Prepare the event's message for a view of the image; made once for each view.
+
+        Data that are no function are the same for every view.
+        """
         if view not in self._made:
             if callable(self._data):
                 data = self._data(view)
@@ -259,7 +262,11 @@ class Hub:
             )
 
     def _offer(self, listener: Peer, subscription: _Subscription, new: _Event) -> None:
-        """Deliver an event now, or keep it until the subscription's rate allows it."""
+        """Deliver an event now, or, if it has a slot, keep it until the subscription's rate
+        allows it.
+
+        A newer event of the same slot replaces it; events without a slot never wait.
+        """
         loop = asyncio.get_running_loop()
         wait = subscription.next_at - loop.time()
         if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
@@ -273,7 +280,7 @@ class Hub:
         self._deliver(listener, subscription, new)
 
     def _flush(self, listener: Peer, subscription: _Subscription) -> None:
-        """Deliver the newest pending event of each slot, and begin the next interval."""
+        """Deliver the pending event of each slot, and begin the next interval."""
         subscription.timer = None
         subscription.next_at = (
             asyncio.get_running_loop().time() + subscription.min_interval_s
@@ -304,7 +311,9 @@ class Hub:
             asyncio.get_running_loop().call_soon(self._refill)
 
     def _refill(self) -> None:
-        """Allow the events of a new turn, and post those that are due."""
+        """Allow `EVENTS_A_TURN` events in a new turn of the loop, and deliver those that are
+        due.
+        """
         self._room = EVENTS_A_TURN
         self._refilling = False
         if self._due_events:

@@ -70,7 +70,11 @@ class Shot:
 
     @property
     def origin(self) -> ImageOrigin:
-        """Description of the origin of an image, for the wire."""
+        """Settings of an image for the wire: sample, material, offset, X-rays, tube, camera,
+        correction.
+
+        No motor positions; an empty stage is None.
+        """
         sample = self.sample
         tube = self.tube
         camera = self.camera
@@ -96,7 +100,7 @@ class Shot:
 
     @property
     def exposure(self) -> ExposureSettings:
-        """Settings of tube and camera."""
+        """Settings of tube (kV, W, whether it is on) and camera (exposure, averages)."""
         camera = self.camera
         tube = self.tube
         return ExposureSettings(
@@ -104,7 +108,7 @@ class Shot:
         )
 
     def same_image(self, other: Shot | None) -> bool:
-        """Return whether another shot has the same image, whatever the time."""
+        """Return whether another shot has the same image: all but its time; False for None."""
         return (
             other is not None
             and self.lit == other.lit
@@ -263,7 +267,9 @@ class LiveView:
 
     @property
     def seen(self) -> ImageFlags | None:
-        """Flags of the last image, such as saturation."""
+        """Flags of the last image, such as saturation, computed at the first access; None
+        before one.
+        """
         if isinstance(self._seen, tuple):  # computed at the first access
             image, shot = self._seen
             self._seen = flags_of(
@@ -302,7 +308,7 @@ class LiveView:
             self._showing = asyncio.create_task(self._publish_newest())
 
     async def _publish_newest(self) -> None:
-        """Publish the newest image that was handed over, until there is none."""
+        """Publish the newest image that was handed over, and again until there is none newer."""
         while self._made is not None:
             made = self._made
             self._made = None
@@ -376,7 +382,7 @@ class StateFeed:
                 settled()
 
     def _publish(self) -> None:
-        """Publish the state to its subscribers; log an error in place of raising it."""
+        """Publish the state if anybody is subscribed; a TwinError is logged, not raised."""
         try:
             if self.hub.wanted("state"):
                 self.hub.publish("state", lambda _view: self.render())

@@ -147,7 +147,10 @@ async def run(options: TwinSettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the process; returns its exit code."""
+    """Run the process until it is stopped; returns its exit code.
+
+    `argv` None is the command line.
+    """
     options = parse(TwinSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     sys.setswitchinterval(SWITCH_S)

@@ -19,7 +19,9 @@ SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
 
 
 def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
-    """Convert the tube's state at `now` to its wire form."""
+    """Convert the tube to its wire form: on, kV, W, whether it is ready at `now`, else in
+    how many s.
+    """
     return w.TubeState(
         on=tube.on,
         kV=tube.kV,
@@ -90,7 +92,7 @@ def correction_view(
 
 
 def clock_view(clock: TwinClock) -> w.ClockState:
-    """Convert the clock's state to its wire form."""
+    """Convert the clock to its wire form: twin time [s], speed-up, measured factor (or None)."""
     return w.ClockState(
         time_s=clock.now(),
         speed_up=clock.speed_up,
@@ -99,7 +101,10 @@ def clock_view(clock: TwinClock) -> w.ClockState:
 
 
 def stopped_view(state: w.State, stopping: StopMotion, now: float) -> w.Stopped:
-    """Return the wire state after a stop, with the motors' stopping motion."""
+    """Return the wire state after a stop: path, duration and distances of the stopping motion.
+
+    If it would hit something, the pair and in how many seconds from `now` (0 if past).
+    """
     hit = stopping.would_hit
     how = w.Stopping(
         path=stopping.path,

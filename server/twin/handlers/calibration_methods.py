@@ -49,7 +49,10 @@ async def apply(
 def get(
     twin: TwinServer, client: h.Client, params: p.CalibrationGet
 ) -> p.CorrectionResult:
-    """Return the applied correction, or the named one."""
+    """Return the correction in force (maybe None), or the named one, which need not be in force.
+
+    An unknown name raises as `Corrections.get`.
+    """
     if params.name is None:
         return p.CorrectionResult(
             correction=twin.correction_state(twin.scanner.correction)
@@ -63,7 +66,10 @@ def get(
 async def list_all(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.CorrectionListResult | Encoded:
-    """List all corrections, oldest first."""
+    """List all corrections, oldest first, and the name of that in force (or None).
+
+    A long list is made in several turns of the loop.
+    """
     current = twin.scanner.correction
     views = await h.in_turns(twin.corrections.all(), twin.correction_state)
     result = p.CorrectionListResult(

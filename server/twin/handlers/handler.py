@@ -67,10 +67,16 @@ _Handler: TypeAlias = Callable[
 
 
 def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_P, _R]]:
-    """Make a function the handler of `methods`, whose parameters and result it has."""
+    """Make a decorator that registers a function as handler of `methods`.
+
+    The function is returned unchanged; a method may have one handler only.
+    """
 
     def mark(handler: _Handler[_P, _R]) -> _Handler[_P, _R]:
-        """Register the handler for its methods, and return it unchanged."""
+        """Register the handler for its methods, and return it unchanged.
+
+        A method that has one already raises AssertionError.
+        """
         for method in methods:
             assert method.name not in HANDLERS, f"{method.name} has a handler"
             HANDLERS[method.name] = handler
@@ -198,7 +204,9 @@ async def change_stage(
     change = await asyncio.to_thread(change.certified)
 
     def files(changes: Changes) -> None:
-        """Add the files of upload, correction and history to the change."""
+        """Add the files of upload, correction and history to the change, as far as there are
+        any.
+        """
         if upload is not None:
             twin.samples.store(changes, upload)
         if correction is not None:
@@ -207,7 +215,10 @@ async def change_stage(
             twin.corrections.store_history(changes, history)
 
     def after(memory: Memory) -> Memory:
-        """Return the state's document as it is after the change."""
+        """Return the state's document as it will be: sample, correction, and a scene's settings.
+
+        The scanner itself is not changed.
+        """
         trial = copy.copy(scanner)
         trial.sample = sample
         trial.correction = correction

@@ -60,7 +60,11 @@ async def get_projection(
     radiograph, cone = await twin.live.shoot(shot, predicted=elsewhere)
 
     def work() -> Encoded:
-        """Compute and encode in a thread, as an image has some megabytes."""
+        """Compute and encode the image in a thread, with marks if asked for.
+
+        An image for another place than the present (`elsewhere`) is made without random
+        noise.
+        """
         view = ImageRequest(params.kind, params.binning)
         way = twin.radiography
         rng = None
@@ -137,7 +141,7 @@ async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult
 
 @answers(p.GEOMETRY_GET)
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
-    """Return the nominal geometry plus the applied correction."""
+    """Return cone_vec, detector shape and pixel [mm] now: nominal plus the applied correction."""
     cone = twin.scanner.cone_vec(twin.clock.now())
     return w.GeometryResult(
         cone_vec=cone.rows[0].tolist(),

@@ -43,7 +43,10 @@ async def check(twin: TwinServer, client: h.Client, params: ScanInput) -> Encode
 
 @h.answers(*SUBMIT)
 async def submit(twin: TwinServer, client: h.Client, params: ScanInput) -> p.SubmitResult:
-    """Put a scan into the queue: a script, or poses with one image each."""
+    """Check a script or poses, and put the scan into the queue; returns job, data set, warnings.
+
+    The client must be allowed to move, when it is asked and again when it is queued.
+    """
     ready = h.ensure_allowed(twin, client, "a scan")
     job = await twin.submissions.submit(
         _source(params), params.name, params.speed_up, client.program, ready
@@ -88,7 +91,10 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
 
 @h.answers(p.JOB_STEP)
 async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """Run one frame or command, then pause again; -32002 as for `resume`."""
+    """Run one frame or command of a paused job; wait at most `PATIENCE_S`, return the status.
+
+    -32002 as for `resume`, also if an obstacle stopped it.
+    """
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
     runner = job.runner
@@ -140,7 +146,9 @@ async def forget(
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 
     def files(changes: Changes) -> None:
-        """Remove the jobs' files, and the records of scans whose data sets do not exist."""
+        """Remove the jobs' files, and the records of scans whose data set's folder does not
+        exist.
+        """
         for job in jobs:
             twin.job_files.remove(changes, job.id)
             if twin.directory.stat(job.name) is None:  # nothing is left to go on with
@@ -162,7 +170,9 @@ async def forget(
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
-    """Wait until `condition` holds, at most PATIENCE_S, and return the job's status."""
+    """Wait until `condition` holds, at most `PATIENCE_S`, and return the job's status either
+    way.
+    """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + PATIENCE_S
     while not condition() and loop.time() < deadline:

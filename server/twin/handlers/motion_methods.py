@@ -216,7 +216,12 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
     stops = twin.scanner.stops
 
     def change(scanner: ScannerTwin) -> None:
-        """Set the tube; refuse X-rays on after a stop that came later than the request."""
+        """Set the tube; None leaves a setting.
+
+        Raises:
+            SafetyError: X-rays are to go on and motion was stopped after the request
+                came.
+        """
         now = twin.clock.now()
         if params.on and twin.scanner.stops != stops:
             raise SafetyError(
@@ -241,7 +246,10 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
 async def set_camera(
     twin: TwinServer, client: Client, params: p.CameraSet
 ) -> w.CameraState:
-    """Change the camera; omitted settings stay."""
+    """Change the camera (needs an idle twin and control); omitted settings stay.
+
+    Returns the camera's state afterwards.
+    """
 
     def change(scanner: ScannerTwin) -> None:
         scanner.set_camera(**camera_change(params))
@@ -253,7 +261,7 @@ async def set_camera(
 
 
 def camera_change(params: p.CameraSet) -> CameraChange:
-    """Convert the parameters to the twin's form."""
+    """Convert the parameters to keyword arguments of `set_camera`; None means unchanged."""
     roi = None
     if params.roi is not None:
         roi = Roi(*params.roi)

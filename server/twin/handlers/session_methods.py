@@ -87,7 +87,11 @@ def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
 
 @answers(p.STATE_SUBSCRIBE)
 def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
-    """Subscribe to events; the present state, image and jobs are sent at once."""
+    """Subscribe to events; state, image and jobs are sent at once where they are among the
+    topics.
+
+    Of the jobs, those that have not ended and the current or last one.
+    """
     view = ImageRequest(params.projection_kind, params.projection_binning)
     twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
     if "state" in params.topics:
@@ -110,7 +114,7 @@ def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Noth
 
 @answers(d.SCENE_SAVE)
 def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult:
-    """Save the motors' targets, settings, sample and correction as a scene."""
+    """Return a scene: motors' targets, settings, sample and correction. Nothing is stored here."""
     scene = save_scene(
         twin.scanner,
         twin.clock.now(),
