@@ -105,6 +105,11 @@ if (
 ):  # with a `__getattr__`, type checkers would take any name for one of ours
 
     def __getattr__(name: str) -> _typing.Any:
+        """Import a public name at its first use and keep it in the module.
+
+        `__version__` is read from the installed package each time. Raises AttributeError
+        on an unknown name, with the nearest known one, if any.
+        """
         if name == "__version__":
             from importlib.metadata import version  # 10 ms that few imports need
 

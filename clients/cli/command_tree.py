@@ -202,7 +202,12 @@ class InSections(TyperGroup):
         return list(super().parse_args(ctx, [*first, *rest]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands to the help page, section by section; those of extensions last."""
+        """Write the commands to the help page, section by section; extensions' commands
+        come last.
+
+        Commands that no section names are the extensions'; names that are absent and
+        empty sections are left out.
+        """
         found = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
         named = {name for names in SECTIONS.values() for name in names}
         others = tuple(name for name in found if name not in named)

@@ -142,7 +142,11 @@ def as_json(document: object) -> str:
 
 
 def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
-    """Format rows as padded text columns; numbers are formatted by the caller."""
+    """Format rows and their header as text columns, padded to the widest cell; numbers
+    are formatted by the caller.
+
+    Empty rows are skipped; returns "" without any row.
+    """
     every = [[str(cell) for cell in row] for row in (header, *rows) if row]
     if not every:
         return ""

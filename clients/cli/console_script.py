@@ -107,7 +107,10 @@ def _end_if_stuck(arrivals: int) -> None:
 
 
 def _end_if_silent() -> None:
-    """End the process after `SILENCE_S` without work."""
+    """End the process once it has used almost no processor time for `SILENCE_S` seconds.
+
+    With FLEXDT_TRACEBACK in the environment, dumps the stacks of all threads first.
+    """
     import time
 
     last_s = _wanted_s()

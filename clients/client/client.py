@@ -592,7 +592,9 @@ class TwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        """Connect to the twin; arguments and errors: see the class."""
+        """Connect to the twin, blocking until the handshake is done; arguments and
+        errors: see the class.
+        """
         self._client = AsyncTwinClient(
             host,
             port,

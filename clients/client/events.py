@@ -82,6 +82,7 @@ class Projection:
         return self.image
 
     def __repr__(self) -> str:
+        """Format columns x rows, data type and kind; the time [s] unless it is None."""
         rows, cols = self.image.shape
         if self.time is None:
             at = ""

@@ -83,7 +83,11 @@ def ask(
 
 
 def sample_shape() -> Flow[scanner.SampleMeshResult]:
-    """Fetch the mesh of the sample on the stage, with its name and revision."""
+    """Fetch the whole mesh of the sample on the stage, in parts, with its name and
+    revision.
+
+    Starts again when another sample is put on the stage meanwhile.
+    """
     while True:
         content = b""
         first = None
@@ -102,7 +106,10 @@ def sample_shape() -> Flow[scanner.SampleMeshResult]:
 
 
 def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:
-    """Run a flow to its end by blocking calls of `perform`."""
+    """Run a flow to its end by blocking calls of `perform`; returns the flow's result.
+
+    An exception of `perform` is thrown into the flow, which may handle it.
+    """
     try:
         effect = next(flow)
         while True:

@@ -300,7 +300,12 @@ class Link:
         await self.ended()
 
     async def _read(self) -> None:
-        """Handle messages until the connection ends, then fail all open requests."""
+        """Handle messages until the connection ends, then fail all open requests with
+        ConnectionLost.
+
+        A violation of the protocol is recorded and closes the connection; it is not
+        raised.
+        """
         try:
             while messages := await self._transport.receive():
                 for message in messages:

@@ -109,7 +109,12 @@ async def listen(
                     tell(message, data, now, now - none_before)
 
     def work() -> None:
-        """Open the SUB socket and its monitor, read until the end, and close both."""
+        """Open the SUB socket and its monitor, subscribe to everything, read until the
+        end, and close both.
+
+        The socket reconnects by itself, sends heartbeats, and holds at most `MAX_HELD`
+        messages of `MAX_BYTES`.
+        """
         with zmq.Context() as context, context.socket(zmq.SUB) as socket:
             for option, value in (
                 (zmq.LINGER, 0),

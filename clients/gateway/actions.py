@@ -264,7 +264,11 @@ def rate_setting(what: Rate, digits: int) -> Action:
     """
 
     async def send(twin: ConnectedTwin, command: Any, progress: CommandProgress) -> str:
-        """Set the value, clamped as the machine does; returns it as text."""
+        """Set speed or acceleration of an axis; returns the value sent, as text.
+
+        A value that the machine would clamp is lowered first to the slowest motor's share
+        of it. Without a machine, or on an axis it lacks, the value is sent as it is.
+        """
         axis = command.component
         machine = twin.machine
         value: float = getattr(command, what)

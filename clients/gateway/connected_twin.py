@@ -184,7 +184,9 @@ class ConnectedTwin:
             state = await self.state()
 
     def record(self) -> Recording:
-        """Return the recording that images go to now; create it at the first use."""
+        """Return the recording that images go to now; the first use creates it, with the
+        machine and profile known then.
+        """
         if self.recording is None:
             machine, profile = self._scanner()
             self.recording = Recording(
@@ -198,7 +200,11 @@ class ConnectedTwin:
         return self.recording
 
     def begin_recording(self, path: str) -> None:
-        """Save later images in another folder, with the commands since the last image."""
+        """Close the recording and save later images in another folder, `path`.
+
+        The new transcript begins with the last command, which leaves the old one; or, if
+        no image was saved yet, with all commands.
+        """
         old = self.record()
         fresh = old.folder is None
         if fresh:
@@ -242,7 +248,11 @@ class ConnectedTwin:
         return self._scanner()[0]
 
     def _scanner(self) -> tuple[Machine | None, Profile | None]:
-        """Return machine and profile, those given or those the twin names; None where unknown."""
+        """Return machine and profile: those given, else those that the twin names.
+
+        (None, None) without any machine; (machine or None, None) if this package lacks
+        the one named or its profile.
+        """
         hello = self.link.hello
         machine = self._machine
         try:

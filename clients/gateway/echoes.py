@@ -206,7 +206,12 @@ class Echoes:
         return exchange, command, exchange.received(now)
 
     def _end(self, state: State, reply: str | None = None) -> Iterator[AcquilaEvent]:
-        """End the script line under way: yield its last event, with a reply as its kind has it."""
+        """End the script line under way: yield its last event; yields nothing if no line
+        is under way.
+
+        Without a `reply`: the axis's position after a move, "TRUE" after REPEAT UNTIL,
+        the argument after "set ..." (except on the scanner), else "".
+        """
         line = self._line
         self._line = None
         if line is None:

@@ -81,7 +81,11 @@ def python() -> CheckOutcome:
 
 
 def packages() -> CheckOutcome:
-    """Check that all required packages of flexdt are installed; extras are left out."""
+    """Check that all required packages of flexdt are installed; those of extras are not
+    checked.
+
+    An "ok" lists the versions, an "error" the missing packages.
+    """
     have = []
     lack = []
     for name in needed():
@@ -241,7 +245,9 @@ def disk(data: Path) -> CheckOutcome:
 
 
 def _greeting(port: int) -> str:
-    """Greet the twin on `port` and return its name and protocol; "" if none answers."""
+    """Greet the twin on `port` and return its name and protocol; "a twin that wants a
+    token" if it refuses for lack of one, "" on any other failure.
+    """
     from flexdt.clients.client.client import TwinClient
     from flexdt.protocol import Code, RpcError
 

@@ -212,7 +212,11 @@ class LocalTwin:
         viewer: bool = False,
         progress: Progress = None,
     ) -> None:
-        """Take the servers' options; they start on entering. Arguments: see the class."""
+        """Take the servers' options; they start on entering. Arguments: see the class.
+
+        Nothing is started yet. Options that are None are not passed on; without `data` a
+        folder is made on entering.
+        """
         self._progress = progress
         options = {
             "sample": sample,

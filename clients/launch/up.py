@@ -85,7 +85,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         )
 
     def viewer(known: Addresses) -> Sequence[str]:
-        """Return module and options of the viewer."""
+        """Return module and command-line options of the viewer, on `viewer_port` or a
+        free port, connected to the twin's address.
+        """
         own = {
             "port": port_of("viewer", options.viewer_port, known),
             "twin": known["twin"],

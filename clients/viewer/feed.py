@@ -64,7 +64,9 @@ class ImageFeed:
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
-        """Subscribe to the images, and take them from now on; nothing if that has happened."""
+        """Subscribe to images of this kind, at most `IMAGE_HZ`, and start the tasks that
+        take them; does nothing if they run.
+        """
         if not self._tasks:
             wish = {
                 "topics": ["projection"],
@@ -98,7 +100,9 @@ class ImageFeed:
             self._due.set()
 
     def _arrived(self, topic: str, params: Mapping[str, object]) -> None:
-        """Keep the newest image, and wake the task that takes it."""
+        """Keep the newest image with the twin instance it is from ("" if unknown), and
+        wake the task that takes it; other topics are ignored.
+        """
         if topic == "projection":
             if self._link is None:
                 hello = None

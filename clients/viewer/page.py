@@ -119,7 +119,11 @@ class Page:
         self._asked = self._busy = 0
 
     async def run(self) -> None:
-        """Run until the browser leaves, or no longer reads."""
+        """Run until the browser leaves or no longer reads, then cancel the page's tasks.
+
+        With more than `MAX_NOTES` notices unsent, logs a warning and closes the
+        connection with TRY_AGAIN.
+        """
         for work in (self.link.run(), self._send(), self._read()):
             self._start(work, "a page's connection", self._over.set)
         try:

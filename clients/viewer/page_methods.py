@@ -640,7 +640,12 @@ async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
 
 
 async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
-    """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
+    """Draw, for this page alone, a ghost of the machine where the plan has it at
+    `time_s`; returns its positions.
+
+    None removes the ghost and returns None for the positions. Raises INVALID_PARAMS while
+    the page has no plan.
+    """
     lab = _lab(viewer)
     time_s = params.time_s
     if time_s is None:

@@ -247,7 +247,12 @@ class Viewer:
         self._due.set()
 
     async def _ask(self) -> None:
-        """Get the state of a twin that sends nothing: it is at rest, or it hangs."""
+        """Request the state of a twin that sent nothing for `QUIET_S`, for ever: it is at
+        rest, or it hangs.
+
+        Skipped while disconnected; a failed request is tried again, a state older than
+        the newest is dropped.
+        """
         while True:
             await asyncio.sleep(max(0.05, self._heard_at + QUIET_S - time.monotonic()))
             if not self.link.connected or time.monotonic() - self._heard_at < QUIET_S:
@@ -329,7 +334,11 @@ class Viewer:
     # -- drawing -----------------------------------------------------------------------------
 
     async def _draw(self) -> None:
-        """Draw the newest state, at most `DRAW_HZ` times a second, for ever."""
+        """Draw the newest state at most `DRAW_HZ` times a second, for ever; older ones
+        are skipped.
+
+        A failure is logged once, until a state is drawn again.
+        """
         loop = asyncio.get_running_loop()
         sound = True
         while True:

@@ -103,6 +103,9 @@ class Truth:
     spot_points: int = 1
 
     def __repr__(self) -> str:
+        """Format the sample's name, the number of views, averages x exposure [ms], kV and
+        W.
+        """
         lit = self.exposure
         return (
             f"<Truth: {self.sample.name!r}, {len(self.geometry)} views of {lit.averages} x "

@@ -124,6 +124,9 @@ class Operator:
         object.__setattr__(self, "detector_shape", scan.of_shape(shape))
 
     def __repr__(self) -> str:
+        """Format the shapes of the volume (z, y, x voxels) and of the images (views,
+        rows, columns).
+        """
         n, rows, cols = self.image_shape
         z, y, x = self.voxel_shape
         views = f"{n} views of {rows} x {cols} pixels (rows x columns)"

@@ -74,6 +74,9 @@ class Minimised:
         return len(self.costs) - 1
 
     def __repr__(self) -> str:
+        """Format whether it converged or stopped, the number of iterations, first and
+        last cost.
+        """
         if self.converged:
             end = "converged"
         else:
@@ -476,6 +479,9 @@ class DeviceRegular(Regular):
         """
 
         def launch() -> None:
+            """Start the named kernel on the device with one thread for each voxel; does
+            not wait for it.
+            """
             from flexdt.twin.reconstruction.kernels import (
                 gpu_reconstruction_kernels as kernels,
             )

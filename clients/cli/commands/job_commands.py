@@ -212,7 +212,11 @@ def forget(
 
 
 def describe(status: JobStatus) -> str:
-    """Format a job as one line."""
+    """Format a job as one line: name, state, frames done of all.
+
+    Then, where known: script line, what runs, time left on the twin's clock (only while
+    queued, running or paused), the error's message, and the data set.
+    """
     text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
     if status.line is not None:
         text += f", line {status.line}"

@@ -147,7 +147,9 @@ def _places(machine: Machine) -> str:
 
 
 def _bodies(machine: Machine) -> str:
-    """Make the table of the machine's bodies."""
+    """Make the table of bodies: name, role, axes that move it ("nothing" without any),
+    size [mm], mesh and source.
+    """
     rows = [
         (
             c.name,
@@ -162,7 +164,11 @@ def _bodies(machine: Machine) -> str:
 
 
 def _times(machine: Machine) -> str:
-    """Make the table of times, measured or assumed."""
+    """Make the table of the twin's times [s] by kind: median, 5 and 95 % where measured
+    (else "assumed").
+
+    A last row states the drift common to all times in %, if any was measured.
+    """
     timing = machine.timing
     rows = []
     for kind in timing.kinds:

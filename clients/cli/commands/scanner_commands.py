@@ -338,7 +338,9 @@ def estop(twin: Twin) -> Answer:
 
 
 def _rest(state: Stopped) -> str:
-    """Describe how the motors come to rest, in words."""
+    """Describe in words after which time and distance each axis rests, and which bodies
+    would collide on the way; "nothing moves" without any.
+    """
     stopping = state.stopping
     if stopping is None or not stopping.distances:
         return "nothing moves"

@@ -115,7 +115,9 @@ class BeamShade:
     """The planes in a scene."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        """Add four hidden images to the scene."""
+        """Add the four images of the beam's shade to the scene, hidden and blank until
+        drawn.
+        """
         plain: Any = {"visible": False, "cast_shadow": False, "receive_shadow": False}
         self._planes: list[Any] = [
             scene.add_image(

@@ -86,7 +86,10 @@ class LabScene:
         drag: Drag = lambda client, targets: None,
         looks: Mapping[str, bytes] | None = None,
     ) -> None:
-        """Build all nodes, each shown or hidden as in `Shown()`; see the class."""
+        """Build all nodes, each shown or hidden as in `Shown()`; see the class.
+
+        `looks` holds glTF bytes that replace a component's own look, by its name.
+        """
         self._server = server
         self.machine = machine
         self.profile = profile
@@ -118,7 +121,11 @@ class LabScene:
     # -- building ----------------------------------------------------------------------------
 
     def _build(self) -> None:
-        """Build floor, machine, cabinet, beam, panel and lines, without any state."""
+        """Build lights, floor, machine, cabinet, beam, panel and lines, before any state.
+
+        Fills the frames and solids by component; positions [mm] of the machine become
+        [m].
+        """
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(enabled=False, cast_shadow=False)
@@ -245,7 +252,11 @@ class LabScene:
         )
 
     def named(self, world: World, shown: Shown) -> list[Name]:
-        """List the names shown now, and their places."""
+        """List the names shown now, with their places [m].
+
+        With "labels": the scale, three axes and the parts; without them, the image's
+        names if "names" is shown, else none.
+        """
         if "labels" not in shown:
             if "names" in shown:
                 return names_of_image(world)
@@ -262,7 +273,9 @@ class LabScene:
     def _hull(
         self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float
     ) -> Any:
-        """Add a translucent mesh to the scene; returns its handle."""
+        """Add a translucent, two-sided mesh without shadows to the scene; returns its
+        handle.
+        """
         vertices, faces = plain(mesh)
         return self._server.scene.add_mesh_simple(
             node,
@@ -303,6 +316,9 @@ class LabScene:
             self._gizmos.update(state, world)
 
     def _place(self, name: str, turn: FloatArray, at: FloatArray) -> None:
+        """Pose a node's frame in the viewer and keep the pose sent; `at` is in [mm], sent
+        in [m].
+        """
         pose = (*quaternion(turn), *(at * MM).tolist())
         self._sent[name] = pose
         frame = self._frames[name]

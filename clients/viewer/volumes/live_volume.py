@@ -412,7 +412,13 @@ def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> N
 
 
 def main() -> None:
-    """Run the process: the volume in a thread, requests from standard input meanwhile."""
+    """Run the process: reconstruct in a thread, answer requests from standard input
+    meanwhile.
+
+    The first line names the folder, the volume's side, and whether the data set is past
+    (complete: all threads) or grows (one thread, ends with the parent). Returns at once
+    if standard input is closed.
+    """
     parent = os.getppid()
     served = Served()
     os.nice(5)  # neither twin nor viewer waits for a volume

@@ -149,7 +149,9 @@ class LiveReconstruction:
 
 
 async def _started() -> asyncio.subprocess.Process:
-    """Start a process that reconstructs, with one thread a library, and pipes to it."""
+    """Start a Python process that reconstructs, with one thread a library; input and
+    output are pipes, its errors are discarded.
+    """
     return await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",

@@ -106,7 +106,11 @@ class TrainingData:
     def __init__(
         self, folder: Path | str, augment: Augment | None = None, seed: int = 0
     ) -> None:
-        """Read the manifest and check that `augment` fits the images; see the class."""
+        """Read the manifest of a finished batch; `indices` are its items that are done.
+
+        Raises CommandError without a manifest, and where `augment` does not fit: the
+        images are counts, or photons would add to their noise.
+        """
         self.folder = Path(folder)
         self.augment = augment
         self.seed = seed

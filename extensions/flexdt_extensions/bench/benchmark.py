@@ -182,7 +182,11 @@ def peer_cases() -> list[Case]:
 
 
 def untuned_cases() -> list[Case]:
-    """List cases that no code was tuned for: exact, and without a cliff in speed."""
+    """List the projection cases that no code was tuned for: wide cones, large tilts, near
+    and far sources, flat, long or anisotropic volumes.
+
+    They show that results are exact and that no geometry is suddenly slow.
+    """
     s = BINNED
     cube = (256, 256, 256)
     strong = (45.0, 45.0, 45.0)

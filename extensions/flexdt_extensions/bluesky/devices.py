@@ -154,7 +154,11 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
         *,
         collisions: bool = True,
     ) -> None:
-        """Make position, speed and acceleration of the axis as signals; see the class."""
+        """Make signals: position (read, with limits), speed, acceleration (configuration)
+        and target (moves the axis); see the class.
+
+        `unit` is mm or deg; speed is in unit/s, acceleration in unit/s^2.
+        """
         self._link = link
         self._axis = axis
         self._collisions = collisions

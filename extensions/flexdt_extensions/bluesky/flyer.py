@@ -143,7 +143,9 @@ class TwinFlyer(
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
-        """Prepare a device without a scan; arguments: see the class."""
+        """Make the device without a scan: it is prepared later, no job runs, no frame is
+        written; arguments: see the class.
+        """
         self._link = link
         self._machine = machine
         self._profile = profile
@@ -203,7 +205,11 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Start the scan: submit its job, and announce the images of its data set."""
+        """Submit the prepared scan as a job, and announce the images of its data set;
+        does not wait for the scan.
+
+        Raises if nothing is prepared.
+        """
         ready = self._ready()
         client = self._link.client
         scan = ready.scan
@@ -258,7 +264,12 @@ class TwinFlyer(
             )
 
     async def pause(self) -> None:
-        """Pause the job after its current frame; one in the queue as soon as it has begun."""
+        """Pause the job after its current frame; one in the queue as soon as it has
+        begun.
+
+        Does nothing if no job runs or it ends meanwhile; raises RpcError if the job
+        refuses while it runs.
+        """
         async with self._submitting:
             waiting = self._running()
         if not waiting:
@@ -336,7 +347,9 @@ class TwinFlyer(
             yield document
 
     async def describe_configuration(self) -> dict[str, DataKey]:
-        """Describe the values of `read_configuration`."""
+        """Describe the values of `read_configuration`: data type, shape ([] for a number,
+        [n] for a list), and units where they have any.
+        """
         source = self.source("script.check")
         keys = dict[str, DataKey]()
         for name, (value, dtype, numpy, units) in self._settings().items():
@@ -453,7 +466,9 @@ def _plan_scan(
 
 
 def _script_error(report: CheckResult) -> LimitsExceeded:
-    """Make the error on a script with errors: the first five, and the number of the others."""
+    """Make (not raise) the error on a script with errors: the message has the first five
+    and the number of the others; its data all errors and collisions.
+    """
     errors = [p for p in report.problems if p.severity == "error"]
     lines = [f"line {p.line}: {p.message}" for p in errors[:5]]
     if len(errors) > 5:

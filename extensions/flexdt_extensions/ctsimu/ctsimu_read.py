@@ -211,7 +211,12 @@ class ScenarioReader:
         return out
 
     def _angles(self) -> FloatArray:
-        """Compute the stage's turn about its w, [rad] per frame."""
+        """Compute the stage's turn about its w, [rad] per frame; negative for direction
+        "CW".
+
+        The last frame is at `stop_angle`, or one step before it if `include_final_angle`
+        is false. Raises if start exceeds stop or the direction is neither CW nor CCW.
+        """
         acquisition = self._at("acquisition")
         start = self._number(("acquisition", "start_angle"), _RAD)
         stop = self._number(("acquisition", "stop_angle"), _RAD)
@@ -520,7 +525,9 @@ class ScenarioReader:
         )
 
     def _stated_text(self, where: str) -> str:
-        """Return the value at a path of the document as JSON, at most 60 characters."""
+        """Return the value at a path of the document as JSON, cut after 60 characters
+        (then " ..."); "null" if nothing is there.
+        """
         found: Any = self._document
         for key in re.findall(r"[^.\[\]]+", where.partition(" ")[0]):
             if isinstance(found, list) and key.isdigit() and int(key) < len(found):

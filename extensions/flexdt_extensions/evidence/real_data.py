@@ -456,7 +456,9 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
 
 
 def tooth(files: list[Path]) -> Iterator[Told]:
-    """Check Tomopy's tooth: half a turn in a parallel beam, which flexdt rejects."""
+    """Check that flexdt rejects Tomopy's tooth, half a turn in a parallel beam: `align`
+    refuses the axis column, and FDK the short arc (an error naming 180 deg).
+    """
     h5py = package("h5py", "HDF5 files", "io")
     with h5py.File(files[0]) as stored:
         scan = stored["exchange"]

@@ -78,6 +78,9 @@ class Outcome(Generic[Images_co]):
     phantom: Phantom
 
     def __repr__(self) -> str:
+        """Format the phantom's name with the number of asked parameters, of frames, the
+        rms [px] and the verdict; or just "not identifiable".
+        """
         d = self.document
         if not self.calibration.identifiable:
             return f"<Calibration with {self.phantom.name!r}: not identifiable>"

@@ -256,6 +256,9 @@ class ImageSet:
         return len(self.frames)
 
     def __repr__(self) -> str:
+        """Format name, number and shape of the projections, complete or not, and how many
+        warnings (none: left out).
+        """
         rows, cols = self.shape
         if self.complete:
             state = "complete"

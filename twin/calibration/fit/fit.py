@@ -236,6 +236,10 @@ def _levenberg(
         return cost + 0.5 * float(weight @ off**2), norms, hess, grad + weight * off
 
     def threshold(norms: FloatArray) -> float:
+        """Compute the residual norm [px] beyond which Huber's loss is linear: `how.huber`
+        times the spread of the residuals in use, at least times `how.floor_px` (the
+        spread is 0 where none is in use).
+        """
         if use.any():
             spread = float(np.median(norms[use])) / RAYLEIGH_MEDIAN
         else:

@@ -259,6 +259,10 @@ class PlanePairs:
         for v in (here[self.pairs[:, 0]], here[self.pairs[:, 1]]):
 
             def heights(at: FloatArray, v: FloatArray = v) -> FloatArray:
+                """Compute the heights on the detector, times `away`, in which rays from
+                each source reach the points `at` (their two coordinates along the
+                detector's axes).
+                """
                 to = v[:, None, 3:6] - v[:, None, :3] + at[:, :1] * v[:, None, 6:9]
                 to = to + at[:, 1:] * v[:, None, 9:12]
                 inward = (to[..., :2] * self.inwards[:, None]).sum(axis=2)

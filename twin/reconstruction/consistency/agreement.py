@@ -89,6 +89,9 @@ class Contradiction:
 
     @property
     def _explanations(self) -> str:
+        """Join the possible explanations by ", or ", each with its figure unless that is
+        empty.
+        """
         words = [
             KINDS[kind] + (f" {figure}" if figure else "")
             for kind, figure in zip(self.kinds, self.figures, strict=True)
@@ -129,6 +132,13 @@ class Comparison:
     """
 
     def __init__(self, trial: Trial, *, doubtful: bool) -> None:
+        """Try the opposite rotation and the other suspected geometries, unless no view
+        pair is reliable ("telling").
+
+        Without `doubtful`, the scan counts as fitting; unfit is only a whole scan of even
+        steps whose misfit exceeds `MAX_MISFIT`. Far geometries are tried only on an unfit
+        scan.
+        """
         self._trial = trial
         self._doubtful = doubtful
         fits = not doubtful or trial.excess <= MAX_MISFIT

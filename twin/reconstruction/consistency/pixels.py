@@ -74,6 +74,9 @@ class BadPixels:
         return int((self.mask.mean(axis=0) > 0.5).sum())
 
     def __str__(self) -> str:
+        """Describe as one sentence how many pixels are interpolated, with the whole
+        columns among them, if any.
+        """
         if self.columns:
             columns = f", {self.columns} whole columns among them"
         else:

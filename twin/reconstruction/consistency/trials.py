@@ -84,6 +84,12 @@ class Trial:
     """
 
     def __init__(self, scan: CoarseScan) -> None:
+        """Reproject the scan in its own geometry and find what can be compared.
+
+        `whole`: no view is truncated. `telling`: where the expected residual is below
+        `MAX_RELIABLE_RESIDUAL`. `even`: enough views for the columns, and no step far
+        above the median.
+        """
         self.scan = scan
         self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
         own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation)
@@ -152,6 +158,13 @@ class Trial:
         return float(ratios[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> Tried:
+        """Compare a suspected geometry with the scan's own, over the reliable ("telling")
+        places.
+
+        Scores and residuals are geometric means of ratios, suspect to own: below 1 the
+        suspect fits better. Without a reprojection or a reliable place only the suspect
+        is filled in.
+        """
         # The explanation of a scan also explains why it seemed cut off.
         shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
         if shown is None or not self.telling.any():
@@ -195,6 +208,9 @@ class Trial:
         tried: dict[float, Tried] = {}
 
         def score(columns: float) -> float:
+            """Score the axis shifted by so many columns; each shift is tried once and
+            kept.
+            """
             if columns not in known:
                 tried[columns] = self._offset(columns)
                 known[columns] = tried[columns].score

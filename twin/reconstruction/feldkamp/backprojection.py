@@ -147,6 +147,9 @@ class OnDevice:
         self.meter: NoiseMeter | None = None
 
         def prepare() -> None:
+            """Allocate on the device the grid, a volume of zeros, the stream and the
+            image upload.
+            """
             from numba import cuda
 
             self._grid = [
