@@ -186,7 +186,13 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
 
 
 def _first(state: Online) -> Online:
-    """Attempt to distinguish the beads from all frames so far."""
+    """Attempt to distinguish the beads from all frames so far; on success return the
+    state with tracks and a first fit.
+
+    Returns the state unchanged with fewer than `FIRST_FRAMES` frames or 6 spots, and if
+    nothing is found or it is ambiguous, explains less than 60 % of the spots, or has more
+    than 1 px rms.
+    """
     assert state.poses is not None
     if len(state.detections) < FIRST_FRAMES or sum(len(d) for d in state.detections) < 6:
         return state

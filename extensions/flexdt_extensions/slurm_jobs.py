@@ -220,7 +220,11 @@ def _words(said: subprocess.CompletedProcess[str]) -> str:
 
 
 def _run(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run one of SLURM's commands; one that is not there or does not answer has failed."""
+    """Run one of SLURM's commands and return its result; never raises.
+
+    A command that is not installed or does not answer within `TIMEOUT_S` returns exit
+    status 1 and the reason as its error text.
+    """
     try:
         return subprocess.run(
             words,

@@ -119,7 +119,9 @@ def _clearance(found: Clearance | None) -> list[str]:
 
 
 def _steps(report: CheckReport) -> list[str]:
-    """Make the HTML table of steps: line, start and duration [s], range, and effect."""
+    """Make the HTML table of steps: line, start and duration [s], its 90 % range, the
+    part of it that is assumed and from what, and effect.
+    """
     timing = report.plan.machine.timing
     rows = [
         (

@@ -134,7 +134,12 @@ def _row(
 
 
 def cell_text(value: object) -> str:
-    """Format the value of a table's cell: numbers short, `None` as a dash."""
+    """Format the value of a table's cell: None and non-finite numbers as "-", booleans as
+    yes or no.
+
+    Other floats get four digits, two if under 0.01 or from 1e4 on; the rest as `str`
+    does.
+    """
     match value:
         case None:
             return "-"

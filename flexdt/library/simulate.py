@@ -551,7 +551,11 @@ def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
 
 
 def _spot_doubt(truth: Truth) -> Iterator[str]:
-    """Warn if one blur does not hold for the sample's depth."""
+    """Warn if one blur does not hold for the sample's depth: with one spot point, when
+    the blur of its near and far side differ by more than `DOUBTED_PX`.
+
+    Yields at most one text; it proposes a number of spot points.
+    """
     spot_mm = truth.chain.tube.focal_spot_mm(truth.exposure.power_W)
     half = 0.5 * float(np.hypot(*truth.sample.size_mm[:2]))
     view = truth.geometry.rows[0]

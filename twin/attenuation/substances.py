@@ -59,7 +59,9 @@ class Tables:
 
 @lru_cache
 def tables() -> Tables:
-    """Load the shipped tables."""
+    """Load the shipped tables: energies [keV], tube spectra by kV, and molar mass,
+    attenuation and edges by element, with their provenance.
+    """
     arrays, provenance = stored_arrays("tables.npz")
     symbols = [str(s) for s in arrays["symbols"]]
     return Tables(

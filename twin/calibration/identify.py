@@ -260,7 +260,11 @@ class _Shadows:
 
     @classmethod
     def of(cls, detections: Sequence[Detections]) -> _Shadows:
-        """Pack the spots of all frames into arrays, padded to the largest number."""
+        """Pack the spots of all frames into arrays (n frames, largest number of spots).
+
+        Points [px] are from the image's centre; padding is infinite in points, NaN in
+        covariances, else 0. Raises ValueError without any frame.
+        """
         counts = np.array([len(d) for d in detections], dtype=np.int64)
         n = len(detections)
         m = max(int(counts.max()), 1)

@@ -60,7 +60,10 @@ class TubeModel:
         return max(self.smallest_spot_mm, self.spot_mm_per_W * power_W)
 
     def figures(self) -> dict[str, float]:
-        """List its figures by name, for data sets; equal filters are one."""
+        """List spot size [mm, mm/W], the number of spot points if above 1, and each
+        filter's thickness [mm], by name, for data sets; layers of one substance are
+        added up.
+        """
         layers: dict[str, float] = {}
         for one in self.filters:
             name = f"{_FILTER}{one.substance.name}_mm"

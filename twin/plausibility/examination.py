@@ -78,7 +78,12 @@ def _found(
     boxes: npt.ArrayLike | None,
     grid: FloatArray | None,
 ) -> Iterator[Finding]:
-    """Yield the findings of all checks of a geometry; arguments as for `examine`."""
+    """Yield the findings of all checks of a geometry; arguments as for `examine`.
+
+    Spans are checked unless projecting, arcs only for an iterative method whose spans are
+    fine; placement needs `boxes`, grid checks need `grid`, both need `shape`. Inclination
+    is checked for FDK only.
+    """
     yield from geometry_findings(geometry, shape)
     if operation is not Operation.PROJECT:
         spans = tuple(span_findings(geometry))

@@ -211,7 +211,12 @@ def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
 
 
 def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
-    """Find directions that no view has, for a method that takes any trajectory."""
+    """Warn if the views leave out an arc of directions, for a method that takes any
+    trajectory; at most one finding, its figure the arc [deg].
+
+    Nothing for fewer than 3 views or directions, or a rotation that is not about z.
+    Opposite directions count as one.
+    """
     if len(cone_vec) < 3 or not about_z(cone_vec):
         return
     at = np.unique((azimuths(cone_vec) % math.pi).round(6) % round(math.pi, 6))

@@ -196,7 +196,9 @@ def warm_up() -> None:
 
 
 def warm_up_forward() -> None:
-    """Run `project_scene`, and `forward` with rays in fans and alone."""
+    """Run `project_scene` and `forward` on tiny problems, so that their kernels are
+    compiled; with rays in fans and alone.
+    """
     shapes = (
         Sphere((0, 0, 0), 1.0),
         Box((0, 0, 0), (1, 1, 1)),
@@ -211,7 +213,9 @@ def warm_up_forward() -> None:
 
 
 def warm_up_back() -> None:
-    """Run `back` into new memory, with rays in fans and alone."""
+    """Run `back` on tiny problems, so that its kernels are compiled; into new memory,
+    with rays in fans and alone.
+    """
     images = np.ones((1, 5, 6), np.float32)
     for volume in _tiny_volumes():
         back(images, END_ON, volume)

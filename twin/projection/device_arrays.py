@@ -111,7 +111,12 @@ class DeviceArray(NDArrayOperatorsMixin):
     def __array_ufunc__(
         self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **options: Any
     ) -> Any:
-        """Apply a function of UFUNCS on the device; other functions are not implemented."""
+        """Apply a function of UFUNCS to device arrays, or to one and a number, on the
+        device; see `_combine`.
+
+        Returns NotImplemented for any other function, method, option or operand, and for
+        a number minus an array.
+        """
         a, b = inputs if len(inputs) == 2 else (self, None)
         if not isinstance(a, DeviceArray) and ufunc is not np.subtract:
             a, b = b, a  # the other three are the same either way round
@@ -168,7 +173,9 @@ def _combine(
         )
 
     def launch() -> DeviceArray:
-        """Launch the kernel into `out`, or into a new array like `a`, and return it."""
+        """Launch the kernel into `out`, or into a new device array like `a` if it is
+        None, and return it.
+        """
         from numba import cuda
 
         from flexdt.twin.projection.kernels import gpu_kernels as kernels

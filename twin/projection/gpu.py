@@ -179,7 +179,9 @@ def upload(flat: Float32Array) -> Any:
 
 
 def free_bytes() -> int | None:
-    """Return the free memory of the device [bytes]: 0 if it fails, None in the simulator."""
+    """Return the free memory of the device [bytes]: 0 if the query fails, None in the
+    simulator.
+    """
     from numba import config, cuda
 
     if config.ENABLE_CUDASIM:
@@ -531,7 +533,9 @@ def launcher(
     kinds, counts = np.unique(kind, return_counts=True)
 
     def launch() -> None:
-        """Launch one kernel for each kind of view."""
+        """Launch one kernel for each kind of view, over its `counts` images; kinds tell
+        the walk, and whether rows and columns are exchanged.
+        """
         first = 0
         for which, count in zip(kinds, counts, strict=True):
             lying_down, walk = divmod(int(which), KINDS)

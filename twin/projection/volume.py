@@ -553,7 +553,12 @@ class Volume:
 
     @cached_property
     def layout(self) -> Layout:
-        """The occupied box with z contiguous; computed once and cached with the volume."""
+        """The occupied box (that of all voxels other than zero) with z contiguous;
+        computed once and cached with the volume.
+
+        Shares the volume's memory if z is contiguous there, else holds a copy. An empty
+        volume has counts of 0.
+        """
         from flexdt.twin.projection.kernels import layout_kernels
 
         nz, ny, nx = self.shape

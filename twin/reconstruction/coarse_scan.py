@@ -187,7 +187,12 @@ class CoarseScan:
 
     @cached_property
     def grid(self) -> Volume:
-        """Grid of the field of view without values, in layers as high as rows."""
+        """Grid of the field of view, zeros, about the rotation axis, in layers as high as
+        rows.
+
+        A scan that rises along z gets at least as many layers as the panel's rows; at
+        most `NODES` layers (then) and columns.
+        """
         x, y = self.circle.centre.tolist()
         scan = self.cone_vec
         away = np.array([x, y, 0.0])

@@ -222,7 +222,12 @@ def _edge_px(seen: FloatArray, shape: tuple[int, int]) -> FloatArray:
 
 
 def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
-    """Build the problem of the planned scans of some beads, every spot of them seen."""
+    """Build the problem of the planned scans of some beads, each of them seen in every
+    frame.
+
+    Measured positions are zeros: only the Jacobian is of use. Bead places are free if a
+    tolerance is given.
+    """
     n = len(planned.poses)
     k = len(model)
     return build_problem(
@@ -238,7 +243,11 @@ def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
 
 
 def _rows(problem: FitProblem) -> FloatArray:
-    """Compute the whitened Jacobian rows of each bead, (k, n, 2, q) edge units."""
+    """Compute the whitened Jacobian rows of each bead, (k, n, 2, q), each parameter in
+    units of its pixel shift at the image's edge.
+
+    With free beads, q includes the bead's own three coordinates.
+    """
     n, k = problem.seen.shape
     factor = np.array([edge_factor(name) for name in problem.layout.names])
     rows = (
@@ -274,7 +283,11 @@ def inverse(information: FloatArray) -> FloatArray:
 
 
 def score_of(covariance: FloatArray, criterion: Criterion) -> FloatArray:
-    """Compute the criterion of a stack of covariances (m, q, q)."""
+    """Compute the criterion of a stack of covariances (m, q, q), (m,); less is better.
+
+    "a": root of the mean variance; "d": geometric mean of the standard deviations along
+    the principal axes; else (worst) the largest standard deviation.
+    """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     match criterion:
         case "a":

@@ -557,7 +557,11 @@ def image_runs(
     images = radiographs(really, poses.cone_vec(truth), beam, [seed, int(name[4:])])
 
     def solve(n: int) -> Run:
-        """Calibrate from `n` of the images, spread evenly over the scan."""
+        """Calibrate from `n` of the images, spread evenly over the scan; returns the run
+        with its errors as its note.
+
+        Bead places may shift within the found tolerance; poses are taken as exact.
+        """
         chosen = np.floor(np.linspace(0, frames - 1, n)).astype(np.intp)
         some = ArrayFrames([images[i] for i in chosen], SHAPE)
         result = calibrate(

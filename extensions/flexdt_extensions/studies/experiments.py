@@ -201,7 +201,9 @@ def tasks(
     scenarios = tuple(thesis()["scenarios"])
 
     def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:
-        """List the units of work of a setting, one for each scenario, all six parameters free."""
+        """List the units of work of a setting, one for each scenario, with all six
+        parameters free and `damping`.
+        """
         return [
             WorkUnit(
                 experiment,

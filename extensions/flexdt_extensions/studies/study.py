@@ -329,7 +329,9 @@ def run_task(task: WorkUnit) -> list[Run]:
 
 
 def authors(name: str) -> Phantom:
-    """Build a cuboid with K beads, `NAME-K`, as the author's public code makes it."""
+    """Build a cuboid of ABS with K steel beads, named "CUBOID-K", at the places on a loop
+    that the author's public code gives.
+    """
     cuboid, beads = name.split("-")
     w, b, h = author()["cuboids"][cuboid]
     return cuboid_with_beads(
@@ -451,7 +453,11 @@ def lego_beam() -> EffectiveBeam:
 
 
 def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> list[Run]:
-    """Run one scan on images: (name, beads as found, seed, frames, counts)."""
+    """Run one scan of the Lego phantom, on images and with the model as found; the task
+    is (name, beads as found, seed, frames, numbers of images).
+
+    Returns one run for each number of images.
+    """
     name, found, seed, frames, counts = task
     phantom = load_phantom("lego")
     return real.image_runs(

@@ -82,7 +82,9 @@ def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str,
 
 
 def _basin_charts(document: Mapping[str, Any]) -> list[str]:
-    """Plot the success share over the start's errors, one heat map (SVG) for each method."""
+    """Plot the share of successes [%] over the start's errors (rows: mm, columns: deg),
+    one heat map (SVG) for each method.
+    """
     rows = [f"{v:g} mm" for v in document["start_mm"]]
     columns = [f"{v:g} deg" for v in document["start_deg"]]
     return [

@@ -151,7 +151,10 @@ class Outcome(Generic[Images_co]):
 
 
 def _digits(value: object, sigma: object) -> tuple[str, str]:
-    """Write a value to the second digit of its sigma; "-" where it must not be used."""
+    """Format value and sigma, both to sigma's second digit; "-" for what is no number.
+
+    Where sigma is no number, 0, negative or infinite, the value has five digits.
+    """
     if not isinstance(sigma, float | int) or not 0.0 < sigma < math.inf:
         if isinstance(value, float | int):
             shown = f"{value:.5g}"

@@ -56,7 +56,9 @@ class DatasetFrames:
         return len(self._dataset)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame, missing ones marked as such."""
+        """Detect the beads of every frame in its normalised image; unreadable or missing
+        frames are marked MISSING, with the reason.
+        """
         normalise = self._dataset.normalisation
 
         def one(index: int) -> FrameSpots:
@@ -101,7 +103,10 @@ class DatasetFrames:
         return out
 
     def _counts(self, index: int) -> Counts | None:
-        """Return the counts of one frame, None if its file is missing or unreadable."""
+        """Return the counts of one frame; None if its file is missing or unreadable.
+
+        Keeps the counts if asked to, and the reason of an unreadable frame.
+        """
         if index in self._kept:
             return self._kept[index]
         if not self._dataset.frames[index].present:

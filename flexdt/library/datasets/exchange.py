@@ -56,7 +56,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Return `ENDINGS` or `WRITERS`, which are deprecated, from `FORMATS`."""
+    """Return `ENDINGS` or `WRITERS`, made from `FORMATS`, with a DeprecationWarning.
+
+    Raises AttributeError on any other name.
+    """
     if name == "ENDINGS":
         found: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}
     elif name == "WRITERS":

@@ -273,7 +273,10 @@ class ImageSet:
         return f"<DataSet {self.name!r}: {images}, {state}{doubts}>"
 
     def _repr_html_(self) -> str:
-        """Show a table of the data set's figures, and the first image."""
+        """Make a table (HTML) of the number and size of projections, completeness,
+        numbers of dark and flat images and warnings, and a thumbnail of the first
+        projection, if one is present.
+        """
         rows, cols = self.shape
         facts = {
             "projections": f"{len(self)} of {rows} x {cols} pixels",

@@ -223,7 +223,9 @@ class _Drawing:
         return DRAWING_PX / 2 + scale * float(x), DRAWING_PX / 2 - scale * float(up)
 
     def still(self, cone_vec: ConeVec) -> str:
-        """Draw the parts that all views share: places of the source, and the sample."""
+        """Draw (SVG) what all views share: places of the source, and the sample as a
+        circle at the origin of at least 2 px.
+        """
         dots = "".join(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="#d33" opacity=".4"/>'
             for x, y in (

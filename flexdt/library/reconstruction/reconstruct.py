@@ -307,7 +307,11 @@ class ReconstructionTask:
 
     @cached_property
     def again(self) -> int:
-        """Images that are needed more than once even of a single slab."""
+        """Images that are needed more than once even of a single slab, at most all.
+
+        All, with ring correction or detector lag; else those that the scatter correction
+        and, for a direct method, the estimates of truncation and bias read once more.
+        """
         count = len(self.views.indices)
         panel = self.views.dataset.panel
         if self.request.rings or (panel is not None and panel.lag):

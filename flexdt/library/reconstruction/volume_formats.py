@@ -198,7 +198,9 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         first = True
 
         def write(slab: Float32Array) -> None:
-            """Write a slab as pages; the first page gets size and place."""
+            """Write a slab as pages, one a layer; only the file's first page gets the
+            description (size and place, JSON).
+            """
             nonlocal first
             for layer in chain.from_iterable(_blocks(slab)):
                 tiff.write(
@@ -216,7 +218,9 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 
 def _nrrd_header(places: VoxelPlaces) -> bytes:
-    """Make NRRD's header; axes point right, front and up."""
+    """Make NRRD's header for raw little-endian floats: sizes (x, y, z), voxel edges and
+    first voxel [mm]; axes point right, front and up.
+    """
     nz, ny, nx = places.shape
     x, y, z = (f"{edge:.9g}" for edge in places.edges_mm)
     lines = (
@@ -260,7 +264,11 @@ def _mha_header(places: VoxelPlaces) -> bytes:
 
 
 def _nifti_header(places: VoxelPlaces) -> bytes:
-    """Make NIfTI-1's header: x to the right, y to the front, z up; data from byte 352 on."""
+    """Make NIfTI-1's header, padded to the data's first byte (352): x to the right, y to
+    the front, z up, [mm].
+
+    Requires nibabel.
+    """
     nibabel = _nibabel()
     nz, ny, nx = places.shape
     affine = np.diag([*places.edges_mm, 1.0])

@@ -226,7 +226,11 @@ def mended(images: Float32Array, windows: Windows) -> Float32Array:
 
 
 def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
-    """Fill dead pixels by the means of their four neighbours, from the gaps' edges inwards."""
+    """Fill dead pixels by the mean of their finite neighbours (of four), from the edges
+    of each dead area inwards.
+
+    Areas wider than `WIDEST_DEAD` keep NaN in their middle.
+    """
     sides = np.pad(np.where(dead, np.float32(np.nan), image), 1, constant_values=np.nan)
     inner = sides[1:-1, 1:-1]
     for _ in range((WIDEST_DEAD + 1) // 2):

@@ -199,7 +199,9 @@ class Candidates:
         return [n for n in MOVING if n in self.fit.values]
 
     def _motion(self, name: str) -> Iterator[FloatArray]:
-        """Yield columns of unit length of a parameter that follows a ramp or half waves."""
+        """Yield the image shifts, scaled to unit length (2 seen, 1), of a parameter that
+        changes over the scan as a ramp or as one to `WAVES` - 1 half waves.
+        """
         problem = self.fit.problem
         n, k = problem.seen.shape
         slope = derivative(problem, self.fit, name, problem.seen).reshape(n, 2 * k)
@@ -301,7 +303,12 @@ class Candidates:
         return model.evidence
 
     def best(self) -> Choice:
-        """Find the most likely choice, by changing one cause at a time from several starts."""
+        """Find the choice of causes and widths with the most evidence, by changing one
+        cause at a time from several starts.
+
+        Starts are no cause and the three best single causes. Returns no cause at all if
+        no single one comes near to it in evidence (a tenth of its likelihood).
+        """
         nothing: Choice = (0.0,) * len(self.causes)
         singles = [
             with_pick(nothing, i, width)

@@ -455,7 +455,11 @@ def _in_motion(
     still = replace(NOMINAL, **{name: getattr(found.parameters, name) for name in SIX})
 
     def fitted(motion: MotionFit | None = None) -> FitResult:
-        """Fit all parameters, frames displaced by `motion`; without it at the stated poses."""
+        """Fit all parameters to the tracks, with the frames displaced by the first of
+        `motion`; None: at the stated poses.
+
+        Starts from the fit without motion; no bound on the offsets.
+        """
         if motion is None:
             moved = here
         else:

@@ -374,7 +374,11 @@ def _looks_alike(column: str) -> str:
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
-    """List beads that were left out in most of their frames."""
+    """List beads seen in at least three frames and left out of more than half of them.
+
+    One finding: a warning, or an error if fewer than three beads remain. Without such
+    beads: an error if over 35 % of all positions were left out, else nothing.
+    """
     problem = fit.problem
     used = fit.certificate.used
     seen = problem.seen.sum(axis=0)

@@ -108,7 +108,9 @@ class FrameNumbers:
 
 
 def _change(frame: int, steps: int) -> str:
-    """Describe lost frames (`steps` > 0) or repeated ones (< 0) at a frame, for the finding."""
+    """Describe in words lost frames (`steps` > 0, their number) or repeated ones (< 0) at
+    a frame, for the finding.
+    """
     if steps < 0:
         if steps == -1:
             times = ""
@@ -189,7 +191,9 @@ def _angles(angle: FloatArray, shift: int) -> FloatArray:
 
 
 def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
-    """Find the path (n,) of least cost through (n, states), changes included."""
+    """Find the path (n,) of least total cost through `costs` (n frames, states); every
+    change of state adds `CHANGE_COST`.
+    """
     n, states = costs.shape
     total = costs[0].copy()
     came = np.zeros((n, states), dtype=np.intp)

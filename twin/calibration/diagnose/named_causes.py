@@ -126,7 +126,9 @@ def _strained(found: Found) -> Finding | None:
 
 
 def _turning(fit: FitResult) -> Finding:
-    """Make the finding on the length of the exposures."""
+    """Make the warning that the object turns during an exposure, with the arc [deg] and
+    its share of a step.
+    """
     layout = fit.problem.layout
     share = float(np.sqrt(max(fit.solution.x[layout.arc_column], 0.0)))
     step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
@@ -151,7 +153,11 @@ def _elsewhere(fit: FitResult) -> Finding:
 
 
 def _distorted(fit: FitResult) -> Finding:
-    """Make the finding on the panel's distortion, and its tiles."""
+    """Make the warning on the panel's fitted distortion: its largest shift [px], and
+    where each tile begins.
+
+    The fit must have a panel model.
+    """
     panel = fit.panel
     assert panel is not None
     rows, cols = panel.model.shape

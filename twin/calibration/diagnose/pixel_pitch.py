@@ -106,7 +106,9 @@ class _Explanations:
     """The residuals of a fit, its columns, and that of the pixel pitch."""
 
     def __init__(self, fit: FitResult) -> None:
-        """Prepare the table of a fit."""
+        """Prepare the whitened Jacobian rows and residuals of a fit, with one more column
+        for the pixel pitch, and the priors of its parameters (none: mean 0).
+        """
         problem = fit.problem
         x = fit.solution.x
         use = fit.solution.use

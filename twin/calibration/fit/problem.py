@@ -314,7 +314,9 @@ class FitProblem:
 
     @cached_property
     def data(self) -> kernels.Data:
-        """The problem's arrays as the kernels take them."""
+        """The problem's arrays as the kernels take them: poses by frame, spots, weights
+        and layout.
+        """
         p = self.poses
         return kernels.Data(
             np.column_stack(
@@ -366,7 +368,12 @@ class FitProblem:
         return out
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
+        """Return parameter sets (groups, 17) and beads (k, 3) [mm] for the values `x` of
+        the columns.
+
+        Fixed parameters keep the base's values; without free beads the model's places are
+        taken, moved by the strain if that is fitted.
+        """
         columns = self.layout.colmap
         own = self.layout.bead_column
         params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])

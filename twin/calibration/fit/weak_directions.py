@@ -53,7 +53,11 @@ class Direction:
 
     @property
     def text(self) -> str:
-        """One line for a report."""
+        """One line for a report: a parameter against those it trades with, its sigma
+        ("not determined at all" if infinite), and the advice.
+
+        At most `MAX_SHOWN` others are named, the rest counted.
+        """
         first, *rest = self.parts
         against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:MAX_SHOWN])
         if len(rest) > MAX_SHOWN:

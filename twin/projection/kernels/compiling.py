@@ -225,7 +225,9 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> A
 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """Fetch array[index]'s cache line for reading; any index is safe."""
+    """Compile to a fetch of array[index]'s cache line for reading; any index is safe,
+    even outside the array.
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         """Emit LLVM's prefetch of the element's cache line, for reading, into all caches."""

@@ -384,7 +384,7 @@ def make_found(room):
 
 @maker
 def make_rays(room):
-    """Create arrays for fans of up to `room` rays."""
+    """Create arrays (not initialised) for fans of up to `room` rays."""
     f32 = np.float32
     u32 = np.uint32
     return Rays(

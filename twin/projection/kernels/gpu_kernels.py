@@ -214,7 +214,9 @@ def crossing(t, slope, distance, steps):
 
 
 def slab_kernel(transposed):
-    """Compile the slab walk as a kernel; forward or transposed."""
+    """Compile the kernel that walks rays slab by slab; forward, or transposed (back
+    projection, adds to voxels).
+    """
 
     @cuda.jit(device=True, inline=True)
     def meet(flat, inside, p, share, value):

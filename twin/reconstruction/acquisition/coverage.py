@@ -132,7 +132,9 @@ class LostVoxels:
         )
 
     def warnings(self) -> list[str]:
-        """List warnings of lost layers, and of voxels that are not seen from all sides."""
+        """List warnings: of lost layers, if any, and of voxels not seen from all sides,
+        if more than `LOST_SHARE`; both are NaN in the volume.
+        """
         said = []
         if self.lost_layers:
             said.append(

@@ -71,7 +71,11 @@ class Contradiction:
     change: float | None = None
 
     def __str__(self) -> str:
-        """Describe the contradiction for the user."""
+        """Describe the contradiction for the user as one sentence, with its figures.
+
+        With `change`, that the images do not decide between geometries; else how much
+        worse they fit than expected, and the explanations, if any.
+        """
         if self.change is not None:
             return (
                 "no accuracy is claimed: the images do not decide between geometries; "
@@ -156,7 +160,13 @@ class Comparison:
         return self._trial.excess / MIN_DOUBTFUL_MISFIT
 
     def contradiction(self) -> Contradiction | None:
-        """Find the error of the scan's geometry; None if there is none."""
+        """Find the error of the scan's geometry; None if there is none, nothing was
+        tried, or no doubt exists.
+
+        A tried geometry is named if it changes the volume, fits clearly better than the
+        scan's own and fits well. Else, if the scan does not fit its own geometry, the
+        result names no explanation.
+        """
         trial = self._trial
         if not self._tried or not self._doubtful:
             return None

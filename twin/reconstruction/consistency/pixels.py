@@ -244,7 +244,11 @@ class _Usual:
 
 
 def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
-    """Find where a response is far above the usual one about it, (rows, cols)."""
+    """Find pixels whose response is far above the usual one (largest block median around
+    them), (rows, cols) of bool.
+
+    Columns at the edges have a minimum of their own.
+    """
     from scipy.ndimage import maximum_filter
 
     (rows, cols) = response.shape

@@ -102,7 +102,9 @@ class OnProcessor:
 
 
 def _weighed(views: Views) -> Float32Array:
-    """Compute weighted rows for the filter, padded with zeros for it, (n, rows, columns)."""
+    """Compute the images weighted for the filter, padded with zeros to its length, (n,
+    rows, padded columns); widened first where they are truncated.
+    """
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     n, _, _, rows = views.sizes
@@ -267,7 +269,9 @@ class OnDevice:
         )
 
     def _convolved(self, views: Views) -> Any:
-        """Weigh and filter by a sum over taps, for rows of any length; as `_transformed`."""
+        """Weigh the images and filter them by a sum over taps, for rows of any length;
+        result as that of `_transformed`, on the device.
+        """
         from numba import cuda
 
         from flexdt.twin.reconstruction.kernels import (
@@ -357,7 +361,12 @@ class OnDevice:
         return self._halves
 
     def volume(self) -> Float32Array:
-        """Return the sum so far, (ny, nx, nz); see `OnProcessor`."""
+        """Return a copy of the sum so far, (ny, nx, nz), after the device has ended its
+        work.
+
+        With a noise meter, its data gets the difference of both half volumes. Raises if
+        the device fails.
+        """
         from flexdt.twin.projection.kernels import layout_kernels
 
         out = np.empty(self._shape, np.float32)

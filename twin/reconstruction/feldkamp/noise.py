@@ -205,7 +205,12 @@ class NoiseMeter:
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
     def found(self) -> Noise | None:
-        """Compute the noise after all views; None if too few rows see the grid."""
+        """Compute the noise after all views; None if too few rows see the grid, or no
+        voxel is seen.
+
+        The result has the local variance of each voxel and the variance common to all
+        views over the radius from the rotation axis.
+        """
         assert self._means is not None
         if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():
             return None
@@ -223,7 +228,9 @@ class NoiseMeter:
         return Noise(self.grid.like(variance), centre, radii, shared)
 
     def _shared_variance(self) -> FloatArray:
-        """Compute the variance at the points common to all views, (points,) [1/mm^2]."""
+        """Compute the variance at each point of the noise that all views share (as of a
+        pixel's fixed error), (points,) [1/mm^2].
+        """
         assert self._means is not None
         length = 2 * (len(self._response) - 1)
         column = np.concatenate([columns for columns, _ in self._hits])

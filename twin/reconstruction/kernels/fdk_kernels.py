@@ -143,7 +143,9 @@ def resample_lanes(
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        """Emit the linear look-up of LANES places, added to LANES elements."""
+        """Emit LLVM code of the linear look-up of LANES places in a line, added to LANES
+        elements of the target.
+        """
         target = _at(context, b, signature, args, 0, args[1])
         # line[at : at + 2 LANES] in two registers, between whose samples the permutation picks.
         second = b.add(args[3], ir.IntType(64)(LANES))
