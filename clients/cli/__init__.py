@@ -13,7 +13,9 @@ __all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line; leaves with the exit codes of docs/command-line.md."""
+    """Run the command line (`argv`, None: the process's arguments) and end the process
+    with its exit code; see docs/command-line.md.
+    """
     from flexdt.clients.cli.console import waited_for
 
     words = sys.argv[1:] if argv is None else list(argv)

@@ -287,7 +287,9 @@ def found(name: str) -> Callable[..., Any] | None:
 
 
 def listed(name: str) -> Callable[..., None]:
-    """Make the placeholder of a command of an extension that is not installed."""
+    """Make the placeholder of a command whose extension is not installed: it takes any
+    words, and raises the error that names the package to install.
+    """
 
     def command(words: list[str] | None = argument(None, "...")) -> None:
         from flexdt.library.extras import extension
@@ -336,7 +338,9 @@ def _add_others(
 def _add(
     app: typer.Typer, name: str, command: Callable[..., Any], context: Any = None
 ) -> None:
-    """Add a command; its help page ends with the options of `flexdt` that it heeds."""
+    """Add a command to `app`; its help page ends with the options of `flexdt` itself that
+    it heeds, if any.
+    """
     complete, heeds = completed(command)
     complete.heeds = heeds  # type: ignore[attr-defined]
     if heeds:

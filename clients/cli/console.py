@@ -161,7 +161,9 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a time span for people: 3.2 s, 4 min 05 s, 2 h 03 min."""
+    """Format a time span [s] for people: 3.2 s, 4 min 05 s, 2 h 03 min; "unknown" if not
+    finite.
+    """
     if not math.isfinite(seconds):
         return "unknown"
     if seconds < 60:
@@ -174,7 +176,7 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Format a number of bytes for people: 1.2 GB."""
+    """Format a number of bytes for people, in units of 1000 up to TB: 12 B, 1.2 GB."""
     for unit in ("B", "kB", "MB", "GB"):
         if abs(count) < 1000:
             if unit == "B":
@@ -273,7 +275,12 @@ class ProgressBar:
         note(self._line(text or self._title, done, total, now - self._begun))
 
     def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:
-        """Make a line of text with what is done, its share and an estimate of the time left."""
+        """Make a line of text with what is done, its share [%] and an estimate of the
+        time left.
+
+        Without a total only what is done; amounts that are not whole are left out; no
+        estimate at the beginning and end.
+        """
         if not total:
             return f"{text}: {done:g} {self._unit}"
         if float(done).is_integer():

@@ -71,7 +71,9 @@ def _interrupt(number: int, frame: object) -> None:
 
 
 def _watch() -> None:
-    """Have a thread end the process where the main thread does not hear of a signal."""
+    """Start a daemon thread that ends the process where the main thread does not react to
+    a signal; changes the process's wake-up descriptor.
+    """
     import threading
 
     heard_of, arrives = os.pipe()
@@ -152,7 +154,7 @@ def _wanted_s() -> float:
 
 
 def _family() -> list[str]:
-    """List the process ids of this process and its descendants."""
+    """List the process ids of this process and all its descendants, read from /proc."""
     parents = {}
     for entry in _entries("/proc"):
         pid = entry.rpartition("/")[2]

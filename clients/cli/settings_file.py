@@ -96,7 +96,9 @@ KEYS: Final = {
 
 
 def config_file(environ: Mapping[str, str]) -> Path:
-    """Return the path of the configuration file, which need not exist."""
+    """Return the path of the configuration file, which need not exist: that named in the
+    environment, else flexdt/config.toml in XDG_CONFIG_HOME or ~/.config.
+    """
     named = environ.get(f"{PREFIX}CONFIG")
     if named:
         return Path(named).expanduser()

@@ -165,7 +165,11 @@ class Core:
         self._listeners[listener] = params
 
     async def unsubscribe(self, listener: Listener) -> None:
-        """Send it no more events; cancel topics without another listener at the server."""
+        """Send it no more events, and unsubscribe at the server from topics without
+        another listener.
+
+        Does nothing for an unknown listener; failures of the request are ignored.
+        """
         self._listeners.pop(listener, None)
         still = {topic for other in self._listeners for topic in other.topics}
         gone = [topic for topic in listener.topics if topic not in still]
@@ -526,7 +530,9 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 def _end_links() -> None:
-    """End the connections of clients that were not closed, before the loop goes with Python."""
+    """End the connections of clients that were not closed, by cancelling all tasks of the
+    clients' loop; called as Python exits.
+    """
 
     async def cancel() -> None:
         """Cancel all tasks of this loop but this one, and wait for their ends."""

@@ -183,7 +183,9 @@ class AsyncSubscription:
         self._started = self._lost = self._closed = False
 
     async def __aenter__(self) -> AsyncSubscription:
-        """Subscribe, unless that has happened already."""
+        """Subscribe unless that has happened already, and return this subscription; after
+        a failure it may be entered again.
+        """
         if not self._started:
             self._started = True
             try:

@@ -68,7 +68,9 @@ class FollowSession:
     unread_example: str = ""
 
     def __post_init__(self) -> None:
-        """Begin with nothing known of the machine, and note the clock's reading at midnight."""
+        """Begin with nothing known of the machine's state, and note the reading of
+        `clock` at the local midnight.
+        """
         machine = self.follower.machine
         now = datetime.now()
         self.mirror = Mirror.of(machine)
@@ -212,7 +214,9 @@ class FollowSession:
                 self._take(self.follower.told(self.mirror, found))
 
     def _is_new(self) -> bool:
-        """Determine whether targets or the next line have changed since the last call."""
+        """Determine whether targets or the next line have changed since the last call;
+        False while nothing was heard.
+        """
         key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
         before = self._looked
         if self.mirror.heard_s is not None:

@@ -126,7 +126,11 @@ async def wait_ready(
 async def take_image(
     twin: ConnectedTwin, command: c.TakeImage, progress: CommandProgress
 ) -> str:
-    """Take an image at the present pose and settings and keep it in the camera."""
+    """Take an image at the present pose and settings, keep it in the camera and wait for
+    its exposure on the twin's clock.
+
+    Returns "columns x rows, mean" of its counts. Nothing is saved.
+    """
     state = await twin.state()
     counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
     twin.image = Image(counts, state)
@@ -463,7 +467,12 @@ def _name_taken(refusal: Refusal) -> bool:
 
 
 async def _adopt(twin: ConnectedTwin, folder: str, state: State) -> str:
-    """Add the frames to this session's folder, if the twin's disk is this machine's."""
+    """Add the frames in a data set's folder to this session's recording; returns how many
+    and where.
+
+    A folder that this machine's disk lacks is returned as it is. Raises Refusal if they
+    cannot be added.
+    """
     if not folder or not Path(folder).is_dir():
         return folder
     try:

@@ -174,7 +174,9 @@ class ConnectedTwin:
         return state
 
     async def until(self, seconds: float, progress: CommandProgress, what: str) -> None:
-        """Wait for `seconds` of the twin's clock; at full speed they need no waiting."""
+        """Wait for `seconds` of the twin's clock, reporting the time left; at speed-up
+        "max" returns at once.
+        """
         state = await self.state()
         end = state.time + seconds
         while state.time < end and state.clock.speed_up != "max":

@@ -305,7 +305,9 @@ class Gateway:
             self._awaited.pop(key, None)
 
     def _forward(self, event: AcquilaEvent) -> None:
-        """Send on the reply of a component elsewhere, unless it is an echo of ours."""
+        """Send on the reply of a component elsewhere, and wake the command that waits for
+        it; an echo of one of our own events is dropped.
+        """
         text = format_event(event)
         if hash(text) in self._recent:
             return
@@ -329,7 +331,9 @@ class Gateway:
             self._busy += Counter()  # without those that are idle
 
     async def _release(self) -> None:
-        """Release control of the twin if no command of this gateway runs any more."""
+        """Release control of the twin if no other command of this gateway runs and the
+        twin is connected; a refusal is ignored, a failure logged.
+        """
         if len(self._running) <= 1 and self.twin.link.connected:
             try:
                 await self.twin.ask("session.control", {"action": "release"})
@@ -346,7 +350,9 @@ class Gateway:
         self._out.send(text.encode("utf-8", "replace"))
 
     def _reject(self, why: str) -> None:
-        """Count a malformed event, log the first ones, and answer with ERR."""
+        """Count a malformed event, log the first `MAX_LOGGED` ones, and answer with ERR
+        and the fields of an event.
+        """
         self._rejected += 1
         if self._rejected <= MAX_LOGGED:
             log("gateway event refused", logging.WARNING, reason=why)
@@ -363,7 +369,9 @@ class Gateway:
             log("gateway command failed", logging.ERROR, error=True, command=command)
 
     def _start(self, work: Coroutine[Any, Any, None], key: tuple[object, int]) -> None:
-        """Run work in a task; `key` marks its event as running until it ends."""
+        """Run work in a task that is kept until it ends; then `key` no longer marks its
+        event as running.
+        """
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
 
@@ -431,7 +439,9 @@ def check_loopback(host: str) -> None:
 
 
 def bind_endpoint(host: str, port: int) -> str:
-    """Format an address as ZeroMQ's endpoint; port 0 is any free port."""
+    """Format an address as ZeroMQ's endpoint: IPv6 in brackets, localhost as 127.0.0.1;
+    port 0 is any free port.
+    """
     if ":" in host:
         place = f"[{host}]"
     elif host == "localhost":
@@ -447,7 +457,12 @@ def bound_port(socket: zmq.asyncio.Socket) -> int:
 
 
 def transcript_line(event: AcquilaEvent, command: c.Command) -> str | None:
-    """Write the command as a line of a script; None if it cannot occur in one."""
+    """Write the command as a tab-separated line of a script; None for a command that is
+    not one of scripts.
+
+    Waits for the position (POS) only after a triggered absolute move, else for the
+    acknowledgement.
+    """
     if type(command).__module__ != c.__name__:
         return None
     if isinstance(command, c.MoveAbsolute) and command.trigger is not None:

@@ -319,7 +319,9 @@ def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
         return (f.kind, f.mode, f.roi, f.exposure_ms, f.averages, f.xrays_on)
 
     def block(run: Sequence[FrameEntry]) -> FrameBlock:
-        """Make the block of a run of frames with one kind and camera setting."""
+        """Make the block of a run of frames with one kind and camera setting, taken from
+        the first; times are `start` plus the frames' own [s].
+        """
         first = run[0]
         camera = CameraSettings(
             first.mode, Roi(*first.roi), first.exposure_ms, first.averages

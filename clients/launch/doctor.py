@@ -175,7 +175,9 @@ def memory() -> CheckOutcome:
 
 
 def gpu() -> CheckOutcome:
-    """Report the CUDA device; its absence is no fault, only its failure is a warning."""
+    """Report the CUDA device, or why the processor computes; without a device "ok", only
+    a failing one is a warning.
+    """
     from flexdt.twin.projection.gpu import availability
 
     found = availability()

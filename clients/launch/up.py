@@ -101,7 +101,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         )
 
     def gateway(known: Addresses) -> Sequence[str]:
-        """Return module and options of the gateway."""
+        """Return module and command-line options of the gateway, connected to the twin's
+        address; without a port given, a free one.
+        """
         own = {
             "port": port_of("gateway", options.gateway_port or 0, known),
             "host": None,

@@ -72,7 +72,7 @@ class SceneClients:
         self._server.on_client_disconnect(self._gone)
 
     def of(self, page: str, view: str | None = None) -> list[viser.ClientHandle]:
-        """List the clients that show `view` (any, if None) of `page`."""
+        """List the connected clients that show `view` (any, if None) of `page`."""
         with self._lock:
             ids = [
                 i

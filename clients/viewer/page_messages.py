@@ -145,7 +145,10 @@ class MessageFilter:
         self._logged: set[str] = set()
 
     def admit(self, raw: str | bytes) -> bytes | None:
-        """Validate a message for viser; None drops it, and its problem is logged once."""
+        """Validate a browser's message for viser and return it; None drops it.
+
+        Counts the dropped; each different problem is logged once, at most `MAX_LOGGED`.
+        """
         try:
             return admitted(raw)
         except Unwanted as error:

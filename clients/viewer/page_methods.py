@@ -264,7 +264,9 @@ async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
 
 
 async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
-    """Put a view of this page back to its preset, or have it look at the sample."""
+    """Set a view of this page back to its preset, or, with `sample`, have it look at the
+    sample (preset while no state is known); returns {}.
+    """
     if params.sample and viewer.world is not None:
         viewer.clients.look(
             page.id, params.view, viewer.world.sample.shift, viewer.look.radius_mm
@@ -291,7 +293,9 @@ async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
 
 
 async def window(viewer: Viewer, page: Page, params: Window) -> object:
-    """Set the window [low, high] of the panel in all scenes; None chooses it automatically."""
+    """Set the window [low, high] of the panel for all pages and draw the newest image
+    again; either None chooses it automatically. Returns {}.
+    """
     low = params.low
     high = params.high
     if low is None or high is None:
@@ -303,7 +307,11 @@ async def window(viewer: Viewer, page: Page, params: Window) -> object:
 
 
 async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
-    """Show this page the ray of a pixel; returns its path lengths through materials."""
+    """Show this page the ray of a pixel; returns the twin's path lengths through
+    materials and the ray's length [mm].
+
+    Without a pixel or a known state hides the ray and returns {}.
+    """
     lab = _lab(viewer)
     world = viewer.world
     clients = viewer.clients.of(page.id)
@@ -518,7 +526,9 @@ async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
 
 
 async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
-    """Compare the volume with the truth of its sample; its document brings the figures."""
+    """Start comparing the volume with the truth of its sample, with the correction in
+    use; the volume's document brings the figures later.
+    """
     if viewer.state is None:
         correction = None
     else:
@@ -661,7 +671,10 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
 
 
 async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
-    """Take a picture of one of this page's views, as a download."""
+    """Take a picture of one of this page's views; returns the offer of a PNG to download.
+
+    Raises INVALID_PARAMS if that view is not open.
+    """
     clients = viewer.clients.of(page.id, params.view)
     if not clients:
         raise RpcError(Code.INVALID_PARAMS, f"the view {params.view!r} is not open")

@@ -196,7 +196,9 @@ class Viewer:
         ]
 
     async def stop(self) -> None:
-        """End all tasks, feeds, pages, reconstructions and planners, and viser's server."""
+        """End all tasks, feeds, pages, reconstructions and planners, and viser's server,
+        in this order, waiting for each but the planners.
+        """
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -266,7 +268,9 @@ class Viewer:
             self._heard_at = time.monotonic()
 
     async def _beat(self) -> None:
-        """Send the pages the age of the state: a hanging twin does not report it."""
+        """Send all pages, every `BEAT_S` for ever, how long the twin has been silent [s]:
+        a hanging twin does not report it.
+        """
         while True:
             now = time.monotonic()
             beat = json.dumps(
@@ -320,7 +324,9 @@ class Viewer:
             self._tell_link(page)
 
     def _tell_link(self, page: Page) -> None:
-        """Send a page the state of the connection to the twin."""
+        """Send a page the state of the connection to the twin: connected, problem,
+        address, its hello, and whether any page shows a scene.
+        """
         hello = self.link.hello
         page.say(
             "link",

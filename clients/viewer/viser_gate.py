@@ -98,7 +98,9 @@ class Scenes:
     async def connect(
         self, path: str, subprotocol: Subprotocol | None
     ) -> AsyncIterator[ClientConnection]:
-        """Connect a browser's frame to viser; `path` identifies the frame."""
+        """Connect a browser's frame to viser's socket, uncompressed; `path` identifies
+        the frame. Closes the connection at the end.
+        """
         async with unix_connect(
             str(self.path),
             f"ws://localhost{path}",
@@ -109,7 +111,9 @@ class Scenes:
             yield connection
 
     def path_of(self, client_id: int) -> str | None:
-        """Return the path of a client's connection; None when it has closed."""
+        """Return the path of a client's connection without its query; None when it has
+        closed.
+        """
         connection = self.server._websock_server._live_connections.get(client_id)
         if connection is None:
             request = None
@@ -142,7 +146,9 @@ class Scenes:
 
 
 def clear_left_behind(folder: Path) -> None:
-    """Remove the sockets of viewers that were killed, on which no process listens any more."""
+    """Remove the sockets of viewers that were killed: those older than `YOUNG_S` on which
+    no process listens; others stay, errors are ignored.
+    """
     for left in folder.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             if time.time() - left.stat().st_mtime < YOUNG_S:

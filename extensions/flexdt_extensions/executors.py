@@ -51,7 +51,9 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def problems_of(name: str, error: ValidationError) -> list[str]:
-    """List the problems of a document, one line each, with key paths."""
+    """List the problems of a document, one line each: name, key path, message and the
+    value given (unless that is a table).
+    """
     lines = []
     for e in error.errors(include_url=False, include_context=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"

@@ -79,7 +79,10 @@ def slabs(grid: Grid) -> list[tuple[int, int]]:
 
 
 def levels(grid: Grid) -> list[tuple[int, int, int]]:
-    """List the shape (z, y, x) of each resolution, halved from one to the next."""
+    """List the shape (z, y, x) of each resolution, finest first, halved (rounded up) from
+    one to the next, until all sides are at most `COARSEST` or a slab has no layer
+    left.
+    """
     first, last = slabs(grid)[0]
     shape = grid.shape
     shapes = [shape]
@@ -210,7 +213,9 @@ class VolumeFormat:
         held: list[Float32Array] = []
 
         def take(layers: Float32Array) -> None:
-            """Gather layers, and write each slab once all of it is there."""
+            """Gather layers, and write each slab once all of it is there; the rest is
+            held for the next call.
+            """
             held.append(layers)
             while todo and sum(map(len, held)) >= todo[0][1][1] - todo[0][1][0]:
                 number, (first, last) = todo.pop(0)
@@ -406,7 +411,9 @@ def same_version(made_by: str) -> None:
 
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:
-    """Move a complete store to `out`, or write its volume into a file of another format."""
+    """Move a complete store to `out` if that is .zarr; else write its finest volume into
+    a file of the other format, and leave the store.
+    """
     if out.suffix.lower() == ".zarr":
         move(store, out)
         return

@@ -159,7 +159,11 @@ class SlurmJobs:
         return lines
 
     def _waiting(self, queue: Mapping[str, str]) -> str:
-        """Describe which jobs are waited for, with their states in the queue (id -> state)."""
+        """Describe in words which jobs are waited for, with their states in the queue (id
+        -> state); the first `SHOWN_JOBS`, the number of the others.
+
+        A job missing in the queue is UNKNOWN.
+        """
         shown = [
             f"{job.id} {queue.get(job.id, 'UNKNOWN')}" for job in self.jobs[:SHOWN_JOBS]
         ]

@@ -72,7 +72,9 @@ def blank(width: float, height: float) -> Figure:
 
 
 def svg(figure: Figure) -> str:
-    """Render a figure as an SVG element, for a page or a file of its own."""
+    """Render a figure as an SVG element with text as text, all points and reproducible
+    ids; without date or XML header.
+    """
     import matplotlib as mpl
 
     text = io.StringIO()

@@ -88,7 +88,9 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
 
 
 def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
-    """Convert type `cone` to rows (n, 12) of our circle, with v upwards."""
+    """Convert ASTRA's type `cone` (angles in radians) to rows (n, 12) of our circle, with
+    v upwards; warns of angles that look like degrees.
+    """
     warn_of(radian_findings(geometry["ProjectionAngles"]), GeometryError)
     circle = ConeVec.circular(
         sod=float(geometry["DistanceOriginSource"]),
@@ -101,7 +103,9 @@ def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
 
 
 def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
-    """Convert to ASTRA's dictionary; see `ConeVec.to_astra`."""
+    """Convert to ASTRA's dictionary of type cone_vec, with a copy of the vectors; see
+    `ConeVec.to_astra`. Raises without a panel shape.
+    """
     rows, cols = cone_vec.of_shape()
     return {
         "type": "cone_vec",
@@ -144,7 +148,7 @@ def to_tomosipo(cone_vec: ConeVec) -> Any:
 
 
 def to_cil(cone_vec: ConeVec) -> Any:
-    """Make an acquisition geometry of CIL; see `ConeVec.to_cil`."""
+    """Make an acquisition geometry of CIL, which must be installed; see `ConeVec.to_cil`."""
     arrays = cil_arrays(_scan(cone_vec))
     framework = _peer("cil.framework", "CIL", ".cil")
     geometry = framework.AcquisitionGeometry.create_Cone3D_Flex(
@@ -278,7 +282,9 @@ def _json(path: Path, given: Given) -> ScanGeometry:
 
 
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
-    """Write a geometry to a file; see `ConeVec.save`."""
+    """Write a geometry to a file, in `format` or, if None, in that of the file's ending
+    (flexdt's own for its own ending); see `ConeVec.save`.
+    """
     path = Path(file)
     if format is None and path.suffix.lower() == OWN_ENDING:
         save_geometry(_scan(cone_vec), path)

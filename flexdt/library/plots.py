@@ -63,7 +63,9 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
 
 
 def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
-    """Plot line integrals of one projection, as the source sees it; returns the axes."""
+    """Plot line integrals of one projection, as the source sees it, with a colour bar;
+    returns the axes (new ones if None).
+    """
     if axes is None:
         axes = _pyplot().figure().add_subplot()
     shown = axes.imshow(data.line_integrals(index), cmap="gray")

@@ -71,7 +71,9 @@ def plan(
 
 
 def check(plan: ScanPlan, sample: object = None) -> CheckReport:
-    """Check a plan, with its collisions and exposures; see `ScanPlan.check`."""
+    """Check a plan, with the exposures of `sample` (None: no sample) and, if the machine
+    has components, its collisions; see `ScanPlan.check`.
+    """
     if sample is None:
         phantom = None
     else:

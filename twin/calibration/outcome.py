@@ -59,7 +59,9 @@ class Calibration:
 
     @property
     def panel(self) -> Panel | None:
-        """Distortion and lag of the panel, where either was found."""
+        """Distortion and lag of the panel, None if neither was found; lag is the mean
+        over the scans that show it.
+        """
         if self.fit is None:
             panel = None
         else:

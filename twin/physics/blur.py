@@ -34,7 +34,9 @@ FOLDS = 20
 
 
 def kernel(sigma_px: float) -> Float32Array:
-    """Compute the weights of a blur, (2 r + 1,), adding up to 1."""
+    """Compute the weights of a Gaussian blur by `sigma_px`, (2 r + 1,), adding up to 1;
+    of narrow ones the discrete Gaussian (Bessel functions).
+    """
     from scipy.special import ive
 
     t = sigma_px * sigma_px

@@ -128,7 +128,9 @@ def geometry_findings(
 
 
 def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
-    """Return whether all views have one source, with beams all around it."""
+    """Return whether all views (3 at least) have one source, with beams on opposite sides
+    of it.
+    """
     if (
         len(cone_vec) < 3
         or float(np.ptp(cone_vec.source, axis=0).max()) > 1e-9 * distance.max()
@@ -198,7 +200,9 @@ def about_z(cone_vec: ConeVec) -> bool:
 
 
 def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
-    """Find radians given as degrees: many views within a few degrees."""
+    """Warn of radians given as degrees: many views about z within a few degrees; yields
+    at most one finding, its figure the span [deg].
+    """
     if len(cone_vec) < RADIANS_VIEWS or not about_z(cone_vec):
         return
     span = arc_deg(cone_vec)

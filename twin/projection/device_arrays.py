@@ -88,7 +88,7 @@ class DeviceArray(NDArrayOperatorsMixin):
             return self
 
         def gather() -> DeviceArray:
-            """Copy the chosen views into a new array on the device."""
+            """Copy the chosen views, in their order, into a new array on the device."""
             from numba import cuda
 
             there = self.images

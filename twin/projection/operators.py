@@ -393,7 +393,7 @@ def corners_of(volume: Volume | DeviceVolume) -> FloatArray:
 
 
 def box_of(layout: Layout) -> Box:
-    """Convert a layout to the kernels' `Box`."""
+    """Convert a layout to the kernels' `Box`, sharing its voxels."""
     return Box(
         layout.flat,
         layout.spans,
@@ -467,7 +467,9 @@ def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
 
 
 def _are_finite(values: npt.NDArray[Any]) -> bool:
-    """Return whether all numbers are finite; many numbers are checked on all cores."""
+    """Return whether all numbers are finite; many contiguous float32 numbers are checked
+    on all cores, others by their sum (which must not overflow).
+    """
     if (
         values.nbytes < MIN_PARALLEL_BYTES
         or values.dtype != np.float32

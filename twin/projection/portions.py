@@ -43,7 +43,9 @@ def layer_portions(volume: Float32Array) -> Iterator[tuple[int, int]]:
 
 
 def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges (first, last) of jobs whose times are `job_ns` (n,)."""
+    """Yield consecutive ranges (first, last) of jobs whose times are `job_ns` (n,) [ns],
+    each about `PORTION_NS` for each thread, at least one job.
+    """
     ends = np.cumsum(job_ns)
     first = 0
     most = PORTION_NS * threads

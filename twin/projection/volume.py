@@ -73,7 +73,10 @@ class Accuracy:
     cut_off: bool = False
 
     def __str__(self) -> str:
-        """Return the accuracy sentence, as docs/glossary.md explains it."""
+        """Return the accuracy sentence: largest errors [%] in nine of ten and in half of
+        the uniform regions, and their largest cause; that none is bounded if the
+        object is cut off. See docs/glossary.md.
+        """
         if self.cut_off:
             return f"{NOT_BOUNDED}; {GRANTED}"
         half, most = (
@@ -272,7 +275,7 @@ class Volume:
         return self.data.__dlpack_device__()
 
     def __repr__(self) -> str:
-        """Describe the volume in one line."""
+        """Describe the volume in one line: shape (z, y, x), voxel and centre [mm]."""
         sizes = [f"{size:g}" for size in self.voxel_xyz]
         if len(set(sizes)) == 1:
             voxel = sizes[0]
@@ -283,7 +286,9 @@ class Volume:
         return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
 
     def _repr_html_(self) -> str:
-        """Return a table of size and values for a notebook."""
+        """Return an HTML table for a notebook: shape, size [mm], least and largest value
+        [1/mm].
+        """
         size = " x ".join(f"{side:g}" for side in self.size_mm)
         least = float(self.data.min())
         most = float(self.data.max())

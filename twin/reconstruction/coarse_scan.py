@@ -274,7 +274,11 @@ class CoarseScan:
         return volume.data
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
-        """Project values on the grid, (nz, ny, nx), and reconstruct them."""
+        """Project values on the grid, (nz, ny, nx), in a rung's geometry and reconstruct
+        them by FDK, unseen voxels as zero.
+
+        Truncation is simulated only for a rung that has it as its flaw.
+        """
         truncation = self.truncation
         if truncation is not None:
             if rung.flaw and truncation.beyond:

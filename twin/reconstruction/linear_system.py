@@ -160,7 +160,9 @@ class LinearSystem:
         return self.measured.shape[1], self.measured.shape[2]
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Return start values: a copy of the first guess, or zeros."""
+        """Return start values: a copy of the first guess, or zeros for None; raises
+        GeometryError if the guess is on another grid.
+        """
         if start is None:
             return np.zeros(self.like.shape, np.float32)
         if start.shape != self.like.shape or not np.allclose(

@@ -69,7 +69,9 @@ class Hardening:
     material: str
 
     def __call__(self, line_integrals: Float32Array) -> Float32Array:
-        """Corrected line integrals; outside the table by its first and last slope."""
+        """Convert measured line integrals to straight ones (without beam hardening) by
+        the table; outside it by its first and last slope.
+        """
         x = np.asarray(line_integrals)
         out = np.interp(x, self.measured, self.straight)
         first = self.straight[1] / self.measured[1]
@@ -401,7 +403,9 @@ def scatterer_of(
 
 
 def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
-    """Reconstruct straightened line integrals by FDK and smooth the volume."""
+    """Reconstruct straightened line integrals by FDK with a Hann window, for the scatter
+    estimate; voxels without a view are zero.
+    """
     shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
     volume = fdk_parts(

@@ -234,7 +234,12 @@ def _minimise(
     little = 0
 
     def tell(at: _At) -> bool:
-        """Record an iteration; return whether it is the last by the stopping rule."""
+        """Record an iteration's cost, report it and the progress; return whether costs
+        have stalled.
+
+        Stalled: `STALLED_ITERATIONS` in a row reduced it by at most `tolerance` of it;
+        never with tolerance 0.
+        """
         nonlocal little
         problem.tell(watch, len(costs) - 1, iterations, at.rest)
         costs.append(at.cost)

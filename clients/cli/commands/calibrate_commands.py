@@ -417,8 +417,8 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def motions(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line on each parameter that may move during the scans: by how much, or that no
-    motion was found.
+    """Return the phantom's name or file; None is a usage error that lists the phantoms
+    that ship.
     """
     for moved in document.get("motion", ()):
         for name, told in moved.items():

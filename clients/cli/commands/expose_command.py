@@ -89,7 +89,9 @@ def expose(
 
 
 def _transmission_lines(found: Forecast | Measured) -> Answer:
-    """Yield lines on transmission, saturated and starved pixels."""
+    """Yield two lines: transmission (least and percentiles), and saturated ("unknown" if
+    None) and starved pixels [%].
+    """
     seen: Transmission = found.transmission
     yield (
         f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "

@@ -122,7 +122,9 @@ def fit(
 
 
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
-    """Make the table of axes with limits, speeds and the figures' sources."""
+    """Make the table of axes: limits, maximum speed and acceleration, unit, and the
+    figures' source.
+    """
     rows = [
         (
             name,
@@ -136,7 +138,9 @@ def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
 
 
 def _places(machine: Machine) -> str:
-    """Make the table of distances along the beam, at their ends and at home."""
+    """Make the table of distances along the beam without zero offsets: their sum, ends
+    and value at home [mm].
+    """
     from flexdt.twin.machine.kinematics import places
 
     rows = [

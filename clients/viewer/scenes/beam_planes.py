@@ -148,7 +148,9 @@ class BeamShade:
             self._draw()
 
     def _draw(self) -> None:
-        """Draw the newest image along the beam, if X-rays are on."""
+        """Draw the newest image as planes along the beam; nothing while X-rays are off or
+        no image is there.
+        """
         if not self._lit or self._newest is None:
             return
         for handle, plane in zip(self._planes, fans(*self._newest), strict=True):

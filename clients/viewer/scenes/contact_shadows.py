@@ -96,7 +96,9 @@ def shadow(part: Component, top_mm: float) -> bytes:
 
 
 def _soft() -> Image.Image:
-    """Draw a black square whose edges fade to transparent, RGBA (SIDE_PX, SIDE_PX)."""
+    """Draw the shadow's texture: a black square whose edges fade to transparent, RGBA
+    (SIDE_PX, SIDE_PX).
+    """
     at = np.abs((np.arange(SIDE_PX) + 0.5) / SIDE_PX * 2.0 - 1.0)
     inner = 1.0 / (1.0 + 2.0 * SPREAD_SHARE)
     share = np.clip((1.0 - at) / (1.0 - inner), 0.0, 1.0)

@@ -63,7 +63,9 @@ class Gizmos:
             self._rest(handle)
 
     def _rest(self, handle: _Handle) -> None:
-        """Put a handle back to its stage unless it is being dragged."""
+        """Put a handle back to its stage's place, that of the object also to no rotation;
+        nothing while it is dragged or the place is unknown.
+        """
         at = self._at.get(handle.stage)
         if handle.dragging or at is None:
             return
@@ -94,7 +96,9 @@ class Gizmos:
 
         # Plain functions would run in threads, in any order.
         async def follow(event: Any) -> None:
-            """Follow the phases of a drag: start, move and end."""
+            """Follow the phases of a drag: begin, move and end; afterwards the handle is
+            put back unless dragged.
+            """
             match event.phase:
                 case "start":
                     self._begin(handle)

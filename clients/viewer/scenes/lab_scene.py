@@ -227,7 +227,9 @@ class LabScene:
         )
 
     def _build_bodies(self) -> None:
-        """Add the hull of each collision body, and its safety margin."""
+        """Add the hull of each collision body, and one grown by the safety margin if the
+        machine has one.
+        """
         margin = self.machine.safety_margin_mm
         for name, body in self._bodies.items():
             hull = bare(body.solid)
@@ -239,7 +241,7 @@ class LabScene:
                 )
 
     def _build_labels(self) -> None:
-        """Build the world's axes and a scale on the floor."""
+        """Build the world's axes and a scale on the floor, in [m]."""
         scene = self._server.scene
         (x, y, z) = _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
@@ -350,7 +352,7 @@ class LabScene:
         self._axis.wxyz = quaternion(world.stage.turn)
 
     def _show_panel(self, world: World) -> None:
-        """Put the live image in front of the panel, as large as it."""
+        """Place the live image in front of the panel, as large as it and turned like it."""
         rows, cols = world.shape
         at = (world.detector - GAP_MM * world.normal) * MM
         width = float(np.linalg.norm(world.u)) * cols * MM
@@ -573,7 +575,9 @@ def _axis_points() -> npt.NDArray[np.float32]:
 
 
 def _cross_points() -> npt.NDArray[np.float32]:
-    """Return the four lines (4, 2, 3) of a cross with an open centre [m]."""
+    """Return four lines, (4, 2, 3) [m], of an upright cross in the xz plane with an open
+    centre.
+    """
     r = 7.0 * MM
     g = 1.5 * MM
     return np.array(

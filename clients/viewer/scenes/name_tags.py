@@ -92,7 +92,9 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
 
 
 def names_of_image(world: World) -> list[Name]:
-    """List names and places [m] of source, sample and detector."""
+    """List the names X-ray source, sample and detector with their places [m]; "detector"
+    is beside the panel's centre.
+    """
     image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
     named = (
         ("X-ray source", world.source),

@@ -160,7 +160,9 @@ def drawn(
 
 
 def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
-    """Encode as good a JPEG as fits into `most` bytes (or the worst)."""
+    """Encode as a JPEG of the best of four qualities that fits into `most` bytes; the
+    worst, if none does.
+    """
     import cv2
 
     for quality in (85, 75, 60, 40):
@@ -173,7 +175,9 @@ def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
 
 
 def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
-    """Compute the colours of a shape's triangles in the scene's light, (n, 3)."""
+    """Compute the colours of a shape's triangles in the scene's light, (n, 3); its own
+    colour if it is not lit.
+    """
     color = np.broadcast_to(shape.color, (len(shape.corners), 3)).astype(np.float32)
     if not shape.lit:
         return color

@@ -104,7 +104,9 @@ class World:
 
 
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
-    """Convert the wire's camera settings to the twin's."""
+    """Convert the wire's camera settings to the twin's, with the detector modes of the
+    machine.
+    """
     return CameraSettings(
         camera.mode,
         Roi(*camera.roi),

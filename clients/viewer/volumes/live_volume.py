@@ -197,7 +197,11 @@ def grow(
     held.hold(target.volume().transpose(2, 0, 1), like)
 
     def parts() -> Iterator[Float32Array]:
-        """Yield line integrals, binned, each as soon as its file is there."""
+        """Yield line integrals (1, rows, cols), binned, each as soon as its file is
+        there.
+
+        Dark and flat images are read when the first projection is there.
+        """
         normalise = None
         for index in indices:
             path = data.frames[index].path

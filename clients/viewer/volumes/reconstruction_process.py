@@ -41,7 +41,9 @@ class LiveReconstruction:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        """Prepare reconstructions, whose lines `tell` gets; processes are started when needed."""
+        """Begin without a reconstruction; `tell` gets the lines of those to come.
+        Processes are started when needed.
+        """
         self._tell = tell
         self.newest = ""
         self._asked: Wish = ()
@@ -70,7 +72,9 @@ class LiveReconstruction:
         self._task = watched(self._follow(*asked), "a live reconstruction")
 
     def stop(self) -> None:
-        """End the running reconstruction, if there is one; the process is killed."""
+        """End the running reconstruction, if there is one, and forget what was requested;
+        its task is cancelled, not waited for.
+        """
         if self._task is not None:
             self._task.cancel()
             self._ending = self._task
@@ -80,7 +84,9 @@ class LiveReconstruction:
         self._hang_up()
 
     async def close(self) -> None:
-        """End the running reconstruction and the spare process, and wait for both."""
+        """End the running reconstruction and the spare process, and wait until both have
+        ended.
+        """
         self.stop()
         if self._ending is not None:
             await asyncio.wait([self._ending])

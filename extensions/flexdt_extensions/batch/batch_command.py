@@ -91,7 +91,9 @@ def batch(
     last = 0.0
 
     def tell(done: int, items: int, rate: float) -> None:
-        """Print progress and the estimated time left, at most every PROGRESS_S and at the end."""
+        """Print items done, their rate and the estimated time left [s], at most every
+        PROGRESS_S and at the end.
+        """
         nonlocal last
         if time.monotonic() - last >= PROGRESS_S or done == items:
             last = time.monotonic()

@@ -234,7 +234,9 @@ def _phantom(
 def _draw_cuboid(
     table: Cuboid, rng: np.random.Generator
 ) -> tuple[Phantom, dict[str, Any]]:
-    """Draw a block with beads on a spiral; returns it and the drawn values by name."""
+    """Draw a cuboid with beads on a spiral from the plan's table; returns it and the
+    drawn values by name.
+    """
     values = {name: getattr(table, name).sample(rng) for name in type(table).model_fields}
     size = tuple(float(values[f"{side}_mm"]) for side in ("width", "breadth", "height"))
     made = bead_phantom(
@@ -415,7 +417,11 @@ def run_item(text: str, index: int) -> ItemOutcome:
 
 
 def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
-    """List warnings where counts of the open beam saturate or starve the panel."""
+    """List warnings where the open beam's counts saturate or starve the panel, in the
+    first view.
+
+    Empty unless the batch makes projections with counts or noise.
+    """
     counted = plan.images.values == "counts" or plan.images.noise
     if plan.batch.kind != "projections" or item.camera is None or not counted:
         return []

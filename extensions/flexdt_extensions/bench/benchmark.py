@@ -125,7 +125,9 @@ def noise(
 
 
 def ball(side: int) -> Volume:
-    """Make a ball of a tenth of the volume's side in its middle, the rest empty."""
+    """Make a (side, side, side) volume of voxels of 0.1 mm with a ball of ones in its
+    middle, whose radius is a tenth of the side; zeros elsewhere.
+    """
     values = np.zeros((side,) * 3, np.float32)
     n = side // 10
     x = np.arange(-n, n + 1)

@@ -322,7 +322,9 @@ def _quietly(call: Callable[[], object]) -> Callable[[], object]:
 
 
 def why_no_astra() -> str | None:
-    """Say why ASTRA cannot take part: not installed, or not to be loaded; None where it can."""
+    """Explain why ASTRA cannot take part: not installed, or fails to load; None where it
+    can.
+    """
     if missing := absent(ASTRA):
         return missing
     try:
@@ -380,7 +382,9 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
 
 
 def row(line: Document) -> str:
-    """Format a target's line as a row of the page's Markdown table."""
+    """Format a target's line as a row of the page's Markdown table: target, accepted and
+    wanted limit, measured ("-" if None), whether met, and why.
+    """
     if line["measured"] is None:
         value = "-"
     else:

@@ -158,7 +158,9 @@ def rtk_volume(
     voxel_mm: tuple[float, float, float],
     center_mm: tuple[float, float, float],
 ) -> Any:
-    """Convert a volume (z, y, x) to an ITK image in RTK's axes."""
+    """Convert a volume (z, y, x) to an ITK image in RTK's axes, with spacing and origin
+    [mm].
+    """
     import itk
 
     image = itk.image_from_array(np.ascontiguousarray(data.transpose(1, 0, 2)[::-1]))

@@ -35,7 +35,9 @@ __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a device or plan when it is first used; an error names the missing package."""
+    """Import a device or plan when it is first used; raises AttributeError on an unknown
+    name, and an error naming the package if ophyd-async or bluesky is missing.
+    """
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from flexdt.extending import package

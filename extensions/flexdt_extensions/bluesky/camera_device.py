@@ -80,7 +80,9 @@ class Announcements(StreamResourceDataProvider):
     async def make_stream_docs(
         self, collections_written: int, collections_per_event: int
     ) -> AsyncIterator[StreamAsset]:
-        """Yield the documents of the images since the last call."""
+        """Yield the documents of the images since the last call; keeps the last stream
+        datum.
+        """
         self.count()
         async for asset in super().make_stream_docs(
             collections_written, collections_per_event
@@ -122,7 +124,7 @@ class Roll:
     """Where images go: a numbered file each, complete before it is counted."""
 
     def __init__(self) -> None:
-        """Begin without a folder and without images."""
+        """Begin without a folder, template or images; written and mean are signals at 0."""
         self.folder: Path | None = None
         self.template = ""
         self.written, self._set_written = soft_signal_r_and_setter(int, 0)
@@ -310,7 +312,10 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
 
     @AsyncStatus.wrap
     async def trigger(self) -> None:  # type: ignore[override]
-        """Take an image, in place of one that no document names."""
+        """Take an image; images that no document names yet are overwritten.
+
+        Waits first for a staging or trigger that was interrupted.
+        """
         if self._staging is not None:
             await (
                 self._staging

@@ -207,7 +207,9 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
 
     @cached_property
     def movable_logic(self) -> AxisLogic:
-        """How this axis moves."""
+        """Setpoint, readback and connection by which ophyd moves this axis, with or
+        without collision checks.
+        """
         return AxisLogic(
             setpoint=self.setpoint,
             readback=self.readback,

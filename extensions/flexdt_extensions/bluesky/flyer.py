@@ -302,7 +302,9 @@ class TwinFlyer(
     # -- documents -----------------------------------------------------------------------------
 
     async def describe_collect(self) -> dict[str, DataKey]:
-        """Describe the images."""
+        """Describe the images: 16 bit, (1, rows, cols), in external files. Raises if no
+        scan is prepared.
+        """
         ready = self._ready()
         return {
             self.name: DataKey(
@@ -336,7 +338,9 @@ class TwinFlyer(
     async def collect_asset_docs(
         self, index: int | None = None
     ) -> AsyncIterator[StreamAsset]:
-        """Yield the documents of the files up to `index`."""
+        """Yield the documents of the files up to `index` (None: all written); nothing
+        before the scan starts.
+        """
         if self._images is None:
             return
         if index is None:

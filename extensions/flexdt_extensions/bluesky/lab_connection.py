@@ -141,7 +141,9 @@ class LabConnection:
         return self.state
 
     def watch(self, watcher: Watcher) -> Callable[[], None]:
-        """Call `watcher` with every new state; the returned function ends that."""
+        """Call `watcher` with the state known now, if any, and every new one; the
+        returned function ends that.
+        """
         self._watchers.append(watcher)
         if self.state is not None:
             watcher(self.state)
@@ -252,7 +254,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         self._end: Callable[[], None] | None = None
 
     def _member(self, state: State) -> _T:
-        """Get the value at `path`; zero where that is not known."""
+        """Get the value at `path` of the state; the zero of its type where it is None."""
         value: Any = state
         for name in self._path.split("."):
             if isinstance(value, Mapping):
@@ -288,7 +290,9 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         await self._link.fresh()
 
     async def get_datakey(self, source: str) -> DataKey:
-        """Describe type, unit and limits."""
+        """Describe type, unit and limits, the last two where there are any; limits are
+        those of a fresh state.
+        """
         dtype, dtype_numpy = DTYPES[cast(type[Value], self.datatype)]
         key = DataKey(dtype=dtype, shape=[], source=source, dtype_numpy=dtype_numpy)
         if self._units is not None:

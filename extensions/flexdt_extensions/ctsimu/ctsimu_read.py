@@ -627,7 +627,9 @@ def _fit_to_frames(values: FloatArray, count: int) -> FloatArray:
 
 
 def drifts_of(value: object) -> list[Any]:
-    """List the drifts of a parameter, also under its older name; empty without any."""
+    """List the drifts of a parameter ("drifts" or, in older documents, "drift"; one alone
+    as a list); empty without any.
+    """
     if isinstance(value, dict):
         found = value.get("drifts")
     else:

@@ -216,7 +216,9 @@ class _Watched(dict[str, Any]):
         return super().__getitem__(key)
 
     def unseen(self, where: str = "") -> Iterator[str]:
-        """Yield the paths of values that nobody has read, comments and empty ones left out."""
+        """Yield the paths of values that nobody has read, of nested ones too; comments
+        and empty ones are left out.
+        """
         for key, value in self.items():
             at = f"{where}.{key}".lstrip(".")
             if key not in self.seen and key not in _WORDS and _says_something(value):
@@ -422,7 +424,9 @@ class _ScanReader(ScenarioReader):
         )
 
     def _material(self, name: object, where: str) -> Substance | None:
-        """Return the substance of a material's id; None for vacuum."""
+        """Return the substance of a material's id; None for None (vacuum). Raises on an
+        unknown id, listing those known.
+        """
         if name is None:
             return None
         if not isinstance(name, str) or name not in self._substances:
@@ -696,7 +700,9 @@ class _ScanReader(ScenarioReader):
     # Values
 
     def _given(self, *path: str) -> Any:
-        """Return the value at a place; None where it or its object is missing or null."""
+        """Return the value at a place; None where it or its object is missing or null.
+        Raises if something on the way is not an object.
+        """
         found: Any = self._document
         for i, key in enumerate(path):
             if not isinstance(found, dict):
@@ -786,7 +792,11 @@ class _ScanReader(ScenarioReader):
         ]
 
     def _table(self, columns: int, *path: str) -> FloatArray | None:
-        """Read the numbers of the file named at a place, by growing first column."""
+        """Read the numbers, (n, columns), of the file named at a place; None without a
+        name.
+
+        Raises unless the first column grows.
+        """
         where = ".".join(path)
         name = self._text(self._given(*path), where)
         if name is None:
@@ -869,7 +879,9 @@ def _fractions(formula: str) -> Mapping[str, float]:
 
 
 def _line(energy_keV: float) -> Spectrum:
-    """Make photons of one energy, shared by the two bins about it."""
+    """Make the spectrum of one energy [keV]: one photon, shared linearly by the two bins
+    about it.
+    """
     bins = tables().energy_keV
     low = monochromatic(energy_keV)
     at = int(low.fluence.argmax())

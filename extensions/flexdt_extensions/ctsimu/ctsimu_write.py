@@ -284,7 +284,12 @@ class _Deviations:
         ]
 
     def of(self, parameters: str) -> list[dict[str, Any]]:
-        """List the deviations of a table of axes and parameters."""
+        """List the deviations of a table "axis parameter, ...": rotations [deg] or
+        translations [mm], by each parameter's unit.
+
+        A minus before the axis turns the sign. A parameter may give a known and an
+        unknown deviation.
+        """
         out = []
         for axis, name in (pair.split() for pair in parameters.split(", ")):
             turn = UNITS[name] == "deg"
@@ -298,7 +303,9 @@ class _Deviations:
 def _deviation(
     kind: str, axis: str, amount: dict[str, Any], known: bool, comment: str
 ) -> dict[str, Any]:
-    """Make a deviation for the scenario's document."""
+    """Make a deviation (rotation or translation about or along an axis) for the
+    scenario's document.
+    """
     return {
         "comment": comment,
         "type": kind,

@@ -123,7 +123,9 @@ class ScenarioImages:
 
     @cached_property
     def _beams(self) -> list[EffectiveBeam]:
-        """Effective beam of each spectrum, through all substances up to the thickest path."""
+        """Effective beam of each spectrum, with the detector's response, through all
+        substances, the surroundings included, up to the thickest path.
+        """
         substances = list(self._thickest)
         thick = list(self._thickest.values())
         if self.scan.environment is not None:
@@ -250,7 +252,10 @@ class ScenarioImages:
         return float(self._grey(self._open[0].max(keepdims=True)).max())
 
     def _grey(self, energy: Float32Array) -> Float32Array:
-        """Convert collected energy to grey values, by the scenario's range, table or line."""
+        """Convert collected energy [keV] to grey values: linearly to the range if it has
+        a maximum (that of the brightest open beam), else by the table over energy [J],
+        else by offset and factor.
+        """
         grey = self.scan.grey
         if grey.imax is not None:
             values = (

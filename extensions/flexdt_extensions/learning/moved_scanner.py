@@ -160,7 +160,11 @@ class Lab:
         return Taken(self.now - start, dose, collided=False)
 
     def seconds_to(self, targets: dict[str, float]) -> float:
-        """Compute the time of `take` without collisions [s]; nothing moves."""
+        """Compute the time of `take` [s], the slowest axis's move and the exposure;
+        collisions are not checked and nothing moves.
+
+        Rotations take the shorter way.
+        """
         ends = [self.now]
         for axis, target in targets.items():
             here = self.position(axis)

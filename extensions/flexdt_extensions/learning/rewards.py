@@ -124,7 +124,9 @@ class InformationTask:
         return np.array([0.5 * (_log_det(m) - _log_det(self._information)) for m in more])
 
     def info(self) -> dict[str, float]:
-        """Return information so far and the worst sigma in tolerances."""
+        """Return the information so far (half the growth of its log determinant) and the
+        worst sigma, in tolerances.
+        """
         start = _log_det(np.eye(len(SIX)) / PRIOR**2)
         return {
             "information": 0.5 * (_log_det(self._information) - start),
@@ -182,7 +184,9 @@ class QualityTask:
         self._start(blank(), Scene(()))
 
     def _start(self, truth: Volume, scene: Scene) -> None:
-        """Begin an episode with another object: no images, and a blank volume."""
+        """Begin an episode with another object: no images, a blank volume, quality 0 and
+        residual 1.
+        """
         self._truth = truth
         self._scene = scene
         self.volume = blank()

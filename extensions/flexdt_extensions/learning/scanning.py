@@ -133,7 +133,11 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draw a new hidden truth and return the scanner to SOD 600 mm without a frame."""
+        """Draw a new hidden truth and return the scanner to its start pose (SOD 600 mm)
+        without a frame; returns observation and info.
+
+        `options` is ignored.
+        """
         super().reset(seed=seed)
         self.lab = self.new_lab()
         self.task.reset(self.lab, self.np_random)
@@ -219,7 +223,11 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return out
 
     def action_for(self, targets: dict[str, float]) -> Action:
-        """Convert targets to an action; the inverse of `targets`."""
+        """Convert targets (angle [deg]) to an action; the inverse of `targets`.
+
+        "discrete": the nearest sector; else the angle in half turns, for "pose" with each
+        axis scaled to -1...1 over its range (its present place if not in `targets`).
+        """
         angle = (targets["rot_obj"] + 180.0) % 360.0 - 180.0
         if self.kind == "discrete":
             return np.int64(round(angle * SECTORS / 360.0) % SECTORS)

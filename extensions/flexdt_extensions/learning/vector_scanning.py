@@ -102,7 +102,7 @@ class TurnedLab(Lab):
     moves."""
 
     def __init__(self, table: Turntable) -> None:
-        """Begin at the angle and time of the table's scanner at rest."""
+        """Begin at the angle and time of the table's scanner at rest, with no dose."""
         still = table.still
         self.machine = still.machine
         self.scanner = still.scanner

@@ -477,7 +477,11 @@ def _exchange_beads(
 def _scores_beside(
     table: SeatTable, others: npt.NDArray[np.int64], criterion: Criterion
 ) -> FloatArray:
-    """Compute the criterion of `others` with each seat added, (m,)."""
+    """Compute the criterion of `others` (the k - 1 beads that stay) with each of the m
+    seats added, (m,).
+
+    Spots that touch in an image are left out.
+    """
     m = len(table.places)
     touch = table.touching(np.arange(m), others)  # (m, k-1, n)
     own = (table.visible & ~touch.any(axis=1)).astype(np.float64)

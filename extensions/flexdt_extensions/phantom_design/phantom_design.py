@@ -403,7 +403,9 @@ def _spiral(
 
 
 def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
-    """Build the mesh of the STL: bricks and beads, or the block with beads as cavities."""
+    """Build the mesh for the STL file: bricks and beads; without bricks the block with
+    beads as cavities.
+    """
     mesh = phantom.mesh()
     if body.bricks is not None:
         return mesh

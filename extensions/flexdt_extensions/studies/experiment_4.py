@@ -186,7 +186,9 @@ def authors_fit(
     pairs = bead_pairs(whole)
 
     def residual(x: FloatArray) -> FloatArray:
-        """Compute the residuals at the six values `x`, as the author's code has them."""
+        """Compute the residuals [px] at the six values `x`, stacked over the visible
+        pairs, as the author's code has them.
+        """
         moved = replace(
             poses,
             axis=poses.axis + from_unity(x[:3]) + _rotate(x[4], x[5], phi),

@@ -155,7 +155,9 @@ def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, O
 
 
 def placement_scenario(setting: str, frames: int) -> tuple[list[Poses], Offsets]:
-    """Make poses of each placement of experiment 6.6 for G = 1, 2 or 8, and the truth."""
+    """Make the poses of each placement of experiment 6.6 in a setting (1, 2 or 8
+    placements), and the true offsets.
+    """
     table = placements()
     poses, _ = scenario(table["scenario"], frames)
     out = []

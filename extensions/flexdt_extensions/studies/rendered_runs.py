@@ -123,7 +123,11 @@ class RenderedFrames:
         return list(self.looks)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut windows (n, k, side, side) of line integrals out of the images; see `Frames`."""
+        """Cut windows (n, k, side, side) of line integrals out of the images; see
+        `Frames`.
+
+        With a camera that counts, they are made from its counts, else they are noiseless.
+        """
         n, k = plan.corner.shape[:2]
         out = np.empty((n, k, plan.side, plan.side), dtype=np.float32)
         for i in range(n):
@@ -136,7 +140,9 @@ class RenderedFrames:
         return out
 
     def image(self, index: int) -> Float32Array:
-        """Compute the line integrals of one frame, (rows, cols)."""
+        """Compute the line integrals of one frame, (rows, cols); without counts zero
+        outside the part that was kept.
+        """
         kept = self.kept[index]
         (top, left) = self.corner[index]
         if self.camera.counts is not None:
@@ -146,7 +152,7 @@ class RenderedFrames:
         return full
 
     def take(self, frames: Sequence[int]) -> RenderedFrames:
-        """Return some of the frames, by number, as frames of their own."""
+        """Return some of the frames, by number and in this order, as frames of their own."""
         return RenderedFrames(
             tuple(self.kept[i] for i in frames),
             tuple(self.corner[i] for i in frames),

@@ -348,7 +348,9 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
 
 
 def _mean_figures(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
-    """Compute means of the other method's figures; empty without any."""
+    """Compute runs, successes and means of the other method's figures (not those of
+    `method`); empty without any.
+    """
     if not figures:
         return {}
     return {

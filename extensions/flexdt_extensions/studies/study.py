@@ -149,7 +149,9 @@ _Found = tuple[Offsets | None, int]
 
 
 def _algorithm_2_solver(lam: float) -> Callable[[_Draw], _Found]:
-    """Return a solver: Algorithm 2 with the damping `lam`."""
+    """Return a function that solves a draw by Algorithm 2 with the damping `lam`; its
+    result is offsets and iterations.
+    """
 
     def solve(draw: _Draw) -> _Found:
         """Solve a draw; returns offsets and iterations."""
@@ -163,7 +165,9 @@ def _algorithm_2_solver(lam: float) -> Callable[[_Draw], _Found]:
 
 
 def _solve_by_fit(draw: _Draw) -> _Found:
-    """Solve a draw by our fit, the beads' identities known; returns offsets and iterations."""
+    """Solve a draw by our fit, with the beads' identities known; returns offsets and
+    number of iterations.
+    """
     fit = estimate_geometry(
         draw.tracks,
         draw.model,
@@ -315,7 +319,11 @@ def _collect_runs(
 
 
 def run_task(task: WorkUnit) -> list[Run]:
-    """Run one task; a plain function, so that it can be sent to another process."""
+    """Run one task on points or, by its fidelity, on rendered images; a plain function,
+    so that it can be sent to another process.
+
+    The phantom is the shipped one for variant "printed", else the author's.
+    """
     if task.variant == "printed":
         phantom = load_phantom(task.phantom)
     else:

@@ -48,7 +48,9 @@ class Aligned(Generic[Images_co]):
 
     @property
     def verdict(self) -> str:
-        """What was found, with its standard deviations, or why nothing was."""
+        """Parameters that were found with value, standard deviation and unit, as text;
+        else why the axis column is not identifiable.
+        """
         told = [
             f"{name} {e.value:.6g} +- {e.sigma:.2g} {e.unit}"
             for name, e in self.alignment.parameters.items()

@@ -91,7 +91,9 @@ class Outcome(Generic[Images_co]):
         )
 
     def _repr_html_(self) -> str:
-        """Show the verdict, and the parameters with their standard deviations."""
+        """Make HTML of the verdict and a table of the asked parameters with value, sigma
+        and unit.
+        """
         heads = ("parameter", "value", "sigma", "unit")
         rows = (
             (name, *_digits(found["value"], found["sigma"]), found["unit"])

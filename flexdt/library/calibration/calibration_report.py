@@ -155,7 +155,9 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
 
 
 def _ellipses(c: Certificate) -> list[str]:
-    """Joint 95 % ellipses of the most correlated pairs."""
+    """Plot (SVG) the joint 95 % ellipses of the `ELLIPSES` most correlated pairs of
+    parameters, after a heading.
+    """
     names = list(c.estimates)
     pairs = [
         (abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)

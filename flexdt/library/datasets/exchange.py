@@ -211,7 +211,9 @@ def _with_doubts(geometry: ScanGeometry, path: Path) -> ScanGeometry:
 
 
 def _known(format: str, allowed: Iterable[str]) -> Format:
-    """Return the format of a name, or raise ExchangeError unless it is allowed."""
+    """Return the format of a name; raises ExchangeError that lists the allowed, unless
+    the name is one of them.
+    """
     names = [*allowed]
     if format not in names:
         raise ExchangeError(

@@ -118,7 +118,9 @@ def _read_rtk(path: Path, given: Given) -> ScanGeometry:
 
 
 def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
-    """Return ASTRA's vectors as text, or as an array for an .npy file."""
+    """Return ASTRA's vectors (n, 12) as text, or as the content of an .npy file if `out`
+    ends so; `out` is not written.
+    """
     import numpy as np
 
     from flexdt.twin.exchange.number_tables import vectors_text
@@ -131,7 +133,9 @@ def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_astra(path: Path, given: Given) -> ScanGeometry:
-    """Read ASTRA's vectors from text or an .npy file; the shape is that of `given`."""
+    """Read ASTRA's vectors from an .npy file or else from text; the panel's shape is that
+    of `given`.
+    """
     from flexdt.library.datasets.geometry_content import arrays_of, text_of
     from flexdt.twin.exchange.geometry import ScanGeometry
     from flexdt.twin.exchange.number_tables import read_vectors_array, read_vectors_text

@@ -37,7 +37,9 @@ class Given:
         return cls(dataset.shape, pitch, len(dataset))
 
     def check_pitch(self, geometry: ScanGeometry, path: Path) -> None:
-        """Raise ExchangeError if a file states another pitch."""
+        """Raise ExchangeError if a file's pixel pitch differs from the given one by over
+        0.1 %; nothing without a given pitch.
+        """
         pitch = geometry.pitch_mm
         if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
             found, asked = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))

@@ -74,7 +74,9 @@ class Arrays:
     integrals: Float32Array | None = None
 
     def of_views(self, chosen: npt.NDArray[np.int64]) -> Arrays:
-        """Select the arrays of some of the images."""
+        """Select the arrays of some of the images, by index; dark and flat images stay,
+        and arrays without counts are returned as they are.
+        """
         if self.counts is None:
             return self
         if self.integrals is None:
@@ -291,7 +293,7 @@ class ImageSet:
         return facts_table(f"DataSet {self.name}", facts) + picture
 
     def _reference_counts(self) -> tuple[int, int]:
-        """Count the dark and the flat images, of files or in memory."""
+        """Count the dark and the flat images, in memory if there, else in files."""
         kept: tuple[npt.NDArray[Any] | None, npt.NDArray[Any] | None] = (None, None)
         if self.arrays is not None:
             kept = (self.arrays.darks, self.arrays.flats)
@@ -716,7 +718,9 @@ def flats_of(data: ImageSet) -> npt.NDArray[Any]:
 
 
 def references(data: ImageSet) -> list[tuple[str, Counts]]:
-    """List dark and flat images with their names; means that are no integers are rounded."""
+    """List dark and flat images with their names; those in memory get names, and means
+    that are no integers are rounded.
+    """
     if data.arrays is None:
         return [(path.name, read_image(path)) for path in (*data.darks, *data.flats)]
     kinds = (("di", data.arrays.darks), ("io", data.arrays.flats))

@@ -33,7 +33,11 @@ BYTES_A_PIXEL: Final = 2
 
 
 def save_nxtomo(data: ImageSet, file: File) -> None:
-    """Write a data set to an NXtomo file; see `DataSet.to_nxtomo`."""
+    """Write a data set to an NXtomo file; see `DataSet.to_nxtomo`.
+
+    Raises DatasetFormatError if projections have several shapes, and an error without
+    h5py or room on the disk. A failure leaves no part of the file.
+    """
     h5py = package("h5py", "to_nxtomo")
     if any(frame.shape != data.shape for frame in data.frames):
         raise DatasetFormatError(

@@ -69,7 +69,9 @@ def coloured(
 
 
 def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Draw marks of the outermost pixels into the picture."""
+    """Widen marks of the outermost pixels into the picture, to a band of at least 2
+    pixels; returns a copy.
+    """
     wide = max(2, max(edge.shape) // BAND)
     out = edge.copy()
     out[:wide] |= edge[0]
@@ -80,7 +82,9 @@ def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def legend(marks: npt.NDArray[np.generic]) -> list[str]:
-    """List the meanings of the colours that occur in a picture."""
+    """List the meanings of the colours that occur in a picture of marks, most with their
+    share of the pixels.
+    """
     values = np.asarray(marks, dtype=np.uint8)
     lines = []
     for bit, _, name, what in MARKS:

@@ -54,7 +54,9 @@ def volume_widgets(
         pictures[name] = widgets.Image(format="png", width=WIDTH_PX)
 
     def draw(_: object = None) -> None:
-        """Draw all slices, each with lines at the two others."""
+        """Draw the three slices in the grey window, each with white lines at the two
+        others; the argument is ignored.
+        """
         black, white = chosen.value
         places = {name: slider.value for name, slider in sliders.items()}
         for name, axis, across in AXES:

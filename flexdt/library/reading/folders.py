@@ -322,7 +322,9 @@ def _foreign_file(content: Folder) -> Path | None:
 
 
 def _other_scan(content: Folder) -> str:
-    """Explain how to open a folder of another program's images."""
+    """Explain how to open a folder of another program's scan or TIFF images, as the end
+    of an error's sentence; "" if it holds neither.
+    """
     for form in SCAN_FORMATS:
         named = sorted(n for n in content.names if n.lower().endswith(form.endings))
         if named:
@@ -334,7 +336,9 @@ def _other_scan(content: Folder) -> str:
 
 
 def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
-    """List the doubts predicted about a scan's exposure that its images do not show already."""
+    """List the doubts predicted at submission about a scan's exposure; those of
+    saturation are left out if its images show it already (`seen`).
+    """
     saturated = any(SATURATED in one for one in seen)
     return [
         f"predicted at submission: {doubt}"

@@ -150,7 +150,9 @@ def _first_look(
 
 
 def nothing_in(blank: Sequence[str]) -> str:
-    """Explain that blank images make a scan incomplete; "" without blank images."""
+    """Explain that blank (all zero) images make a scan incomplete, naming the first and
+    last; "" without blank images.
+    """
     if not blank:
         return ""
     more = f" to {blank[-1]}" if len(blank) > 1 else ""

@@ -121,7 +121,9 @@ class StandingImages:
         return slice(max(first - MARGIN, 0), min(last + MARGIN, self.shape[0]))
 
     def part(self, rows: slice) -> tuple[ConeVec, tuple[int, int], Truncation | None]:
-        """Return geometry, (rows, cols) and truncation of some rows."""
+        """Return geometry, (rows, cols) and truncation of a range of detector rows; all
+        columns, rows counted from its first.
+        """
         shape = rows.stop - rows.start, self.shape[1]
         if shape == self.shape:
             return self.cone_vec, self.shape, self.truncation

@@ -175,7 +175,9 @@ class MiddleSlices:
         self._done = 0
 
     def take(self, slab: npt.NDArray[np.float32]) -> None:
-        """Take the next layers (k, ny, nx), from the lowest up."""
+        """Take the next layers (k, ny, nx), from the lowest up, and keep the parts of the
+        three middle slices.
+        """
         nz, ny, nx = self._shape
         layers = slice(self._done, self._done + len(slab))
         self._across_y[layers] = slab[:, ny // 2]

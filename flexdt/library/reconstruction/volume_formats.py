@@ -147,7 +147,9 @@ def _write_headed(
     """
 
     def write(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
-        """Write header and voxels; yields the function that takes the slabs."""
+        """Write header and voxels to a file, compressed by gzip if asked for; yields the
+        function that takes the slabs.
+        """
         first = header(places)
         with (
             gzip.open(part, "wb", compresslevel=1)

@@ -179,7 +179,9 @@ def of_intensity(image: Float32Array) -> Float32Array:
 
 
 def coarser(image: Float32Array, factor: int) -> Float32Array:
-    """Average factor x factor pixels; incomplete blocks at the far edges are dropped."""
+    """Average factor x factor pixels; incomplete blocks at the far edges are dropped.
+    Factor 1 returns the image itself, one larger than the image an empty array.
+    """
     if factor == 1:
         return image
     rows = image.shape[0] // factor

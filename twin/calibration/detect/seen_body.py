@@ -55,7 +55,9 @@ class SeenBody:
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def scene(self, described: Scene) -> Scene:
-        """Return the body's solids with the estimated place and attenuation."""
+        """Return the described body's solids, shifted [mm] and with attenuation scaled,
+        as estimated.
+        """
         return Scene(
             tuple(
                 Solid(

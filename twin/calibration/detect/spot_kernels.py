@@ -77,7 +77,9 @@ def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
 
 @linked
 def raised(value, power):  # type: ignore[no-untyped-def]
-    """Return value^power with its sign, for the powers of `weight_power`."""
+    """Return |value|^power with the value's sign, for power 2, 3 and 4; any other is
+    taken as 2.5, as in `weight_power`.
+    """
     size = abs(value)
     if power == 2.0:
         return value * size

@@ -406,7 +406,9 @@ def blur_kernel(blur: float) -> FloatArray:
 
 
 def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
-    """Blur the intensity of line integrals (n, k, side, side) by a standard deviation [px]."""
+    """Blur line integrals (n, k, side, side) as intensities, exp(-p), by a standard
+    deviation [px]; edges are repeated outwards. Returns line integrals.
+    """
     out = np.empty_like(line_integrals)
     side = line_integrals.shape[-1]
     kernel = blur_kernel(blur)

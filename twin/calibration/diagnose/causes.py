@@ -345,7 +345,9 @@ class Candidates:
                 return choice
 
     def odds(self) -> dict[str, float]:
-        """Compute the logarithm of the odds of each cause, from all choices judged."""
+        """Compute the logarithm of the odds of each cause, present to absent, summed over
+        all choices judged so far.
+        """
         out = {}
         for i, cause in enumerate(self.causes):
             sides: list[list[float]] = [[], []]

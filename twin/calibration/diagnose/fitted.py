@@ -218,7 +218,9 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
 
 
 def _other_size(ratio: float) -> Finding:
-    """Make the error on bead sizes; `ratio` is measured over predicted size."""
+    """Make the error that the shadows have another size than predicted; `ratio` is
+    measured over predicted size.
+    """
     return error(
         "bead_size",
         f"the shadows are {100 * abs(ratio - 1):.0f} % "
@@ -254,7 +256,9 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
 
 
 def judge_lag(lag: Lag) -> Finding:
-    """Make the finding that the camera shows part of the frame before."""
+    """Make the warning that the camera shows part of the frame before (detector lag),
+    with the part [%].
+    """
     return warning(
         "lag",
         f"the camera still shows {100 * lag.part:.2g} % of the frame "

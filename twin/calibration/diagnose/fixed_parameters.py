@@ -270,7 +270,9 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
 
 
 def _other_pixels(fit: FitResult, dD_z: float) -> str:
-    """Describe the pixels that would look like a panel `dD_z` [mm] further away."""
+    """Describe in words the pixel width [mm] that would look like a panel `dD_z` [mm]
+    further away.
+    """
     poses = fit.problem.poses
     pixel = float(np.median(np.linalg.norm(poses.u, axis=1)))
     sdd = float(np.median(poses.sdd))
@@ -304,7 +306,9 @@ def doubtful(
 
 
 def narrow_priors(judged: PriorsJudged) -> Finding:
-    """Make the finding that the priors are widened by the factor of `judged`."""
+    """Make the warning that all priors are widened by the factor of `judged`, with the
+    causes that alone would explain it.
+    """
     if judged.causes:
         cause = f"; {' or '.join(judged.causes)} alone would explain it"
     else:

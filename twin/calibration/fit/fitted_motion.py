@@ -435,7 +435,9 @@ class _Mixed:
         )
 
     def likelihood(self, choice: _Choice) -> float:
-        """Compute the logarithm of the restricted likelihood, up to a constant."""
+        """Compute the logarithm of the restricted likelihood of a choice of motions, up
+        to a constant; the noise is eliminated.
+        """
         part = self._eliminated(choice)
         lower = linalg.cholesky(part.left, lower=True, check_finite=False)
         found = linalg.solve_triangular(lower, part.push, lower=True)

@@ -302,7 +302,9 @@ class FitProblem:
 
     @property
     def start(self) -> FloatArray:
-        """Values of the columns at the start."""
+        """Values of the columns at the start: the base's for free parameters, the model's
+        for free beads, else zero.
+        """
         x = np.zeros(len(self.layout.names))
         free = self.layout.colmap >= 0
         x[self.layout.colmap[free]] = self.base[

@@ -111,7 +111,9 @@ class OppositeColumn(NamedTuple):
 
     @property
     def warning(self) -> str | None:
-        """Warning that the two disagree; None where they agree."""
+        """Warning that opposite rays and the mean image find different axis columns,
+        beyond their uncertainty; None where they agree.
+        """
         sigma = math.hypot(self.mean_sigma_px, self.sigma_px)
         if not abs(self.apart_px) > max(APART_SIGMAS * sigma, LEAST_APART_PX):
             return None
@@ -297,7 +299,10 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
 
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
-    """Make the width of a gap the last parameter, where the plane determines it."""
+    """Make the width of the gap between two panel tiles the last parameter, with its
+    prior; fixed if the gap lies beside the axis, where the plane does not determine
+    it.
+    """
     if gap.beside_axis:
         return replace(first, preface=f"{gap.text}; ")
     return replace(

@@ -173,7 +173,9 @@ def read_turn(
 
 
 def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
-    """Divide rows about the plane of the source into groups, (top, end) each."""
+    """Divide the rows about `middle`, where the plane of the source meets the panel, into
+    at most `GROUPS` groups, (top, end) each.
+    """
     half = max(BAND, cols // BAND_PART)
     centre = min(
         max(round(middle), min(half, rows // 2)), rows - 1 - min(half, (rows - 1) // 2)
@@ -250,7 +252,11 @@ def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
 
 
 def _thumb(image: Float32Array) -> Float32Array:
-    """Average over square blocks; incomplete blocks at the ends are left out."""
+    """Average over square blocks, to about `THUMB_COLUMNS` columns; incomplete blocks at
+    the ends are left out.
+
+    Raises NotIdentifiableError if the image has fewer than two blocks a side.
+    """
     factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
     if min(image.shape) < 2 * factor:
         raise NotIdentifiableError.instead(

@@ -340,7 +340,9 @@ def locate(vertices, g, inverse, p, pixels):
 
 @maker
 def make_band(vertices, cols):
-    """Create a worker's arrays: sums, vertices, pixels, edge forms, flips, plane."""
+    """Create a worker's arrays, not initialised: sums, vertices (twice), edge forms,
+    flips, plane.
+    """
     return (
         np.empty((MESH_BAND, cols)),
         np.empty((vertices, 3)),

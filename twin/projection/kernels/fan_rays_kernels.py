@@ -370,7 +370,7 @@ def start(grid, fan, rays, work, n):
 
 @maker
 def make_found(room):
-    """Create arrays for fans of up to `room` pixels."""
+    """Create arrays, not initialised, for fans of up to `room` pixels."""
     return Found(
         row=np.empty(room),
         column=np.empty(room),
@@ -406,7 +406,9 @@ def make_rays(room):
 
 @maker
 def make_work(slabs, levels):
-    """Create a worker's arrays for a box of up to `slabs` slabs and `levels` levels."""
+    """Create a worker's arrays for a box of up to `slabs` slabs and `levels` levels; sums
+    are zero, the others not initialised.
+    """
     f32 = np.float32
     return Work(
         head=np.empty(slabs + 2, np.uint32),

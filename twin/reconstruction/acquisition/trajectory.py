@@ -78,7 +78,9 @@ class Circle:
         return not len(self.gaps)
 
     def from_gap(self, angle: FloatArray) -> FloatArray:
-        """Compute angles to the nearest gap, zero within it, infinite without gaps [rad]."""
+        """Compute angles [rad] to the nearest edge of an arc without views ("gap"): zero
+        within it, infinite on a full circle.
+        """
         if self.full:
             return np.full_like(angle, np.inf)
         first, last = self.gaps.T

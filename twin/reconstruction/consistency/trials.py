@@ -237,7 +237,11 @@ class Trial:
 
 
 def _lowest(known: dict[float, float]) -> float:
-    """Find the vertex of a parabola through the squares of the three lowest scores."""
+    """Find the place of the lowest score: vertex of a parabola through the squares of the
+    three lowest, within their range.
+
+    The lowest of them if a score is not finite or the parabola opens downwards.
+    """
     places = sorted(known, key=known.__getitem__)[:3]
     squares = np.square([known[place] for place in places])
     if not np.isfinite(squares).all():

@@ -69,7 +69,7 @@ class Views:
         return replace(self.without_images(which), images=self.images[which])
 
     def without_images(self, which: slice | npt.NDArray[np.intp]) -> Views:
-        """Select some of these views, with the images of all."""
+        """Select the tables of some of these views; images still hold all views."""
         return replace(
             self,
             beyond=self.beyond.of(which),

@@ -25,7 +25,9 @@ class ImageUpload:
     """
 
     def __init__(self, stream: Any) -> None:
-        """Begin uploads for kernels that run in `stream`."""
+        """Begin uploads for kernels that run in `stream`: a stream of its own and two
+        buffers in turn, allocated at their first use.
+        """
         from numba import cuda
 
         self._reader = stream

@@ -62,7 +62,9 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
 
 
 def pieces_of(part: Component) -> list[PaintedMesh]:
-    """Build the part's painted meshes, in its own frame [mm]."""
+    """Build the part's painted meshes, in its own frame [mm]: the convex hull of its
+    points if it has any, else the look of its name, role or shape.
+    """
     if part.points_mm:
         return [
             PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), ALUMINIUM)
