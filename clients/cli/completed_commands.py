@@ -89,7 +89,9 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 
 
 def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:
-    """Return the parameter with the allowed words of its option as its type."""
+    """Return the parameter with the allowed words of its option (and None, if that is its
+    default) as its type; unchanged if its option has no such list.
+    """
     among = getattr(parameter.default, "among", None)
     if among is None:
         return parameter

@@ -97,7 +97,9 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
 
 
 def say(text: str = "", end: str = "\n") -> None:
-    """Print a line of the result to standard output."""
+    """Print text (and `end`) to standard output at once; a closed pipe silences all later
+    output.
+    """
     _end_silence()
     try:
         print(text, end=end, flush=True)
@@ -106,7 +108,9 @@ def say(text: str = "", end: str = "\n") -> None:
 
 
 def note(text: str) -> None:
-    """Write a line of progress or a warning to standard error."""
+    """Write a line of progress or a warning to standard error at once; a closed pipe
+    silences all later lines.
+    """
     _end_silence()
     try:
         print(text, file=sys.stderr, flush=True)

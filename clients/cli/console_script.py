@@ -168,7 +168,9 @@ def _family() -> list[str]:
 
 
 def _entries(folder: str) -> list[str]:
-    """List the paths in a folder; none of a process that has ended."""
+    """List the paths in a folder; empty if it is missing, as of a process that has ended,
+    except for /proc itself (raises).
+    """
     try:
         return [f"{folder}/{name}" for name in os.listdir(folder)]
     except FileNotFoundError:
@@ -178,7 +180,7 @@ def _entries(folder: str) -> list[str]:
 
 
 def _text(file: str) -> str:
-    """Read a small file; nothing of a process that has ended."""
+    """Read a small text file; "" if it is missing or its process has ended."""
     try:
         with open(file, encoding="ascii", errors="replace") as opened:
             return opened.read()

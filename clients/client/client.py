@@ -181,7 +181,7 @@ class Core:
                 )
 
     async def close(self) -> None:
-        """End all subscriptions and the connection; it is not opened again."""
+        """End all subscriptions and disconnect; the connection is never opened again."""
         self.closed = True
         listeners = list(self._listeners)
         self._listeners.clear()
@@ -440,7 +440,9 @@ class AsyncTwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        """Prepare a client; nothing is sent before `connect`. Arguments: see the class."""
+        """Prepare a client for `transport`, or for TCP to host and port if None; nothing
+        is sent before `connect`. Arguments: see the class.
+        """
         link: Transport
         if transport is None:
             link = TcpTransport(host, port, ssl=ssl)

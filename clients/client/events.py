@@ -248,7 +248,9 @@ class AsyncSubscription:
                 await self._cancel(self)
 
     def put(self, params: Mapping[str, object]) -> None:
-        """Append an event; the oldest one is dropped, and counted, where too many wait."""
+        """Append an event and wake who waits for it; if the queue is full, the oldest
+        event is dropped and counted.
+        """
         if len(self._events) >= self._max_queue:
             self._events.popleft()
             self.dropped += 1

@@ -208,7 +208,9 @@ class TcpTransport:
         return messages
 
     def close(self) -> None:
-        """Close the connection, if there is one."""
+        """Close the connection, if there is one; does nothing if its event loop has
+        ended.
+        """
         streams = self._streams
         self._streams = None
         if streams is not None:
@@ -321,7 +323,9 @@ class Link:
             self._on_end()
 
     def _take(self, message: Message) -> None:
-        """Give a message's answers to those who wait for them, and its events to `on_event`."""
+        """Give a message's answers to the requests that wait for them (cancelled ones are
+        skipped), and its events to `on_event`; the rest is ignored.
+        """
         for item in self.calls.receive(message):
             match item:
                 case Answered(waiter) if not waiter.done():

@@ -120,7 +120,9 @@ class FollowSession:
         return time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
-        """Write a message to the recording, if there is one."""
+        """Write a message with its time since midnight and its delay [s] to the
+        recording, and flush it; nothing without a recording.
+        """
         if self.record is not None:
             self.record.write(
                 format_recorded(Recorded(at - self._midnight, late_s, data))
@@ -128,7 +130,7 @@ class FollowSession:
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
-        """Replace the mirror, and report the alarms that are new in it."""
+        """Replace the mirror, report each alarm that is new in it, and call `changed`."""
         new = mirror.raised - self.mirror.raised
         self.mirror = mirror
         for alarm in mirror.alarms[len(mirror.alarms) - new :] if new else ():

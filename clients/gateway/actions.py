@@ -69,7 +69,9 @@ async def remember(
 async def write_settings(
     twin: ConnectedTwin, command: c.WriteSettingsFile, progress: CommandProgress
 ) -> str:
-    """Write the present motor positions into the settings texts."""
+    """Write the present motor positions into the recording's settings texts; returns "".
+    Raises Refusal if that fails.
+    """
     try:
         twin.record().write_settings(await twin.state())
     except DatasetError as error:
@@ -457,7 +459,9 @@ async def _run(
 
 
 def _name_taken(refusal: Refusal) -> bool:
-    """Check whether the twin refused a job because its name is in use."""
+    """Check whether the twin refused a job because its name is in use: a problem of the
+    refusal is at "name".
+    """
     data = getattr(refusal.__cause__, "data", None)
     if isinstance(data, Mapping):
         problems = data.get("problems")

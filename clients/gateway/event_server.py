@@ -209,7 +209,9 @@ class Gateway:
     async def _run_guarded(
         self, work: Coroutine[Any, Any, None], event: AcquilaEvent
     ) -> None:
-        """Await the work of a command; log an error, and answer with ERR."""
+        """Await the work of a command; an exception is logged and answered with ERR, not
+        raised.
+        """
         try:
             await work
         except Exception:
@@ -415,7 +417,9 @@ class Gateway:
         raise AssertionError("unreachable")
 
     def _socket(self, kind: int) -> zmq.asyncio.Socket:
-        """Make a socket of a ZeroMQ kind, with our time limits."""
+        """Make a socket of a ZeroMQ kind, with our handshake time limit and backlog, and
+        IPv6 if the host has one.
+        """
         made = self._context.socket(kind)
         made.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         made.setsockopt(zmq.BACKLOG, BACKLOG)

@@ -166,7 +166,9 @@ class Recording:
                 self._write_texts()
 
     def close(self) -> None:
-        """Close the folder; nothing is saved into it any more."""
+        """Close the folder, once a saving in progress has ended; nothing is saved into it
+        any more.
+        """
         with self._turn:
             self._closed = True
             if self._folder is not None:

@@ -139,7 +139,9 @@ class Servers:
         return process.returncode
 
     def log_tail(self, lines: int = 5) -> Sequence[str]:
-        """Read the last lines of the processes' standard error."""
+        """Read the last lines of the processes' standard error; empty if the log cannot
+        be read.
+        """
         try:
             text = self._log_path.read_text(encoding="utf-8", errors="replace")
         except OSError:
@@ -290,7 +292,9 @@ class LocalTwin:
             raise ServersError(f"data: {error.filename}: {error.strerror}") from None
 
     def stop(self) -> None:
-        """End the client and the servers, and delete a temporary data folder."""
+        """End the client and the servers, and delete a temporary data folder; does
+        nothing if they do not run.
+        """
         running = self._running
         self._running = None
         if running is not None:

@@ -55,7 +55,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     for_twin = [x for x in options.limit if x not in for_viewer]
 
     def projector(known: Addresses) -> Sequence[str]:
-        """Return module and options of the projector."""
+        """Return module and command-line options of the projector, on this machine's
+        loopback address.
+        """
         given = {
             "host": LOOPBACK,
             "port": port_of("projector", options.projector_port, known),

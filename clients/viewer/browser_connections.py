@@ -45,7 +45,9 @@ class BrowserConnection(ServerConnection):
     """A connection that is cut where a newer one needs its room, or where all hold too much."""
 
     def __init__(self, admission: Admission, *given: Any, **more: Any) -> None:
-        """Prepare a connection that counts against the limits of `admission`."""
+        """Prepare a connection that counts against the limits of `admission`; nothing is
+        held yet.
+        """
         super().__init__(*given, **more)
         self._admission = admission
         self._held = 0
@@ -53,7 +55,9 @@ class BrowserConnection(ServerConnection):
         self.address = ""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Put the new connection among those that have sent no request."""
+        """Count the new connection among those that have sent no request, and note its
+        network address.
+        """
         super().connection_made(transport)
         peer = transport.get_extra_info("peername") or ("?", 0)
         self.address = neighbourhood(str(peer[0]))
@@ -74,7 +78,9 @@ class BrowserConnection(ServerConnection):
         self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes, unless it and all together hold too many."""
+        """Take received bytes; aborts the connection if all connections together hold
+        more than `MAX_HELD` and this one more than `FAIR_BYTES`.
+        """
         self._hold(self._held + len(data))
         if self._admission.held > MAX_HELD and self._held > FAIR_BYTES:
             self.transport.abort()

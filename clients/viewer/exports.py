@@ -178,7 +178,7 @@ def beside(state: State | None, image: ShownImage | None) -> str:
 
 
 def at_positions(state: State, positions: dict[str, float]) -> State:
-    """Copy the state with its motors elsewhere and X-rays on."""
+    """Copy the state with its motors at `positions` (others stay) and X-rays on."""
     axes = {
         name: axis.model_copy(update={"position": positions.get(name, axis.position)})
         for name, axis in state.axes.items()
@@ -188,7 +188,9 @@ def at_positions(state: State, positions: dict[str, float]) -> State:
 
 
 def standpoint(client: viser.ClientHandle) -> Standpoint:
-    """Return the present camera of a client."""
+    """Return the present camera of a client: position, the point it looks at, up
+    direction, and field of view [rad].
+    """
     c = client.camera
     position, look_at, up = (
         (float(v[0]), float(v[1]), float(v[2]))

@@ -82,7 +82,9 @@ class ImageFeed:
             ]
 
     def stop(self) -> asyncio.Future[Any]:
-        """Listen no longer, from now on; done once the connection has ended."""
+        """Cancel the feed's tasks at once; the returned future is done once they have
+        ended.
+        """
         tasks = self._tasks
         self._tasks = []
         for task in tasks:

@@ -433,7 +433,7 @@ def _same(given: str | None, wanted: str) -> bool:
 
 
 def _cookie(request: Request) -> str | None:
-    """Return the value of our cookie; None without."""
+    """Return the value of our cookie in a request; None without it."""
     for header in request.headers.get_all("Cookie"):
         for part in header.split(";"):
             name, _, value = part.strip().partition("=")

@@ -208,7 +208,9 @@ class Page:
             await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:
-        """Send what waits for the page, whenever there is something, until it closes."""
+        """Send what waits for the page, in order of its slots, whenever there is
+        something; returns when the connection closes.
+        """
         with contextlib.suppress(ConnectionClosed):
             while True:
                 await self._due.wait()
@@ -233,7 +235,9 @@ class Page:
         return (b"\0" if self._image else b"\1") + part
 
     def _may_send(self, slot: str) -> bool:
-        """Check that there is room for one more message on the way, and count it."""
+        """Check that fewer messages of a slot are on the way than allowed, and if so
+        count one more; slots without a limit may always send.
+        """
         if (sent := self._sent_at.get(slot)) is None:
             return True
         if len(sent) >= ON_THE_WAY[slot]:
@@ -325,7 +329,7 @@ class Page:
             raise
 
     def _fail(self, id: object, error: RpcError) -> None:
-        """Answer a request with an error."""
+        """Answer the request `id` with an error's code, message and data without bytes."""
         data = without_bytes(error.data)
         self.say(
             "answer",

@@ -112,7 +112,7 @@ class SceneClients:
             self._shown[id] = built, nodes
 
     def page_of(self, client_id: int | None) -> str | None:
-        """Return the page that a client belongs to."""
+        """Return the page that a client belongs to; None for an unknown client or None."""
         with self._lock:
             if client_id is None:
                 who = None
@@ -201,7 +201,9 @@ class SceneClients:
         aim(client, camera)
 
     def _untouched(self, client: viser.ClientHandle) -> bool:
-        """Check that a client's camera is still where it was put."""
+        """Check that a client's camera is still where it was put, within a share of its
+        distance; False if it never was.
+        """
         put = self._sent.get(client.client_id)
         if put is None:
             return False
@@ -241,7 +243,9 @@ class SceneClients:
 
 
 def _now(client: viser.ClientHandle) -> Standpoint:
-    """Return the present camera of a client."""
+    """Return the present camera of a client: position, the point it looks at, up
+    direction, and field of view [rad].
+    """
     c = client.camera
     position, look_at, up = (
         (float(v[0]), float(v[1]), float(v[2]))
@@ -251,7 +255,9 @@ def _now(client: viser.ClientHandle) -> Standpoint:
 
 
 def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
-    """Set place, direction and field of view of a client's camera in one message."""
+    """Set up direction, place, target and field of view [rad] of a client's camera in one
+    message.
+    """
     with client.atomic():
         client.camera.up_direction = camera.up
         client.camera.position = camera.position

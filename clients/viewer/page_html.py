@@ -44,7 +44,7 @@ def token_form(wrong: bool) -> bytes:
 
 
 def boxes(layers: tuple[Layer, ...]) -> str:
-    """Make a labelled checkbox for each layer, a line each."""
+    """Make (HTML) a labelled checkbox for each layer, a line each, named "layer-NAME"."""
     return "\n        ".join(
         f'<div><label><input type="checkbox" id="layer-{layer.name}" data-layer="{layer.name}">'
         f"{html.escape(layer.title)}</label></div>"

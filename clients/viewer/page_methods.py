@@ -247,7 +247,9 @@ class Export(Params):
 
 
 async def layers(viewer: Viewer, page: Page, params: Params) -> object:
-    """Show or hide layers on this page."""
+    """Show or hide the layers named in `params` on this page alone, and report them to
+    it; returns {}.
+    """
     page.shown = page.shown.changed(**params.model_dump())
     if viewer.lab is not None and viewer.state is not None and "ranges" in page.shown:
         viewer.lab.draw_ranges(viewer.state)
@@ -614,7 +616,9 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
 
 
 async def datasets(viewer: Viewer, page: Page, params: Datasets) -> object:
-    """List data sets, newest first, with thumbnails."""
+    """List data sets, newest first, from `start` on and matching `search`, with
+    thumbnails in base64; the twin's answer.
+    """
     asked = {"search": params.search, "start": params.start, "thumbnail": 96}
     told: Any = await page.link.request("dataset.list", asked)
     for info in told["datasets"]:
@@ -764,7 +768,9 @@ def _data(viewer: Viewer) -> Path:
 
 
 def _offer(viewer: Viewer, name: str, content: bytes) -> dict[str, object]:
-    """Keep a file for download, the oldest of many dropped; returns its url, name and bytes."""
+    """Keep a file in memory for download, at most 16 of them (the oldest is dropped);
+    returns its url, name and bytes.
+    """
     key = secrets.token_hex(16)
     while len(viewer.downloads) >= 16:
         del viewer.downloads[next(iter(viewer.downloads))]

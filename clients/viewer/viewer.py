@@ -241,7 +241,10 @@ class Viewer:
             page.say(topic, data=without_bytes(data))
 
     def _state_came(self, data: Mapping[str, Any]) -> None:
-        """Keep a state of the twin, and wake the task that draws it; a new twin begins anew."""
+        """Keep a state of the twin, and wake the task that draws it.
+
+        A time earlier than the last one means another twin: it is then reported anew.
+        """
         if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
             self._told = -1
         self._twin_time = float(data["time"])
@@ -443,7 +446,9 @@ class Viewer:
         return self.lab
 
     async def _dress(self, lab: LabScene, state: State) -> None:
-        """Show the sample's shape, and begin to fetch one that is missing."""
+        """Show the look of the sample on the stage, and begin to fetch its shape if that
+        is missing.
+        """
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.wear(self.look)
         self._built = self.scenes.said

@@ -167,7 +167,9 @@ def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
 
 
 def _changes(nodes: Nodes) -> Iterator[Message]:
-    """Yield viser's messages that set the nodes' properties."""
+    """Yield viser's messages that set the nodes' properties: visibility apart, the others
+    together.
+    """
     for name, properties in nodes.items():
         if (rest := dict(properties)).pop("visible", None) is not None:
             yield SetSceneNodeVisibilityMessage(name, properties["visible"])

@@ -26,7 +26,7 @@ def watched(
     """
 
     async def run() -> None:
-        """Await the work; log an error and call `died`."""
+        """Await the work; an exception is logged and `died` called, not raised."""
         try:
             await work
         except Exception:

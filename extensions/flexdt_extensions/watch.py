@@ -147,7 +147,9 @@ def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _machine_priors(client: TwinClient) -> dict[str, float]:
-    """Return the priors of the twin's machine; the general ones if it does not ship."""
+    """Return the prior widths of the twin's machine with its default profile; the general
+    ones if this package lacks it.
+    """
     try:
         machine = builtin_machine(client.server.machine)
     except UnknownNameError:

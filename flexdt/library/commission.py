@@ -255,7 +255,9 @@ def commission(
 
 
 def _machine_errors(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
-    """Yield the error of `flexdt machine check` for the machine's file, if there is one."""
+    """Yield the error that `flexdt machine check` would raise on the machine (it cannot
+    stand at home), if there is one.
+    """
     try:
         check_home(machine, profile, MACHINE_FILE)
     except TwinError as error:

@@ -287,7 +287,7 @@ class DataSet(ImageSet):
 
 
 def _names(materials: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return the names of several materials, or of one."""
+    """Return the names of several materials, or of one, as a tuple; None for None."""
     if materials is None:
         return None
     if isinstance(materials, str):

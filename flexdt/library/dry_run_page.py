@@ -94,7 +94,9 @@ def printable(text: str) -> str:
 
 
 def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
-    """Make the section on a script's problems, as HTML parts; empty without any."""
+    """Make HTML parts on a script's problems: heading and table of line, severity, code
+    and message; empty without any.
+    """
     if not problems:
         return []
     head = ("line", "severity", "code", "what")

@@ -225,7 +225,7 @@ def image_under(
 
 
 def axes_of(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
-    """Add axes that fill a figure, with a title and labels."""
+    """Add axes to a figure, with a title and labels."""
     axes = figure.add_subplot()
     axes.set_title(title, size=10, weight="bold", loc="left")
     axes.set_xlabel(x_label, size=9)

@@ -250,7 +250,11 @@ def load(
     shape: Shape2 | None,
     pixel: float | Sequence[float] | None,
 ) -> ConeVec:
-    """Read a geometry from a file; see `ConeVec.load`."""
+    """Read a geometry from a file; see `ConeVec.load`.
+
+    Without `format`, by the file's ending; flexdt's own ending is JSON. `shape` and
+    `pixel` [mm] are for formats that lack them.
+    """
     path = Path(file)
     pitch = None if pixel is None else _pair(pixel)
     if format is None and path.suffix.lower() == OWN_ENDING:

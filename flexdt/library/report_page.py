@@ -125,7 +125,9 @@ def table(
 def _row(
     tag: str, cells: Sequence[object], sides: Sequence[str], kind: str = ""
 ) -> Markup:
-    """Make a table row of cells with the tag `td` or `th`, each with the class of its side."""
+    """Make an HTML table row of cells with the tag `td` or `th`, each with the class of
+    its side; `kind` is the row's class.
+    """
     made = (
         _element(tag, cell_text(c), kind=side)
         for c, side in zip(cells, sides, strict=True)
@@ -156,7 +158,9 @@ def cell_text(value: object) -> str:
 
 
 def _element(tag: str, *content: str, kind: str = "") -> Markup:
-    """Make an element with its class; content that is no `Markup` is escaped."""
+    """Make an HTML element with its class (none if ""); content that is no `Markup` is
+    escaped.
+    """
     inner = "".join(
         part if isinstance(part, Markup) else html.escape(part) for part in content
     )

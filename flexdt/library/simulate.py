@@ -113,7 +113,9 @@ class Truth:
         )
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
-        """Select the geometry and scatter of some of the views."""
+        """Select the geometry and, if there is any, scatter of some of the views, by
+        index.
+        """
         if self.scatter is None:
             scatter = None
         else:
@@ -422,7 +424,9 @@ def _check_sampling(noise: int | None, rays: int, spot_points: int) -> None:
 
 
 def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
-    """Return the attenuation of a sample's voxels; None without voxels."""
+    """Return the attenuation of a sample's voxels; None for solids and for voxels with
+    material labels.
+    """
     if isinstance(body, Volume):
         return body.data
     voxels = body.voxels

@@ -269,7 +269,9 @@ def parse_formula(formula: str) -> dict[str, float]:
 
 
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
-    """Compute the mass fractions of a compound from its numbers of atoms."""
+    """Compute the mass fractions of a compound's elements, by symbol, from its numbers of
+    atoms.
+    """
     masses = {
         symbol: n * float(tables().molar_mass[_row(symbol)])
         for symbol, n in atoms.items()

@@ -120,7 +120,9 @@ def _rolled(plan: Windows, step: int) -> Windows:
 def _near(
     corner: npt.NDArray[np.int64], plan: Windows, some: slice
 ) -> npt.NDArray[np.bool_]:
-    """Mark pixels of windows (n, k, side, side) that are near a bead of that frame."""
+    """Mark pixels of windows (n, k, side, side) within reach of any bead predicted in
+    that frame; n are the frames of `some`.
+    """
     reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
     out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
     for bead in range(reach.shape[1]):

@@ -109,7 +109,9 @@ class ArrayFrames:
         return len(self.images)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame, as `Frames` declares."""
+        """Detect the beads of every frame, as `Frames` declares; a frame that is None is
+        MISSING.
+        """
         return [
             FrameSpots(nothing(self.shape), FrameState.MISSING)
             if image is None
@@ -118,7 +120,9 @@ class ArrayFrames:
         ]
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows of every frame, as `Frames` declares."""
+        """Cut the windows (n, k, side, side) of every frame, as `Frames` declares; nan
+        for a frame that is None.
+        """
         n, k = plan.corner.shape[:2]
         out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
         for i, image in enumerate(self.images):

@@ -510,7 +510,9 @@ def _with_tracks(
 
 
 def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
-    """Keep hypotheses that ended at different angles, best first."""
+    """Keep hypotheses of finite loss that ended over 3 deg from every better one;
+    `hypotheses` are best first.
+    """
     out: list[_Hypothesis] = []
     for h in hypotheses:
         if math.isfinite(h.loss) and all(

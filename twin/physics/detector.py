@@ -380,7 +380,9 @@ def _is_low(camera: CameraSettings) -> bool:
 
 
 def detector_of(spec: DetectorSpec) -> Detector:
-    """Make the detector of a machine: its own pixels and depth, the default's other figures."""
+    """Make the detector model of a machine: pixels, bits, lag and response as in its
+    file, other figures by default.
+    """
     return Detector(
         pixels=spec.pixels,
         bits=spec.bits,

@@ -101,7 +101,9 @@ class TubeModel:
 
 
 def tube_of(spec: TubeSpec) -> TubeModel:
-    """Convert the tube of a machine file: its filters and spot."""
+    """Convert the tube of a machine file: its filters, focal spot and number of spot
+    points.
+    """
     return TubeModel(
         tuple(Filter(Substance.called(f.material), f.thickness_mm) for f in spec.filters),
         spec.spot_mm_per_W,

@@ -217,7 +217,9 @@ def _decimal(
 
 
 def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str, ...]:
-    """Names of which only a few have their text, among many that share one."""
+    """Return the few names whose text (without numbers) differs from that which most
+    share; empty unless at least four share one and the others are rare.
+    """
     texts = Counter(_text(keys[name]) for name in names)
     usual, most = texts.most_common(1)[0] if texts else ("", 0)
     few = [name for name in names if _text(keys[name]) != usual]
@@ -227,7 +229,9 @@ def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str,
 
 
 def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
-    """Yield a finding on the first two names with equal numbers, e.g. `7.tif` and `007.tif`."""
+    """Yield at most one finding: on the first two names with equal numbers, e.g. `7.tif`
+    and `007.tif`; nothing for names without numbers.
+    """
     seen: dict[Key, str] = {}
     for name in names:
         key = keys[name]

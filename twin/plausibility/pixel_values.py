@@ -79,7 +79,9 @@ _FROM_COUNTS: Final = (
 
 
 def _beam(images: npt.NDArray[Any]) -> float | None:
-    """Return the value at the images' left and right edges if both are alike, else None."""
+    """Return the mean of the median values at the images' left and right edges if both
+    differ by at most 10 %, else None.
+    """
     wide = max(1, int(EDGE_PART * images.shape[2]))
     edges = images[:, :, :wide], images[:, :, -wide:]
     left, right = (float(np.median(edge)) for edge in edges)

@@ -61,7 +61,7 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_voxels(cls, volume: Volume) -> DeviceArray:
-        """Copy the voxels of a volume from the host."""
+        """Copy a volume's voxels, on its grid, to the device; raises if the device fails."""
         layout = blank_layout(volume)
         layout_data(layout)[...] = volume.data
         layout = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
@@ -210,7 +210,9 @@ def _fold(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
     """
 
     def launch() -> FloatArray:
-        """Launch the kernel and copy its parts to the host."""
+        """Launch the kernel that folds `a` and `b`, and copy its partial results
+        (float64) to the host.
+        """
         from numba import cuda
 
         from flexdt.twin.projection.kernels import gpu_kernels as kernels

@@ -406,7 +406,7 @@ def box_of(layout: Layout) -> Box:
 
 
 def layout_data(layout: Layout) -> Float32Array:
-    """View the voxels of a layout as (nz, ny, nx)."""
+    """View the voxels of a layout's box as (nz, ny, nx), without a copy."""
     nx, ny, nz = layout.counts
     size = layout.flat.itemsize
     return np.lib.stride_tricks.as_strided(
@@ -438,7 +438,9 @@ def check_projections(projections: npt.ArrayLike, n: int) -> Any:
 
 
 def require_line_integrals(projections: Any) -> None:
-    """Raise GeometryError for a detector's counts, which are unsigned integers."""
+    """Raise GeometryError for unsigned integers, which are a detector's counts; anything
+    else passes.
+    """
     kind = getattr(projections, "dtype", None)
     if kind is not None and kind.kind == "u":
         said = f"projections are {kind}, as a detector's counts are"

@@ -229,7 +229,9 @@ class CoarseScan:
 
     @cached_property
     def more(self) -> int:
-        """Layers of the object above and below the grid, as far as views see."""
+        """Layers of the object above and below the grid, as far as views see; 0 for one
+        row, and if the images' first and last row are nearly empty.
+        """
         count = self.images.shape[1]
         ends = float(np.abs(self.images[:, [0, -1]]).mean())
         if count == 1 or ends <= ACCURACY * float(np.abs(self.images).mean()):

@@ -245,7 +245,9 @@ class DeviceProblem(LinearSystem):
 
     @classmethod
     def of_host(cls, problem: LinearSystem) -> DeviceProblem:
-        """Copy a system to the device; line integrals that are there stay."""
+        """Copy a system to the device; line integrals that are there stay, and the result
+        then stays there too.
+        """
         there: Any = DeviceArray.of_images(problem.measured)
         weights: Any = problem.weights
         if weights is not None:

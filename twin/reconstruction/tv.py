@@ -293,7 +293,9 @@ class _At:
     cost: float = math.nan
 
     def beyond(self, last: _At, part: float) -> _At:
-        """Extrapolate from `last` through this point by `part`; nothing is projected."""
+        """Extrapolate from `last` through this point by `part` of their distance;
+        residuals too, so that nothing is projected. Returns this point itself for 0.
+        """
         if part == 0.0:
             return self
         factor = np.float32(part)
@@ -324,7 +326,9 @@ class _Objective:
         return self.regular.proximal(z, step * self.strength)
 
     def subset_pass(self, x: Float32Array, step: float, count: int) -> Any:
-        """Take a step for each subset of views, and one proximal map in the end."""
+        """Take a step for each subset of views, far apart in turn, and one proximal map
+        at the end; returns a new volume.
+        """
         n = len(self.problem.geometry)
         x = x.copy()
         for k in far_apart(count):
@@ -416,7 +420,9 @@ class Regular:
         return x
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """Compute x from the dual variables; see `tv_kernels.primal_step`."""
+        """Compute x, in place, from the dual variables, by portions of layers; see
+        `tv_kernels.primal_step`.
+        """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
@@ -427,7 +433,9 @@ class Regular:
     def dual_step(
         self, x: Any, ahead: Any, rate: np.float32, further: np.float32
     ) -> None:
-        """Update `dual` and `ahead`; see `tv_kernels.dual_step`."""
+        """Update `self.dual` and `ahead` in place, by portions of layers; see
+        `tv_kernels.dual_step`.
+        """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):

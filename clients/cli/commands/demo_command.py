@@ -71,7 +71,7 @@ def demo(
     """
 
     def stay(url: str) -> None:
-        """Print the lab's address, and wait for Ctrl-C."""
+        """Print the lab's address, and wait until Ctrl-C; returns then."""
         note(f"the lab is at {url}; Ctrl-C ends the demonstration")
         try:
             while True:

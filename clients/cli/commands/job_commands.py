@@ -164,7 +164,9 @@ def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., 
     """
 
     def command(twin: Twin, job: Job = None) -> Answer:
-        """Call the method for a job of the twin; yield its status as a document and as a line."""
+        """Call the method for a job (None: the current one) of the twin; print its
+        warnings, and yield its status as a document and as a line.
+        """
         with twin() as client:
             if job is None and steers is not None:
                 _require_current(client, steers)

@@ -79,7 +79,9 @@ has_parameters(
 
 
 def alone(name: str, about: str) -> Callable[[typer.Context], None]:
-    """Make the command that runs one process with the words that follow it."""
+    """Make the command that starts one process with the words that follow it; `about` is
+    its help.
+    """
 
     def command(context: typer.Context) -> None:
         start(name, context.args)

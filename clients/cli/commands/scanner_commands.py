@@ -502,7 +502,9 @@ def snap(
 
 
 def warn_of_exposure(flags: ImageFlags) -> None:
-    """Say which part of an image's pixels is saturated or starved, where it is worth saying."""
+    """Warn on standard error of the share [%] of saturated and of starved pixels, each
+    from `WARNING_SHARE` on.
+    """
     from flexdt.twin.physics.exposure import WARNING_SHARE
 
     for name, share in (("saturated", flags.saturated), ("starved", flags.starved)):

@@ -140,7 +140,9 @@ class BeamShade:
         self._draw()
 
     def light(self, on: bool) -> None:
-        """Show the shaded beam, drawn with the newest image, or hide it."""
+        """Show the shaded beam, drawn with the newest image, or hide it; nothing if that
+        is so already.
+        """
         if on != self._lit:
             self._lit = on
             for handle in self._planes:

@@ -47,7 +47,9 @@ class Gizmos:
     """
 
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
-        """Add a handle for each stage; `drag` gets the axes' targets when one is dragged."""
+        """Add a handle for each stage (source, object, detector); `drag` gets the axes'
+        targets when one is dragged.
+        """
         self._machine = machine
         self._drag = drag
         self._positions: dict[str, float] = {}
@@ -55,7 +57,9 @@ class Gizmos:
         self._handles = [self._add(server, stage) for stage in STAGES]
 
     def update(self, state: State, world: World) -> None:
-        """Move the handles with their stages, except the one being dragged."""
+        """Note the motors' positions and move the handles to their stages, except the one
+        being dragged.
+        """
         self._positions = motors(self._machine, state)
         at = {"source": world.source, "object": world.axis, "detector": world.detector}
         self._at = {stage: tuple((point * MM).tolist()) for stage, point in at.items()}

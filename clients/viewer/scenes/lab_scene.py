@@ -397,7 +397,9 @@ class LabScene:
     def show_image(
         self, rgb: npt.NDArray[np.uint8], lines: npt.NDArray[np.generic], world: World
     ) -> None:
-        """Draw an image (rows, cols, 3) on the panel, and its line integrals in the air."""
+        """Draw an image (rows, cols, 3) on the panel, and its line integrals as the
+        shaded beam.
+        """
         self._image.image = rgb
         with self._server.atomic():
             self._shade.show(

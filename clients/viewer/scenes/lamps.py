@@ -20,7 +20,9 @@ FILL_AT: Final = (-2.6, 1.4, 1.2)
 
 
 def light_plainly(scene: viser.SceneApi) -> None:
-    """Replace the scene's lamps by three without shadows, for all clients."""
+    """Replace the scene's lamps by sky, key and fill light without shadows, for all
+    clients.
+    """
     scene.configure_environment_map(None)
     scene.add_light_hemisphere(
         SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.35

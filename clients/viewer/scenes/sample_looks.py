@@ -172,7 +172,9 @@ def _skins(phantom: Phantom) -> SampleLook:
 
 
 def _box(sample: SampleState) -> SampleLook:
-    """Show a sample of which only the size is known as a box; nothing without a size."""
+    """Show a sample of which only the size is known as a box, marked as not exact;
+    nothing without a size.
+    """
     if sample.size_mm is None:
         return NOTHING
     vertices, faces = plain(trimesh.creation.box(extents=sample.size_mm))

@@ -434,7 +434,9 @@ def main() -> None:
     held = Held(served.say, about)
 
     def work() -> None:
-        """Reconstruct a data set that is complete, or one that grows."""
+        """Reconstruct a past (complete) data set, or follow one that grows, on one
+        thread, until the parent process ends.
+        """
         if past:
             reconstruct(held, Path(folder), int(side))
             return

@@ -585,7 +585,9 @@ def load() -> float | None:
 
 
 def line_of(entry: Document) -> str:
-    """Format one result for people."""
+    """Format one result for people: name, ms per view, mean and worst error (if known),
+    and for each peer how many times slower it is, with its ms.
+    """
     text = f"{entry['name']:16} {entry['ms_per_view']:10.2f} ms"
     if entry["worst_error"] is not None:
         text += f"   mean {entry['mean_error']:.1e} worst {entry['worst_error']:.1e}"

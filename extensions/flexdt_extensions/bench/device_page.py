@@ -311,7 +311,7 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
 
 
 def _quietly(call: Callable[[], object]) -> Callable[[], object]:
-    """Wrap a call so that its warnings about these images are dropped."""
+    """Wrap a call so that all its warnings are dropped."""
 
     def quiet() -> object:
         with warnings.catch_warnings():
@@ -395,7 +395,9 @@ def row(line: Document) -> str:
 
 
 def page(document: Document) -> str:
-    """Format the document as one page of Markdown."""
+    """Format the document as one page of Markdown: device, table of targets, and for each
+    case the times by views a call [ms].
+    """
     head = "| target | to be accepted | wanted | measured | met |\n|---|---|---|---|---|"
     lines = [f"# {document['device']}", "", head, *map(row, document["targets"]), ""]
     for name, seen in document["cases"].items():

@@ -64,7 +64,9 @@ def peers() -> list[Peer]:
 
 
 def absent(package: str) -> str | None:
-    """Return why a package on PyPI cannot take part, or None."""
+    """Return the reason why a package is absent ("... is not installed"), or None if it
+    is installed; it is not imported.
+    """
     # Asked of the installer: a look for the module itself would load itk into this process.
     try:
         metadata.distribution(package)

@@ -29,7 +29,7 @@ NOISE_COUNT: Final = 32
 
 
 def field_mm(scan: ConeVec, shape: tuple[int, int]) -> float:
-    """Compute the radius about the axis that each view of a circle sees [mm]."""
+    """Compute the radius about the z axis that the first view of a circle sees [mm]."""
     ends = (np.array([0.0, shape[1] - 1.0]) - (shape[1] - 1) / 2)[:, None]
     ray = (scan.detector[0] + ends * scan.u[0] - scan.source[0])[:, :2]
     source = scan.source[0, :2]
@@ -63,7 +63,9 @@ def cylinders(
 
 
 def _longer(scan: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Compute the length of rays over that of their horizontal part, (rows, cols)."""
+    """Compute the length of the first view's rays over that of their horizontal part,
+    (rows, cols).
+    """
     r, c = (np.arange(size) - (size - 1) / 2 for size in shape)
     ray = scan.detector[0] + c[None, :, None] * scan.u[0] + r[:, None, None] * scan.v[0]
     ray = ray - scan.source[0]

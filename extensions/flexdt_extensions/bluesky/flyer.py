@@ -107,7 +107,9 @@ class FrameEvents(Device, EventCollectable):
         }
 
     def collect(self) -> Iterator[PartialEvent]:
-        """Yield one event for each complete image."""
+        """Yield one event for each image completed since the last call, with its angle
+        [deg] and start [s]; stamped with the present time.
+        """
         flyer = self._flyer()
         name = flyer.name
         for angle, start in flyer.taken():
@@ -292,7 +294,9 @@ class TwinFlyer(
             await self._link.client.resume_job(self._job())
 
     async def stop(self, success: bool = True) -> None:
-        """Abort the scan's job if it has not ended."""
+        """Abort the scan's job if it has not ended, once a submission under way is done;
+        `success` is ignored.
+        """
         async with self._submitting:
             if self._running():
                 self.job = await self._link.client.job_status(self._job())
@@ -413,7 +417,7 @@ class TwinFlyer(
         return self.job is not None and self.job.state not in FINAL_STATES
 
     def _scanner(self) -> tuple[Machine, Profile]:
-        """Return machine and profile, those given or those of the twin."""
+        """Return machine and profile, those given, else those that the twin names."""
         server = self._link.client.server
         if self._machine is None:
             machine = builtin_machine(server.machine)
@@ -517,7 +521,9 @@ def fly_scan(
     start = {"plan_name": "fly_scan", "detectors": [flyer.name], **(md or {})}
 
     def inner() -> MsgGenerator[None]:
-        """Prepare the scan and carry it out; not replayed after an interruption."""
+        """Prepare the scan, then carry it out; that part is not replayed after an
+        interruption.
+        """
         prepared = yield from bps.prepare(flyer, scan, wait=True)
         # A replay would begin the scan again, and number images as those before. Without one,
         # the message that was interrupted is lost: what follows asks again where it may have
@@ -542,7 +548,9 @@ def fly_scan(
         )
 
     def images() -> MsgGenerator[None]:
-        """Collect images until the scan is done, with a checkpoint before each time."""
+        """Collect images every `flush_s` until the scan is done, with a checkpoint before
+        each time.
+        """
         ending = yield from bps.complete(flyer)
         done = False
         while not done:

@@ -106,7 +106,7 @@ class LabConnection:
             atexit.register(self._end_at_exit)
 
     async def close(self) -> None:
-        """End the connection, and the task that reads it."""
+        """End the task that reads the connection, wait for it, and close the client."""
         atexit.unregister(self._end_at_exit)
         if self._pump is not None:
             self._pump.cancel()
@@ -126,7 +126,9 @@ class LabConnection:
             ending.result(AT_EXIT_S)
 
     async def fresh(self) -> State:
-        """Get the present state; listen again if the connection was lost for too long."""
+        """Fetch the present state, keep it and return it; start listening again if that
+        has ended because the connection was lost.
+        """
         state = await self.client.state()
         self._take(state)
         if self._pump is not None and self._pump.done():  # the twin was gone for too long
@@ -155,7 +157,9 @@ class LabConnection:
         return end
 
     async def states(self) -> AsyncIterator[State]:
-        """Yield fresh states: one at once, then one after every change of the twin."""
+        """Yield fresh states for ever: one at once, then one after every event of the
+        twin or after `PATIENCE_S` of silence.
+        """
         while True:
             self._news.clear()
             yield await self.fresh()
@@ -164,7 +168,9 @@ class LabConnection:
                     await self._news.wait()
 
     async def _listen(self) -> None:
-        """Take states of the twin and wake who waits, until the connection is lost."""
+        """Take states and jobs of the twin and wake who waits; returns when the
+        connection is lost.
+        """
         async with self.client.subscribe("state", "job", max_rate_hz=RATE_HZ) as events:
             with contextlib.suppress(ConnectionLost):
                 async for event in events:
@@ -173,7 +179,9 @@ class LabConnection:
                     self._news.set()
 
     def _take(self, state: State) -> None:
-        """Keep a state unless it is older than the one before, and call the watchers."""
+        """Keep a state unless it is older than the one before, and call all watchers with
+        it.
+        """
         if self.state is not None and state.time < self.state.time:
             return  # an event that is older than the answer to a request
         self.state = state

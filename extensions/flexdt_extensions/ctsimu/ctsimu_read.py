@@ -579,7 +579,9 @@ def place(
         axes = rotation_about(axes[:, 2], float(turn[frame])) @ axes
 
     def coordinate_system(reference: str) -> tuple[FloatArray, FloatArray]:
-        """Return origin and axes of a coordinate system, seen from the part's own."""
+        """Return origin [mm] and axes of a coordinate system (world, stage or else the
+        part's own), as deviations of this part use it.
+        """
         if reference == WORLD and part.on_stage and stage is not None:
             return -stage[1].T @ stage[0], stage[1].T
         if reference == WORLD or (reference == STAGE and part.on_stage):

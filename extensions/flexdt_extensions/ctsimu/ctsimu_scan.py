@@ -232,7 +232,9 @@ class _Watched(dict[str, Any]):
 
 
 def _says_something(value: object) -> bool:
-    """Check whether a value holds anything besides comments, zeros and empty texts."""
+    """Check whether a value holds anything besides comments, None, False, zeros, and
+    empty texts and lists; of an object, any member.
+    """
     if isinstance(value, dict):
         return any(
             _says_something(one) for key, one in value.items() if key not in _WORDS
@@ -436,7 +438,9 @@ class _ScanReader(ScenarioReader):
         return self._substances[name]
 
     def _layers(self, *path: str) -> tuple[Filter, ...]:
-        """Read the list of layers at a path, without those of vacuum or no thickness."""
+        """Read the list of filter layers at a path, without those of vacuum or no
+        thickness.
+        """
         where = ".".join(path)
         found = [
             self._layer(one, f"{where}[{i}]") for i, one in enumerate(self._list(*path))

@@ -137,7 +137,9 @@ class ScenarioImages:
         ]
 
     def _distance(self, frame: int) -> Float32Array:
-        """Compute the distance from the source to each pixel, (rows, cols) [mm]."""
+        """Compute the distance from the source to each pixel's centre in a frame, (rows,
+        cols) [mm].
+        """
         row = self.scan.views[frame]
         (rows, cols) = self.scan.shape
         v = np.arange(rows)[:, None, None] - (rows - 1) / 2
@@ -495,7 +497,9 @@ class ScenarioImages:
             }
 
         def images(kind: str, asked: Reference) -> dict[str, Any]:
-            """Describe dark or flat images."""
+            """Describe dark or flat images (`kind`) for the metadata file: number,
+            averages, file name, and whether projections are corrected.
+            """
             return {
                 "number": asked.number,
                 "frame_average": asked.averages,

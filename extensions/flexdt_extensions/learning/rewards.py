@@ -68,7 +68,9 @@ class InformationTask:
     features = len(SIX)
 
     def __init__(self) -> None:
-        """Begin with the LEGO phantom at nominal offsets, of which only the prior is known."""
+        """Begin with the LEGO phantom at nominal offsets; the information is that of the
+        prior alone.
+        """
         self.phantom = load_phantom("lego")
         self.size_mm = self.phantom.size_mm
         self._model = bead_model(self.phantom)

@@ -227,7 +227,11 @@ class SharedQuality(QualityTask):
         self._ahead = True
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """Take one frame and return its gain in quality; see `QualityTask`."""
+        """Take one frame, solve for the volume and return its gain in quality; see
+        `QualityTask`.
+
+        A frame that was measured and solved ahead is not taken again; `poses` is ignored.
+        """
         if not self._ahead:
             self.measure(_sector(lab.position("rot_obj")), rng)
             self.table.rays.solve([self])

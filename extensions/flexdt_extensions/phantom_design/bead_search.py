@@ -138,7 +138,9 @@ def measured_spread(
 
 
 def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
-    """Project the beads: (n, k, 2) pixels of the spots that count, nan elsewhere."""
+    """Project the beads: (n, k, 2) pixels; nan where a spot overlaps another or is not
+    visible.
+    """
     cone = planned.poses.cone_vec(at)
     pixels = cone.project_points(model.beads, planned.shape)
     hidden = overlapping(pixels, spot_radii(model, planned.poses.cone_vec(at)))
@@ -402,7 +404,9 @@ class _Rules:
 def _allowed_seats(
     table: SeatTable, rules: _Rules, others: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.bool_]:
-    """Find the seats that a further bead may take, given `others`: (m,)."""
+    """Find the seats that a further bead may take, given `others`, (m,): far enough from
+    them, in a brick that is not full, and visible in some frame.
+    """
     gaps = np.linalg.norm(table.places[:, None] - table.places[others][None], axis=2)
     full = (
         np.bincount(rules.slot[others], minlength=int(rules.slot.max()) + 1) >= rules.most

@@ -85,7 +85,9 @@ class PlannedScans:
         )
 
     def thinned(self, frames: int) -> tuple[PlannedScans, float]:
-        """Select at most `frames` of the frames; returns the weight of each as well."""
+        """Select at most `frames` of the frames, spread evenly; returns as well how many
+        frames each stands for (1.0 if all are kept).
+        """
         n = len(self.poses)
         if n <= frames:
             return self, 1.0

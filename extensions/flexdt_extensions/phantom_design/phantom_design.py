@@ -243,7 +243,9 @@ def run_design(
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """Compare the design's score with that of the thesis's spiral in a sentence."""
+    """Compare the design's score with that of the thesis's spiral in a sentence; states
+    if the spiral does not determine the geometry (no gain).
+    """
     name = document["spiral"]["name"]
     gain = document["gain"]
     if gain is None:
@@ -591,7 +593,7 @@ def _disc(
 
 
 def _bead(axes: Axes, x: float, y: float, radius: float, number: int) -> None:
-    """Draw a bead as a numbered disc on a cross."""
+    """Draw a bead [mm] as a disc with its number, over a cross."""
     reach = 2.2 * radius
     axes.plot([x - reach, x + reach], [y, y], color=LINE, lw=1.0)
     axes.plot([x, x], [y - reach, y + reach], color=LINE, lw=1.0)

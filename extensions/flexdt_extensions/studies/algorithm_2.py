@@ -95,7 +95,9 @@ def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
     ]
 
     def residual(x: FloatArray) -> FloatArray:
-        """Compute the residuals at scaled values `x`; inf where the geometry is impossible."""
+        """Compute the stacked residuals at scaled values `x`; one infinite value where
+        the geometry is impossible.
+        """
         try:
             predicted = problem.residuals(x / unit)[0] - problem.origin[:, None, :]
         except TwinError:

@@ -98,7 +98,9 @@ def write_tracks(outcome: Outcome[ImageSet], path: Path) -> None:
 
 
 def _pixels(points: npt.NDArray[np.float64]) -> list[list[float] | None]:
-    """Convert points (k, 2) to [column, row], rounded; None for a point that was not seen."""
+    """Convert points (k, 2) to [column, row], rounded to `DIGITS`; None for a point that
+    was not seen (not finite).
+    """
     return [
         [round(c, DIGITS), round(r, DIGITS)]
         if math.isfinite(c) and math.isfinite(r)

@@ -659,7 +659,7 @@ def rounded_up(sigma: float) -> str:
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Format growing numbers as ranges: 2, 5-9, 12."""
+    """Format numbers in growing order as ranges of successive ones: 2, 5-9, 12."""
     runs = [
         [n for _, n in run]
         for _, run in groupby(enumerate(sorted(numbers)), lambda pair: pair[1] - pair[0])

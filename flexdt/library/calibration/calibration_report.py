@@ -46,7 +46,9 @@ second, third... is drawn."""
 
 
 def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
-    """Write the report as HTML, or the document as JSON if the name ends in .json."""
+    """Write the outcome's report as HTML, or its document as JSON if the name ends in
+    .json.
+    """
     if path.suffix.lower() == ".json":
         text = json.dumps(outcome.document, indent=1) + "\n"
     else:

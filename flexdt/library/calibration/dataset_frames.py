@@ -62,7 +62,9 @@ class DatasetFrames:
         normalise = self._dataset.normalisation
 
         def one(index: int) -> FrameSpots:
-            """Search one frame for spots; a frame that cannot be read is missing."""
+            """Search one frame for spots; a frame that is missing or cannot be read is
+            marked so, with the reason.
+            """
             counts = self._counts(index)
             if counts is None:
                 why = self._unreadable.get(index, "")

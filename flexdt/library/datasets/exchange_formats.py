@@ -162,7 +162,7 @@ def _read_tomosipo(path: Path, given: Given) -> ScanGeometry:
 
 
 def _array_file(arrays: Mapping[str, Any]) -> bytes:
-    """Return arrays as the bytes of an .npz."""
+    """Return arrays as the bytes of an uncompressed .npz file."""
     import numpy as np
 
     buffer = io.BytesIO()

@@ -34,7 +34,7 @@ def emphasised(text: str) -> str:
 
 
 def values_table(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Write a table with a row of heads; texts are escaped."""
+    """Write an HTML table with a row of heads; texts are escaped."""
     head = "".join(f"<th>{escape(one)}</th>" for one in heads)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>"

@@ -114,7 +114,9 @@ def _write(data: ImageSet, out: Any) -> None:
 
 
 def _field_of_view(axis_column: float, columns: int) -> str:
-    """Return `Full`, or `Half` where the rotation axis is near a side of the panel."""
+    """Return NXtomo's `Full`, or `Half` where the rotation axis is near a side of the
+    panel.
+    """
     left = axis_column + 0.5
     right = columns - 0.5 - axis_column
     if min(left, right) < HALF_SEEN * max(left, right):

@@ -131,7 +131,9 @@ def unfinished(path: Path) -> str:
 
 
 def _read_note(path: Path) -> Mapping[str, object]:
-    """Read the content that the folder was to hold; empty where the file is damaged."""
+    """Read the note of what an unfinished folder was to hold; {} where it is missing or
+    damaged.
+    """
     try:
         noted = json.loads((path / UNFINISHED).read_text(encoding="utf-8"))
     except (OSError, ValueError):

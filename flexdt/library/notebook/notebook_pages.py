@@ -215,7 +215,9 @@ class _Drawing:
         )
 
     def point(self, place: npt.ArrayLike) -> tuple[float, float]:
-        """Return the pixel (right, down) of a place (x, y, z) [mm]."""
+        """Return the pixel (right, down) at which the oblique drawing has a place (x, y,
+        z) [mm].
+        """
         x, y, z = np.asarray(place, dtype=float) - self.middle
         slope = np.radians(ELEVATION_DEG)
         up = z * np.cos(slope) + y * np.sin(slope)

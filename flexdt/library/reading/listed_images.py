@@ -141,7 +141,9 @@ def listed(
 def _first_look(
     frames: Sequence[Frame], flats: Sequence[Path], full_scale: int | None
 ) -> list[str]:
-    """Check whether the first flat image is saturated, or the projection in the middle."""
+    """Check whether the first flat image or the middle present projection is saturated at
+    `full_scale`; returns the warnings.
+    """
     taken = [frame.path for frame in frames if frame.present and frame.path is not None]
     kinds = {FLAT_IMAGE: [*flats], RADIOGRAPHS: taken[len(taken) // 2 :]}
     return first_look(

@@ -188,7 +188,9 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
 
 
 def _sources(data: Any) -> Iterator[str]:
-    """Iterate over the external files that hold the images."""
+    """Yield the names of the other files that hold the images of a virtual or external
+    dataset, each once in each kind; none if it holds them itself.
+    """
     if data.is_virtual:
         yield from dict.fromkeys(
             s.file_name for s in data.virtual_sources() if s.file_name != "."

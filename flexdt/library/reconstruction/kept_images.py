@@ -51,7 +51,9 @@ class ImagesOnDisk:
     """
 
     def __init__(self, folder: Path, most_pixels: int) -> None:
-        """Open a temporary file in `folder` for images of at most `most_pixels`."""
+        """Open a temporary file in `folder`, without a buffer, for images of at most
+        `most_pixels` each (float32).
+        """
         self._folder = folder
         self._most_bytes = 4 * most_pixels
         self._shapes: dict[int, tuple[int, int]] = {}
@@ -144,7 +146,10 @@ class CountsOnce:
         return self._latest[index]
 
     def read_by(self, dataset: ImageSet) -> ImageSet:
-        """Return the data set with its counts read through this object."""
+        """Return the data set with its counts read through this object, each once.
+
+        A data set in memory is returned as it is, and what was looked at is forgotten.
+        """
         held = dataset.arrays or Arrays(None)
         if held.counts is not None:  # in memory already
             self._looked_at.clear()

@@ -254,7 +254,7 @@ class Work:
         self._say()
 
     def _say(self) -> None:
-        """Report the share of the work that is done."""
+        """Report the work done, reading and all slabs, as a number of images out of all."""
         done = self._reading * (self._read / self._images)
         done += sum(
             work * part for work, part in zip(self._slabs, self._done, strict=True)

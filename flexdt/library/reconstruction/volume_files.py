@@ -92,7 +92,10 @@ def ending(path: Path) -> str:
 
 
 def check_name(path: Path) -> VolumeFormat:
-    """Return the format of a file name; checks, before any work, that it can be written."""
+    """Return the volume format of a file name, before any work.
+
+    Raises on an unknown ending, and LimitError if the folder does not exist.
+    """
     form = _format(path)
     if not path.absolute().parent.is_dir():
         raise LimitError(
@@ -167,7 +170,7 @@ class MiddleSlices:
     """
 
     def __init__(self, shape: tuple[int, int, int]) -> None:
-        """Allocate the middle slices of a volume (nz, ny, nx)."""
+        """Allocate the three middle slices, zeros, of a volume (nz, ny, nx)."""
         nz, ny, nx = self._shape = shape
         self._across_z = np.zeros((ny, nx), np.float32)
         self._across_y = np.zeros((nz, nx), np.float32)
@@ -188,7 +191,9 @@ class MiddleSlices:
 
     @property
     def images(self) -> dict[str, npt.NDArray[np.float32]]:
-        """By name: xy (seen from above, +y up), xz and yz (+z up)."""
+        """Return the middle slices by name, first row at the top: xy (seen from above, +y
+        up), xz and yz (+z up).
+        """
         return {
             "xy": self._across_z[::-1],
             "xz": self._across_y[::-1],

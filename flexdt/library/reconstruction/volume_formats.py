@@ -94,7 +94,7 @@ class VoxelPlaces:
 
     @property
     def first_mm(self) -> list[float]:
-        """Centre of the first voxel, (x, y, z) [mm]."""
+        """Centre of the first voxel (lowest x, y and z), (x, y, z) [mm]."""
         counts = reversed(self.shape)
         return [
             middle - (n - 1) / 2 * edge
@@ -127,7 +127,9 @@ class VolumeFormat:
 def _write_and_rename(
     write: Callable[[Path, VoxelPlaces], Iterator[Sink]],
 ) -> Callable[..., Iterator[Sink]]:
-    """Write one file, which then gets its final path."""
+    """Wrap the writer of one file: it writes to a temporary path, which then gets the
+    final one; not after an error.
+    """
 
     def write_whole_file(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
         yield from write(part, places)
@@ -163,7 +165,9 @@ def _write_headed(
 
 
 def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
-    """Return a function that writes slabs to a file, float32 with x fastest."""
+    """Return a function that writes slabs to a file as raw float32, x fastest, then y,
+    then z.
+    """
 
     def write(slab: Float32Array) -> None:
         for block in _blocks(slab):
@@ -330,7 +334,9 @@ def _map_values(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
 
 
 def _read_nrrd(path: Path) -> Stored:
-    """Read voxels, edges and the first voxel's place from an .nrrd file."""
+    """Read voxels (memory-mapped), edges [mm], the first voxel's place [mm] and True (it
+    is the first voxel's, not the centre) from an .nrrd file.
+    """
     fields, begin = _header(path, ":", b"\n\n")
     values = _map_values(path, begin, fields["sizes"])
     rows = fields["space directions"].split()
@@ -340,7 +346,9 @@ def _read_nrrd(path: Path) -> Stored:
 
 
 def _read_tiff(path: Path) -> Stored:
-    """Read voxels, edge and centre from a .tif file."""
+    """Read voxels, edge [mm], centre [mm] and False (it is the centre, not the first
+    voxel's place) from a .tif file.
+    """
     import tifffile
 
     with tifffile.TiffFile(path) as file:

@@ -351,7 +351,9 @@ def _largest_group(
 
 
 def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
-    """Compute typical radius and contrast of each group of similar spots."""
+    """Compute typical (median) radius [px] and contrast of each group of similar spots,
+    largest group first.
+    """
     out = []
     while found:
         group, found = _largest_group(found, SpotFinder.same)

@@ -58,7 +58,9 @@ def fading(
 
 
 def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
-    """Subtract from values (n, k) the means of their frame and bead; 0 where not seen."""
+    """Subtract from values (n, k) the means of their frame and of their bead, in turn
+    `MEAN_ROUNDS` times; 0 where not seen.
+    """
     out = np.where(seen, values, 0.0)
     for _ in range(MEAN_ROUNDS):
         for axis in (0, 1):

@@ -196,7 +196,7 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
-    """Return a shape moved by `shift` (x, y, z) [mm]."""
+    """Return a copy of a shape moved by `shift` (x, y, z) [mm]."""
     if isinstance(shape, ConvexPolyhedron):
         offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(
             shift

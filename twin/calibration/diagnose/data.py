@@ -317,7 +317,9 @@ def _convincing(found: Identification) -> bool:
 
 
 def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
-    """Mirror the spots of all frames in columns (`axis` 0) or in rows (1)."""
+    """Mirror the spot centres of all frames in columns (`axis` 0) or in rows (1); shapes
+    and covariances stay.
+    """
     out = []
     for d in detections:
         centers = d.centers.copy()

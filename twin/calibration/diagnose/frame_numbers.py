@@ -59,7 +59,9 @@ class FrameNumbers:
 
     @property
     def _settled(self) -> npt.NDArray[np.int64]:
-        """The shift without single frames, of which the last may be one."""
+        """Return the shift of frame numbers (n,) without changes that last one frame, or
+        that only the last frame has.
+        """
         out = self.shift.copy()
         n = len(out)
         for i in range(1, n):

@@ -143,7 +143,9 @@ def _turning(fit: FitResult) -> Finding:
 
 
 def _elsewhere(fit: FitResult) -> Finding:
-    """Make the finding on beads away from the phantom's model."""
+    """Make the warning that beads lie off the phantom's model and were fitted too, with
+    the largest distance [um] and the prior.
+    """
     moved = np.linalg.norm(fit.beads - fit.problem.model.beads, axis=1)
     return warning(
         "bead_tolerance",

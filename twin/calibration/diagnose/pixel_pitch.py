@@ -142,7 +142,9 @@ class _Explanations:
 
 
 def _pitch_column(problem: FitProblem, x: FloatArray) -> FloatArray:
-    """Compute whitened shifts (2 n k,) of the positions by a unit of the pitch's logarithm."""
+    """Compute whitened shifts (2 n k,) of the positions for a unit change of the
+    logarithm of the pixel pitch.
+    """
     predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
     w = problem.whiten
     across = predicted[..., 0]

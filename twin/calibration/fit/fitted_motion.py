@@ -188,7 +188,9 @@ def follow_motion(
 
 
 def aware(fit: FitResult, held: MotionFit) -> FitResult:
-    """Add the uncertainty of the motion in the poses to the sigmas of a fit."""
+    """Add the uncertainty of the motion that is in the poses to the sigmas of a fit;
+    returned unchanged if it is not identifiable.
+    """
     if not fit.identifiable:
         return fit
     names = held.motions[0].names

@@ -116,7 +116,7 @@ class ColumnLayout:
 
     @property
     def bead_columns(self) -> slice:
-        """Columns of the beads' coordinates."""
+        """Columns of the beads' coordinates; empty if beads are not free."""
         if self.bead_column < 0:
             return slice(self.parameter_count, self.parameter_count)
         if self.strain_column < 0:
@@ -343,7 +343,9 @@ class FitProblem:
 
     @cached_property
     def strain_basis(self) -> FloatArray:
-        """(3 k, 10) displacement of the beads' coordinates [mm] by a unit of each strain."""
+        """Displacement (3 k, 10) of the beads' coordinates [mm] by a unit of each strain:
+        uniform scale, then the single terms.
+        """
         beads = self.model.beads
         out = np.zeros((len(beads), 3, len(STRAINS)))
         out[..., 0] = beads

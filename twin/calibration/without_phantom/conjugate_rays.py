@@ -184,7 +184,9 @@ class Profile:
         return np.asarray(self.basis[:, 0, 2] < MOST_MOVED)
 
     def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit steps: values (r, 3), their covariances, and residuals in sigmas, (r, m)."""
+        """Fit the steps of each row by weighted least squares: values (r, 3), their
+        covariances, and residuals in sigmas, (r, m).
+        """
         scaled = self.basis / sigma[:, None]
         aim = self.shift / sigma
         across = scaled.transpose(0, 2, 1)
@@ -325,7 +327,9 @@ class ConjugateRays:
         return cls(scan, band, np.array(turn.band_rows), step)
 
     def closed(self, column: int, width: float) -> ConjugateRays:
-        """Close a gap: columns beyond its first one move by its width."""
+        """Return rays with a gap between panel tiles closed: columns from `column` on
+        move back by its `width` [px].
+        """
         there = np.arange(self.cols, dtype=np.float64)
         at = there - np.clip(there - (column - 0.5), 0.0, width)
         low = np.minimum(np.floor(at).astype(np.intp), self.cols - 2)

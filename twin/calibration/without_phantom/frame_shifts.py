@@ -154,7 +154,9 @@ class _System:
         return np.stack([parts[a][side] for side in (0, 1) for a in (0, 1)], axis=1)
 
     def share(self, noise: Float32Array) -> FloatArray:
-        """Compute the noise's share in the squares of the slopes for either shift, (2,)."""
+        """Compute the share of noise in the squared slopes for either shift (columns,
+        rows), (2,).
+        """
         own, all_ = (
             np.einsum("qak,qak,q->a", slopes, slopes, self.weight)
             .reshape(2, 2)

@@ -218,7 +218,9 @@ def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
 def _evidence_of_rays(
     columns: npt.NDArray[np.intp], axis: float, profile: Profile
 ) -> FloatArray:
-    """Compute log likelihood ratios, (w, c), from the steps of both ends of rays."""
+    """Compute log likelihood ratios (w, c), of a gap of each width at each column to
+    none, from the steps of both ends of rays.
+    """
     beside = columns - 0.5 - axis
     steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
     width = np.array([step.width for step in steps]) * np.sign(beside)

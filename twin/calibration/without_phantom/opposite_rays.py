@@ -140,7 +140,10 @@ class OppositeRays:
         return tried[best], ratio
 
     def find(self, values: FloatArray) -> Symmetry:
-        """Estimate the parameters, coarse to fine, at the level with the best first one."""
+        """Estimate the parameters from coarse to fine images; returns the level with the
+        least sigma of the first parameter among those that converged (the first, if
+        none did).
+        """
         found = []
         for part in LEVELS:
             found.append(_Level(self, max(self.shape[1] / part, 1.0)).solve(values))

@@ -199,7 +199,9 @@ class PlanePairs:
         return np.hstack([pairs, blocks.reshape(len(LEVELS), -1)])
 
     def scales(self, costs: FloatArray) -> FloatArray:
-        """Compute 1 / usual cost of pairs as far apart as each one, laid out as `costs`."""
+        """Compute 1 / usual cost of pairs as far apart as each one, laid out as `costs`;
+        0 where that cost is 0.
+        """
         pairs = costs[:, : len(self.pairs)]
         usual = np.add.reduceat(pairs, self.starts, axis=1) / self.sizes
         scale = np.where(usual > 0, 1.0 / np.maximum(usual, 1e-300), 0.0)

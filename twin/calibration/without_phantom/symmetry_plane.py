@@ -215,7 +215,9 @@ def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColum
 
 
 def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
-    """Search for the axis' column in the mean image of a turn, and set the start to it."""
+    """Search for the axis's column in the mean image of a full turn, and set the start
+    values to it; yaw alone has a prior.
+    """
     nominal = scan.column(scan.start)
     values = scan.start[:OF_TURN]
     scales = scan.scales[:OF_TURN]
@@ -280,7 +282,9 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
 
 
 def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFound:
-    """Look for a gap between two tiles that is not undone already."""
+    """Look for a gap between two panel tiles that the known panel does not close already;
+    nothing without a full turn.
+    """
     if first.turn is None:
         return GapFound(None, None)
     borders = panel.model.borders if panel else ()

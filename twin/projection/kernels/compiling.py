@@ -180,7 +180,9 @@ ENTRY_POINT = {"cache": True, "nogil": True, "pipeline_class": _EntryPoint}
 
 
 def _entry_point(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function that Python calls, and keep its code on disk."""
+    """Compile a function that Python calls, and keep its code on disk; without a function
+    returns the decorator with these options.
+    """
     if function is None:
         return partial(_entry_point, **options)
     made = njit(function, **{**ENTRY_POINT, **options})
@@ -245,7 +247,7 @@ def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def fetch_next(typingctx: Any, counter: Any) -> Any:
-    """Return counter[0] and add one to it, atomically; counter is int64."""
+    """Compile to: return counter[0] and add one to it, atomically; counter is int64."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         word = ir.IntType(64)

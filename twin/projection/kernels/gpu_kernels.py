@@ -588,7 +588,9 @@ def column_kernel(transposed):
 
 @cuda.jit(device=True, inline=True)
 def enter_box(s, d, n, enter, leave):
-    """Cut [enter, leave] down to where s + t d is in [0, n)."""
+    """Cut [enter, leave] down to where s + t d is in [0, n); returns (1, 0), which is
+    empty, if it never is and d is 0.
+    """
     if d == 0.0:
         if s < 0.0 or s >= n:
             return 1.0, 0.0

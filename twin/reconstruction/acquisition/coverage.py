@@ -123,7 +123,7 @@ class LostVoxels:
         return cls(len(data), len(data) - len(held), held.size, int(held.sum()))
 
     def __add__(self, more: LostVoxels) -> LostVoxels:
-        """Add those of further layers."""
+        """Add the counts of further layers."""
         return LostVoxels(
             self.layers + more.layers,
             self.lost_layers + more.lost_layers,

@@ -355,7 +355,9 @@ def _check_covered(circle: Circle, widest: float) -> None:
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
-    """Compute the overlap of gaps with the opposites of others, up to a fan angle [rad]."""
+    """Compute how far arcs without views overlap with the opposites of others, in view of
+    the fan angle `widest` [rad]; negative if they do not.
+    """
     width = np.diff(gaps)[:, 0]
     middle = gaps.mean(axis=1)
     apart = np.abs(

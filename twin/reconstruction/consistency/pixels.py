@@ -201,7 +201,9 @@ def _largest_about(response: Float32Array) -> Float32Array:
 
 
 def _interpolated(view: Float32Array, mask: npt.NDArray[np.bool_]) -> Float32Array:
-    """Interpolate some pixels of an image along their rows, (rows, cols)."""
+    """Interpolate the masked pixels of an image along their rows, (rows, cols), in a
+    copy; rows masked as a whole stay.
+    """
     made = view.copy()
     columns = np.arange(view.shape[1])
     for row in np.flatnonzero(mask.any(axis=1) & ~mask.all(axis=1)):

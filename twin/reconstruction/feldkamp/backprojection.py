@@ -58,7 +58,9 @@ class OnProcessor:
     """
 
     def __init__(self, like: Volume) -> None:
-        """Allocate a volume of zeros with the place and size of `like`."""
+        """Allocate a volume of zeros with the place and size of `like`, and no noise
+        meter.
+        """
         nz, ny, nx = like.shape
         self._first, self._size = first_and_steps(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
@@ -164,7 +166,12 @@ class OnDevice:
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume; see `OnProcessor`."""
+        """Weigh and filter views, and add them to the volume on the device; see
+        `OnProcessor`.
+
+        Views are sorted by the noise meter's sign, if there is a meter. Raises if the
+        device fails.
+        """
         signs = np.zeros(len(views.images), np.float32)
         if self.meter is not None:
             signs = self.meter.note(views)
@@ -351,7 +358,9 @@ class OnDevice:
         )
 
     def _both(self) -> list[tuple[Any, Any]]:
-        """List the meter's grid with a volume for either sign, (grid, flat) each."""
+        """List the noise meter's grid with a volume for either sign, (grid, flat) each,
+        allocated at the first use; empty without a meter.
+        """
         from numba import cuda
 
         if self.meter is not None and not self._halves:

@@ -40,7 +40,7 @@ def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
 
 
 def _even_length(least: int) -> int:
-    """Find the first even length from `least` on whose transform is fast."""
+    """Find the first even length, `least` or more, whose real Fourier transform is fast."""
     from scipy import fft
 
     length = int(fft.next_fast_len(least, real=True))

@@ -97,7 +97,9 @@ class ImageUpload:
         self._read[self._chunk] = done
 
     def _room(self, name: str, count: int) -> Any:
-        """Return device memory for one array of this chunk, (count,)."""
+        """Return device memory (count,) for the array `name` of this chunk, kept for
+        later chunks and enlarged where too small.
+        """
         from numba import cuda
 
         pair = self._rooms.setdefault(name, [None, None])
@@ -127,7 +129,9 @@ class ImageUpload:
         return portion[:count]
 
     def _fetch(self, portion: Any, there: Any) -> None:
-        """Let the device fetch the portion whose turn it is."""
+        """Start the copy of a portion to the device, and record when it is done; does not
+        wait.
+        """
         from numba import cuda
 
         there.copy_to_device(portion, self._writer)

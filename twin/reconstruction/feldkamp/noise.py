@@ -58,7 +58,11 @@ class Noise:
     shared: FloatArray
 
     def sigma(self, grid: Volume) -> Float32Array:
-        """Compute the standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
+        """Compute the standard deviation of noise at each voxel of a grid, (nz, ny, nx)
+        [1/mm]; nan where the grid is.
+
+        Adds the variance common to all views, by the distance from the rotation axis.
+        """
         x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
         out = interpolated(self.views, grid)

@@ -16,7 +16,7 @@ the axes too."""
 
 
 def bare(solid: ConvexSolid) -> trimesh.Trimesh:
-    """Build the mesh of a convex solid, without margin [mm]."""
+    """Build the mesh of an upright cylinder or polytope, without margin [mm]."""
     if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height
         return cylinder(*size, solid.center, STEEL).mesh
