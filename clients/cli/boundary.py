@@ -127,7 +127,9 @@ def _wire_error(error: RpcError) -> tuple[str, ...]:
 
 
 def wire_code(error: RpcError) -> int:
-    """Determine the exit code of an error reply: that of its problems, or that of its kind."""
+    """Determine the exit code of an error reply: of a rejected script that of its
+    problems (errors only), else that of the error's kind; INVALID for an unknown one.
+    """
     if error.code == -32005 and isinstance(error.data, Sequence):
         wrong = [p for p in error.data if p.get("severity", "error") == "error"]
         return verdict(str(p.get("code")) for p in wrong) or INVALID

@@ -43,7 +43,9 @@ _R = TypeVar("_R")
 
 
 def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
-    """Pauses between attempts to connect [s]: each twice the one before, at most a second."""
+    """Yield pauses between attempts to connect [s], for ever: each twice the one before,
+    at most `LONGEST_PAUSE_S`.
+    """
     pause = first_s
     while True:
         yield pause
@@ -190,14 +192,16 @@ class Core:
         await self.disconnect()
 
     async def disconnect(self) -> None:
-        """End the connection; another one may be made, with the same subscriptions."""
+        """End the connection, if there is one; another may be made, with the same
+        subscriptions.
+        """
         link = self.link
         self.link = None
         if link is not None:
             await link.close()
 
     def _deliver(self, params: Mapping[str, object]) -> None:
-        """Send an event's params to the listeners of its topic."""
+        """Put an event's params to all listeners of its topic; dropped without one."""
         topic = params.get("topic")
         for listener in list(self._listeners):
             if topic in listener.topics:

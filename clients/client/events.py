@@ -241,7 +241,9 @@ class AsyncSubscription:
                 raise TimeoutError(f"no {what} event in {timeout_s:g} s") from None
 
     async def close(self) -> None:
-        """Unsubscribe; an iteration in another task ends."""
+        """End the subscription and unsubscribe at the twin, if it had started; an
+        iteration in another task ends. A second call does nothing.
+        """
         if not self._closed:
             self.end()
             if self._started:

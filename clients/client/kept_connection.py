@@ -164,7 +164,9 @@ class KeptConnection:
             raise Unsendable(method, error) from None
 
     def put(self, params: Mapping[str, object]) -> None:
-        """Take an event; one that cannot be handled must not end the connection."""
+        """Pass an event and its topic to the handler; an exception is logged and does not
+        end the connection.
+        """
         try:
             self._on_event(str(params.get("topic")), params)
         except Exception:

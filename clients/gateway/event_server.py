@@ -345,7 +345,9 @@ class Gateway:
                 self._log_failure("session.control")
 
     def _send(self, event: AcquilaEvent) -> None:
-        """Publish an event, and remember it as our own."""
+        """Publish an event, and remember it so that its echo is recognised; dropped for a
+        subscriber that is too slow.
+        """
         text = format_event(event)
         self._recent.append(hash(text))
         # A PUB socket never blocks: it drops messages that a slow subscriber does not take.

@@ -159,7 +159,9 @@ class Recording:
         return len(document.frames)
 
     def write_settings(self, state: State) -> None:
-        """Use these motor positions in the settings texts (`write settings file`)."""
+        """Keep these motor positions for the settings texts, and write these now if the
+        folder has images (`write settings file`).
+        """
         with self._turn:
             self._settings = state
             if self._folder is not None and self._blocks:
@@ -268,7 +270,9 @@ class Recording:
 
 
 def camera_of(state: State) -> CameraSettings:
-    """Return the camera's settings in a state."""
+    """Return the camera's settings in a state: mode, region of interest, exposure [ms],
+    averages and frames.
+    """
     c = state.camera
     left, top, right, bottom = c.roi
     roi = Roi(left, top, right, bottom)

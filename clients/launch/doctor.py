@@ -73,7 +73,7 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
 
 
 def python() -> CheckOutcome:
-    """Report the interpreter, the platform and flexdt's version."""
+    """Report interpreter, version, platform and flexdt's version; always "ok"."""
     found = f"{platform.python_implementation()} {platform.python_version()}, {platform.system()}"
     return CheckOutcome(
         "python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}"

@@ -94,7 +94,9 @@ class BrowserConnection(ServerConnection):
         return message
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Free the place of an ended connection among those that count."""
+        """Free the place of an ended connection among those that are counted, and the
+        bytes it held.
+        """
         self._hold(0)
         self._admission.strangers.leave(self)
         self._admission.answered.leave(self)

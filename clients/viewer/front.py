@@ -193,7 +193,7 @@ class Front:
         one_at_a_time(self._server.server)
 
     async def close(self) -> None:
-        """Stop listening and end every connection."""
+        """Stop listening, end every connection and wait for that."""
         self._closing.set()
         if self._server is not None:
             self._server.close()

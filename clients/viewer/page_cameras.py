@@ -143,7 +143,9 @@ class SceneClients:
                         self._put(client, preset.at(aspect))
 
     def reset(self, page: str, view: str) -> None:
-        """Put a page's view back to its preset."""
+        """Set a page's view back to its preset for the client's aspect ratio; nothing
+        without a preset.
+        """
         preset = self.cameras.get(view)
         for client in self.of(page, view):
             if preset is not None:
@@ -187,14 +189,16 @@ class SceneClients:
         self._theme.pop(page, None)
 
     def _looking(self, view: str) -> list[viser.ClientHandle]:
-        """List the clients that show a view, of any page."""
+        """List the connected clients that show a view, of any page."""
         with self._lock:
             ids = [i for i, w in self._who.items() if w.view == view]
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
     def _put(self, client: viser.ClientHandle, camera: Standpoint) -> None:
-        """Set a client's camera, unless it was put there last."""
+        """Set a client's camera, unless it was put there last and has not been moved
+        since.
+        """
         if self._sent.get(client.client_id) == camera and self._untouched(client):
             return
         self._sent[client.client_id] = camera
@@ -235,7 +239,7 @@ class SceneClients:
         self.joined(client, who.page)
 
     def _gone(self, client: viser.ClientHandle) -> None:
-        """Forget a client that has closed."""
+        """Forget page, camera and layers of a client that has closed."""
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)

@@ -541,7 +541,7 @@ class Viewer:
                 page.show("volume", slices)
 
     def ungrow(self) -> None:
-        """Stop the growing volume and hide its surface, once no page wants it."""
+        """Stop the growing volume and hide its surface, unless a page still wants it."""
         if not any(page.live for page in self.pages.values()):
             self.grower.stop()
             if self.lab is not None:
@@ -605,7 +605,9 @@ class Viewer:
                 feed.stop()
 
     def _joined(self, client: viser.ClientHandle, id: str) -> None:
-        """Draw a page's plan path in its new view; called in one of viser's threads."""
+        """Draw a page's plan path in its new view; nothing without a path. Called in one
+        of viser's threads.
+        """
         page = self.pages.get(id)
         lab = self.lab
         if page is not None and page.orbit is not None and lab is not None:

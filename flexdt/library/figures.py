@@ -64,7 +64,9 @@ def require_plots() -> None:
 
 
 def blank(width: float, height: float) -> Figure:
-    """Make an empty figure [px] that belongs to no window."""
+    """Make an empty figure [px] that belongs to no window; raises if matplotlib is
+    missing.
+    """
     require_plots()
     from matplotlib.figure import Figure
 

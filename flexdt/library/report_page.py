@@ -76,7 +76,9 @@ def code(text: str) -> Markup:
 
 
 def bullets(texts: Iterable[str], kinds: Iterable[str] = ()) -> Markup:
-    """Make a list, each item of a kind (see `paragraph`)."""
+    """Make an HTML list; `kinds` are the items' kinds in order (see `paragraph`), none
+    for those beyond.
+    """
     items = zip_longest(texts, kinds, fillvalue="")
     return _element(
         "ul", Markup("".join(_element("li", text, kind=kind) for text, kind in items))

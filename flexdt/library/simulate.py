@@ -382,7 +382,9 @@ def simulate(
         def read(
             number: int, expected: Expected, lit: ExposureSettings = exposure
         ) -> Counts:
-            """Read out an expected image, with the noise of frame `number` unless noise is off."""
+            """Read out an expected image as counts, with the noise of frame `number`
+            unless noise is off (None).
+            """
             if noise is None:
                 rng = None
             else:

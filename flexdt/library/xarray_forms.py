@@ -35,7 +35,9 @@ def images_to_xarray(data: ImageSet) -> Any:
 
 
 def volume_to_xarray(volume: Volume) -> Any:
-    """Return a volume as a DataArray; see `Volume.to_xarray`."""
+    """Return a volume as a DataArray (z, y, x) with places [mm]; see `Volume.to_xarray`.
+    Raises if xarray is missing.
+    """
     xarray = package("xarray", "to_xarray")
     places = zip("xyz", volume.centers(), strict=True)
     coords = {axis: (axis, values, {"units": "mm"}) for axis, values in places}

@@ -86,7 +86,9 @@ def nothing(shape: tuple[int, int]) -> Detections:
 
 
 def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
-    """Detect the beads of one line-integral image, unless it is dark."""
+    """Detect the beads of one line-integral image; without any, marked DARK, if its
+    median exceeds `DARK` and intensities are not asked for.
+    """
     shape = (image.shape[0], image.shape[1])
     if not detector.intensities and float(np.median(image[::16, ::16])) > DARK:
         return FrameSpots(nothing(shape), FrameState.DARK)
@@ -156,7 +158,9 @@ class SpotFrames:
         return list(self.looks)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows of every frame; nan without images."""
+        """Cut the windows (n, k, side, side) of every frame; all nan if there are no
+        images.
+        """
         if self.images is not None:
             return self.images.windows(plan)
         return np.full(

@@ -223,7 +223,7 @@ def identify(
 def attempt(
     detections: Sequence[Detections], model: BeadModel, poses: Poses, **how: Any
 ) -> Identification | None:
-    """Call `identify` with the options `how`; None where nothing fits."""
+    """Call `identify` with the options `how`; None where it raises a TwinError."""
     try:
         return identify(detections, model, poses, **how)
     except TwinError:
@@ -501,7 +501,9 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
 def _with_tracks(
     problem: FitProblem, shadows: _Shadows, index: npt.NDArray[np.int64]
 ) -> FitProblem:
-    """Set the assigned spots as measurements of unit weight."""
+    """Set the spots assigned by `index` (n, k; negative: none) as the problem's
+    measurements, of unit weight.
+    """
     tracks, _, bias = shadows.picked(index, np.zeros((len(index), 2)))
     whiten = np.broadcast_to([1.0, 0.0, 1.0], (*index.shape, 3)).copy()
     return replace(
@@ -633,7 +635,7 @@ def _at(problem: FitProblem, x: FloatArray, start: Offsets) -> Offsets:
 
 
 def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:
-    """Mark beads whose predicted spot touches another one, (n, k)."""
+    """Mark beads whose predicted spot nearly touches another bead's, (n, k)."""
     distance = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=3)
     reach = 1.12 * (radii[:, :, None] + radii[:, None]) + 2.0
     k = predicted.shape[1]

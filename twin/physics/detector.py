@@ -425,7 +425,7 @@ def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pa
     cols = (right - left + 1) // b
 
     def blocks(values: npt.NDArray[np.float32]) -> Float32Array:
-        """Average the unbinned pixels of each image pixel."""
+        """Average the b x b unbinned panel pixels of each image pixel, (rows, cols)."""
         part = values[top : top + rows * b, left : left + cols * b]
         mean: Float32Array = part.reshape(rows, b, cols, b).mean(
             axis=(1, 3), dtype=np.float32

@@ -443,7 +443,9 @@ class ScanScatter:
 
     @cached_property
     def _stack(self) -> dict[str, FloatArray]:
-        """Arrays of the simulated views by name, (k, v, u)."""
+        """Stack the arrays mean, error and spread of the simulated views by name, (k, v,
+        u).
+        """
         names = ("mean", "error", "spread")
         return {
             name: np.array([getattr(one, name) for one in self.images]) for name in names

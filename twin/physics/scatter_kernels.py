@@ -168,7 +168,7 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
 
 @inline
 def depth_of(paths: Any, mu: Any) -> float:
-    """Compute the optical depth of path lengths."""
+    """Compute the optical depth: sum of path lengths [mm] times attenuation [1/mm]."""
     depth = 0.0
     for m in range(len(paths)):
         depth += paths[m] * mu[m]

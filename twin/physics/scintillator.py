@@ -83,7 +83,9 @@ def deposited(screen: Filter) -> Deposited:
     here = np.broadcast_to((stopped / stopping / SLICES)[:, None], depth.shape)
 
     def escaping(mu: FloatArray) -> FloatArray:
-        """Compute the part of isotropic photons that escapes, (e, slice)."""
+        """Compute the part of isotropically emitted photons that escapes through both
+        faces, (e, slice).
+        """
         return np.asarray(
             (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth)))
             / 2.0

@@ -138,7 +138,7 @@ class Spectrum:
         return float(self.fluence @ self.energy_keV / self.fluence.sum())
 
     def behind(self, *filters: Filter) -> Spectrum:
-        """Attenuate the spectrum by filters."""
+        """Return the spectrum attenuated by filters; unchanged without any."""
         depth = np.zeros_like(self.fluence)
         for one in filters:
             depth += one.substance.attenuation() * one.thickness_mm
@@ -275,7 +275,9 @@ class Tube:
 
 
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
-    """Convert (material, thickness [mm]) to a filter, and check its thickness."""
+    """Convert (material, thickness [mm]) to a filter; raises unless its thickness is 0 to
+    1000 mm.
+    """
     if not isinstance(layer, Filter):
         layer = Filter(Substance.called(layer[0]), float(layer[1]))
     name = f"Tube: filter {layer.substance.name}"

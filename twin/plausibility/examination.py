@@ -101,7 +101,9 @@ def _found(
 
 
 def _values(images: Any, volume: npt.NDArray[Any] | None) -> Iterator[Finding]:
-    """Yield the findings of all checks of values; arguments as for `examine`."""
+    """Yield the findings of all checks of values: of a sample of the images' line
+    integrals, and of the volume; None is not checked.
+    """
     if images is not None and len(images):
         yield from integral_findings(some_of(images))
     if volume is not None:

@@ -103,7 +103,9 @@ def _numbered(names: list[str]) -> Ordered | None:
 
 
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
-    """Tell of names that are written otherwise than those of the other images."""
+    """Make the warning on names that are written otherwise than those of the other
+    images.
+    """
     like = next(name for name in names if name not in others)
     told = ", ".join(others[:MAX_NAMES_SHOWN])
     cause = f"{told} {_is(others)} named otherwise than the rest, such as {like}"
@@ -112,7 +114,7 @@ def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
 
 
 def duplicate(one: str, other: str) -> Finding:
-    """Make the refusal of two files with one number."""
+    """Make the refusal (a finding, not raised) of two files with one number."""
     cause = f"{one} and {other} have one number: which of them is meant is not known"
     return Finding(
         "duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0

@@ -79,7 +79,9 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
 
 
 def _drifts(levels: FloatArray) -> bool:
-    """Return whether levels rise or fall throughout the scan."""
+    """Return whether levels rise or fall steadily, near a straight line, throughout the
+    scan.
+    """
     line = np.polyval(
         np.polyfit(np.arange(len(levels)), levels, 1), np.arange(len(levels))
     )

@@ -169,7 +169,7 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
 
 
 def _round_degrees(span: float, step: float) -> bool:
-    """Return whether a span, alone or with a step, is a usual number of degrees."""
+    """Return whether a span [deg], alone or with one step more, is a multiple of 5 deg."""
     return any(
         abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0
         for whole in (span, span + step)
@@ -177,7 +177,9 @@ def _round_degrees(span: float, step: float) -> bool:
 
 
 def arc_deg(cone_vec: ConeVec) -> float:
-    """Compute the angle that the views of a circular scan cover [deg]."""
+    """Compute the arc that the views of a circular scan cover [deg]: the full turn
+    without its widest gap between views.
+    """
     azimuth = azimuths(cone_vec)
     at = np.sort(azimuth % math.tau)
     gaps = np.diff(at, append=at[0] + math.tau)
@@ -191,7 +193,9 @@ def azimuths(cone_vec: ConeVec) -> FloatArray:
 
 
 def about_z(cone_vec: ConeVec) -> bool:
-    """Return whether the views turn about z at one inclination, as on a circle or helix."""
+    """Return whether the views' central beams have nearly one inclination to the
+    horizontal and none is nearly vertical, as on a circle or helix about z.
+    """
     beam = cone_vec.detector - cone_vec.source
     level = np.hypot(beam[:, 0], beam[:, 1])
     if not (level > 0.05 * np.linalg.norm(beam, axis=1)).all():

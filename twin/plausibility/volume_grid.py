@@ -111,7 +111,9 @@ def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
 
 
 def voxel_findings(voxel_mm: float, view_mm: float) -> Iterator[Finding]:
-    """Refuse voxels so large that too few fit into a field of view of `view_mm`."""
+    """Refuse voxels so large that fewer than `FEWEST_VOXELS` fit into a field of view of
+    `view_mm`; yields at most one finding.
+    """
     if voxel_mm * FEWEST_VOXELS > view_mm:
         cause = f"voxels of {voxel_mm:g} mm in a field of view of {view_mm:.4g} mm across"
         remedy = f"allowed: below {view_mm / FEWEST_VOXELS:.3g} mm; is the voxel in mm?"

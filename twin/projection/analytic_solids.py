@@ -174,7 +174,9 @@ def as_convex(shape: Shape) -> Convex:
 
 
 def hull_points(one: Convex) -> FloatArray:
-    """Compute points whose convex hull holds a solid, (k, 3) [mm]."""
+    """Compute points whose convex hull holds a solid, (k, 3) [mm]: its corners, or those
+    of a round solid's box.
+    """
     if one.corners is not None:
         return one.corners
     assert one.semi_axes is not None

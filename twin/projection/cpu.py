@@ -101,7 +101,9 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
 def _project_alone(
     box: Box, views: FloatArray, chosen: IntArray, out: Float32Array
 ) -> None:
-    """Fill the chosen views of out with rays that are walked one by one."""
+    """Fill the chosen views of `out` with line integrals of rays that are walked one by
+    one, on all threads.
+    """
     from flexdt.twin.projection.kernels import siddon_kernels
 
     jobs = len(chosen) * -(-out.shape[2] // TILE)

@@ -47,7 +47,9 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
-        """Take images (n, rows, cols) from the host, or share their memory on the device."""
+        """Copy images (n, rows, cols) from the host, or share their memory if they are on
+        the device; raises if the device fails.
+        """
         if gpu.is_there(images):
             there = images
         else:

@@ -117,7 +117,9 @@ class Operator:
         like: Volume | Grid,
         shape: Shape2 | None = None,
     ) -> None:
-        """Take the geometry, the volume's grid and the detector's shape; see the class."""
+        """Take the geometry, the volume's grid and the detector's shape (None: the
+        geometry's); see the class. Values of `like` are ignored.
+        """
         scan = as_cone_vec(geometry)
         object.__setattr__(self, "geometry", scan)
         object.__setattr__(self, "like", as_volume(like))

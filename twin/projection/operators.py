@@ -81,7 +81,9 @@ Shape2 = tuple[int, int]
 
 
 def in_order(geometry: ConeVec, order: Order) -> ConeVec:
-    """Return the geometry for `Volume.in_order`; the images are the same."""
+    """Return the geometry with its axes permuted as `Volume.in_order` does; the images
+    are the same.
+    """
     if order == ORDERS[0]:
         return geometry
     rows = geometry.rows.reshape(-1, 4, 3)[:, :, list(order)].reshape(-1, 12)

@@ -633,7 +633,9 @@ class DeviceVolume:
 
     @classmethod
     def blank(cls, like: Volume) -> DeviceVolume:
-        """Create zeros on the grid of `like`."""
+        """Create a volume of zeros on the grid of `like` on the device; raises if the
+        device fails.
+        """
         from flexdt.twin.projection import gpu
 
         layout = blank_layout(like)

@@ -96,7 +96,7 @@ def fdk(
         chunk = CHUNK
 
     def parts() -> Iterable[Float32Array]:
-        """Yield the images as float32 in chunks, checked for values that are not finite."""
+        """Yield the images as float32 in chunks; raises on values that are not finite."""
         for start in range(0, len(values), chunk):
             part = np.asarray(values[start : start + chunk], dtype=np.float32)
             require_finite(part)

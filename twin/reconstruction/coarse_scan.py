@@ -178,7 +178,9 @@ class CoarseScan:
 
     @cached_property
     def ends(self) -> tuple[float, float]:
-        """Distances from the axis that the panel sees on its two sides [mm]."""
+        """Return the largest distances from the axis that the panel sees on its two
+        sides, signed, low and high [mm].
+        """
         fan = fan_angles(circle_of(self.cone_vec), self.level, self.images.shape[2])
         low, high = reach(fan)
         return float(self.circle.radius * np.sin(low)), float(

@@ -450,7 +450,9 @@ class DeviceRegular(Regular):
 
     @classmethod
     def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
-        """Create the same on the device, with all dual variables zero."""
+        """Create the same regulariser on the device, with all dual variables zero; raises
+        if the device fails.
+        """
         allowed = DeviceArray.of_voxels(like.like(regular.allowed.astype(np.float32)))
         dual = gpu.demand(lambda: gpu.zeros(3 * allowed.flat.size))
         flat = DeviceArray.of_images(dual.reshape(1, 1, dual.size))

@@ -81,7 +81,9 @@ class UniformNodes:
 
 
 def smoothed(values: Float32Array) -> Float32Array:
-    """Smooth values of nodes, (nz, ny, nx)."""
+    """Smooth values of nodes by a Gaussian, less along z if there are few layers, (nz,
+    ny, nx).
+    """
     from scipy.ndimage import gaussian_filter
 
     layers = min(SMOOTHING_NODES, (len(values) - 1) / 4)
@@ -101,7 +103,9 @@ def _typical(values: Float32Array) -> float:
 
 
 def _evenness(values: Float32Array, most: float) -> FloatArray:
-    """Compute weights of nodes, small where values change by more than `most`."""
+    """Compute weights of nodes, 1 where values are uniform, near 0 where they change by
+    more than `most`.
+    """
     from scipy.ndimage import gaussian_gradient_magnitude
 
     steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")

@@ -133,7 +133,9 @@ def run_demo(
 
 @contextlib.contextmanager
 def _drawn_truth() -> Iterator[Path]:
-    """Write a random hidden misalignment to a file outside the folder of the results."""
+    """Write a random hidden misalignment to a temporary file outside the folder of the
+    results; deleted at the end.
+    """
     with tempfile.TemporaryDirectory(prefix="flexdt-truth-") as secret:
         path = Path(secret) / "truth.toml"
         hidden.write(hidden.draw(), path)

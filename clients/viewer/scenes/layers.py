@@ -100,7 +100,9 @@ class Shown:
 
     @property
     def told(self) -> dict[str, object]:
-        """Return shown (layer -> bool) and opacity, as the page gets them."""
+        """Return what the page gets: "shown" (layer -> bool, of all layers) and
+        "opacity".
+        """
         return {
             "shown": {layer.name: layer.name in self for layer in LAYERS},
             "opacity": self.opacity,

@@ -122,7 +122,9 @@ def _draw_lines(
 
 
 def _remove(clients: Iterable[viser.ClientHandle], name: str) -> None:
-    """Remove a node from the scenes of some clients that have it."""
+    """Remove a node by name from the scenes of some clients; those without it are left
+    alone.
+    """
     for client in clients:
         handle = client.scene.get_handle_by_name(name)
         if handle is not None:

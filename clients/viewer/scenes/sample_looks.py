@@ -93,7 +93,9 @@ class SampleLook:
         return None if far is None else 2.0 * far
 
     def _reach(self, axes: int) -> float | None:
-        """Compute the greatest distance from the origin along the first axes [mm]."""
+        """Compute the greatest distance of the skins from the origin along the first
+        `axes` axes [mm]; None without skins.
+        """
         far = [
             np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins
         ]

@@ -108,7 +108,9 @@ def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
 
 
 def cone(world: World, color: tuple[int, int, int], opacity: float) -> Shape:
-    """Make the shape of the beam's outside, from the focal spot to the image."""
+    """Make the translucent shape of the beam's sides, from the focal spot to the image's
+    corners [m], not lit.
+    """
     corners = world.corners * MM
     spot = np.broadcast_to(world.source * MM, corners.shape)
     sides = np.stack([spot, np.roll(corners, -1, axis=0), corners], axis=1)

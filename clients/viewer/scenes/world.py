@@ -91,7 +91,7 @@ class World:
         return self.view.piercing_points().reshape(2)
 
     def pixel(self, column: float, row: float) -> FloatArray:
-        """Compute the centre of a pixel (3,) [mm]."""
+        """Compute the centre of a pixel (column, row), in the world's frame, (3,) [mm]."""
         rows, cols = self.shape
         across = column - (cols - 1) / 2
         down = row - (rows - 1) / 2
@@ -118,7 +118,7 @@ def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
 
 
 def parameters_of(state: State) -> Offsets:
-    """Return the correction in force, or none."""
+    """Return the offsets of the correction in force, or the nominal ones."""
     correction = state.correction
     if correction is None:
         return NOMINAL

@@ -345,7 +345,7 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:
-    """Wait until a file is there; exit if the parent process has ended."""
+    """Wait until a file is there; raises SystemExit(0) once the parent process has ended."""
     while not path.is_file():
         if not alive():
             raise SystemExit(0)

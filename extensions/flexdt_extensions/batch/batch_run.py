@@ -139,7 +139,9 @@ class Store:
     # -- helpers -------------------------------------------------------------------------------
 
     def _sort_log(self, items: list[dict[str, Any]]) -> None:
-        """Sort the log by item, independent of the order of completion."""
+        """Rewrite the log in the order of `items`, independent of their completion, and
+        open it again for appending.
+        """
         self._log.close()
         lines = [_canonical(record) + "\n" for record in (self._head, *items)]
         write_whole(self._log_path, "".join(lines))

@@ -149,7 +149,9 @@ class TrainingData:
         return len(self.indices)
 
     def __getitem__(self, number: int) -> Sample:
-        """Return an item: its arrays by name, and `index`, its number in the batch."""
+        """Return the item `number` of those done: its arrays by name, and `index`, its
+        number in the batch; augmented if asked for.
+        """
         index = int(self.indices[number])
         return self._finish(
             index, {name: self._arrays[name][index] for name in self.names}
@@ -187,7 +189,9 @@ class TrainingData:
                 )
 
     def _finish(self, index: int, sample: Sample) -> Sample:
-        """Augment a sample in place, with a generator of its own, and add its index."""
+        """Augment a sample in place, with a generator seeded by seed, epoch and index,
+        and return it with its index.
+        """
         if self.augment is not None:
             rng = np.random.default_rng((self.seed, self.epoch, index, 1))
             self.augment.apply(sample, rng)

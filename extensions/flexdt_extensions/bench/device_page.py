@@ -90,7 +90,9 @@ def _best(
     from numba import cuda
 
     def now() -> tuple[float, Any]:
-        """Wait for the device; return the host's time [s] and an event of the device's."""
+        """Wait until the device is idle; return the host's time [s] and an event recorded
+        on the device before.
+        """
         event = cuda.event()
         event.record()
         cuda.synchronize()

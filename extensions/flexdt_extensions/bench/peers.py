@@ -56,7 +56,7 @@ class Peer:
 
 
 def peers() -> list[Peer]:
-    """List all peers this benchmark knows, installed or not."""
+    """List all peers this benchmark knows, with the reason if one is not installed."""
     return [
         Peer("itk-rtk", absent("itk-rtk"), False, joseph),
         Peer("diffdrr", absent("diffdrr"), True, DiffDrr),

@@ -94,7 +94,9 @@ def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
 
 
 def noise(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Draw images (n, rows, cols) of random numbers from 0 to 1; a few are repeated."""
+    """Draw images (n, rows, cols) of random numbers from 0 to 1, always the same;
+    `NOISE_COUNT` of them are repeated.
+    """
     drawn = np.random.default_rng(0).random(
         (min(NOISE_COUNT, len(scan)), *shape), dtype=np.float32
     )

@@ -135,7 +135,9 @@ class Roll:
         its end."""
 
     def load(self, folder: PurePath, filename: str) -> None:
-        """Begin a new series of images: make the folder if needed, and number from 0."""
+        """Begin a new series of images: make the folder if needed, name files
+        FILENAME_000000.tif and on, and count from 0.
+        """
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.template = f"{filename}_{{:06d}}.tif"

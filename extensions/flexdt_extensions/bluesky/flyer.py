@@ -165,7 +165,7 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Connect to the twin, and forget an earlier scan."""
+        """Connect to the twin, and forget an earlier scan with its images and job."""
         await self._link.connect()
         self._prepared = None
         self._images = None

@@ -341,7 +341,9 @@ def _changes(
     last: list[_T] = []
 
     def notify(state: State) -> None:
-        """Call back if the value differs from the last one."""
+        """Call back with a reading if the value differs from the last one, and at the
+        first state.
+        """
         value = get(state)
         if not last or last[0] != value:
             last[:] = [value]

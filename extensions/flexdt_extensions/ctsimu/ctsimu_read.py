@@ -518,7 +518,9 @@ class ScenarioReader:
             )
 
     def _error(self, where: str, allowed: str) -> ExchangeError:
-        """Make the error on the value at `where`: what it is, and what is allowed."""
+        """Make (not raise) the error on the value at `where`: what it is, and what is
+        allowed.
+        """
         asked = self._stated_text(where)
         return ExchangeError.instead(
             f"{self._file}: {where} is {asked}", asked, allowed, path=where

@@ -113,7 +113,9 @@ class ScenarioImages:
             ) from None
 
     def _mesh(self, sample: MeshSample) -> TriangleMesh:
-        """Read a sample's mesh, centred and scaled to mm."""
+        """Read a sample's mesh, from the scenario's folder, centred on its bounding box
+        and scaled to mm.
+        """
         found = read_mesh(self.path.parent / sample.file)
         corners = np.asarray(found.vertices, dtype=np.float64)
         middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
@@ -358,7 +360,9 @@ class ScenarioImages:
         return [self._counts(one) for one in self._references(self.scan.dark, False, 0)]
 
     def flats(self) -> list[Counts]:
-        """Compute the flat images, uint16 (rows, cols)."""
+        """Compute the flat images, uint16 (rows, cols); their noise is numbered after the
+        dark images'.
+        """
         first = self.scan.dark.number
         return [
             self._counts(one) for one in self._references(self.scan.flat, True, first)

@@ -98,7 +98,7 @@ def _with_errors(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told
 
 
 def _modules(error: BaseException) -> Iterator[str]:
-    """Yield the names of the modules that an error came through."""
+    """Yield the names of the modules in an error's traceback, outermost first."""
     at = error.__traceback__
     while at is not None:
         yield str(at.tb_frame.f_globals.get("__name__"))
@@ -130,7 +130,9 @@ class _Numbers(pickle.Unpickler):
 
 
 def _numbers(file: Path) -> Any:
-    """Load CaTE's form of storage: one pickled dictionary in a NumPy file."""
+    """Load CaTE's form of storage: one pickled dictionary in a NumPy file; unpickling is
+    restricted by `_Numbers`.
+    """
     with file.open("rb") as stream:
         np.lib.format.read_magic(stream)
         np.lib.format.read_array_header_1_0(stream)
@@ -483,7 +485,7 @@ def zeiss(files: list[Path]) -> Iterator[Told]:
 
 
 def _result_text(make: Callable[[], Any]) -> str:
-    """Return flexdt's result as text, or its error."""
+    """Return flexdt's result as text, or the text of its TwinError; others are raised."""
     try:
         return str(make())
     except fx.TwinError as error:

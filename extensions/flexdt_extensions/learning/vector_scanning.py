@@ -49,7 +49,9 @@ class Turntable:
     """
 
     def __init__(self, size_mm: tuple[float, float, float], exposure_s: float) -> None:
-        """Make a scanner at rest, and one that turns, with a box on the stage."""
+        """Make a scanner at rest and one that turns, with a box of `size_mm` on the
+        stage; nothing is computed yet.
+        """
         self.still = Lab(size_mm, exposure_s)
         self._moved = Lab(size_mm, exposure_s)
         self._ways: dict[tuple[float, float], tuple[Taken, float]] = {}
@@ -79,7 +81,7 @@ class Turntable:
         return taken, end + turns
 
     def poses(self, angle: float) -> Poses:
-        """Return the nominal pose with rot_obj at an angle [deg]."""
+        """Return the nominal pose with rot_obj at an angle [deg]; each is computed once."""
         key = angle % 360.0
         if key not in self._poses:
             self._poses[key] = self.still.poses({"rot_obj": key})
@@ -118,7 +120,9 @@ class TurnedLab(Lab):
         return self.table.still.position(axis)
 
     def take(self, targets: dict[str, float]) -> Taken:
-        """Take a frame as `Lab.take`, for a target of rot_obj."""
+        """Take a frame as `Lab.take`, for the target of rot_obj; other targets are
+        ignored. Adds to time [s] and dose.
+        """
         taken, self.angle = self.table.way(self.angle, targets["rot_obj"])
         self.now += taken.seconds
         self.dose += taken.dose
@@ -210,7 +214,9 @@ class SharedQuality(QualityTask):
         super().__init__(draw)
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """Draw a new object, projected at every sector."""
+        """Draw a new object, project it at every sector without noise, and forget the
+        frames.
+        """
         super().reset(lab, rng)
         self._clean = project_scene(self._scene, self.table.rays.cone, lab.small_shape)
         self.sectors: list[int] = []
@@ -249,7 +255,9 @@ class _TurnEnv(ScanEnv):
     """A `ScanEnv` on a common turntable."""
 
     def __init__(self, **words: Any) -> None:
-        """Make an environment, whose images are shared if its task is one of quality."""
+        """Make an environment; if its task is one of quality, this is replaced by one
+        whose projections are shared.
+        """
         super().__init__(**words)
         if isinstance(self.task, QualityTask):
             table = turntable(self.task.size_mm, self.lab.exposure_s)

@@ -103,7 +103,9 @@ def scan_names() -> tuple[str, ...]:
 
 
 def poses_of(name: str, angle: FloatArray) -> Poses:
-    """Make a scan's geometry as the author's code has it, for stage angles (n,) [rad]."""
+    """Make a real scan's poses as the author's code has them, for stage angles (n,)
+    [rad].
+    """
     real = author()["real"]
     scan = real["scans"][name]
     detector = np.add(scan["detector"], real["detector_added"])

@@ -159,7 +159,9 @@ def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
 
 
 def geometry_of(task: WorkUnit, n: int) -> tuple[list[Poses], Offsets]:
-    """Make nominal poses (one set for each placement) and truth of a task."""
+    """Make the poses (one set for each placement) and true offsets of a task, with `n`
+    frames.
+    """
     if task.experiment == "detector":
         return placement_scenario(task.setting, n)
     poses, truth = scenario(task.scenario, n, task.variant)

@@ -208,7 +208,9 @@ METHODS: Final = tuple(_SOLVERS)
 
 
 def _solve(method: str, draw: _Draw) -> _Found:
-    """Solve a draw by a method; offsets are None if it fails."""
+    """Solve a draw by a method; returns offsets and iterations, (None, 0) if it fails
+    with a TwinError.
+    """
     try:
         return _SOLVERS[method](draw)
     except TwinError:
@@ -459,7 +461,9 @@ def _real(
 
 
 def lego_beam() -> EffectiveBeam:
-    """Compute effective energies of the tube's beam behind the LEGO phantom."""
+    """Compute effective energies of the tube's beam behind the LEGO phantom (60 mm of
+    ABS, 2.5 mm of others).
+    """
     names = sorted({solid.material for solid in load_phantom("lego").scene.solids})
     signal, noise = weights_of(Chain(Detector()), KILOVOLTS)
     longest = [60.0 if name == "abs" else 2.5 for name in names]

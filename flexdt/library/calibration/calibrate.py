@@ -312,7 +312,9 @@ def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
 def explained_by(
     saturated: Sequence[Finding], findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
-    """List saturated images first, and leave out the sizes of beads that they falsify."""
+    """List findings on saturated images first, and leave out those that saturation
+    falsifies (`OF_SATURATION`); unchanged if none is saturated.
+    """
     if not saturated:
         return tuple(findings)
     others = (finding for finding in findings if finding.code not in OF_SATURATION)
@@ -320,7 +322,9 @@ def explained_by(
 
 
 def with_undetermined(result: Calibration) -> Calibration:
-    """Add the finding of a calibration that nothing forbids and the images do not determine."""
+    """Add the error UNDETERMINED, with the weak directions, to a calibration without
+    errors that is not identifiable; others are returned as they are.
+    """
     if result.identifiable or result.errors:
         return result
     weak = () if result.fit is None else result.fit.certificate.weak
@@ -651,7 +655,7 @@ def digits(value: float | None, sigma: float | None) -> str:
 
 
 def rounded_up(sigma: float) -> str:
-    """Format a sigma rounded up to one digit: 0.012 is 0.02."""
+    """Format a sigma rounded up to one digit: 0.012 is 0.02; "0" unless it is positive."""
     if not sigma > 0:
         return "0"
     place = math.floor(math.log10(sigma))

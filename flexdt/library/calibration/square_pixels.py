@@ -74,7 +74,9 @@ class ResampledRows:
     @overload
     def __getitem__(self, index: npt.NDArray[np.int64]) -> ResampledRows: ...
     def __getitem__(self, index: int | npt.NDArray[np.int64]) -> Counts | ResampledRows:
-        """Return the resampled counts of one image, or select several."""
+        """Return the resampled counts of one image, rounded to uint16, or for an array of
+        indices these images, not yet resampled.
+        """
         if isinstance(index, np.ndarray) and index.ndim:
             return replace(self, original=self.original[index])
         counts = self.of(self.original.counts(int(index)))

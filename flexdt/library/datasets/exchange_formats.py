@@ -154,7 +154,7 @@ def _write_tomosipo(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_tomosipo(path: Path, given: Given) -> ScanGeometry:
-    """Read tomosipo's vectors from an .npz file."""
+    """Read tomosipo's vectors from an .npz file; `given` is ignored."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.number_tables import read_tomosipo
 
@@ -177,7 +177,7 @@ def _write_cil(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_cil(path: Path, given: Given) -> ScanGeometry:
-    """Read CIL's arrays from an .npz file."""
+    """Read CIL's arrays from an .npz file; `given` is ignored."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.cil_arrays import read_cil
 
@@ -191,7 +191,7 @@ def _write_tigre(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_tigre(path: Path, given: Given) -> ScanGeometry:
-    """Read TIGRE's arrays from an .npz file."""
+    """Read TIGRE's arrays from an .npz file; `given` is ignored."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.tigre_arrays import read_tigre
 
@@ -205,7 +205,7 @@ def _write_leap(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_leap(path: Path, given: Given) -> ScanGeometry:
-    """Read LEAP's arrays from an .npz file."""
+    """Read LEAP's arrays from an .npz file; `given` is ignored."""
     from flexdt.library.datasets.geometry_content import arrays_of
     from flexdt.twin.exchange.leap_arrays import read_leap
 
@@ -233,7 +233,7 @@ def _write_csv(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_csv(path: Path, given: Given) -> ScanGeometry:
-    """Read a table of vectors, one view a line."""
+    """Read a table of vectors, one view a line; `given` is ignored."""
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.twin.exchange.number_tables import read_csv
 
@@ -243,7 +243,9 @@ def _read_csv(path: Path, given: Given) -> ScanGeometry:
 def _export_nxtomo(
     dataset: ImageSet, out: Path, parameters: Offsets | None, real: Offsets | None
 ) -> None:
-    """Write a complete data set as NXtomo, with other offsets if `parameters` are given."""
+    """Write a complete data set as NXtomo, with other offsets if `parameters` are given;
+    `real` is ignored. Raises if it is incomplete.
+    """
     from flexdt.library.datasets.nxtomo_writing import save_nxtomo
 
     whole = dataset.require_complete()

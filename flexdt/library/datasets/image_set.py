@@ -479,7 +479,9 @@ class ImageSet:
 
     @cached_property
     def dark(self) -> Float32Array:
-        """Mean of the dark images, (rows, cols); zero, with a warning, without any."""
+        """Mean of the dark images, (rows, cols) [counts]; zero, with a warning, without
+        any.
+        """
         dark = self._mean(self.darks, None if self.arrays is None else self.arrays.darks)
         if dark is None:
             return np.zeros(self.shape, dtype=np.float32)
@@ -516,7 +518,9 @@ class ImageSet:
 
     @cached_property
     def normalisation(self) -> LineIntegrals:
-        """How counts become line integrals; `dead` marks the pixels for which they cannot."""
+        """Conversion of counts to line integrals; its `dead` marks the pixels for which
+        it has none, and bad pixels found are interpolated.
+        """
         plain = LineIntegrals.of(self.dark, self.flat)
         if self.interpolated is None:
             return plain
@@ -611,7 +615,7 @@ class ImageSet:
 
 
 def _are_counts(values: npt.NDArray[Any]) -> bool:
-    """Check whether values are integers from 0 to 65535."""
+    """Check whether values are whole numbers from 0 to 65535, of any type."""
     if values.dtype == np.uint16:
         return True
     top = np.iinfo(np.uint16).max
@@ -710,7 +714,9 @@ def _image_stack(
 
 
 def flats_of(data: ImageSet) -> npt.NDArray[Any]:
-    """Return the flat images, (k, rows, cols); a single file is not read."""
+    """Return the flat images, (k, rows, cols); none (k = 0) of files if there is a single
+    one, which is not read.
+    """
     if data.arrays is not None and data.arrays.flats is not None:
         return data.arrays.flats
     several = data.flats if len(data.flats) > 1 else ()

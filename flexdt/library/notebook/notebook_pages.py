@@ -267,7 +267,9 @@ class _Drawing:
 
 
 def _slider_indices(count: int) -> list[int]:
-    """Choose indices, evenly spread, of which a slider shows one."""
+    """Choose at most `MOST_PICTURES` indices below `count`, evenly spread, of which a
+    slider shows one.
+    """
     if not count:
         return []
     spread = np.linspace(0, count - 1, min(count, MOST_PICTURES))

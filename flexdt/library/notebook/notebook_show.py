@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
-    """Return widgets, or a page without ipywidgets, of a volume; see `Volume.show`."""
+    """Return widgets, in a notebook with ipywidgets, else a page of the volume; see
+    `Volume.show`.
+    """
     if in_notebook() and lacking("ipywidgets", "ipywidgets", "notebook") is None:
         widgets = package("ipywidgets", "a volume with live sliders", "notebook")
         return volume_widgets(widgets, volume, window)

@@ -379,7 +379,7 @@ def _stated_figures(
 
 
 def _unit(dataset: Any, usual: str) -> str:
-    """Return the unit that an attribute states, or the usual one."""
+    """Return the unit that a dataset's attribute states, or the usual one."""
     said = dataset.attrs.get("units", usual)
     if isinstance(said, bytes):
         return said.decode()

@@ -182,7 +182,9 @@ class ScanFrames:
         return rows // self.binning, cols // self.binning
 
     def parts(self) -> Iterator[Float32Array]:
-        """Iterate over line integrals of all frames, `PART` at a time, (k, rows, cols)."""
+        """Yield line integrals of all frames in order, `PART` at a time, (k, rows, cols);
+        not kept for another pass.
+        """
         count = len(self.indices)
         for first in range(0, count, PART):
             numbers = range(first, min(first + PART, count))
@@ -944,7 +946,7 @@ def _iterative(
 
 
 def _stack_integrals(views: ScanFrames) -> Float32Array:
-    """Stack line integrals of all frames, (n, rows, cols)."""
+    """Stack line integrals of all frames, (n, rows, cols), each read once."""
     stack = np.empty((len(views.indices), *views.shape), np.float32)
     for number, image in enumerate(stack):
         image[:] = views.view(number, again=False)

@@ -114,7 +114,9 @@ class StandingImages:
         return stood
 
     def rows(self, like: Volume) -> slice:
-        """Return the rows with a slab's shadow in some view."""
+        """Return the rows with a slab's shadow in some view, with a margin; all rows if
+        the scan rises or the panel is not upright.
+        """
         if self.rises or not is_upright(self.cone_vec):
             return slice(0, self.shape[0])
         first, last = rows_needed(self.cone_vec, self.shape, like)

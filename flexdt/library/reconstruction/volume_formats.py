@@ -307,7 +307,7 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         done = 0
 
         def write(slab: Float32Array) -> None:
-            """Write a slab behind the ones before."""
+            """Write a slab behind those written before."""
             nonlocal done
             for block in _blocks(slab):
                 values[done : done + len(block)] = block
@@ -375,7 +375,9 @@ def _read_nifti(path: Path) -> Stored:
 
 
 def _read_hdf5(path: Path) -> Stored:
-    """Read voxels, edge and centre from an .h5 file."""
+    """Read voxels, edge [mm], centre [mm] and False (it is the centre, not the first
+    voxel's place) from an .h5 file.
+    """
     with _h5py().File(path) as file:
         values = file["volume"]
         about = values.attrs

@@ -96,7 +96,9 @@ def fits(
 
 
 def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
-    """Return the typical noise of line integrals around complete spots; 0 without any."""
+    """Return the median noise of line integrals around complete, valid spots; 0 without
+    any.
+    """
     good = results[entire, kernels.OK] > 0
     if good.any():
         return float(np.median(results[entire[good], kernels.NOISE]))

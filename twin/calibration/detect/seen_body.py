@@ -180,7 +180,9 @@ def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
 
 
 def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArray:
-    """Subtract the mean from the values in each ring; 0 elsewhere, (m, side * side)."""
+    """Subtract from the values in each ring their mean, (m, side * side); 0 outside the
+    ring.
+    """
     inside = np.where(ring, values, 0.0).astype(np.float64)
     mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)
     return np.asarray(

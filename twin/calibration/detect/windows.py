@@ -420,7 +420,9 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
 
 
 def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bool_]:
-    """Mark pixels of this window that no other bead's spot touches, (side, side)."""
+    """Mark pixels of this bead's window in this frame that no other bead's spot touches,
+    (side, side).
+    """
     d2 = distances2(windows.corner[frame, bead], windows.side, windows.predicted[frame])
     reach = windows.radii[frame] * windows.stretch[frame, :, 2] + 3.0
     touched = d2 < (reach**2)[:, None, None]

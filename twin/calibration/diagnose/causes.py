@@ -296,7 +296,9 @@ class Candidates:
         return self._judged[choice]
 
     def evidence(self, choice: Choice) -> float:
-        """Return the logarithm of a choice's probability, up to a constant."""
+        """Return the logarithm of a choice's probability, up to a constant; -inf if it
+        cannot be judged.
+        """
         model = self.judged(choice)
         if model is None:
             return -math.inf
@@ -392,7 +394,9 @@ class Candidates:
         return at.mean[own], at.covariance(last)[own, own]
 
     def width(self, choice: Choice, name: str) -> float:
-        """Return the width of a cause in a choice; 0: it is not chosen, or not in the table."""
+        """Return the width of the named cause in a choice; 0 if it is not chosen or not a
+        candidate.
+        """
         for cause, pick in zip(self.causes, choice, strict=True):
             if cause.name == name:
                 return pick

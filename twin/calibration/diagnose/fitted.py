@@ -370,7 +370,9 @@ def _drifts(fit: FitResult) -> list[Finding]:
 
 
 def _looks_alike(column: str) -> str:
-    """Return words on other motions that look like a change of a parameter."""
+    """Return words on another motion that looks like a change of a parameter, in
+    brackets; "" without one.
+    """
     name = column.split("@")[0]
     if name in ALIKE_MOTION:
         return f" (or {ALIKE_MOTION[name]}, which looks alike)"

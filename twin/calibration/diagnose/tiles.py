@@ -95,7 +95,9 @@ def likely_border(
 
 
 def _allowed(at: FloatArray, side: int, known: Sequence[float]) -> npt.NDArray[np.bool_]:
-    """Mark borders that leave every tile its least width."""
+    """Mark borders `at` that leave every panel tile its least width: from the ends of a
+    side [px] and from the known borders.
+    """
     least = LEAST_TILE * side
     out = (at > least) & (at < side - least)
     for other in known:

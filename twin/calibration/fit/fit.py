@@ -388,7 +388,7 @@ class FitResult:
 
     @property
     def panel(self) -> Panel | None:
-        """The panel's distortion; None if it was not estimated."""
+        """The panel's estimated distortion; None if it was not estimated."""
         model = self.problem.panel
         first = self.problem.layout.panel_column
         if model is None:

@@ -163,7 +163,9 @@ class Profile:
         return max(found, key=lambda one: abs(one.width) / one.least)
 
     def at(self, radius: float) -> Step:
-        """Return the step at the radius next to one; its sigma is inf without a bin inside."""
+        """Return the step at the radius [px] beside the axis; its sigma and least are inf
+        unless there is a bin further inside.
+        """
         place = int(np.abs(self.radii - radius).argmin())
         step = self.beside_axis(radius)
         if self._has_inside[place]:

@@ -170,7 +170,9 @@ class _System:
         return self._difference(self.pairs.integrals(self.at, self.views, sums)[0])
 
     def solve(self, rest: FloatArray) -> FloatArray:
-        """Solve for shifts (n, 2) that would leave such differences (q, k)."""
+        """Solve by weighted least squares for the frames' shifts (n, 2) that would leave
+        such differences (q, k).
+        """
         right = np.zeros(len(self.normal))
         np.add.at(
             right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight)

@@ -191,7 +191,9 @@ class _Level:
         self.images, self.alone = (self._soft(i) for i in (rays.frames, rays.noise))
 
     def _soft(self, images: Float32Array) -> FloatArray:
-        """Compute coefficients of a spline through all smoothed images, one below the other."""
+        """Compute spline coefficients of all images, smoothed by the level's sigma,
+        stacked below each other with mirrored rows between.
+        """
         soft = gaussian_filter(images, (0, self.sigma, self.sigma))
         for axis in (1, 2):
             soft = spline_filter1d(soft, axis=axis, output=np.float32)

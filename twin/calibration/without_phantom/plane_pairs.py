@@ -237,7 +237,9 @@ class PlanePairs:
         return np.asarray(np.sqrt(worst))
 
     def noise(self, random: np.random.Generator) -> Float32Array:
-        """Draw images of noise as large as that of the frames, laid out as `sums`."""
+        """Draw images of noise as large as that of the frames, summed along columns like
+        `sums`.
+        """
         out = np.zeros_like(self.sums)
         np.cumsum(
             noise_like(np.diff(self.sums, axis=2), random), axis=2, out=out[:, :, 1:]

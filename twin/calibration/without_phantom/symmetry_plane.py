@@ -103,7 +103,9 @@ class OppositeColumn(NamedTuple):
 
     @property
     def floor_px(self) -> float:
-        """Part missing in the mean's sigma, as far as opposite rays show it [px]."""
+        """Compute the systematic part missing in the mean's sigma, as far as opposite
+        rays show it [px]; the mean's own sigma if theirs is infinite.
+        """
         if not math.isfinite(self.sigma_px):
             return self.mean_sigma_px
         share = self.mean_sigma_px / math.hypot(self.mean_sigma_px, self.sigma_px)
@@ -294,7 +296,9 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
 
 
 def _closes(found: Symmetry, gap: Gap) -> bool:
-    """Check whether the plane of symmetry determines the width, and leaves no gap."""
+    """Check whether the fit converged, determines the gap's width better than its prior,
+    and leaves no gap; False if it is beside the axis.
+    """
     if gap.beside_axis:
         return False
     sigma = float(np.sqrt(found.covariance[-1, -1]))
@@ -457,7 +461,7 @@ def _opposite_column(
 
 
 def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Turn]:
-    """Close a gap in the images and in their mean."""
+    """Close a gap between panel tiles in the images (as they are read) and in their mean."""
     own = gap.panel(scan.shape)
     image = scan.image
     mean = own.undistorted(turn.mean.astype(np.float32)).astype(float)
@@ -476,7 +480,9 @@ def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> flo
 def _keep_roll(
     values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
 ) -> None:
-    """Replace the roll by the one in force, since few rows gave values up to six sigma off."""
+    """Replace, in place, the roll's value and covariance by the one in force, [rad]: few
+    rows gave values up to six sigma off.
+    """
     values[1] = roll_rad
     covariance[1] = 0.0
     covariance[:, 1] = 0.0

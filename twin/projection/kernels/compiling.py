@@ -273,7 +273,9 @@ def count_one(typingctx: Any, counters: Any, index: Any) -> Any:
 
 @intrinsic
 def _look(typingctx: Any, counters: Any, index: Any) -> Any:
-    """Return counters[index]; all that was written before it was counted is visible."""
+    """Compile to: return counters[index]; all that was written before it was counted is
+    visible.
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         address = _address(context, builder, signature.args[0], *args)

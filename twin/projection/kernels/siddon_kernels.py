@@ -235,7 +235,7 @@ def spread_rays(box, views, chosen, values, slices, marks, first_column, last_co
 
 @inline
 def faces(s, d, n):
-    """Compute t at which the ray s + t d enters and leaves [0, n]; never, if d is 0."""
+    """Compute t at which the ray s + t d enters and leaves [0, n]; (-inf, inf) if d is 0."""
     if d > 0.0:
         return -s / d, (n - s) / d
     if d < 0.0:

@@ -46,7 +46,9 @@ def is_upright(cone_vec: ConeVec) -> bool:
 
 
 def on_its_side(cone_vec: ConeVec) -> bool:
-    """Return whether columns are nearer to the horizontal than rows, over all views."""
+    """Return whether detector columns are clearly nearer to the horizontal than rows, on
+    average over the views.
+    """
     steep = np.abs(np.stack([cone_vec.u[:, 2], cone_vec.v[:, 2]]))
     steep /= np.linalg.norm([cone_vec.u, cone_vec.v], axis=2)
     rows, columns = steep.mean(axis=1)

@@ -163,7 +163,7 @@ def _on_circle(angle: FloatArray) -> FloatArray:
 def mean_image(
     image: Callable[[int], npt.NDArray[np.generic]], views: npt.NDArray[np.intp]
 ) -> Float32Array:
-    """Average some views' images; among repeated angles, the order has no effect."""
+    """Average some views' images, summed in the given order, (rows, cols)."""
     total = np.asarray(image(int(views[0])), np.float32)
     for view in views[1:].tolist():
         total = total + np.asarray(image(view), np.float32)
@@ -326,7 +326,9 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
-    """Compute the confidence, 0 to 1, of views at angles from a gap."""
+    """Compute the confidence, 0 to 1, of views: it falls smoothly towards an arc without
+    views ("gap").
+    """
     from_gap = circle.from_gap(angle)
     return np.asarray(
         np.sin(np.pi / 2 * np.minimum(from_gap / GAP_RAMP_RAD, 1.0)) ** 2 + 1e-12

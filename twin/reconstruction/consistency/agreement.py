@@ -222,7 +222,9 @@ class Comparison:
     def _named(
         self, as_good: list[Tried], score: float, change: float | None = None
     ) -> Contradiction:
-        """Make the contradiction that names some explanations."""
+        """Make the contradiction that names the explanations `as_good`, each kind once,
+        with their figures.
+        """
         figures = {one.suspect.kind: one.suspect.figure for one in as_good}
         kinds = tuple(figures)
         told = tuple(figures.values())

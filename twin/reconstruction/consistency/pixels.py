@@ -193,7 +193,9 @@ def _lasting_or_flickering(
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
-    """Compute half of the largest response of a pixel and its neighbours in the row."""
+    """Compute half of the largest response among a pixel and `NEIGHBOURS` on each side in
+    the row.
+    """
     from scipy.ndimage import maximum_filter
 
     size = (1, 2 * NEIGHBOURS + 1)
@@ -238,7 +240,9 @@ class _Usual:
             rest = smaller
 
     def root(self) -> Float32Array:
-        """Compute the root mean square of the others, (rows, cols)."""
+        """Compute the root mean square of the images without each pixel's largest values,
+        (rows, cols).
+        """
         assert self._total is not None  # as there was an image
         rest = self._total - sum(self._largest, np.float32(0.0))
         mean = rest / np.float32(self.count - len(self._largest))

@@ -134,7 +134,7 @@ def _beyond_neighbours(view: Float32Array, size: int) -> Float32Array:
 
 
 def _column_means(image: Float32Array) -> Float32Array:
-    """Average some rows about each pixel, (rows, cols)."""
+    """Average `COLUMN_ROWS` rows about each pixel in its column, (rows, cols)."""
     from scipy.ndimage import uniform_filter1d
 
     mean = uniform_filter1d(image, min(COLUMN_ROWS, len(image)), axis=0, mode="nearest")
@@ -155,7 +155,9 @@ class _Pattern:
 
     @classmethod
     def of(cls, groups: Float32Array) -> _Pattern:
-        """Compute the pattern from groups of views, (k, rows, cols)."""
+        """Compute the pattern common to groups of views, (k, rows, cols): their median,
+        with its variance from their spread, averaged over blocks.
+        """
         middle = np.median(groups, axis=0)
         apart = SIGMA_OF_MEDIAN * np.median(np.abs(groups - middle), axis=0)
         noise = MEDIAN_VARIANCE / len(groups) * np.square(apart)

@@ -314,7 +314,9 @@ class OnDevice:
         return ready
 
     def _ready(self, n: int, cols: int, rows: int) -> Any:
-        """Reserve device memory for filtered columns, (n, cols, rows)."""
+        """Reserve device memory for filtered columns, (n, cols, rows); reused by the next
+        call, enlarged where too small.
+        """
         from numba import cuda
 
         if self._room is None or self._room.size < n * cols * rows:

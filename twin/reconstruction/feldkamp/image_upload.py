@@ -73,7 +73,9 @@ class ImageUpload:
         return there
 
     def table(self, name: str, values: FloatArray | Float32Array) -> Any:
-        """Upload a table of single precision; tables of one name share their memory."""
+        """Upload a table as single precision, without waiting; tables of one name share
+        their memory, chunk by chunk.
+        """
         there = self._room(name, values.size).reshape(values.shape)
         portion = self._portion(values.size).reshape(values.shape)
         np.copyto(portion, values, casting="same_kind")
@@ -81,7 +83,9 @@ class ImageUpload:
         return there
 
     def hand_over(self) -> None:
-        """Let the kernels launched from now on wait for the uploads so far."""
+        """Let the kernels launched from now on wait for the uploads so far; the host does
+        not wait.
+        """
         from numba import cuda
 
         done = cuda.event()
@@ -89,7 +93,9 @@ class ImageUpload:
         done.wait(self._reader)
 
     def end(self) -> None:
-        """Say that the last kernel that reads this chunk has been launched."""
+        """Record that the last kernel that reads this chunk has been launched, so that
+        its memory may be filled again.
+        """
         from numba import cuda
 
         done = cuda.event()

@@ -150,7 +150,7 @@ def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh
 
 
 def _linear(channel: int) -> float:
-    """Convert a channel of sRGB to glTF's: linear, 0 to 1."""
+    """Convert a channel of sRGB (0 to 255) to glTF's: linear, 0 to 1."""
     c = channel / 255.0
     if c <= 0.04045:
         return c / 12.92
