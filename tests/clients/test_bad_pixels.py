@@ -8,6 +8,7 @@ import bias_bound
 import numpy as np
 import pytest
 
+import flexdt as fx
 from flexdt import DataSet
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -92,6 +93,31 @@ def test_bad_pixels_leave_no_rings(kind: str, seed: int) -> None:
     assert int(told.split()[0]) == pytest.approx(int(bad.sum()), abs=1 + 0.1 * bad.sum())
     assert not any("starved" in one or "saturated" in one for one in said)
     assert body(found).std() <= 1.3 * body(clean).std()
+
+
+@pytest.mark.parametrize(
+    ("sample", "shape", "views"),
+    [
+        ("chiral", (73, 91), 77),
+        ("coplanar", (46, 57), 71),
+        ("tall", (80, 100), 32),
+        ("lego", (55, 68), 65),
+    ],
+)
+def test_beads_and_walls_of_a_pixel_are_no_bad_pixels(
+    sample: str, shape: tuple[int, int], views: int
+) -> None:
+    """Without noise, on panels so coarse that beads come and go like flicker; one bead is on
+    the axis."""
+    pixel = 0.1496 * 1536 / shape[0]
+    scan = ConeVec.circular(sod=600.0, sdd=1059.0, angles=views, shape=shape, pixel=pixel)
+    data = fx.simulate(
+        sample, scan, noise=None, detector=fx.Detector.ideal(), progress=False
+    )
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        data.reconstruct("fdk", voxel=pixel, errors=False, progress=False)
+    assert not any("do not respond" in str(one.message) for one in said)
 
 
 def test_rings_are_corrected_where_there_are_some_and_nowhere_else() -> None:

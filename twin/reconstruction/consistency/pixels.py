@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 NEIGHBOURS: Final = 2
 """Columns on either side that a pixel is compared with: each of two bad columns has
@@ -46,9 +46,23 @@ MIN_DEVIATION_RATIO: Final = 0.5
 MIN_LASTING_SHARE: Final = 0.75
 """Least share of the views in which a dead or hot pixel deviates; a bead at the turn
 of its orbit does so in less than half of them."""
+AXIS_BAND_PX: Final = 2.0
+"""Distance from the axis within which a small feature of the object is always there [pixels]."""
+EXPLAINED_ABOVE: Final = 0.5
+"""Attenuation above all others that a feature at the axis may have, over their range."""
+EXPLAINED_BELOW: Final = 0.1
+"""Attenuation below all others that one may have, over their range."""
+MIN_CHANGES_RATIO: Final = 3.0
+"""Least changes of a flickering pixel over the median of those about."""
+COMPARED_COLUMNS: Final = 4
+"""Columns on either side whose changes are compared."""
+MIN_SLOPE_RATIO: Final = 0.5
+"""Least distance of a lasting bad pixel beyond its neighbours, over their own range."""
 MIN_CHANGES_SHARE: Final = 0.25
 """Least share of views at which a flickering pixel changes between deviating and not;
 an object's feature comes and goes once."""
+MIN_AXIS_CHANGES_SHARE: Final = 0.375
+"""The same before the axis, where a bead stays longer; random flicker has half."""
 MAX_BAD_SHARE: Final = 0.05
 """Largest share of bad pixels; above it none is bad: the images are of another kind."""
 
@@ -108,7 +122,12 @@ def bad_pixels(
         response >= _largest_about(np.where(first, response, np.float32(0.0)))
     )
     second, _ = _outliers((_interpolated(view, worst) for view in views()), axis_column)
-    mask = _lasting_or_flickering(views(), worst | second)
+    columns = np.arange(first.shape[1])
+    at_axis = np.broadcast_to(abs(columns - axis_column) < AXIS_BAND_PX, first.shape)
+    lasting, flickering = _lasting_and_flickering(views(), worst | second, at_axis)
+    if (lasting & at_axis).any():
+        lasting &= ~at_axis | _no_feature(views(), lasting, at_axis)
+    mask = lasting | flickering
     if not mask.any():
         return None
     if mask.mean() <= MAX_BAD_SHARE:
@@ -169,27 +188,114 @@ def _short_groups(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     return np.asarray(mask & several & ~longer)
 
 
-def _lasting_or_flickering(
-    views: Iterable[Float32Array], mask: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
-    """Keep pixels that deviate in nearly all views, or now and then, (rows, cols).
+def _lasting_and_flickering(
+    views: Iterable[Float32Array],
+    mask: npt.NDArray[np.bool_],
+    at_axis: npt.NDArray[np.bool_],
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Find pixels that deviate in nearly all views, and those that do now and then.
 
-    An object's features stay before a pixel for a row of views and leave it.
+    A flickering pixel deviates from its row and from its column at once; one of a bad column
+    from the row alone, and one beside other bad ones in its row from the column alone. Edges
+    and thin walls of the object deviate from one of the two. Its beads deviate from both, and
+    visit the pixels about as often: a pixel flickers if it does so more often than they do.
+    The top of a round body at the axis is always there, but less beyond its neighbours than
+    they are apart.
+
+    Args:
+        views: line integrals (rows, cols).
+        mask: pixels that are beyond their neighbours.
+        at_axis: pixels before the axis, where a feature of the object comes and goes slowly.
+
+    Returns:
+        Both kinds, each (rows, cols).
     """
-    distances = np.array(
-        [
-            np.maximum(_beyond_neighbours(view), _beyond_neighbours(view.T).T)[mask]
-            for view in views
-        ]
-    )
+    from scipy.ndimage import binary_dilation
+
+    area = binary_dilation(mask, np.ones((1, 2 * COMPARED_COLUMNS + 1), np.bool_))
+    along = []
+    down = []
+    slopes_along = []
+    slopes_down = []
+    for view in views:
+        along.append(_beyond_neighbours(view)[area])
+        down.append(_beyond_neighbours(view.T).T[area])
+        slopes_along.append(_neighbours_range(view)[area])
+        slopes_down.append(_neighbours_range(view.T).T[area])
+    in_row = np.array(along)
+    clear_in_row = in_row - MIN_SLOPE_RATIO * np.array(slopes_along)
+    clear_in_column = np.array(down) - MIN_SLOPE_RATIO * np.array(slopes_down)
+    in_bad_column = np.broadcast_to(mask.mean(axis=0) > 0.5, mask.shape)
+    share = np.where(at_axis, MIN_AXIS_CHANGES_SHARE, MIN_CHANGES_SHARE)
+    flickers = _flickers(np.minimum(clear_in_row, clear_in_column), area, share)
+    flickers |= in_bad_column & _flickers(in_row, area, share)
+    flickers |= _short_groups(mask) & _flickers(clear_in_column, area, share)
+    lasts = np.zeros_like(mask)
+    clear = np.maximum(clear_in_row, clear_in_column)
+    lasts[area] = _deviates(clear).mean(axis=0) >= MIN_LASTING_SHARE
+    return mask & lasts, mask & flickers
+
+
+def _no_feature(
+    views: Iterable[Float32Array],
+    mask: npt.NDArray[np.bool_],
+    at_axis: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.bool_]:
+    """Find pixels at the axis that no feature of the object explains, (rows, cols).
+
+    A bead on the axis stands before one pixel in all views, as a defect does. Columns that are
+    bad over most rows, and means beyond what the object gives elsewhere, are defects.
+
+    Args:
+        views: line integrals (rows, cols).
+        mask: pixels that seem bad.
+        at_axis: pixels before the axis.
+    """
+    elsewhere = ~mask & ~at_axis
+    lows = []
+    highs = []
+    total = np.zeros(mask.shape, np.float64)
+    for view in views:
+        lows.append(float(view[elsewhere].min(initial=0.0)))
+        highs.append(float(view[elsewhere].max(initial=0.0)))
+        total += view
+    span = max(highs) - min(lows)
+    mean = total / len(lows)
+    beyond = mean > max(highs) + EXPLAINED_ABOVE * span
+    beyond |= mean < min(lows) - EXPLAINED_BELOW * span
+    whole = np.broadcast_to(mask.mean(axis=0) > 0.5, mask.shape)
+    return np.asarray(whole | beyond)
+
+
+def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
+    """Find where distances (views, pixels) are like a pixel's root mean square, or larger."""
     usual = np.sqrt(np.mean(np.square(distances), axis=0))
-    deviates = distances > np.maximum(MIN_DEVIATION_RATIO * usual, 2.0 * MIN_BAD_RESPONSE)
-    changes = (deviates[1:] != deviates[:-1]).sum(axis=0)
-    kept = np.zeros_like(mask)
-    kept[mask] = (deviates.mean(axis=0) >= MIN_LASTING_SHARE) | (
-        changes >= MIN_CHANGES_SHARE * len(distances)
-    )
-    return kept
+    least = np.maximum(MIN_DEVIATION_RATIO * usual, 2.0 * MIN_BAD_RESPONSE)
+    return np.asarray(distances > least)
+
+
+def _flickers(
+    distances: Float32Array | FloatArray,
+    area: npt.NDArray[np.bool_],
+    least_share: npt.NDArray[np.float64],
+) -> npt.NDArray[np.bool_]:
+    """Find pixels that deviate and cease often, and more often than those about, (rows, cols).
+
+    Args:
+        distances: beyond the neighbours, (views, pixels of the area).
+        area: the pixels, (rows, cols).
+        least_share: changes of a flickering pixel over the views, (rows, cols).
+    """
+    from scipy.ndimage import median_filter
+
+    deviates = _deviates(distances)
+    changes = np.zeros(area.shape, np.float32)
+    changes[area] = (deviates[1:] != deviates[:-1]).sum(axis=0)
+    about = np.ones((1, 2 * COMPARED_COLUMNS + 1), np.bool_)
+    about[0, COMPARED_COLUMNS] = False
+    usual = median_filter(changes, footprint=about, mode="reflect")
+    least = np.maximum(least_share * len(distances), MIN_CHANGES_RATIO * usual)
+    return np.asarray(changes >= least)
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
@@ -270,6 +376,14 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
     least = np.full(cols, MIN_BAD_RESPONSE)
     least[:NEIGHBOURS] = least[-NEIGHBOURS:] = MIN_EDGE_RESPONSE
     return np.asarray(response > np.maximum(BAD_RESPONSE_RATIO * usual, least))
+
+
+def _neighbours_range(view: Float32Array) -> Float32Array:
+    """Compute the range of a pixel's neighbours in its row, without it, (rows, cols)."""
+    cols = view.shape[1]
+    wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")
+    others = [wide[:, k : k + cols] for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
+    return np.asarray(np.max(others, axis=0) - np.min(others, axis=0))
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
