@@ -16,6 +16,7 @@ from typing import Any, Final, Literal
 import typer
 
 from flexdt.clients.cli.console import emit, say
+from flexdt.clients.cli.settings_file import configuration
 from flexdt.clients.cli.twin_connection import connect
 from flexdt.runtime.files.writable import require_writable
 from flexdt.runtime.settings import described, has_parameters
@@ -52,9 +53,11 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 
     @wraps(command)
     def complete(context: typer.Context, **given: Any) -> None:
-        """Run the command with the arguments that it takes from `flexdt` itself: check that its
-        output files can be written, and print its answers, as lines or (--json) as documents.
+        """Run the command with the arguments that it takes from `flexdt` itself: check the keys
+        of the settings file and that its output files can be written, and print its answers, as
+        lines or (--json) as documents.
         """
+        configuration()
         root = context.find_root().params
         if "context" in own:
             given["context"] = context

@@ -20,6 +20,7 @@ variable is not set, or the one that FLEXDT_CONFIG names.
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -42,8 +43,15 @@ from flexdt.runtime.process_settings import (
     ViewerSettings,
 )
 from flexdt.runtime.settings import Settings, option, read, words
+from flexdt.twin.errors import UnknownNameError
 
 S = TypeVar("S", bound=Settings)
+
+OPTION_PROBLEM: Final = re.compile(
+    r"Invalid value for '--(?P<flag>[a-z0-9-]+)': (?:Value error, )?(?P<why>.*)",
+    re.DOTALL,
+)
+"""Message of typer about the value of an option."""
 
 PREFIX: Final = "FLEXDT_"
 PATHS: Final = ("FILE", "DIR")
@@ -199,8 +207,14 @@ def _require_known(
     """
     for key in given:
         if key not in known:
-            allowed = ", ".join((*known, *tables))
-            raise CommandError(f"{where} unknown key {key!r}; allowed: {allowed}")
+            allowed = (*known, *tables)
+            raise CommandError(
+                str(
+                    UnknownNameError.among(
+                        f"{where} unknown key {key!r}; allowed", key, allowed
+                    )
+                )
+            )
 
 
 def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
@@ -228,9 +242,22 @@ def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
         if not hasattr(error, "format_message"):
             raise
         raise CommandError(
-            f"{config_file(os.environ)}: [{name}] {error.format_message()}"
+            f"{config_file(os.environ)}: [{name}] {_by_key(error.format_message())}"
         ) from None
     return read(kind, [*given, *more]) if more else found
+
+
+def _by_key(problem: str) -> str:
+    """Return a problem of an option's value as one of the file's key.
+
+    Example:
+        >>> _by_key("Invalid value for '--http-port': 7 is no port")
+        'http_port: 7 is no port'
+    """
+    found = OPTION_PROBLEM.fullmatch(problem)
+    if found is None:
+        return problem
+    return f"{found['flag'].replace('-', '_')}: {found['why']}"
 
 
 def chosen(kind: type[S]) -> S:

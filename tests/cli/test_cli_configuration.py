@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -136,6 +137,30 @@ def test_a_table_of_the_file_holds_the_options_of_a_process(
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            'serer = "x:1"',
+            "config.toml: unknown key 'serer'; allowed: server, .*'server'",
+        ),
+        ('[reconstruct]\nwindwo = "hann"', r"\[reconstruct\] unknown key .*'window'"),
+        ("[reconstrct]\n", r"unknown key 'reconstrct'; allowed: .*'\[reconstruct\]'"),
+    ],
+)
+def test_every_command_names_a_misspelt_key(
+    text: str, says: str, no_configuration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    no_configuration.write_text(f"{text}\n")
+    commands = (["state"], ["phantom", "list"], ["machine", "list"], ["doctor"], ["twin"])
+    for words in commands:
+        assert run(words) == 1, words
+        told = capsys.readouterr()
+        assert re.search(f"{says}\\?\n$", told.err), told.err
+        assert told.out == ""
+    assert run(["phantom", "list", "--help"]) == 0
+
+
 COMMANDS = [kind for kind in TABLES.values() if not issubclass(kind, ProcessSettings)]
 
 
@@ -166,10 +191,10 @@ def test_an_option_that_went_to_the_file_names_its_key(
             (f"[script_new]\nheight = {height}", "script new --kind fly", code, message)
             for height, code, message in (("nan", 3, "height_mm is nan; allowed"),
                                     ("inf", 3, "height_mm is inf; allowed"),
-                                    ('"high"', 1, "[script_new] Invalid value for '--height'"))
+                                    ('"high"', 1, "[script_new] height: "))
         ),
         ('[reconstruct]\nwindow = "square"', "reconstruct . --out x.tif", 1,
-         "[reconstruct] Invalid value for '--window': "),
+         "[reconstruct] window: 'square' is not one of"),
         ('[reconstruct]\nmemory = "much"', "reconstruct . --out x.tif", 1,
          "'much' is not a size such as 512M or 4GiB"),
         ('[phantom_make]\nbead = "cheese"', "phantom make p.json --like normal", 1, "cheese"),
