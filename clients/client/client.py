@@ -28,7 +28,13 @@ from typing import Any, Final, Generic, ParamSpec, Protocol, TypeVar, overload
 from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.events import AsyncSubscription, Subscription
 from flexdt.clients.client.flows import Ask, Effect, Flow, Tell, adrive, drive, perform
-from flexdt.clients.client.transport import ConnectionLost, Link, TcpTransport, Transport
+from flexdt.clients.client.transport import (
+    ConnectionLost,
+    Link,
+    NoTwinError,
+    TcpTransport,
+    Transport,
+)
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol import METHODS, RpcError, hello_params, parse_result
 from flexdt.protocol.methods.session_messages import HelloResult
@@ -245,14 +251,13 @@ class Core:
 
         Raises:
             ConnectionLost: no connection, or the client was closed meanwhile.
+            NoTwinError, TimeoutError: what answers, or is silent, is no twin.
             RpcError: the server refuses the client; the connection is closed.
         """
         await self.transport.open()
         link = Link(self.transport, self._deliver, self._notify_end)
         try:
-            params = hello_params(self.name, self.token)
-            answer = await link.request("session.hello", params, self.timeout_s)
-            hello = parse_result(HelloResult, answer)
+            hello = await self._introduce(link)
             for wanted in list(self._listeners.values()):
                 await link.request("state.subscribe", wanted, self.timeout_s)
             if self.closed:  # by another thread or task, meanwhile
@@ -265,6 +270,36 @@ class Core:
             raise
         self.hello = hello
         return link
+
+    async def _introduce(self, link: Link) -> HelloResult:
+        """Greet the server and check that it is a twin.
+
+        Raises:
+            ConnectionLost: the server ended the connection.
+            NoTwinError: its answer is that of another program.
+            TimeoutError: no answer.
+            RpcError: the server refuses the client.
+        """
+        place = self.transport.place
+        try:
+            params = hello_params(self.name, self.token)
+            answer = await link.request("session.hello", params, self.timeout_s)
+        except TimeoutError as error:
+            raise TimeoutError(f"{place} is no twin, or hangs: {error}") from None
+        except ConnectionLost as error:
+            if link.calls.violation is not None:
+                raise NoTwinError(
+                    f"{place} is no twin: what it sends is not flexdt's protocol"
+                ) from None
+            if link.calls.reason is not None:
+                raise
+            raise ConnectionLost(
+                f"{place} is no twin, or one that ends: {error}", sent=error.sent
+            ) from None
+        hello = parse_result(HelloResult, answer)
+        if not hello.machine:
+            raise NoTwinError(f"{place} is no twin: it is {hello.server}")
+        return hello
 
 
 def _require_same(

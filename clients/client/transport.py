@@ -56,9 +56,21 @@ class ConnectionLost(ConnectionError):
         return cls(f"the server ended the connection{why}", sent=sent)
 
 
+class NoTwinError(ConnectionError):
+    """What answers at the address is another program than a twin."""
+
+
 class Transport(Protocol):
     """A connection to a server. `open` may be called again after the connection has been
-    lost."""
+    lost.
+
+    Attributes:
+        place: of the server, for people.
+    """
+
+    @property
+    def place(self) -> str:
+        """Address of the server, for people."""
 
     async def open(self) -> None:
         """Connect, or raise `ConnectionLost`."""
@@ -121,6 +133,11 @@ class TcpTransport:
         self.ssl = ssl
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._wire = Connection(codec)
+
+    @property
+    def place(self) -> str:
+        """HOST:PORT of the server."""
+        return f"{self.host}:{self.port}"
 
     def __repr__(self) -> str:
         return f"TcpTransport({self.host!r}, {self.port}, codec={self.codec})"

@@ -191,6 +191,8 @@ class InProcessTransport(asyncio.Transport):
         serve: makes the server's end of a connection.
     """
 
+    place = "this process"
+
     def __init__(
         self, loop: asyncio.AbstractEventLoop, serve: Callable[[], _Receiver]
     ) -> None:

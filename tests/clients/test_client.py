@@ -17,6 +17,7 @@ from in_process_transport import InProcessTransport
 from numpy.testing import assert_array_equal
 
 from flexdt.clients import AsyncTwinClient, ConnectionLost, TwinClient
+from flexdt.clients.cli.boundary import REFUSED, describe
 from flexdt.clients.client.transport import TcpTransport
 from flexdt.protocol import (
     METHODS,
@@ -558,6 +559,56 @@ def _serve_broken(connected: socket.socket, last: bytes, asked: list[str]) -> No
             connected.sendall(
                 wire.send(Response(request.id, answer(request.method, Empty())))
             )
+
+
+def strange_server(says: bytes, *, ends: bool) -> Iterator[int]:
+    """A server that is no twin: answers the first bytes with its own, and may end then."""
+    listening = socket.create_server(("127.0.0.1", 0))
+
+    def serve_all() -> None:
+        with suppress(OSError):
+            while True:
+                connected, _ = listening.accept()
+                with connected:
+                    connected.recv(1 << 16)
+                    connected.sendall(says)
+                    while not ends and connected.recv(1 << 16):
+                        pass
+
+    threading.Thread(target=serve_all, daemon=True).start()
+    with listening:
+        yield listening.getsockname()[1]
+
+
+PROJECTOR = {"protocol": "1.0", "server": "flexdt projector 9", "machine": ""}
+STRANGE = {
+    "another program": (
+        b"HTTP/1.1 400 Bad Request\r\n\r\n",
+        True,
+        "is not flexdt's protocol",
+    ),
+    "one that greets": (b"SSH-2.0-OpenSSH_9.6\r\n", False, "is not flexdt's protocol"),
+    "one that hangs up": (b"", True, "ended the connection"),
+    "one that is silent": (b"", False, "no answer to session.hello within 0.3 s"),
+    "a projector": (
+        Connection(Codec.MSGPACK).send(Response(1, PROJECTOR)),
+        False,
+        "it is flexdt projector 9",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+def test_what_is_no_twin_is_called_so(kind: str) -> None:
+    says, ends, why = STRANGE[kind]
+    with (
+        contextmanager(strange_server)(says, ends=ends) as port,
+        pytest.raises(OSError, match=f"^127.0.0.1:{port} is no twin.*{why}") as caught,
+    ):
+        TwinClient("127.0.0.1", port, timeout_s=0.3 if not (says or ends) else 60.0)
+    [line], code = describe(caught.value)  # type: ignore[arg-type]
+    assert str(port) in line
+    assert code == REFUSED
 
 
 BROKEN = {

@@ -19,6 +19,8 @@ class InProcessTransport:
         codec: what the two ends speak.
     """
 
+    place = "this process"
+
     def __init__(
         self,
         handler: Callable[[Message], Iterable[Message]],
