@@ -411,10 +411,44 @@ def sample(
                 sent = client.upload_mesh(file, unit=in_unit, material=material)
             now = client.set_sample(file=sent.name)
         else:
-            now = client.set_sample(name)
+            now = _named_sample(client, name)
     warn(now.warnings)
     yield now
     yield f"on the stage: {now.sample.name or 'nothing'}"
+
+
+def _named_sample(client: TwinClient, name: str) -> State:
+    """Put a sample on the stage by its name.
+
+    Args:
+        client: connected to the twin.
+        name: of a sample of the twin.
+
+    Returns:
+        The twin's state.
+
+    Raises:
+        CommandError: the twin has no such sample, and the name is that of a file, which is
+            not there or holds no sample.
+        RpcError: the twin refuses it.
+    """
+    from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
+    from flexdt.protocol.rpc_errors import RpcError
+
+    try:
+        return client.set_sample(name)
+    except RpcError:
+        file = Path(name)
+        known = (*MESH_FORMATS, *SCENE_FORMATS)
+        ends = file.suffix.lower().lstrip(".") in known
+        if file.is_file() and not ends:
+            endings = ", ".join(f".{ending}" for ending in known)
+            raise CommandError(
+                f"{name}: not a sample's file; allowed: {endings}"
+            ) from None
+        if not file.is_file() and (ends or len(file.parts) > 1):
+            raise CommandError(f"{name}: no such file") from None
+        raise
 
 
 def delete_sample(twin: Twin, name: str = argument(..., "NAME")) -> Answer:
