@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import subprocess
@@ -285,3 +286,40 @@ def test_a_retired_command_says_in_one_line_what_to_do(
     assert said.out == ""
     assert said.err.count("\n") == 1
     assert "tar -cf" in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["state", "--server", "127.0.0.1:9"], 4),
+        (["check", "nothere.txt"], 1),
+        (["script", "new", "--kind", "fly", "--frames", "5"], 3),
+        (["machine", "check", "nothere.toml"], 1),
+        (["calibrate", ".", "--phantom", "lego"], 1),
+        (["calibrate", "."], 2),
+        (["reconstruct", ".", "--out", "nowhere/volume.tif"], 1),
+        (["phantom", "make"], 2),
+        (["nothing"], 2),
+    ],
+)
+def test_json_of_a_command_that_fails_is_empty(
+    words: list[str],
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command_tree.run(["--json", *words]) == code
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("flexdt")
+
+
+def test_json_of_a_bad_finding_is_its_document(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "bad.txt"
+    script.write_text("camera set exposure fast ACK\n")
+    assert command_tree.run(["--json", "check", str(script)]) == 1
+    assert json.loads(capsys.readouterr().out)["ok"] is False
