@@ -26,6 +26,8 @@ LAYERS = {
     "sigma": "noise of attenuation",
     "bias_bound": "bound of its bias",
 }
+DOT_PT = 6.0
+"""Size of the dots of sources and panels."""
 PANELS = 12
 """Largest number of panels drawn, evenly chosen."""
 
@@ -42,7 +44,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
     """
     if axes is None:
         axes = _pyplot().figure().add_subplot(projection="3d")
-    axes.plot(*cone_vec.source.T, ".", label="source")
+    axes.plot(*cone_vec.source.T, "C0.", markersize=DOT_PT, label="source")
     shown = np.unique(
         np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), PANELS)).astype(int)
     )
@@ -52,7 +54,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
         if view.detector_shape is not None:
             (corners,) = panel_corners(view)
             axes.plot(*np.vstack([corners, corners[:1]]).T, "C1-", linewidth=0.8)
-    axes.plot(*cone_vec.detector.T, "C1.", markersize=2, label="detector")
+    axes.plot(*cone_vec.detector.T, "C1.", markersize=DOT_PT, label="detector")
     axes.plot([0.0], [0.0], [0.0], "k+", label="origin of the object")
     axes.set(
         xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views"

@@ -105,12 +105,28 @@ def test_a_geometry_is_drawn_with_one_scale() -> None:
     assert abs(float(x1) - float(x2)) < 0.2  # along the line of sight
     assert abs(float(x3) - float(x4)) == pytest.approx(300.0 * per_mm, abs=0.3)
     assert page.html.count('style="display:none"') == 1
+    (ax, ay, bx, by) = map(
+        float,
+        re.search(  # type: ignore[union-attr]
+            r'class="axis" x1="(.*?)" y1="(.*?)" x2="(.*?)" y2="(.*?)"', page.html
+        ).groups(),
+    )
+    named = re.findall(r"([xyz]) ([\d.e+]+) mm</text>", page.html)
+    assert [name for name, _ in named] == list("xyz")
+    assert (bx - ax) == pytest.approx(float(named[0][1]) * per_mm, abs=0.3)
+    assert ay == by
+    dots = [float(r) for r in re.findall(r'r="([\d.]+)" fill="#d33" opacity', page.html)]
+    assert len(dots) == 2
+    assert min(dots) >= 2.0
 
 
 def test_axes_of_a_plotted_geometry_are_equal() -> None:
     pytest.importorskip("matplotlib", reason="the extra `plots`").use("Agg")
     axes = fx.ConeVec.circular(sod=100, sdd=300, angles=9, shape=(4, 5), pixel=2.0).plot()
     assert axes.get_aspect() == "equal"
+    assert [axes.get_xlabel(), axes.get_zlabel()] == ["x [mm]", "z [mm]"]
+    dots = [line for line in axes.lines if line.get_label() in ("source", "detector")]
+    assert min(line.get_markersize() for line in dots) >= 4.0
 
 
 def test_widgets_show_any_layer_and_window() -> None:

@@ -5,6 +5,7 @@ Percentiles of the image become black and white; values beyond them are clipped.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from typing import Any, Final
@@ -33,6 +34,17 @@ PNG_EFFORT: Final = 3
 """Of zlib, 0 to 9: more takes longer and saves a few per cent."""
 BAND: Final = 100
 """Marks on the edge are drawn 1 / BAND of the picture wide, to be visible."""
+
+
+def round_length(most: float) -> float:
+    """Choose the greatest 1, 2 or 5 times a power of ten up to `most`, for a scale.
+
+    Example:
+        >>> round_length(37.0), round_length(0.7)
+        (20.0, 0.5)
+    """
+    power = 10.0 ** math.floor(math.log10(most))
+    return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= most)
 
 
 def windowed(

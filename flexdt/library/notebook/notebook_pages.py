@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.datasets.pictures import png_of
+from flexdt.library.datasets.pictures import png_of, round_length
 from flexdt.library.notebook.notebook_slices import AXES, grey_of, layer_of, window_of
 from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.errors import TwinError
@@ -37,6 +37,9 @@ DRAWING_PX: Final = 420
 """Side of the drawing of a geometry."""
 MARGIN: Final = 0.06
 """Free margin around a geometry, as a share of the drawing's side."""
+DOT_PX: Final = 2.5
+"""Radius of the dot of a source's place."""
+AXIS_COLOUR: Final = "#456"
 ELEVATION_DEG: Final = 30.0
 """Of the eye above the plane of the turn, in the drawing of a geometry."""
 NOT_DRAWN: Final = ' style="display:none"'
@@ -169,7 +172,8 @@ def geometry_page(cone_vec: ConeVec) -> NotebookPage:
     caption = f"{cone_vec!r}".strip("<>")
     slider = _slider(len(shown), "view", handler, 0)
     scale = (
-        f"{drawing.millimetres:.4g} mm across; red source, orange panel, circle sample"
+        f"{drawing.millimetres:.4g} mm across, axes of the object [mm]; red source, orange "
+        "panel, circle sample"
     )
     return NotebookPage(
         f"<div>{svg}<br>{slider}<span>view {shown[0]} of {len(cone_vec)}</span></div>"
@@ -225,20 +229,38 @@ class _Drawing:
         return DRAWING_PX / 2 + scale * float(x), DRAWING_PX / 2 - scale * float(up)
 
     def still(self, cone_vec: ConeVec) -> str:
-        """Draw (SVG) what all views share: places of the source, and the sample as a
+        """Draw (SVG) what all views share: axes, places of the source, and the sample as a
         circle at the origin of at least 2 px.
         """
         dots = "".join(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="#d33" opacity=".4"/>'
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT_PX}" fill="#d33" opacity=".6"/>'
             for x, y in (
                 self.point(cone_vec.source[i]) for i in _slider_indices(len(cone_vec))
             )
         )
         x, y = self.point((0.0, 0.0, 0.0))
         radius = max(2.0, self.radius_mm * DRAWING_PX / self.millimetres)
-        return dots + (
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="none" stroke="#456"/>'
+        return (
+            self.axes()
+            + dots
+            + (
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="none" stroke="#456"/>'
+            )
         )
+
+    def axes(self) -> str:
+        """Draw the object's axes from its origin, each with its name and a length in mm."""
+        length = round_length(self.millimetres / 4)
+        x0, y0 = self.point((0.0, 0.0, 0.0))
+        parts = []
+        for k, name in enumerate("xyz"):
+            x, y = self.point(length * np.eye(3)[k])
+            parts.append(
+                f'<line class="axis" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x:.1f}" y2="{y:.1f}" '
+                f'stroke="{AXIS_COLOUR}"/><text x="{x + 3:.1f}" y="{y - 3:.1f}" '
+                f'font-size="11" fill="{AXIS_COLOUR}">{name} {length:g} mm</text>'
+            )
+        return "".join(parts)
 
     def view(self, cone_vec: ConeVec, index: int) -> str:
         """Draw one view: source, central ray and panel.
