@@ -10,6 +10,8 @@ from collections.abc import Iterable
 
 AXIS_VALUE = "="
 """Separates an axis from its value in words such as rot_obj=90."""
+UNKNOWN_MARKERS = "unknown"
+"""Word for beads at unknown places, instead of a phantom."""
 
 
 def machine_names(typed: str) -> list[str]:
@@ -31,6 +33,19 @@ def sample_names(typed: str) -> list[str]:
     from flexdt.phantoms import phantom_names
 
     return _beginning(typed, phantom_names())
+
+
+def bead_phantom_names(typed: str) -> list[str]:
+    """List shipped phantoms that have beads, as completions."""
+    from flexdt.phantoms import load_phantom
+
+    return [name for name in sample_names(typed) if len(load_phantom(name).beads)]
+
+
+def calibration_targets(typed: str) -> list[str]:
+    """List what a calibration may be of, as completions: phantoms with beads, and the
+    word for markers at unknown places."""
+    return [*bead_phantom_names(typed), *_beginning(typed, [UNKNOWN_MARKERS])]
 
 
 def material_names(typed: str) -> list[str]:

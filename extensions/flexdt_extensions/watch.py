@@ -22,7 +22,7 @@ import numpy as np
 
 from flexdt.clients import FINAL_STATES, JobStatus, TwinClient
 from flexdt.extending import Answer, Twin, argument, assignments, note, option
-from flexdt.phantoms import load_phantom
+from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.twin.calibration import SIX, bead_model, detect_beads
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.pipeline import detector_for
@@ -157,12 +157,28 @@ def _machine_priors(client: TwinClient) -> dict[str, float]:
     return prior_widths(machine, profile_of(machine))
 
 
+def bead_phantoms(typed: str) -> list[str]:
+    """List shipped phantoms that have beads, as completions."""
+    names = (name for name in phantom_names() if name.startswith(typed.lower()))
+    return [name for name in names if len(load_phantom(name).beads)]
+
+
+def tolerances(typed: str) -> list[str]:
+    """List the parameters that a calibration estimates, each with the sign before its
+    sigma, as completions; after a comma those of a further one."""
+    before, comma, last = typed.rpartition(",")
+    return [f"{before}{comma}{name}=" for name in SIX if name.startswith(last)]
+
+
 def watch_job(
     twin: Twin,
-    phantom: str = argument(..., "PHANTOM"),
+    phantom: str = argument(..., "PHANTOM", proposes=bead_phantoms),
     job: str | None = argument(None, "[JOB]"),
     stop_when: str = option(
-        ..., "End the job at these sigmas (mm, deg).", metavar="P=SIGMA,..."
+        ...,
+        "End the job at these sigmas (mm, deg).",
+        metavar="P=SIGMA,...",
+        proposes=tolerances,
     ),
 ) -> Answer:
     """End a scan of beads once its calibration is sure enough.

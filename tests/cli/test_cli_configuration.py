@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from flexdt.clients.cli import value_completion
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands import process_commands
 from flexdt.clients.cli.settings_file import (
@@ -274,6 +275,13 @@ def test_a_file_that_is_named_must_be_there() -> None:
     assert config_file({}) == Path("~/.config/flexdt/config.toml").expanduser()
 
 
+def test_phantoms_of_a_calibration_are_those_with_beads() -> None:
+    assert value_completion.calibration_targets("un") == ["unknown"]
+    assert "lego" in value_completion.bead_phantom_names("")
+    assert not value_completion.calibration_targets("she")  # the Shepp-Logan has no beads
+    assert value_completion.sample_names("she")
+
+
 @pytest.mark.slow
 def test_a_shell_completes_commands_and_options() -> None:
     def offered(words: str) -> set[str]:
@@ -292,4 +300,5 @@ def test_a_shell_completes_commands_and_options() -> None:
     assert offered("flexdt check script.txt --machine xy") == {"xyzr_cabinet"}
     assert "lego" in offered("flexdt sample le")
     assert "normal" in offered("flexdt calibrate --phantom nor")
+    assert offered("flexdt twin --machine xy") == {"xyzr_cabinet"}
     assert offered("flexdt expose --material stee") == {"steel"}

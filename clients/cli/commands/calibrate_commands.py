@@ -37,7 +37,9 @@ def calibrate(
     twin: Twin,
     datasets: list[Path] | None = argument(None, "[DATASET...]"),
     phantom: str | None = option(
-        None, metavar="NAME, FILE or unknown", proposes=value_completion.sample_names
+        None,
+        metavar="NAME, FILE or unknown",
+        proposes=value_completion.calibration_targets,
     ),
     free: options.Free = None,
     per_scan: str = option("", metavar="P,P,..."),
@@ -277,7 +279,7 @@ def align(
 def compare(
     dataset: Path = argument(..., "DATASET"),
     phantom: str | None = option(
-        None, metavar="NAME or FILE", proposes=value_completion.sample_names
+        None, metavar="NAME or FILE", proposes=value_completion.bead_phantom_names
     ),
     tolerance: float = option(0.5, metavar="PX", min=0.0),
     out: Path | None = option(None, metavar="DIR"),

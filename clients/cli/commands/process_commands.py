@@ -8,6 +8,7 @@ so signals and exit codes are the server's. Their options come from
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Annotated, Any, Final, Literal, NoReturn
@@ -15,9 +16,10 @@ from typing import Annotated, Any, Final, Literal, NoReturn
 import typer
 
 from flexdt.clients.cli import value_completion
+from flexdt.clients.cli.console import COMPLETION_VARIABLE
 from flexdt.clients.cli.settings_file import TABLES, settings_of
 from flexdt.runtime.process_settings import UpSettings
-from flexdt.runtime.settings import has_parameters, parameters, words
+from flexdt.runtime.settings import Settings, has_parameters, parameters, words
 
 MODULES: Final = {
     "up": "flexdt.clients.launch.up",
@@ -53,14 +55,20 @@ def up(context: typer.Context, only: str | None, **given: object) -> None:
     start(only or "up", [*words(given), *context.args])
 
 
+def _declared(settings: type[Settings]) -> list[inspect.Parameter]:
+    """List the options of a process, with the values that a shell completes."""
+    own = [*parameters(settings).values()]
+    for p in own:
+        [declared] = p.annotation.__metadata__
+        declared.autocompletion = COMPLETED.get(p.name)
+    return own
+
+
 def _public() -> list[inspect.Parameter]:
     """List the options that `up` shows; one left out is None, so that the settings
     file can set it."""
     public = {f.name for f in fields(UpSettings) if f.metadata["public"]}
-    own = [p for name, p in parameters(UpSettings).items() if name in public]
-    for p in own:
-        [declared] = p.annotation.__metadata__
-        declared.autocompletion = COMPLETED.get(p.name)
+    own = [p for p in _declared(UpSettings) if p.name in public]
     return [p if p.default is False else p.replace(default=None) for p in own]
 
 
@@ -78,16 +86,20 @@ has_parameters(
 )
 
 
-def alone(name: str, about: str) -> Callable[[typer.Context], None]:
+def alone(name: str, about: str) -> Callable[..., None]:
     """Make the command that starts one process with the words that follow it; `about` is
     its help.
+
+    The process reads them itself; its options are declared here for shells that complete.
     """
 
-    def command(context: typer.Context) -> None:
+    def command(context: typer.Context, **_: object) -> None:
         start(name, context.args)
 
     command.__doc__ = about
-    has_parameters(command, inspect.signature(command, eval_str=True).parameters.values())
+    own = inspect.signature(command, eval_str=True).parameters["context"]
+    completing = COMPLETION_VARIABLE in os.environ
+    has_parameters(command, [own, *(_declared(TABLES[name]) if completing else ())])
     return command
 
 

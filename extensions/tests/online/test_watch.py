@@ -21,7 +21,7 @@ from flexdt.clients import TwinClient
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt_extensions.watch import watch
+from flexdt_extensions.watch import bead_phantoms, tolerances, watch
 
 FRAMES = 60
 SEEDS = range(6)
@@ -95,3 +95,9 @@ def test_what_is_not_reached_lets_the_scan_end_by_itself(
             watch(client, "lego", {"warp": 1.0}, job)
         with pytest.raises(TwinError, match="no tolerance given"):
             watch(client, "lego", {}, job)
+
+
+def test_a_shell_is_proposed_phantoms_with_beads_and_parameters() -> None:
+    assert "lego" in bead_phantoms("")
+    assert not bead_phantoms("she")  # the Shepp-Logan has no beads
+    assert tolerances("dO_x=0.1,al") == ["dO_x=0.1,alpha="]
