@@ -28,6 +28,8 @@ def lego_phantom() -> Phantom:
     """Make the LEGO phantom: 24 x 16 x 49.8 mm about the origin, its lowest face at
     z = -24.9 mm.
 
+    Measures that the thesis does not state are assumed, and listed in `assumed`.
+
     >>> len(lego_phantom().beads)
     5
     """
@@ -84,6 +86,8 @@ def brick_shapes(
     v: dict[str, float], studs: tuple[int, int], floor: float, turn: float
 ) -> list[tuple[analytic.Shape, float]]:
     """List the shapes of one brick with +1 (filled) or -1 (hole), turned about the axis.
+
+    Holes are in the list after what they cut; the roof stays closed.
 
     Args:
         v: the brick's measures [mm].

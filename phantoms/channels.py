@@ -64,6 +64,9 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
     """Divide a phantom into its materials and where they are; empty for a
     phantom of nothing.
 
+    Voxels without labels are one channel of their material, or of water of varying
+    density; such stand-ins are stated in the channel.
+
     Args:
         phantom: solids, surfaces and voxels.
 

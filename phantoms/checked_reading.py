@@ -198,6 +198,9 @@ def packed(dtype: str) -> PlainValidator:
     def read(value: object) -> npt.NDArray[np.generic]:
         """Decode {dtype, shape, data}; check type, size and base64.
 
+        Arrays above `MAX_ARRAY_BYTES` and data of another length than the shape's are
+        PhantomErrors, too.
+
         Args:
             value: the document of an array.
         """

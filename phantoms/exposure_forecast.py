@@ -595,6 +595,8 @@ class _Ray:
 def _layer(what: str, words: str) -> tuple[str, float]:
     """Parse MATERIAL:MM to name and thickness [mm].
 
+    The thickness is above 0 and at most 1000; the material is not looked up here.
+
     Raises:
         LimitError: anything else.
     """

@@ -56,6 +56,9 @@ Ring = FloatArray
 def gear_phantom() -> Phantom:
     """Build the gear and its pinion: 40 x 40 x 30 mm about the origin.
 
+    The body is one closed surface; windows and pores are negative solids in it. All
+    measures are assumed.
+
     >>> gear_phantom().size_mm
     (40.0, 40.0, 30.0)
     """

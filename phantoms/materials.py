@@ -61,6 +61,8 @@ class Material:
         """Interpolate the linear attenuation coefficient at `energy_keV` [1/mm], log-log
         between the points.
 
+        A material without own points is interpolated in the tables of its elements.
+
         Args:
             energy_keV: of the photons.
 

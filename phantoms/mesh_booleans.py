@@ -199,6 +199,9 @@ def _solid(
 ) -> manifold3d.Manifold:
     """Unite the bodies of a mesh, each without the cavities in it, as a manifold.
 
+    A surface of negative volume is a cavity of the smallest body whose box holds its box;
+    without one it is dropped.
+
     Args:
         mesh: all bodies and cavities.
         bodies: indices of the faces of each.

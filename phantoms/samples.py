@@ -75,6 +75,9 @@ ALLOWED_FORMS: Final = (
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
     """Make the Shepp-Logan phantom in a cube, [-1, 1] in its definition.
 
+    Its attenuation 1 is that of water; `size_mm` of the phantom is that of the skull,
+    less than the cube.
+
     Args:
         size_mm: side of the cube.
 
@@ -207,6 +210,10 @@ def _one(
     priority: Sequence[float] = (),
 ) -> Phantom:
     """Convert a sample of any kind to a phantom; see `as_phantom` for the kinds.
+
+    In order: labels (mapping of materials), name or path, volume, array, mesh, (sample,
+    material), then, without a material, phantom, solid or scene, document, and a sequence
+    of parts.
 
     Args:
         sample, material, voxel_mm, priority: as for `as_phantom`.

@@ -156,6 +156,8 @@ def _ball_around() -> float:
 def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
     """Make the mesh of a shape [mm]; round shapes are inscribed.
 
+    Boxes and polyhedra are exact.
+
     Args:
         shape: of a solid.
     """

@@ -118,6 +118,9 @@ def _add_surface(
 ) -> None:
     """Add a filled mesh to `data`, in place.
 
+    Overlapping bodies fill once, inward shells are cavities; a voxel's share is that of
+    its columns.
+
     Args:
         data: attenuation [1/mm], (z, y, x), changed.
         surface: closed.

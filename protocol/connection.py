@@ -231,6 +231,9 @@ class Connection:
         """Divide JSON lines one by one; queue an error for HTTP (fatal) and for lines
         that are too long.
 
+        Blank lines are dropped; the rest of a refused line is skipped up to its end; an
+        incomplete line is kept, refused as soon as it is too long.
+
         Args:
             data: received bytes, any part of the stream.
         """

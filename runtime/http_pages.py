@@ -221,6 +221,8 @@ def _application(
     """Make the pages a WSGI application, whose pages are made in turns of the running
     event loop.
 
+    Only GET and HEAD are answered, HEAD without a body.
+
     Args:
         pages: path -> function that makes the page.
         token: required beyond `OPEN_PAGES`; None: of no client.
@@ -234,6 +236,9 @@ def _application(
 
     def response(asked: Mapping[str, Any]) -> HttpResponse:
         """Check a request and have the loop make its page.
+
+        In order: 403 another site's Host (on loopback), 405 method, 404 path, 401 token,
+        503 no turn of the loop within `MAX_HELD_S`. An exception of a page is raised.
 
         Args:
             asked: the request as WSGI has it.

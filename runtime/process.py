@@ -137,6 +137,9 @@ class ServerLoop(asyncio.SelectorEventLoop):
         def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
             """Log what asyncio reports: once in a while of each kind, errors of the
             system without a traceback.
+
+            Errors of the system, and reports without an error, are warnings; others
+            errors with traceback.
             """
             what = str(context.get("message"))
             error = context.get("exception")

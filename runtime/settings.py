@@ -50,6 +50,8 @@ def option(default: object, *flags: str, public: bool = True, **details: Any) ->
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
     """Convert a table's keys to options: parameters of a function that typer reads.
 
+    A field without own flags is --its-name; a tuple becomes a list option.
+
     Args:
         settings: class of the table.
 

@@ -166,6 +166,9 @@ class Supervisor:
         """Start a service whenever it ends, after a growing pause, and note each end;
         ends only by cancellation.
 
+        Only an exit with a code >= 0 at the first start gives up; a signal's death is
+        restarted. Ends are noted in words as long as they are worth reporting.
+
         Args:
             start: the service and the events of its start.
 
@@ -231,6 +234,9 @@ class Supervisor:
 
     async def _wait_until_ready(self, process: Process, start: _Start) -> None:
         """Wait until a service is ready; report the wait and the progress.
+
+        A note comes after `SILENT_S`, then again; it is given up after `STALLED_S`
+        without CPU work (not where the work cannot be measured).
 
         Args:
             process: of the service.

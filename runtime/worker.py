@@ -134,6 +134,9 @@ def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> li
 def main() -> int:
     """Limit this process's memory, then answer requests until the parent is gone; return
     the exit code.
+
+    Arguments: descriptor of the socket, memory limit [bytes]. It runs at low priority;
+    each answer has the peak memory in its second part.
     """
     channel = socket.socket(fileno=int(sys.argv[1]))
     limit("RLIMIT_AS", int(sys.argv[2]))

@@ -121,6 +121,9 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
     """Return the scan with motor positions, camera and the zero offsets behind its
     printed figures.
 
+    Zero offsets are chosen so that the machine's computed SOD, SDD, HC, VC and COR agree
+    with the text; roll stays 0.
+
     Args:
         scan: with the content of its settings text.
         machine: whose motors and camera these are.
@@ -295,6 +298,9 @@ def contradictions(
     """Yield where texts, scripts, images and replies of the scans and the shipped machine
     state things differently.
 
+    Lengths agree within `MATCH_MM`, others within a relative tolerance. Also yields
+    cameras that the shipped machine does not allow.
+
     Args:
         scans: that are compared.
         shipped: machine of the file.
@@ -353,6 +359,9 @@ def contradictions(
 
 def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
     """Yield (name, value, who) of what a scan's own parts state of the same thing.
+
+    Empty and missing values are skipped; nothing without a settings text. Scripted
+    targets are cut to the travel.
 
     Args:
         scan: with texts, script and images.
@@ -469,6 +478,10 @@ def zero_offsets(
 ) -> ZeroOffsets:
     """Estimate zero offsets and their drift from all scans; scans that contradict the
     others are findings.
+
+    Only scans whose images give roll and axis column are fitted; drift only with scans of
+    `FOR_A_LINE` dates, and undated ones are then left out. Other offsets are the latest
+    text's, else `usual`.
 
     Args:
         scans: the oldest first, those without a date last.

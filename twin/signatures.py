@@ -211,6 +211,9 @@ class Known:
     """
 
     def __init__(self, function: Callable[..., Any], text: str) -> None:
+        """Take a function and the docstring that describes it; no combination of types is
+        allowed yet.
+        """
         self.function = function
         self.text = text
         self.allowed: set[tuple[Any, ...]] = set()
@@ -289,6 +292,8 @@ class Known:
 
     def _renamed(self, where: str, named: dict[str, Any]) -> dict[str, Any]:
         """Rename deprecated keyword arguments, with a DeprecationWarning.
+
+        Functions with `**` arguments take all names unchanged.
 
         Args:
             where: name of the function, for messages.

@@ -146,6 +146,10 @@ def filled_mesh(
 ) -> Phantom:
     """Make a phantom filled with one material inside a closed mesh that has been read already.
 
+    A convex mesh becomes a solid, any other a surface. A shell inside another that is
+    turned outwards changes nothing; a warning counts such shells. The largest extent must
+    be above 0 and at most `MAX_EXTENT_MM`.
+
     Args:
         mesh: its triangles; not changed.
         unit, material, name, place: as for `mesh_phantom`.

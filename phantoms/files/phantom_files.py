@@ -109,6 +109,8 @@ def _version(value: object, where: str) -> object:
 def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
     """Make the phantom of a scene: solids and meshes with their priorities.
 
+    All solids have priority 0, a mesh the one it states. Without a name it is "scene".
+
     Args:
         document: of the file.
         folder: where its meshes are; None: none may be named.
@@ -149,6 +151,10 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
 
 def require_replaced(phantom: Phantom, solids: object) -> None:
     """Check that the material that solids of a scene file replace is there, once.
+
+    Voxelised coarsely, solids and meshes of that material must have no clearly negative
+    attenuation anywhere. `replaces` of the document's solids are looked at; others are
+    ignored.
 
     Args:
         phantom: of the scene's meshes and solids.
@@ -259,6 +265,10 @@ def _unit(value: object, where: str) -> object:
 
 def _bead_file(document: Mapping[str, object]) -> Phantom:
     """Make the phantom of a bead file: a body with beads, or with a spiral of them.
+
+    Without a body the beads are in air and the size is that around them about the origin.
+    Exactly one of beads and spiral must be given. Only listed beads are checked for
+    overlap.
 
     Args:
         document: of the file.

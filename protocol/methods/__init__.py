@@ -49,6 +49,9 @@ def openrpc_document(
     """Make the OpenRPC document of a server as plain data
     (https://spec.open-rpc.org, version 1.3).
 
+    Schemas of parameters and results are in components, once each, with the errors by
+    name.
+
     Args:
         methods: method table of the server.
         title: title of the document.

@@ -187,6 +187,8 @@ class Changes:
     def undo(self) -> None:
         """Restore each file, in reverse order, unless somebody else has changed it since;
         failures are logged.
+
+        A file that is gone is skipped. At the end all changes are forgotten.
         """
         for change in reversed(self._made):
             try:

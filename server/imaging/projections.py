@@ -92,6 +92,9 @@ class TrueGeometry:
 def load_truth(path: Path, data: Path) -> TrueGeometry:
     """Read the hidden misalignment from a truth file: TOML, parameter = value [mm, deg].
 
+    The path is resolved, so a link into the data directory is refused, too; text values
+    and those not below `MAX_TRUTH_VALUE` are errors.
+
     Args:
         path: the file.
         data: the data directory, which must not contain it.
@@ -472,6 +475,9 @@ class Imaging:
     async def _forget_old(self) -> None:
         """Drop the least recently used samples beyond the limits, here and on the
         projector; with `_sending` held.
+
+        The newest, those that must stay, and those in use are kept, even beyond the
+        limits.
         """
         stays = self._pinned_keys()
         if self.memory_limit is None:

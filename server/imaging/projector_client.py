@@ -177,6 +177,8 @@ class ProjectorClient:
         """Connect and introduce the client; forget what was sent to a server that has
         restarted.
 
+        Also notes whether that server drops volumes when memory is needed.
+
         Raises:
             ProjectorUnavailable: the client is closed, or no projector answers.
             RpcError: the projector refuses the client.

@@ -411,6 +411,10 @@ def flags_of(
     """Compute the saturated and starved parts of an image, their bounds, and the edges
     that cut the sample off.
 
+    Every `JUDGED_STEP_PX`-th pixel without noise is judged; an edge is cut where any of
+    its pixels is above `CUT_OFF_INTEGRAL`. `good_counts` and `good_lines` are the ranges
+    of counts and of line integrals that are neither starved nor saturated.
+
     Args:
         radiography: how images are made.
         radiograph: the image.

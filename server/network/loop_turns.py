@@ -36,6 +36,9 @@ class LoopTurns:
     def _give_turn(self) -> None:
         """Give the first waiting connection of the most urgent lane its turn; reschedule
         if others wait.
+
+        A connection has one turn and then is last of its lane; cancelled waits are
+        skipped.
         """
         self._due = False
         for lane in self._lanes:

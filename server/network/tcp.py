@@ -113,6 +113,8 @@ class TcpServer(ListeningServer):
     def _start_urgent(self) -> None:
         """Let waiting connections start their urgent requests, for up to `LOOK_S`;
         reschedule the rest.
+
+        At least one connection is examined at each call.
         """
         until = time.perf_counter() + LOOK_S
         try:
@@ -307,13 +309,21 @@ class _Link(asyncio.BufferedProtocol):
 
     def overtake(self) -> None:
         """Start the urgent requests among the received messages, wherever in the
-        queue they are."""
+        queue they are.
+
+        Nothing before admission or after the end. If not all was examined it goes on: at
+        the loop's next turn for an emergency stop, else in the server's order.
+        """
         if self.gone.is_set() or not self.let_in:
             return
         found: list[Coroutine[object, object, None]] = []
 
         def wanted(raw: bytes) -> bool:
             """Decode a message and start it if it is urgent; return whether to take it out.
+
+            Large messages, ordinary ones, and those beyond the number in service wait for
+            their turn. Of a batch with other items the urgent ones are started; it stays
+            in the queue.
 
             Args:
                 raw: the message as received.
@@ -361,6 +371,8 @@ class _Link(asyncio.BufferedProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Cancel the work of an ended connection, give back its place and close its
         session.
+
+        An error of the session's close is logged.
 
         Args:
             exc: the reason, not used.
@@ -496,6 +508,9 @@ class _Link(asyncio.BufferedProtocol):
     async def _serve_messages(self) -> None:
         """Serve the connection's messages in order, one in each turn; close after its
         stream has ended.
+
+        Before admission its turns are urgent. Urgent items of a batch are awaited before
+        the batch is answered. At the stream's end all answers are sent before it closes.
 
         A fatal error in the stream is answered and ends the connection at once.
         """

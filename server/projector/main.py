@@ -21,6 +21,9 @@ from flexdt.runtime.settings import parse
 async def run(options: ProjectorSettings) -> int:
     """Serve until SIGTERM or SIGINT; return the exit code.
 
+    It uses all threads, and half of the memory, unless options say otherwise. The port is
+    announced when bound, all addresses when ready.
+
     Args:
         options: of the process.
     """

@@ -160,6 +160,9 @@ class ProjectorServer(ListeningServer):
     async def _serve(self, client: JobClient, body: memoryview) -> None:
         """Decode a frame, answer its request, and release the client's lane and memory.
 
+        Batches and ids in use are refused. A failure to answer aborts the connection,
+        with a log line.
+
         Reading resumes once little is pending. A violation of the protocol ends the
         connection.
 
@@ -223,6 +226,9 @@ class ProjectorServer(ListeningServer):
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
         """Check token, parameters and place of a call, and answer it.
+
+        Before the token only hello is served. Unknown errors are logged and answered as
+        internal; only ConnectionError is raised.
 
         Args:
             client: that calls.

@@ -258,6 +258,9 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
 def _info(name: str, value: Body) -> wire.VolumeInfo:
     """Describe a volume, mesh or scene.
 
+    All have name, kind and bytes; a mesh its triangles, a volume shape, voxel and centre
+    [mm], a scene its number of solids.
+
     Args:
         name: of the body.
         value: the body.

@@ -370,6 +370,9 @@ def _refusing_large(
 def require_runnable(report: CheckReport) -> None:
     """Raise an error with the report's problems unless the plan may run.
 
+    At most as many problems as `_worst` keeps are sent, and `MAX_PROBLEMS` collisions
+    with their number in all.
+
     Args:
         report: of the scan.
 

@@ -214,6 +214,9 @@ class Jobs:
     def status(self, job: Job) -> JobStatus:
         """Make the wire form of a job: its phase, progress, times [s], error and
         warnings.
+
+        An ended job remains 0 s; speed-up is the job's, else the clock's; `retry_s` is
+        only of the current job.
         """
         p = job.where
         step = None if p is None else p.step
@@ -483,6 +486,8 @@ class Jobs:
     async def work(self) -> None:
         """Run queued jobs one after the other; ends only by cancellation.
 
+        Jobs aborted while they waited are skipped.
+
         Each job runs at its own speed of the clock; the speed from before is restored
         after it, unless somebody changed it meanwhile. A job's error ends that job alone.
         """
@@ -518,6 +523,9 @@ class Jobs:
 
     async def _run(self, job: Job) -> JobPhase:
         """Prepare one job at rest, run it, and finish or mark its data set.
+
+        A stop from outside that came since its turn pauses it at once. The data set is
+        closed in any case, incomplete unless it was finished.
 
         An aborted job switches X-rays off. Errors of the job are logged and stored in it.
 

@@ -230,6 +230,8 @@ class ScanRunner:
         """Run the complete plan on the clock: settings, motion and frames, with pauses
         and steps.
 
+        After a single step it pauses again.
+
         Existing frames are skipped without waiting for their time. Motors are stopped if
         the run ends by an error.
 

@@ -222,6 +222,8 @@ class JobRecord:
     def _of(cls, data: bytes) -> JobRecord:
         """Decode a record from the bytes of its file, also of earlier servers.
 
+        Records without `flat` have none taken.
+
         Raises:
             ValueError, KeyError, TypeError: another schema, or fields that are missing or
                 wrong.

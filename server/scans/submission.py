@@ -185,6 +185,9 @@ class Submissions:
     ) -> None:
         """Put a job that ended early into the queue again; only missing images are made.
 
+        What the scan began from is its record; where the data set exists, that one's
+        start, sample and correction count.
+
         Args:
             job: that has ended.
             ensure_allowed: raises if the requester has lost control.
@@ -279,6 +282,9 @@ class Submissions:
         """Check a scan completely (text, plan, collisions, disk, memory, counts) and
         prepare its start.
 
+        Warnings are those of the check, of the predicted counts, and (resumed) how many
+        images exist and that the sample on the stage is another.
+
         Args:
             job_record: record of the scan.
             name: of the data set.
@@ -318,6 +324,9 @@ class Submissions:
         async def prepare() -> JobInputs:
             """Check the scan again at its turn, and open its data set; return the inputs
             of the job.
+
+            A scan that is not resumed begins from the motors and the sample of now.
+            Counts are predicted again only if check or sample differ.
 
             Raises:
                 RpcError: it may not run any more; DatasetWriteError: the data set cannot

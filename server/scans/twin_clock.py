@@ -178,6 +178,9 @@ class TwinClock:
     def _set_timer(self) -> None:
         """Schedule the wake-up of the first future that waits, in place of the one
         scheduled before.
+
+        None while time is held or nobody waits; at speed "max" after some rounds of the
+        loop; at most an hour ahead.
         """
         if self._timer is not None:
             self._timer.cancel()

@@ -187,7 +187,11 @@ class DatasetWriter:
 
     def _is_complete_image(self, name: str) -> bool:
         """Return whether the file holds an image of the right format (only its
-        header is read)."""
+        header is read).
+
+        The file must have 16-bit pixels, the planned shape, and all bytes that the header
+        claims. False if it cannot be read.
+        """
         try:
             with self._files.open(name) as file, tifffile.TiffFile(file) as tiff:
                 page = tiff.pages[0]
@@ -204,6 +208,8 @@ class DatasetWriter:
     def _check_same(self) -> None:
         """Check that the folder holds this scan, and adopt its start and its correction
         in `record`.
+
+        Frames, machine, profile and noise must agree.
 
         Raises:
             DatasetExistsError: it cannot be read, or holds another scan.
@@ -236,6 +242,8 @@ class DatasetWriter:
 
     def _check_room(self) -> None:
         """Check that the missing images fit on the disk.
+
+        With `RESERVE_BYTES` to spare; nothing is checked where free space is unknown.
 
         Raises:
             DiskFullError: they do not.

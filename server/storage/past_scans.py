@@ -253,6 +253,9 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
 def _scan(folder: files.Folder, most: int) -> _Scan:
     """Read a folder: its document of at most `most` bytes, else the scanner's texts.
 
+    Without either, only files, kinds and whether X-rays were on are known. `problem`
+    states why the document was not used.
+
     Args:
         folder: of a data set.
         most: largest size of the document [bytes].
@@ -333,6 +336,9 @@ def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
     """Summarise a data set as a row of the list; nothing is read here.
 
+    Complete only with all files there; without a document, values come from the scanner's
+    texts, or are unknown. The problem is cut to 500 characters.
+
     Args:
         path: of the data set.
         modified: its time of modification [s].
@@ -401,6 +407,10 @@ def _list(
 ) -> p.DatasetListResult:
     """Answer dataset.list: the data sets that match the search, newest first, within the
     time limit.
+
+    All words of the search must be in name, state, sample, operator, machine, mode, start
+    or settings. At most `MAX_SETS` folders; `left_out` counts the others and those with
+    bad names.
 
     Summaries and thumbnails are cached. Data sets for which the time was too short are
     listed as not read yet.
@@ -503,6 +513,8 @@ def _with_thumbnail(
 ) -> p.DatasetInfo:
     """Add a thumbnail to a summary, unless the time is over.
 
+    Thumbnails made before are used even after the time; without one, None.
+
     Args:
         root: data directory.
         info: the summary.
@@ -556,6 +568,9 @@ def _get(
     root: Directory, asked: p.DatasetGet, context: TwinContext, codec: Codec
 ) -> p.DatasetResult:
     """Answer dataset.get: settings, poses over time, and the other requested parts.
+
+    At most `points` images, evenly spread; times are None unless all of them have one.
+    Script and measurements only if asked for.
 
     Args:
         root: data directory.
@@ -737,6 +752,8 @@ def _frame(
     root: Directory, asked: p.DatasetFrame, context: TwinContext, codec: Codec
 ) -> p.DatasetFrameResult:
     """Answer dataset.frame: one image, normalised and binned as requested.
+
+    Counts are rounded after binning; a document's frame must have its shape.
 
     Args:
         root: data directory.

@@ -132,6 +132,9 @@ def _figures(
 ) -> list[Metric]:
     """List the metrics of the twin server, read now; those of requests are not among
     them.
+
+    Free disk space is left out where the system does not report it; an unknown factor is
+    0.
     """
     jobs = Counter(job.phase for job in twin.jobs.all())
     phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}

@@ -316,6 +316,8 @@ class TwinServer:
         """Put `sample` on the stage at the motors' present positions, and start the
         services.
 
+        Unless jobs were restored, files of jobs are removed first.
+
         Contacts at the start are warnings in the log.
 
         Args:
@@ -438,6 +440,8 @@ class TwinServer:
     def _readable_sample(self, sample: Sample) -> Sample:
         """Read the stored sample, and return the empty stage, with a warning in the log,
         if that fails.
+
+        Of uploaded voxels the material is dropped.
         """
         head = self.samples.head(sample.name)
         if head is not None and head.kind == "voxels":
@@ -476,6 +480,9 @@ class TwinServer:
 
     def state(self) -> w.State:
         """Compute the complete state for the wire.
+
+        Job, correction, controller, image, unsaved problem and projector problem are None
+        where there is none.
 
         Raises:
             GeometryError: the pose is impossible for a scanner.
@@ -522,6 +529,8 @@ class TwinServer:
     def sample_state(self) -> w.SampleState:
         """Describe the sample on the stage for the wire; the name is None for an empty
         stage.
+
+        Size, description and revision only of a sample.
         """
         sample = self.scanner.sample
         offset = w.SamplePlacement(**asdict(sample.offset))
@@ -618,6 +627,8 @@ class TwinServer:
     async def motion_ended(self, motors: Collection[str]) -> None:
         """Wait until `motors` are at rest, at any position, also after stops and further
         moves.
+
+        At once if none of them moves.
         """
         while True:
             now = self.clock.now()
@@ -683,6 +694,9 @@ class TwinServer:
     def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
         """Judge the scan's latest image and publish it, with its public geometry, to
         subscribers.
+
+        Only projections are judged; without subscribers nothing is published, and other
+        kinds are ignored.
 
         Args:
             frame: of the scan.

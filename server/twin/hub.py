@@ -166,6 +166,8 @@ class Hub:
         """Check that a listener's subscriptions and view stay within the limits of the
         hub.
 
+        The listener's earlier subscriptions to the same topics do not count.
+
         Raises:
             RpcError: -32003, there would be more.
         """

@@ -285,6 +285,9 @@ class LiveView:
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
         """Make an image in each subscribed view, in a thread, and publish it; keep it for
         the state.
+
+        The noise depends on the number of the image alone, so all views of it agree. A
+        view subscribed meanwhile is made when it is delivered.
         """
         self._count += 1
         count = self._count
@@ -339,6 +342,8 @@ class StateFeed:
     async def run(self, settled: Callable[[], None]) -> None:
         """Publish the state after each change and during motion; ends only by
         cancellation.
+
+        During motion every `STATE_INTERVAL_S` of real time, and once more at its end.
 
         Args:
             settled: called when motion has ended, or X-rays have become ready.

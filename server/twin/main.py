@@ -36,6 +36,9 @@ async def run(options: TwinSettings) -> int:
     """Run the server until SIGTERM or SIGINT: lock the data directory, restore, serve,
     and end.
 
+    Without a state (or `fresh`) the default sample is put on the stage; `sample` counts
+    before the state's. Memory is a quarter of the machine's unless stated.
+
     Args:
         options: of the process.
 

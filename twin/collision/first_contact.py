@@ -167,6 +167,9 @@ class PathSearch:
     def contact(self, k: int, found: PairResult) -> Contact:
         """Convert the contact of pair k to the scene's terms.
 
+        Without a contact in the result it is at the path's start. The last free moment is
+        the start if there is none; the contact says so.
+
         Args:
             k: index of the pair.
             found: result of the pair's sweep.

@@ -15,6 +15,9 @@ from flexdt.twin.machine.kinematics import place
 def check_home(machine: Machine, profile: Profile, file: str) -> None:
     """Check the machine at home: source, sample, panel in order, nothing touching.
 
+    Checked in that order; the first failure is raised. Pairs closer than the safety
+    margin count as touching, those of `allowed_contacts` do not.
+
     No motor may take the rotation axis or the panel behind the source.
 
     Args:

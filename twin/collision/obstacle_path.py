@@ -176,6 +176,9 @@ class _Planner:
     ) -> list[tuple[str, float]] | None:
         """Search for the quickest free path over stations (A*), one motor at a time.
 
+        It counts time of single moves; `free` is asked only for moves that would be an
+        improvement.
+
         Args:
             stations: motor -> positions that are tried [mm, deg].
             goal: motor -> target [mm, deg]; the others return to where they are.

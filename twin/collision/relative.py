@@ -306,6 +306,9 @@ class _Turn:
     def of(cls, body: Body, side: float, path: Path, kept: Kept) -> _Turn:
         """Evaluate the turning of a body over the segments of a path.
 
+        `sense` is the one direction of turning over all kept segments, 0 if it changes or
+        it stands.
+
         Args:
             body: that turns.
             side: -1 for a, +1 for b.

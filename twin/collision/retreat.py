@@ -238,6 +238,9 @@ class _Overlap:
     def _refined(self, q: FloatArray) -> FloatArray:
         """Search for the direction (1, 3) of the widest gap, where no faces give it exactly.
 
+        From the best of known directions, by `REFINEMENT_STEPS` shrinking steps along x,
+        y, z: a local search.
+
         Args:
             q: positions of all motors (axes,) [mm, rad].
         """

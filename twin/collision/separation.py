@@ -37,6 +37,9 @@ def separation_of(
 ) -> Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]:
     """Make a function that computes the certified separation of `a` from `b`.
 
+    The gap is that of a slab without points of either, hence never more than the
+    distance.
+
     Args:
         a: solid in its own frame.
         b: the other, in its own frame.

@@ -378,6 +378,8 @@ class FrameEntry(_Model):
     def all_of(cls, record: ScanRecord, block: FrameBlock) -> Iterator[FrameEntry]:
         """Yield an entry for each image of a block, with its positions and nominal
         cone_vec.
+
+        With time, camera settings and whether X-rays are on; no correction is applied.
         """
         rows = record.poses_of(block).cone_vec().rows.tolist()
         times = np.asarray(block.times_s).tolist()

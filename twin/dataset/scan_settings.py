@@ -175,6 +175,10 @@ ENTRIES: Final[Mapping[str, Entry]] = {
 def settings_of(record: ScanRecord) -> ScanSettings:
     """Compute the settings file's content for a scan.
 
+    Facts that the twin does not model (vacuum, filter, batch) are empty; the target
+    current is that of power over voltage [uA]. Flats before the first projection are pre,
+    others post.
+
     Counts of flats and offset images are exposures, as the scanner counts them: a flat
     averaged over 30 exposures counts 30. Start and last angle are those of the first and
     last projection.

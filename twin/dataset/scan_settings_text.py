@@ -119,6 +119,8 @@ _KINDS: Final[Mapping[Kind, tuple[Callable[[Any], str], Callable[[str], object]]
 def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
     """Format `scan settings.txt` (CRLF) for a scan.
 
+    Lines are in the order of the fields, with the scanner's headings.
+
     Args:
         scan: a record, or the settings themselves; fields that are None have no line.
     """

@@ -33,6 +33,8 @@ _TALL_MM: Final = 2000.0
 def format_xre(record: ScanRecord) -> str:
     """Format `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
 
+    The flat's position is there only if its axis has a motor line.
+
     Values of the maker's reconstruction and of hardware the twin does not model are zero
     or empty there, so that readers find every key.
 
@@ -144,6 +146,8 @@ def _utc(moment: datetime) -> str:
 def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     """Compute the entries of the XRE file's points of interest at the settings file's
     moment.
+
+    Positions [mm] in the world frame; an entry has place and three axes.
 
     Args:
         record: of the scan.

@@ -49,6 +49,9 @@ class XreSettings:
     def settings(self) -> ScanSettings:
         """The corresponding content of `scan settings.txt`, as far as this file has it.
 
+        Missing entries are None. Cancelled if "Succeeded" is FALSE; the scan type is
+        smooth or unknown.
+
         Raises:
             DatasetFormatError: a figure is not a number.
         """

@@ -50,6 +50,10 @@ _NUMBERS: Final[Mapping[str, Any]] = {
 def flexdata_text(geometry: ScanGeometry) -> str:
     """Write the TOML file for images turned upside down.
 
+    Refused: a bent panel, no circle, unequal angle steps (beyond `ROUNDED_MM` at the
+    object), or a source that is not before axis and detector. Only a known shape has
+    det_rows and det_cols.
+
     Args:
         geometry: of the images before they are turned.
 
@@ -127,6 +131,9 @@ def read_flexdata(
     file: str = "<toml>",
 ) -> ScanGeometry:
     """Read a `geometry.toml`; the result is for images as they are, with row 0 on top.
+
+    `views` and `shape`, if given, count before the file's. Of the three distances two are
+    needed. Another version of the format is a note of the result, not an error.
 
     Args:
         text: the file.

@@ -89,6 +89,9 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
     """Parse a table whose header names the twelve numbers, in any order; other columns
     are ignored.
 
+    Blank lines and lines that begin with # are skipped. A `file` column gives file names
+    if each row has one. Without the comment the shape is None.
+
     Args:
         text: of the table; a comment may state the detector's shape.
         file: for messages.
@@ -153,6 +156,8 @@ def read_tomosipo(
     arrays: Mapping[str, npt.NDArray[np.generic]], file: str = "<npz>"
 ) -> ScanGeometry:
     """Convert the arguments of `ts.cone_vec`, as in `tomosipo_arrays`, to a geometry.
+
+    Its arrays are in the order z, y, x; the result has x, y, z.
 
     Args:
         arrays: name -> array.
@@ -289,6 +294,9 @@ def _rows(name: str, cone_vec: ConeVec) -> str:
 
 def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     """Parse and validate the project's JSON file of a geometry.
+
+    Keys that are null count as absent, unknown keys are ignored; of rows and columns both
+    or none are given.
 
     Args:
         text: of the file.

@@ -144,6 +144,10 @@ class Follower:
         """Update the mirror after time without a message: raise alarms for overdue and
         silent commands.
 
+        Overdue commands are reported only while it is known that their ends are not
+        heard; a late script is an error. An alarm is raised once until its condition
+        ends.
+
         Commands without a sign of life for long are forgotten.
 
         Args:
@@ -327,6 +331,9 @@ class Follower:
         """Predict one command, from the machine as it is now, and raise alarms for its
         problems.
 
+        Motors under way go on from their predicted paths; a trigger is ignored, as is
+        what depends on X-rays while it is unknown whether they are on.
+
         Args:
             mirror: the machine.
             waiting: the command under way; its prediction is added.
@@ -402,6 +409,10 @@ class Follower:
     def _follow_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
         """Find the command in the script: advance, or raise an alarm.
 
+        The first line after the end begins the script anew. A command that is not the
+        next line is a warning once the script has begun; before that, and without a
+        script, nothing.
+
         Args:
             mirror: present state.
             command: that was sent.
@@ -469,6 +480,10 @@ class Follower:
         self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
     ) -> Mirror:
         """Update the mirror with the end of a command: record, range, positions, settings.
+
+        An error is an alarm, and the motors count as at rest. A move that has passed its
+        trigger stays under way. A reading counts as such, other commands' settings as
+        made.
 
         Args:
             mirror: present state.
@@ -594,6 +609,8 @@ class Follower:
         self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
     ) -> Mirror:
         """Compare a reading of a motor's position with its predicted path.
+
+        Positions within `TARGET_TOLERANCE` of start or target are never off.
 
         Args:
             mirror: the machine.

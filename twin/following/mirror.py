@@ -300,6 +300,9 @@ class Mirror:
     def to_dict(self, now: float) -> dict[str, object]:
         """Return the JSON form at a moment: the public fields, and their ages [s].
 
+        Age is None for what was never heard; `expected` is the predicted position at
+        `now`. Motors are in mm and deg.
+
         Args:
             now: moment [s].
         """

@@ -494,6 +494,9 @@ class ConeVec:
     def _facts(self) -> dict[str, str]:
         """Format sizes and distances for printing, under the keys views, detector, source
         to detector and source to origin.
+
+        Values that differ between views are ranges; pitch as columns x rows if they
+        differ.
         """
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
         if steps[0] == steps[1]:

@@ -101,7 +101,11 @@ class Motion:
 
     def to_dict(self) -> dict[str, dict[str, object]]:
         """Convert to parameter -> {unit, values, sigmas, evidence, moves} in edge
-        units (mm, deg)."""
+        units (mm, deg).
+
+        A standard error that is not finite becomes None; `moves` is whether any value is
+        not 0.
+        """
         return {
             name: {
                 "unit": UNITS[name],
@@ -119,6 +123,8 @@ class Motion:
     @classmethod
     def from_dict(cls, document: Mapping[str, Mapping[str, object]]) -> Motion:
         """Make a motion from the document of `to_dict`.
+
+        The unit in the document is not read; a null standard error becomes NaN.
 
         Args:
             document: parameter -> its values and standard errors [mm, deg].

@@ -139,7 +139,11 @@ class Panel:
     @cached_property
     def _map(self) -> tuple[Float32Array, Float32Array]:
         """Columns and rows of the panel, (rows, cols) both, to which
-        undistorted pixels belong."""
+        undistorted pixels belong.
+
+        Inverted by four fixed-point steps; a pixel in a gap between tiles is interpolated
+        between the lines beside it.
+        """
         rows, cols = self.model.shape
         places = np.moveaxis(np.mgrid[:rows, :cols][::-1], 0, -1).astype(np.float64)
         out = places
@@ -217,6 +221,8 @@ class Panel:
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Panel:
         """Make a panel from a document.
+
+        Lag is 0 if absent; the width of the priors is not in the document and becomes 0.
 
         Args:
             document: shape, borders, coefficients and lag.

@@ -158,6 +158,8 @@ class Axis(_Frozen):
     def _ordered(self) -> Axis:
         """Check that home, speed and acceleration are within their limits.
 
+        Lower at most upper, home within, speed and acceleration at most their maxima.
+
         Raises:
             PydanticCustomError: names the field, its value and the allowed ones.
         """
@@ -613,6 +615,8 @@ class Machine(_Frozen):
         """Check the relations between tables: names, kinds of axes, chains,
         roles, E-stop, contacts.
 
+        The first violation is raised.
+
         Raises:
             PydanticCustomError: names the key, its value and the allowed ones.
         """
@@ -733,6 +737,8 @@ class Machine(_Frozen):
     def _check_roles(self) -> None:
         """Check that focal spot, active area and holder are where the X-ray geometry has
         them.
+
+        Machines without components pass; a sample_mount may be missing.
 
         Each role has one component, at its own anchor, carried by all motors of that
         anchor, and large enough to hold its place. Otherwise a motor of `geometry` would
@@ -998,6 +1004,9 @@ def _data(kind: str, name: str) -> str:
 def _meshed(own: Raw, corners: Corners | None) -> Raw:
     """Replace the meshes of components by their convex bodies, in place.
 
+    The corners are moved by `mesh_at_mm` (else not); shape becomes "hull" with size and
+    centre of their box.
+
     Args:
         own: content of a machine file; it is changed.
         corners: reads the corners of a mesh file; None: no files may be read.
@@ -1181,6 +1190,8 @@ def _credit(merged: Raw, old: Raw, own: Raw) -> None:
 
 def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str) -> _M:
     """Parse and validate TOML, and collect all problems into one error.
+
+    A text that is no TOML, or nests too deep, and too large numbers are such errors, too.
 
     Args:
         model: type of the result.

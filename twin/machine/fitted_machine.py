@@ -48,6 +48,8 @@ def fitted_text(
 def _replaced(text: str, blocks: Mapping[str, str]) -> str:
     """Replace tables of `text`; a comment stays unless it is right before one.
 
+    Tables named timing.* that are not in `blocks` are removed.
+
     Args:
         text: of a machine file.
         blocks: table's name -> its new text; those that the file lacks are appended.
@@ -91,6 +93,8 @@ def _axis_table(name: str, axis: Axis) -> str:
 def _timing_table(timing: Timing) -> str:
     """Format times as the TOML tables [timing] and [timing.spread], with measured or
     assumed behind each.
+
+    Defaults and None are left out; a kind with a spread counts as measured.
     """
     lines = ["[timing]"]
     for line in _keys(timing, {"spread"}):

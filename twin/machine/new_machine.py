@@ -62,6 +62,10 @@ class Answers:
 def new_machine_text(answers: Answers) -> str:
     """Write a machine file (TOML) from answers; it is parsed before it is returned.
 
+    A range for SOD or SDD becomes the travel of its first motor, two equal ends a fixed
+    distance without motors. Values that are None are the base's. A fixed panel may get a
+    rail for SDD only.
+
     Args:
         answers: name, base, and the values that differ from it.
 

@@ -216,6 +216,9 @@ def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
 def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
     """Compute the law of programme time that brings all motors to rest soonest, within limits.
 
+    No cells if nothing moves noticeably. Constant slowing in each; where a motor
+    accelerates it is an approximation, in short cells.
+
     Args:
         drives: motors that are under way.
         now: start of braking [s].
@@ -319,6 +322,9 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
 
 def _braked_trajectory(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
     """Convert the cells to one motor's trajectory.
+
+    At rest at once if it does not move; a target within `POSITION_ROUNDING` of the leg's
+    own is set to that.
 
     Args:
         drive: the motor's programme.

@@ -470,6 +470,9 @@ class _Builder:
 def _first_root(a: float, b: float, c: float) -> float | None:
     """Solve for the smallest non-negative root of a x^2 + b x + c, or None.
 
+    A discriminant that is negative by rounding counts as 0; None if there is no such root
+    or all are infinite.
+
     Args:
         a: quadratic coefficient.
         b: linear coefficient.

@@ -209,6 +209,9 @@ class ScannerTwin:
     def state(self, now: float) -> ScannerState:
         """Return everything public, as one frozen value.
 
+        Motors and virtual axes, tube, camera, sample, readout, safety, correction, and
+        whether anything moves at `now`.
+
         Args:
             now: twin time [s].
         """
@@ -831,6 +834,9 @@ class ScannerTwin:
 
     def _axis_state(self, name: str, now: float) -> AxisReading:
         """Read a motor.
+
+        Limits, speed and acceleration are the present ones; position in mm or deg
+        (`unit`).
 
         Args:
             name: of the motor.

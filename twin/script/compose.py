@@ -174,6 +174,9 @@ class _Writer(MotorTargets):
     def settings(self) -> Iterator[str]:
         """Yield the rows that set tube and camera: voltage, power, mode, exposure and
         ROI.
+
+        Voltage and power are the machine's if the request has none; averages are not set
+        here.
         """
         w = self.request
         m = self.machine
@@ -250,6 +253,8 @@ class _Writer(MotorTargets):
     def helical(self) -> Iterator[str]:
         """Yield the rows of several turns while source and detector rise at constant
         speed.
+
+        Motors that also move something else are refused.
 
         They rise from before the trigger to after the end. Where no motors raise them,
         the sample sinks. Speeds are set back at the end.
@@ -425,6 +430,9 @@ class _Writer(MotorTargets):
     ) -> dict[str, float]:
         """Compute the motor targets that put source, detector and sample in their places.
 
+        A quantity without a motor of its own may be off by rounding, across and up by a
+        share of the detector.
+
         Args:
             sod: source-object distance [mm].
             lateral: of the sample from the beam's middle [mm].
@@ -563,6 +571,8 @@ class _Writer(MotorTargets):
 
 def _check_counts(request: _Request) -> None:
     """Check the counts and distances of a request against their allowed ranges.
+
+    The first rule that fails is raised; values that are not finite fail.
 
     Args:
         request: what the script is composed for.

@@ -27,6 +27,9 @@ def html_report(report: CheckReport, name: str = "script") -> str:
 def against_summary(found: LogComparison) -> Facts:
     """List the figures of a log comparison as (label, value).
 
+    Machine and timing source, executed and predicted time with its 90 % range, sum of
+    absolute errors, lines in their range, and the assumed start.
+
     Args:
         found: a log and what was predicted for it.
     """
@@ -53,6 +56,9 @@ def against_summary(found: LogComparison) -> Facts:
 
 def summary(report: CheckReport) -> Facts:
     """List the figures of a report as (label, value).
+
+    Machine, duration and its parts, images, X-rays, sample, start, one group for each
+    camera setting, and collisions.
 
     Args:
         report: of `check_script`.
@@ -82,6 +88,8 @@ def summary(report: CheckReport) -> Facts:
 
 def _optics_facts(o: Optics) -> Facts:
     """List the figures of one camera setting as (label, value).
+
+    Pixels, distances, magnification, field of view, and truncation if it was computed.
 
     Args:
         o: of one camera setting.
@@ -114,6 +122,8 @@ def _optics_facts(o: Optics) -> Facts:
 def _collisions(report: CheckReport) -> str:
     """Format the number of collisions, or "none" with the smallest clearance, or "not
     checked".
+
+    The clearance is given only without collisions and where it is known.
     """
     c = report.clearance
     if c is None:

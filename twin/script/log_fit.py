@@ -92,6 +92,9 @@ class Fit:
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `flexdt machine fit`.
 
+        Axes have limits, maxima, source, last position and number of replies; `single`
+        lists kinds with one sample.
+
         Its keys are axes, timing, drift, frame_period_s, lines, sum_abs_error_s,
         cross_validated_s, single and total_s.
         """
@@ -440,6 +443,9 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
 def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ...]]:
     """Collect the time beyond motion, pause and exposures [s] by kind of command.
 
+    Commands that do not wait (ACK) and a motor's first move are left out; a wait for
+    X-rays counts from X-rays on, if it was a real one.
+
     Args:
         logs: executed scripts.
         machine: with which motion is computed.
@@ -477,6 +483,9 @@ def _timing(
     samples: Mapping[str, Times], before: Timing, source: str, logs: int
 ) -> Timing:
     """Fit the times of commands: medians, 90 % ranges and the common drift.
+
+    The drift is the common change from earlier to later times, shrunk by its uncertainty;
+    without later times 0.
 
     Args:
         samples: kind of command -> times [s], oldest first.

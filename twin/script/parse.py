@@ -420,6 +420,8 @@ class _Line:
     def command(self) -> c.Command | None:
         """Read the row's command; add an error to `problems` and return None if it cannot
         be read.
+
+        An unknown component or command may be a custom one, with a warning.
         """
         try:
             if not self.component.text:
@@ -437,6 +439,8 @@ class _Line:
 
     def _tabbed(self, columns: tuple[Field, ...]) -> _Parts | None:
         """Divide a row of TAB separated columns; None for an unknown command.
+
+        A row without a known command in its second column is divided at spaces instead.
 
         Args:
             columns: of the row.
@@ -465,6 +469,9 @@ class _Line:
 
     def _padded(self) -> _Parts | None:
         """Divide a row padded with spaces; drop its comment.
+
+        One number after the wait is the expected duration; two are time-out and expected
+        duration.
 
         Returns:
             The columns; None for an unknown command.

@@ -58,6 +58,7 @@ class ScriptError(TwinError):
     """A script that does not hold; `problems` has every error and warning, in line order."""
 
     def __init__(self, problems: Iterable[ScriptProblem]) -> None:
+        """Make the error; the message lists the errors, `data` has all problems, in line order."""
         self.problems = in_order(problems)
         errors = [p for p in self.problems if p.severity == "error"]
         count = f"{len(errors)} error{'s' if len(errors) != 1 else ''}"

@@ -101,6 +101,8 @@ async def delete(
     """Delete a correction and its file from the list and the history of `revert`; data
     sets keep theirs.
 
+    The client must be allowed to move when it is done.
+
     Raises:
         UnknownNameError: there is no such correction.
         LimitError: it is in force.

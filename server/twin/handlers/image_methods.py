@@ -155,6 +155,8 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
     """Predict the image quality of a circular scan at the present distances, in a worker
     process.
 
+    A sample that is named is read, be it on the stage or not (with its own material).
+
     Settings that the request leaves out are the present ones.
 
     Returns:

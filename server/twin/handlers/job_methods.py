@@ -141,6 +141,9 @@ async def forget(
 ) -> p.JobForgetResult:
     """Remove ended jobs, and their files, from the list.
 
+    The job named (whenever it ended), or else all that ended at least `days` ago; resumed
+    ones stay. Returns the ids removed.
+
     An incomplete one whose data set exists is resumed if its scan is submitted again.
     """
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))

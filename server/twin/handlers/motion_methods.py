@@ -209,6 +209,9 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
     """Change the tube: voltage, power, X-rays; omitted settings stay. Voltage and power
     are saved.
 
+    Voltage and power need an idle twin; X-rays alone are switched at once, also during a
+    job.
+
     Raises:
         SafetyError: X-rays on after motion was stopped meanwhile.
     """

@@ -27,6 +27,8 @@ async def set_sample(
 ) -> p.SampleResult:
     """Put a shipped phantom or an upload on the stage; without an offset it is centred.
 
+    It needs an idle twin; an unknown upload or phantom is an error.
+
     The sample is read first, in a thread; the answer warns of motion that was halted.
     """
     if params.name is None:
@@ -60,6 +62,8 @@ async def list_samples(
 ) -> p.SampleListResult | Encoded:
     """List the empty stage, shipped phantoms and uploads, with their sizes, and all
     materials.
+
+    In that order; a long list is made in several turns of the loop.
     """
     empty = p.SampleInfo(
         name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
@@ -83,6 +87,8 @@ async def mesh(
     twin: TwinServer, client: h.Client, params: p.SampleMesh
 ) -> p.SampleMeshResult:
     """Send a part of the mesh (binary STL) of the sample on the stage, for drawing.
+
+    A part beyond the end is empty; `total` is the mesh's size [bytes].
 
     The mesh is made once for each sample, in a thread.
 
@@ -119,6 +125,9 @@ async def upload(
     twin: TwinServer, client: h.Client, params: p.SampleUpload
 ) -> p.UploadResult:
     """Write one chunk of an upload; after the last one parse and store the sample.
+
+    A sample in use needs an idle twin at each chunk. Until complete the result has only
+    the bytes received; then sample and warnings, too.
 
     A complete upload under the name of the sample on the stage replaces that one there.
     """

@@ -130,6 +130,9 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
     """Load a scene: check all of it, the motion included, then change stage and settings
     and start the motors.
 
+    A scene without a correction ends the one in force. It needs an idle twin, before and
+    after the reading.
+
     Returns:
         The complete state afterwards; halted motion is told in the log.
 

@@ -139,6 +139,8 @@ def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProble
 def _outside_text(view: View) -> str:
     """Describe, for a warning, on which side the first image without the sample has lost
     it.
+
+    Left, right, or above or below.
     """
     i = int(np.argmax(view.outside))
     rows, cols = view.camera.shape

@@ -227,6 +227,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     def exposures(self) -> tuple[Exposure, ...]:
         """Every image of the plan as one value, in the order of time; long plans have
         many.
+
+        Images that are not saved have no file (None).
         """
         names = list(self.image_positions)
         rows = np.array([self.image_positions[n] for n in names]).T.tolist()

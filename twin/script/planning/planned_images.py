@@ -225,6 +225,9 @@ class ImageCollector:
         """Simulate `save image`: name the last image, which determines its kind; report
         problems.
 
+        No file name, and no image taken before, are errors; a moving axis is a warning.
+        Saved again under another name it is a copy.
+
         Args:
             command: with the file's name.
             now: moment of the script [s].
@@ -421,6 +424,9 @@ class ImageCollector:
         """Compute the nominal moments of a fly scan's images, and positions by the rule;
         report deviations.
 
+        A late start, angles that are not whole turns, a short run-up and an overrun are
+        warnings.
+
         Args:
             trigger: the motion during the scan.
             found: frames and increment.
@@ -484,6 +490,8 @@ class ImageCollector:
     def _check_saved(self, draft: ExposureGroup) -> None:
         """Note the names of saved images; warn of repeated names, missing settings and
         X-rays that do not fit the kind.
+
+        All are warnings; a dark with X-rays on, any other without.
         """
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
@@ -503,6 +511,8 @@ class ImageCollector:
     def _warn_of_defaults(self, draft: ExposureGroup) -> None:
         """Warn, once each, of the settings that a saved image takes from the machine's
         defaults.
+
+        Tube settings only if X-rays are on; averages not where a hint was given.
         """
         s = draft.camera
         self._default("mode", "the camera mode", s.mode)

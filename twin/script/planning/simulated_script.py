@@ -71,6 +71,10 @@ class Simulation:
     def __init__(
         self, machine: Machine, start: StartState, averages: int | None = None
     ) -> None:
+        """Begin at 0 s with motors, tube and camera as `start` has them, and no steps.
+
+        `averages` is the number of averages assumed where the script sets none.
+        """
         self.machine = machine
         self.now = 0.0
         self.motors = planned.Motors(machine, start)
@@ -94,6 +98,9 @@ class Simulation:
 
     def run(self, commands: tuple[c.Command, ...]) -> None:
         """Simulate all commands in order: advance the clock, and add a step for each.
+
+        A camera command waits until the camera is free (assumed). Names are matched to
+        the machine's whatever their case.
 
         Args:
             commands: of the script, in order; problems go to `findings`.
@@ -285,6 +292,8 @@ class Simulation:
     def _axis(self, command: c.MotorCommand) -> bool:
         """Return whether the machine has the command's axis; report it if not (a custom
         one as a warning).
+
+        A name that scanners reserve is an error.
         """
         name = command.component
         if self.machine.has(name):
