@@ -139,6 +139,9 @@ def bead_phantom(
 ) -> Phantom:
     """Make a cuboid with `beads` beads on the spiral, or beads in air at given positions.
 
+    Overlapping beads of the spiral are allowed, and stated in `assumed`; of beads at
+    positions the size is that of a box about the origin.
+
     Args:
         name_or_dims: a name of Table 6.2, (width, breadth, height) [mm], or the beads'
             centres (k, 3) [mm], in the object's frame.

@@ -191,6 +191,8 @@ Lengths = Annotated[
 def packed(dtype: str) -> PlainValidator:
     """Make the validator of an array of `dtype` that `PACK` wrote; nothing is executed.
 
+    The array that it makes is read-only.
+
     Args:
         dtype: name of the array's type, such as float32.
     """

@@ -97,6 +97,9 @@ class Transmission:
     def of(cls, values: npt.NDArray[Any]) -> Transmission:
         """Compute least, quantiles and histogram of the transmission of all pixels.
 
+        Quantiles are 1 %, 5 % and the median; the histogram has shares of all pixels
+        between `TRANSMISSION_EDGES`, negative values counted as 0.
+
         Args:
             values: of images, any shape, 1 for an open beam.
         """
@@ -350,6 +353,9 @@ def _check_settings(
 ) -> None:
     """Check that the machine has these settings.
 
+    The first that fails is raised. Averages and images must be whole; at least one
+    voltage.
+
     Args:
         machine: with the ranges.
         kVs: voltages.
@@ -465,6 +471,9 @@ class _SeenDetail:
 
     def setting(self, layer: str, at: ExposureSettings) -> Setting:
         """Compute contrast to noise and dose of a setting.
+
+        The dose is the air kerma [mGy] at the object's distance, over all images of the
+        scan.
 
         Args:
             layer: name of the filter.

@@ -103,6 +103,8 @@ def _box(one: analytic.Solid | Surface) -> tuple[FloatArray, FloatArray]:
 def _filled(one: analytic.Solid | Surface) -> Surface:
     """Convert a piece to a filled mesh of exactly its form.
 
+    The solid's negative attenuation makes it a hole.
+
     Args:
         one: mesh, box or convex solid.
 
@@ -133,6 +135,8 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
 
 def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
     """Subtract the others from a filled mesh.
+
+    Attenuation is kept.
 
     Args:
         surface: filled.

@@ -189,6 +189,8 @@ class Phantom(ArrayValue):
     def from_dict(cls, document: object) -> Phantom:
         """Make a phantom from a document of `to_dict`.
 
+        A document of version 0.2.0, with one `surface`, is read as well.
+
         Raises:
             PhantomError: names the key path, the value and the allowed ones.
         """

@@ -141,6 +141,8 @@ def is_shipped(name: str) -> bool:
 def load_phantom(name: str) -> Phantom:
     """Make the phantom called `name`; a bare cuboid's name has five beads.
 
+    Names: special phantoms, cuboids, and cuboids with -K for K beads.
+
     Args:
         name: see `phantom_names`.
 
@@ -299,6 +301,8 @@ def _array(
 ) -> Phantom:
     """Make the phantom of an array: attenuation, or the part that `material` fills.
 
+    Parts may be `FILLED_TOLERANCE` outside 0 to 1; attenuation has no limits here.
+
     Args:
         values: (z, y, x).
         material: of the filled part; None: the values are attenuation [1/mm].
@@ -336,6 +340,8 @@ def _labelled(
     sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None
 ) -> Phantom:
     """Make voxels of several materials from an array of labels or a Volume that holds them.
+
+    Attenuation is that of the label's material; a label that is named need not occur.
 
     Args:
         sample: array of labels, or a Volume.

@@ -82,6 +82,8 @@ def _add_solid(
     """Add a convex solid to `data` [z, y, x], with `oversample` columns per voxel
     along x and y.
 
+    Heights are exact in each column; nothing is added for a shape outside the grid.
+
     Args:
         data: attenuation [1/mm], changed.
         shape: convex.

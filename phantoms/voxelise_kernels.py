@@ -110,7 +110,10 @@ def _winding(t, px, py):
 @linked
 def _height(t, px, py):
     """Compute the height of the plane of triangle t above (px, py), within
-    the triangle's heights."""
+    the triangle's heights.
+
+    The triangle must not be vertical.
+    """
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     vx, vy, vz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
     area = ux * vy - uy * vx

@@ -122,6 +122,8 @@ def json_pieces(document: object) -> list[bytes]:
 def read_msgpack(data: bytes | bytearray | memoryview) -> object:
     """Parse one MessagePack object, with strings as UTF-8 and binary values as bytes.
 
+    Keys of maps must be texts or bytes.
+
     Args:
         data: the object, with nothing after it.
 
@@ -172,6 +174,8 @@ def write_msgpack(document: object) -> bytes:
 def _check_depth(document: object) -> None:
     """Raise ValueError for nesting deeper than `MAX_DEPTH`, or for a timestamp.
 
+    The document counts as the first level; only maps and lists nest.
+
     Args:
         document: plain data that a codec has read.
     """
@@ -199,6 +203,9 @@ def _no_extension(code: int, data: bytes) -> object:
 def _plain(value: object) -> object:
     """Convert a value that an encoder does not know to plain Python: models, arrays,
     NumPy numbers, sets (sorted lists) and mappings.
+
+    Of models, a dict of their fields; mappings become dicts; what is inside is left to
+    the encoder.
 
     Raises:
         TypeError: anything else.

@@ -211,6 +211,9 @@ class Connection:
         """Divide received bytes into JSON lines; a chunk of many short lines is split at
         once.
 
+        A chunk that is too long, has one line end or none, or may hold HTTP is divided
+        line by line; blank lines are dropped.
+
         Args:
             data: received bytes, any part of the stream.
         """
@@ -262,6 +265,8 @@ class Connection:
     def _feed_frames(self, data: bytes | bytearray | memoryview) -> None:
         """Divide MessagePack frames; queue an error for one that is too long, and skip
         its rest.
+
+        An incomplete frame waits for more bytes.
 
         A length above `MAX_FRAME` is a fatal error, as the stream has no known next frame
         then.

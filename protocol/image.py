@@ -95,6 +95,8 @@ def from_bytes(
 def payload(data: object) -> bytes | memoryview:
     """Return the bytes of a `data` field: raw bytes unchanged, base64 text decoded.
 
+    A bytearray is copied to bytes, a memoryview not.
+
     Raises:
         RpcError: -32602, neither bytes nor base64.
     """

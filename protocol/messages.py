@@ -138,6 +138,9 @@ def event(topic: str, seq: int, time: float, data: object) -> Notification:
 def to_plain(message: Message) -> object:
     """Convert a message to the dict (or the list, for a batch) that a codec encodes.
 
+    Parameters that are None are left out; error data only if there is any, with values
+    that are not finite replaced as `finite` does.
+
     Args:
         message: a call, an answer, a malformed message (its error) or a batch.
     """
@@ -203,6 +206,8 @@ def _call(plain: dict[str, object], params: Params) -> dict[str, object]:
 
 def _single(document: object) -> Single:
     """Convert one document of a codec to a message; raises nothing.
+
+    The checks, in this order: object, version "2.0", id, then method, result or error.
 
     Args:
         document: plain data; not a batch.

@@ -280,6 +280,8 @@ def _application(
     def application(asked: dict[str, Any], start: Callable[..., object]) -> list[bytes]:
         """Answer a request, as WSGI has it: begin the response by `start`, and return its
         body.
+
+        It also has type and length, and forbids caches.
         """
         page = response(asked)
         body = page.text.encode()

@@ -47,6 +47,8 @@ class Address:
 def address(text: str) -> Address:
     """Parse HOST:PORT or [IPv6]:PORT.
 
+    The host is not looked up; brackets are removed. Ports are 1 to `MAX_PORT`.
+
     Raises:
         typer.BadParameter: the text has another form, or the port is none.
     """
@@ -83,6 +85,9 @@ def several(text: str) -> str:
 def memory_size(text: str) -> int:
     """Parse "4GiB", "512M" or "1000000" [bytes].
 
+    Units are powers of 1024 whatever their spelling (K, KB, KiB; case does not count);
+    the result is rounded down and above 0.
+
     Raises:
         typer.BadParameter: not a size.
     """
@@ -97,6 +102,8 @@ def memory_size(text: str) -> int:
 
 def speed_up(text: str | float) -> float | Literal["max"]:
     """Parse the speed-up of the twin's time: a positive number, or max.
+
+    Case and surrounding spaces do not count. The upper limit is not checked here.
 
     Raises:
         typer.BadParameter: neither.
@@ -115,6 +122,9 @@ def speed_up(text: str | float) -> float | Literal["max"]:
 
 def scatter_method(text: str) -> str:
     """Parse a method of simulating scatter: off or mc.
+
+    The text is returned unchanged; "first", which has been removed, has a message of its
+    own.
 
     Raises:
         typer.BadParameter: another one.

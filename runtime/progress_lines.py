@@ -93,6 +93,8 @@ class _Work:
     def tell(self) -> None:
         """Show the work's name and fraction as they are now, unless it has ended, and set
         when to show it next.
+
+        Also nothing while another work covers it, or if the log takes no warnings.
         """
         with self.lock:
             if self.ended or self.covered() or not LOG.isEnabledFor(logging.WARNING):
@@ -147,6 +149,8 @@ class _ProgressThread:
     def _run(self) -> None:
         """Show each work when it is due, again and again; runs in a thread until the
         process ends.
+
+        Works are shown without the lock held.
         """
         while True:
             with self._changed:
@@ -259,6 +263,9 @@ def shown_work(what: str, progress: Progress = None) -> Iterator[Advance]:
 def _show_until_end(what: str) -> Iterator[_Work]:
     """Show a work until the context ends, and log the time it took.
 
+    That is only of kinds in `FOLLOWED`, within `SILENT_S`; nothing is shown before
+    `SILENT_S`.
+
     Work of the same kind shortly after is shown as one that goes on.
 
     Args:
@@ -297,6 +304,8 @@ def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
 def _renamed(outer: _Work | None, what: str) -> Iterator[None]:
     """Show a work under the name of one within it until the context ends; None shows
     nothing.
+
+    The earlier name comes back at the end, also after an error.
     """
     if outer is None:
         yield

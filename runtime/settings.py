@@ -128,7 +128,10 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
 
 def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
     """Read like `read`, in a process of its own: exit with code 2 for wrong words, 0
-    after the help."""
+    after the help.
+
+    Reasons go to standard error; errors that are not of the words are raised.
+    """
     try:
         found = read(settings, words)
     except Exception as error:

@@ -209,6 +209,8 @@ class Supervisor:
     async def _spawn(self, service: Service) -> Process:
         """Start and record a service's process, which ends with its parent.
 
+        It runs in a session of its own, with pipes for input and output.
+
         Args:
             service: with its command.
 
@@ -283,6 +285,9 @@ class Supervisor:
     async def _read_addresses(self, process: Process, start: _Start) -> None:
         """Read a service's output up to `ready`: record the address of `bound` and
         `ready` lines, skip others.
+
+        At the end of the output it waits for ever: the caller sees that the process has
+        ended.
 
         Args:
             process: of the service.

@@ -37,6 +37,9 @@ def explain(error: Exception, root: Path | None = None) -> RpcError:
     """Convert `error` to the wire's error; paths below `root`, the data directory, become
     relative to it.
 
+    Wire errors stay; a script's has its problems as data; TwinErrors get the code of
+    their class.
+
     Args:
         error: any exception.
         root: data directory; None: paths stay as they are.

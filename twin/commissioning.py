@@ -268,6 +268,9 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
 def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
     """List folders by scanner, in words, where they are of more than one; "" otherwise.
 
+    Folders are grouped by machine and serial number; unknown ones do not count as
+    another.
+
     Args:
         scans: of which the folders are named.
         known: machines that they may be of.
@@ -407,6 +410,9 @@ def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any
 def _common_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
     """Yield (name, value) of what should be alike in all scans: scanner, pixel, rates,
     limits, offsets.
+
+    Values that are missing are skipped; rates not of rotations; limits are those of the
+    log's replies; the last of `OFFSETS` is left out.
 
     Args:
         scan: with texts and log.

@@ -203,6 +203,9 @@ class InProcessTransport(asyncio.Transport):
     async def open(self) -> None:
         """Connect, after closing an earlier connection.
 
+        The connection starts with MessagePack and an empty inbox; nothing is waited for
+        from the server.
+
         Raises:
             RuntimeError: called in another event loop.
         """

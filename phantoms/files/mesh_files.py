@@ -212,6 +212,8 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     """Read the triangles of a machine's part [mm], from a GLB (m) or STL file (mm); they
     may be open.
 
+    Bytes, triangles and extent have limits of their own for parts.
+
     Args:
         path: of the file.
 
@@ -297,6 +299,8 @@ def _read(
 ) -> tuple[bytes, str, str]:
     """Read a mesh file, or take its bytes; check size and format.
 
+    A file that is too large is not read. Bytes need `file_type`.
+
     Args:
         source: path or content.
         file_type: format; None: the path's suffix.
@@ -344,6 +348,9 @@ def _check_size(size: int, label: str) -> None:
 
 def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     """Parse a mesh file with trimesh, claims checked before and content after.
+
+    Any error of the parser becomes a PhantomError; so do vertices that are not finite and
+    triangles of unknown vertices.
 
     Args:
         raw: content.
@@ -448,6 +455,9 @@ def _check_glb(raw: bytes) -> None:
 def _check_gltf(document: Any, total: int) -> None:
     """Check the JSON document of a GLB file: extensions, data in the file, sizes, places,
     number of triangles.
+
+    Also refused: sparse data, a node with two places, triangle fans, and more than
+    `MAX_FACES` triangles.
 
     Args:
         document: of the file's JSON part.

@@ -219,6 +219,9 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
 def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, float]:
     """Read the mesh of a scene file and its priority.
 
+    With a position the mesh is centred there, without one it stays as it is in its file.
+    The unit is the format's unless stated; the priority 0.
+
     Args:
         value: entry of the document.
         where: its place, for messages.
@@ -370,6 +373,9 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
 def sent_scene(text: bytes, *, name: str) -> Phantom:
     """Parse the phantom of a text that names no other file, and check its size and its
     meshes.
+
+    There are limits for solids, triangles and extent; voxels must be alone. The size is
+    at least the stated one.
 
     Args:
         text: UTF-8, TOML or JSON.

@@ -42,6 +42,8 @@ def filled_twice(vertices: FloatArray, faces: Faces) -> int:
 def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
     """Find the faces of each connected surface.
 
+    Faces are connected by shared vertices.
+
     Args:
         vertices: (v, 3).
         faces: (f, 3).

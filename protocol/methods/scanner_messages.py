@@ -212,6 +212,9 @@ class SampleUpload(f.Params):
         """Check that the chunk fits into the total, and that format, kind, material,
         shape and voxel size agree.
 
+        Returns the upload unchanged. In the order: end of the chunk, kind of the format,
+        material of a scene, shape and voxel size of voxels, extent.
+
         Raises:
             ValueError: names the first of these that does not.
         """

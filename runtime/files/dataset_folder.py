@@ -309,6 +309,8 @@ def read_values(
 ) -> npt.NDArray[np.uint16 | np.float32]:
     """Read one TIFF image: counts as uint16 or, where `kinds` has an f, float32.
 
+    Any failure to decode becomes a DatasetFormatError with path and reason.
+
     Args:
         path: of the file.
         shape: (rows, cols) that the image must have; None: any.
@@ -350,6 +352,9 @@ def read_values(
 
 def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     """Decode the pixels of a TIFF, once its head is known to be that of such an image.
+
+    Signed counts are allowed if none is negative. LZW and the like are decoded by another
+    library; only the first image of the file is read.
 
     A file of a few bytes may claim any size, and inflate to any: both are looked at
     before memory is taken.
@@ -442,6 +447,8 @@ def _check_kind(
 
 def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
     """Check that every strip inflates to no more than the image's `size` [bytes].
+
+    No more than `size` + 1 bytes of a strip are inflated.
 
     Raises:
         DatasetFormatError: a strip inflates to more.

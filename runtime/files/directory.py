@@ -151,6 +151,8 @@ class Directory:
     def make(self) -> None:
         """Make the directory if it is missing; safe from a power cut when this returns.
 
+        Nothing for the topmost folder, which must exist, or if it is there.
+
         Raises:
             DatasetNameError: there is a link or a file in its place.
             DatasetWriteError: the system refuses.
@@ -363,6 +365,8 @@ class Directory:
         """Open the listing of everything in the directory, as `os.scandir`; closed with
         the context.
 
+        Hidden and temporary names are in it, too.
+
         Raises:
             OSError: there is no such directory.
         """
@@ -529,6 +533,8 @@ class Directory:
     def _failed(self, name: str, error: OSError, size: int) -> ds.DatasetWriteError:
         """Convert a system error to DiskFullError or DatasetWriteError; returned, not
         raised.
+
+        It has path, size, error number and free bytes (None if unknown).
 
         Args:
             name: of the file.

@@ -144,6 +144,8 @@ class Changes:
     def remove(self, folder: Directory, name: str) -> None:
         """Delete a file, safely; none there is no error.
 
+        The file is only renamed, so that `undo` restores it; `done` deletes it.
+
         Raises:
             DatasetWriteError: the system refuses.
         """

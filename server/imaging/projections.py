@@ -314,6 +314,8 @@ class Imaging:
     async def nominal_integrals(self, sample: Sample, cone: ConeVec) -> Float32Array:
         """Compute line integrals without the hidden truth, float32 (n, rows, cols); see
         `nominal_paths`.
+
+        Zeros for an empty stage.
         """
         views, *grid = cone.shape
         if not sample.name:
@@ -336,6 +338,8 @@ class Imaging:
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """Sample the materials of `sample` on a grid of about `voxels` cubes; the last
         grid is kept.
+
+        It is kept for one phantom, whatever the number of voxels asked later.
         """
         async with self._on_projector(sample, "material") as divided:
             phantom = divided.phantom
@@ -351,6 +355,8 @@ class Imaging:
     async def require_room(self, sample: Sample, pieces: Pieces) -> None:
         """Check that a scan's sample fits into memory: here, in addition to the pinned
         ones, and there.
+
+        Nothing to check for an empty stage, and on a side without a known limit.
 
         Args:
             sample: that the scan is to show.
@@ -551,6 +557,8 @@ def bytes_of(body: Body) -> int:
 def digest_of(body: Body) -> str:
     """Hash everything of a body that images depend on: equal for equal contents, in every
     process.
+
+    Volumes with shape, voxel size, centre and float32 values; names count only in scenes.
 
     Returns:
         16 hexadecimal digits.

@@ -97,6 +97,8 @@ class ProjectorClient:
     ) -> npt.NDArray[np.float32]:
         """Compute line integrals; send the body again if the server has dropped it.
 
+        At most `MAX_TRIES` times; without `body` an unknown volume is an error at once.
+
         Args:
             name, body: the body to project; None if it is there already.
             cone_vec: n views, object frame.
@@ -214,6 +216,8 @@ async def _send(
 ) -> None:
     """Send a volume or mesh in chunks, or a scene as one message; each chunk waits for
     its answer.
+
+    Values go as little-endian float32, corners as float64, faces as int32.
 
     Args:
         channel: connection to the projector.

@@ -130,6 +130,9 @@ class ProjectorPool:
         """Request images of a free projector, and of another one if it is late; take the
         first answer.
 
+        Invalid parameters are raised at once, other errors once every projector has
+        refused. While all are busy or rest it waits.
+
         A projector that fails rests for a while, and the request goes to the next.
 
         Args:
@@ -213,6 +216,8 @@ class ProjectorPool:
     ) -> asyncio.Task[Float32Array | None]:
         """Start a request in a task that counts as open until it ends, and then wakes a
         waiting request.
+
+        The task is returned at once.
 
         Args:
             member: the projector.

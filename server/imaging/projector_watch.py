@@ -73,6 +73,8 @@ class ProjectorWatch:
         """Ask one projector for its health, and report silence, a failure, or that it
         answers.
 
+        An error of the wire is an answer, too.
+
         An answer later than `silent_s` is reported and waited for.
 
         Args:

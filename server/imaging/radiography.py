@@ -125,6 +125,8 @@ class Radiography:
     ) -> Radiography:
         """Make the radiography of a machine's tube and detector.
 
+        The ideal response, panel and tube are made whatever the physics.
+
         Raises:
             LimitError: ideal physics has no scatter.
         """
@@ -184,6 +186,9 @@ class Radiography:
         truth: TrueGeometry | None = None,
     ) -> list[Radiograph]:
         """Compute radiographs of `sample`, without noise, one for each of `exposures`.
+
+        With an extended focal spot images are made one by one. An empty stage has no
+        scatter.
 
         Args:
             sample: on the stage.

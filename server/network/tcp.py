@@ -283,6 +283,8 @@ class _Link(asyncio.BufferedProtocol):
         """Divide received bytes into messages; start E-stops at once, other urgent
         requests soon.
 
+        While reading pauses, the deadline is stopped.
+
         Starts and stops the deadline of an incomplete message, and pauses reading while
         too many messages wait.
 
@@ -655,6 +657,8 @@ class _Link(asyncio.BufferedProtocol):
     ) -> m.Response | m.Failure | None:
         """Answer one message and count it; a violation of the protocol ends the connection.
 
+        A malformed message is answered with its error and counted as broken.
+
         Args:
             message: decoded, or read in another process.
             refused: error to answer with instead of serving it.
@@ -685,7 +689,11 @@ class _Link(asyncio.BufferedProtocol):
 
     def _count(self, *, broken: bool) -> None:
         """Count broken messages in a row; without the token every message counts. Close
-        after too many."""
+        after too many.
+
+        A good message of an admitted client resets the count; the limit is `malformed`,
+        or `MAX_STRANGE_MESSAGES` before the token.
+        """
         if broken or not self.let_in:
             self.broken = self.broken + 1
         else:
@@ -774,6 +782,8 @@ class _Link(asyncio.BufferedProtocol):
 
     def _check_rate(self) -> None:
         """Count a request against the client's rate `requests_per_s`, if it has one.
+
+        The allowance is at most one second's requests; a refused one does not count.
 
         Raises:
             RpcError: -32003, more requests than that.

@@ -240,6 +240,10 @@ async def backproject(
 async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
     """Return figures about the server as a dict, by the names of the wire.
 
+    Instance, version, backend and threads, uptime [s], clients, waiting, views,
+    superseded, volumes, and memory used, allowed and evictable [bytes]. `client`, `id`
+    and `p` are ignored.
+
     Args:
         context: of the server.
         client: that calls.

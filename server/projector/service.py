@@ -68,6 +68,8 @@ class ProjectorServer(ListeningServer):
     async def close(self) -> None:
         """Stop listening, abort all connections, cancel their work, and end the compute
         thread.
+
+        It waits for the cancelled work.
         """
         if self.server is not None:
             self.server.close()
@@ -135,6 +137,9 @@ class ProjectorServer(ListeningServer):
     def frame(self, link: FrameLink, body: memoryview) -> None:
         """Serve a client's frame in a task; refuse it from one with too many, or
         without a token.
+
+        Refused clients are disconnected. Reading pauses for a client without a token or
+        with more than `MAX_PENDING_BYTES` pending.
 
         Args:
             link: connection of the client.
@@ -344,6 +349,8 @@ async def serve_projector(
 
 def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
     """Make the monitoring pages of a running projector.
+
+    They are /healthz, with the version, and /metrics.
 
     Args:
         server: whose figures they show.

@@ -125,6 +125,9 @@ class FrameLink(asyncio.BufferedProtocol):
         """Count received bytes, restart the frame's deadline, and pass a complete frame
         to `on_frame`.
 
+        The first four bytes are the length; bytes after the end of the stream are
+        ignored.
+
         Args:
             count: number of bytes written into the buffer of `get_buffer`.
         """
@@ -410,6 +413,8 @@ class ProjectorLink:
     def _frame(self, link: FrameLink, body: memoryview) -> None:
         """Pass the answers and parts of a frame to their requests; close on a violation
         of the protocol.
+
+        Answers to abandoned requests and parts of unknown ones are ignored.
         """
         try:
             received = self._calls.receive(frames.unpack(body))

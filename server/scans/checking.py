@@ -100,6 +100,8 @@ class CheckInput:
         """Parse, plan and check the scan, collisions included where the machine has
         bodies; blocks.
 
+        For poses the moves between them go around obstacles, unless nothing is swept.
+
         Args:
             bytes_at_most: largest size of the report; None for no limit.
             swept: whether collisions are looked for.
@@ -457,6 +459,8 @@ def _pickled_pieces(plan: ScanPlan) -> list[bytes]:
 def _rebuilt_plan(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
     """Rebuild the plan that `_pickled_pieces` pickled; in a thread, so that others run between
     pieces.
+
+    Garbage collection is off meanwhile.
 
     Args:
         pieces: of `_pickled_pieces`, all and in order.

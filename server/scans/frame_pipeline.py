@@ -87,6 +87,8 @@ class FramePipeline(Generic[T]):
     async def _process_batches(self) -> None:
         """Take batches of waiting frames and produce each until it succeeds; ends only by
         cancellation.
+
+        Several such tasks may run; each wakes who waits for room or for the end.
         """
         while True:
             async with self._changed:
@@ -102,6 +104,8 @@ class FramePipeline(Generic[T]):
     def _next_batch(self) -> list[T]:
         """Remove the next batch from the queue: consecutive frames of one kind, at most
         `batch`.
+
+        The queue must not be empty.
         """
         batch = [self._waiting.popleft()]
         kind = self.kind(batch[0])
@@ -116,6 +120,8 @@ class FramePipeline(Generic[T]):
     async def _produce_until_done(self, batch: Sequence[T]) -> None:
         """Produce a batch; after a failure call `failed`, wait for `retry`, and try
         again.
+
+        The batch is tried again whole.
         """
         while True:
             try:

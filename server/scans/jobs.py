@@ -104,6 +104,8 @@ class Jobs:
     def get(self, job: str | None) -> Job:
         """Return the job with id `job`, or for None the current or else the last one.
 
+        An ended job is returned, too, while it is kept.
+
         Raises:
             UnknownNameError: lists the existing jobs, at most `MAX_NAMED_JOBS`.
         """
@@ -355,6 +357,9 @@ class Jobs:
     def interrupt(self, reason: Exception) -> None:
         """Pause the job that runs or is about to, after a stop from outside (stop,
         E-stop).
+
+        A retry that was planned is cancelled; the job goes on only when it is resumed by
+        hand. Nothing more if none runs.
         """
         self._take_over()
         self._interrupted = reason

@@ -97,6 +97,8 @@ class Job:
 def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
     """Restore a job of an earlier server from its record.
 
+    The ended phases are kept as they were. Nothing starts by itself.
+
     One that had not ended is done if its data set is complete, else incomplete with an
     error with the way to go on.
 

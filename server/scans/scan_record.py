@@ -157,6 +157,9 @@ class JobRecord:
         """Add the record, as JSON for the data set `name`, to changes that are written
         together.
 
+        The file is in `FOLDER`, named after the data set; the listing of poses is not in
+        it.
+
         Args:
             changes: files written as one.
             root: data directory.

@@ -287,6 +287,9 @@ class ObstacleMoves:
         """Resolve targets and find moves to them that touch nothing; the search runs in a
         thread.
 
+        Without bodies the direct move is the way. The order is one of single moves or
+        moves together.
+
         Args:
             targets: axis -> target [mm, deg].
             relative: whether targets are distances from where the motors will rest.
@@ -346,6 +349,8 @@ class ObstacleMoves:
     async def _follow_legs(self, way: Way) -> None:
         """Move along the legs of a way one by one, each after the motors' rest; call
         `changed` at each start.
+
+        It first waits for the motors' rest, and ends when the last leg has ended.
 
         Raises:
             SafetyError: other motion has begun or motion was stopped.

@@ -366,6 +366,8 @@ class Submissions:
     ) -> CheckInput:
         """Collect the input of a scan's check; shapes are computed in a thread.
 
+        The correction in force and the physics of now are in it.
+
         Args:
             source: script or poses.
             start: scanner before the scan.
@@ -427,6 +429,9 @@ class Submissions:
     ) -> JobInputs:
         """Write the scan's record and create (or resume) its data set; in a worker
         thread.
+
+        Physics, scatter and seed are those of the start conditions; the geometry is
+        checked before anything is written.
 
         Args:
             job_record: record of the scan.
@@ -503,6 +508,8 @@ class Submissions:
 
     def _resumable(self, name: str, source: ScanSource) -> StartConditions | None:
         """Read the start conditions of the interrupted data set called `name`.
+
+        Compared are script, poses and, for poses, exposure.
 
         Args:
             name: of the data set.

@@ -37,6 +37,8 @@ WAKE_ROUNDS = 3
 def check_speed_up(value: float | str) -> SpeedUp:
     """Return `value` if it is "max" or a number the clock can run at.
 
+    A number is returned as float; it is above 0 and at most `MAX_SPEED_UP`.
+
     Raises:
         LimitError: names the allowed values.
     """

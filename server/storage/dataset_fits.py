@@ -25,6 +25,8 @@ PHANTOM_SUFFIXES: Final = (".toml", ".json")
 def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
     """Calibrate from data sets for `calibration.fit`; blocks, for a worker process.
 
+    Without a fit, residuals and steps are left out; a bead that was not used has None.
+
     Args:
         root: the data directory, against which names of data sets and phantom files are
             resolved.

@@ -152,6 +152,9 @@ def read_memory(root: Directory) -> Memory | None:
 def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     """Set the scanner to the state in `memory`, X-rays off; an E-stop stays in force.
 
+    A voltage outside the tube's range is replaced by the present one, with a warning in
+    the log. The correction is not restored here.
+
     Args:
         memory: the state.
         scanner: to be set.
@@ -245,6 +248,9 @@ class StateStore:
     async def run(self, moving: Callable[[], bool]) -> None:
         """Write the state after each change, and while motors move; ends only by
         cancellation.
+
+        At most once in `MIN_INTERVAL_S`, unless a write is asked for at once. Failed jobs
+        alone are tried again later.
 
         A failure is logged and tried again after `FAR_S`.
 

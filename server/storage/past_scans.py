@@ -615,6 +615,9 @@ def _get(
 def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:
     """List contradictions of a data set's files and its geometry.
 
+    From the texts their warnings; else those of the projections' geometry above a note;
+    none if no projection has a geometry.
+
     Args:
         scan: the data set.
         shape: of its projections, (rows, cols).
@@ -711,6 +714,9 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
     """Compute the smallest clearance at images' poses [mm]; the last four results are
     cached.
+
+    The sample counts as a cylinder on the axis if both its sizes are known, else it is
+    left out.
 
     Args:
         scan: with its document.

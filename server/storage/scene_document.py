@@ -26,6 +26,9 @@ def save_scene(
 ) -> p.Scene:
     """Convert the scanner to a document; a motor under way is saved at its target.
 
+    It has rates of all axes, tube, camera, sample with offset, and the correction or
+    None.
+
     Args:
         scanner: whose state is saved.
         now: twin time [s].

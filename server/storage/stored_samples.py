@@ -364,6 +364,8 @@ class SampleStore:
     def _read_bytes(self, head: UploadHead) -> bytes:
         """Read the bytes of an upload and compare them with its size and revision.
 
+        Without a stored revision only the size is compared.
+
         A damaged upload is removed from the list and its files are set aside.
 
         Args:
@@ -421,6 +423,8 @@ def _shown(head: UploadHead, revision: str) -> str:
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
     """Parse the bytes of an upload: mesh or scene in a worker, voxels here.
 
+    The material of a scene is its own; `material` is not used for it.
+
     Args:
         head: description of the upload.
         raw: its bytes.
@@ -468,7 +472,10 @@ def _bytes_file(name: str, revision: str | None) -> str:
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
     """Make the reader of an upload's description, which validates it as if it
-    was uploaded now."""
+    was uploaded now.
+
+    It raises ValueError for one that is invalid or about another sample than its file's.
+    """
 
     def read(data: bytes) -> UploadHead:
         """Parse a description; raise ValueError if its sample is not the one in the file's name."""

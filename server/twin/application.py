@@ -103,6 +103,8 @@ def twin_pages(
 ) -> Pages:
     """Make the pages /healthz and /metrics of a running twin server.
 
+    /healthz answers 503 after a part of the twin has failed for good.
+
     Args:
         twin, server, projector: whose figures they show.
         requests: counted calls.

@@ -367,6 +367,9 @@ class TwinServer:
         """Restore scanner and jobs of the previous server, before `start`; log a warning
         if it was killed.
 
+        A warning also if jobs are to be resumed. A sample that cannot be read gives the
+        empty stage.
+
         Returns:
             The sample for the stage; None if nothing is stored, or nothing that fits this
             machine.
@@ -392,6 +395,9 @@ class TwinServer:
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
         """Restore the jobs of earlier servers, and write files for those that have none.
+
+        Where files cannot be written, the state keeps those jobs and writing is tried
+        again.
 
         Args:
             memory: state of the previous server, in which older ones kept their jobs.
@@ -515,6 +521,8 @@ class TwinServer:
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
         """Compute the smallest clearance at a state's positions; None for a machine
         without components.
+
+        Always computed anew; it needs the guard's scene.
         """
         guard = self.scanner.guard  # its scene is the one in force, and has been made
         motors = {
@@ -585,6 +593,8 @@ class TwinServer:
 
     def _memory(self, ended: bool) -> kept.Memory:
         """Record the twin's state for the file that a restarted server reads.
+
+        Jobs that have files are not in it; only how many were made.
 
         Args:
             ended: whether the server ends now.
@@ -681,6 +691,9 @@ class TwinServer:
     def _job_changed(self, job: Job) -> None:
         """Publish a job's status, log a change of its phase, and mark the state as
         changed.
+
+        Running is not logged, nor a phase that was logged before; an ended job with an
+        error is logged as an error.
         """
         status = self.jobs.status(job)
         self.hub.publish("job", status, slot=job.id)

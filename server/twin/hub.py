@@ -300,6 +300,8 @@ class Hub:
     def _drain(self) -> None:
         """Post as many due events as one turn of the loop allows, and schedule the next
         turn.
+
+        Events of subscriptions that have ended are dropped, and do not count.
         """
         while self._due_events and self._room:
             listener, subscription, new = self._due_events.popleft()

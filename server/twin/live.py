@@ -57,6 +57,8 @@ class Shot:
     def of(cls, scanner: ScannerTwin, now: float, revision: str | None = None) -> Shot:
         """Read the scanner's state at `now`, with the revision of the sample on its
         stage.
+
+        Positions are of all motors, sorted by name; `revision` None if unknown.
         """
         return cls(
             time=now,
@@ -201,6 +203,9 @@ class LiveView:
     async def run(self) -> None:
         """Compute and publish images while the pose changes, one at a time; ends only by
         cancellation.
+
+        An image equal to the last one is not made again; at most one in
+        `FRAME_INTERVAL_S`.
 
         Nothing is computed without subscribers or while a scan runs. A failure is logged
         and tried again.
@@ -370,6 +375,8 @@ class StateFeed:
     async def _wait_until_warm(self, settled: Callable[[], None]) -> None:
         """Wait until X-rays are ready and publish the state then, if nothing else changes
         before.
+
+        Nothing is waited for if they are ready or off, or while a scan runs.
 
         Args:
             settled: called then.

@@ -81,6 +81,9 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
 def _pickled_call(message: m.Single) -> bytes:
     """Pickle a message as a call with validated parameters; errors, and too large ones,
     are pickled in place of parameters.
+
+    Messages that are no calls are pickled as they are; parameters above `MAX_PARAMS`
+    become an error unless the method is bulky.
     """
     if not isinstance(message, m.Request | m.Notification):
         return pickle.dumps(message)
@@ -100,6 +103,8 @@ def _pickled_call(message: m.Single) -> bytes:
 def _params(message: m.Request | m.Notification) -> Params | RpcError:
     """Read a call's parameters as its method's model; returns the error if they do not
     fit.
+
+    Poses are packed to one text.
     """
     try:
         params = parse_params(find(message.method), message.params)

@@ -55,6 +55,9 @@ def safety_view(
 ) -> w.SafetyState:
     """Convert safety state and clearance to their wire form.
 
+    Clearance and pair are None where nothing is near; the margin's warning names the
+    pair.
+
     Args:
         safety: of the scanner.
         clearance: smallest one now; None for a machine without components.

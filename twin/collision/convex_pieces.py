@@ -187,6 +187,8 @@ def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> Float
 def _cap(points: FloatArray, axis: int) -> FloatArray:
     """Triangulate the convex hull of points (k, 3) of a plane across `axis`, as corners
     (m, 3, 3).
+
+    Fewer than three points give none; points on one line a flat fan.
     """
     from scipy.spatial import ConvexHull, QhullError
 

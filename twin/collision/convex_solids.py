@@ -180,6 +180,8 @@ def box(size: npt.ArrayLike, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Polytop
 def hull(points: npt.ArrayLike) -> Polytope:
     """Compute the convex hull of points.
 
+    Faces are turned outwards; vertices inside are dropped.
+
     Flat or thin point sets are thickened by a micrometre, outwards, so that every hull is
     a solid.
 

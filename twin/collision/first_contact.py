@@ -106,6 +106,9 @@ class PathSearch:
     def first_contact(self, *, only_contacts: bool = False) -> SweepResult:
         """Find the first contact, and the least clearance on the way (not refined).
 
+        Pairs are taken nearest bound first, and left out once their bound exceeds the
+        best. With a contact, clearance and pair are the contact's.
+
         Args:
             only_contacts: skip pairs too distant for a contact, so that clearances are
                 incomplete.
@@ -246,7 +249,10 @@ def _nearest(
     scene: CollisionScene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray
 ) -> NearestPair:
     """Find the nearest pair with the motors at `q`; `bounds` are lower bounds
-    of the clearances."""
+    of the clearances.
+
+    (inf, None) without pairs; of equal gaps the first is kept.
+    """
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
@@ -259,7 +265,10 @@ def _nearest(
 
 def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
     """Compute the certified clearance [mm] of a pair with the motors at `q` (axes,); 0
-    for an overlap."""
+    for an overlap.
+
+    It is never more than the true distance.
+    """
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)
     turn_a = None

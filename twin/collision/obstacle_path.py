@@ -140,6 +140,9 @@ class _Planner:
     def stations(self, goal: Mapping[str, float]) -> dict[str, list[float]]:
         """List positions worth a stop for the goal's motors and those of the obstacles.
 
+        Motors are those of the goal and all that move a blocking body; a rotation is
+        tried `ASIDE_TURN_DEG` to each side, within travel.
+
         Args:
             goal: motor -> target [mm, deg].
 
@@ -231,6 +234,9 @@ class _Planner:
     ) -> list[tuple[str, float]]:
         """Shorten the excursions of a path as far as it stays free.
 
+        Each by bisection, in order; moves to where the motor already stands are not
+        changed either.
+
         Args:
             way: (motor, position) in order, free.
             goal: motor -> target [mm, deg]; moves to it are not changed.
@@ -270,6 +276,8 @@ class _Planner:
 
     def joined(self, way: Sequence[tuple[str, float]]) -> list[dict[str, float]]:
         """Join neighbouring moves where moving together is free as well.
+
+        Two moves of one motor are never joined.
 
         Args:
             way: (motor, position) in order, free.

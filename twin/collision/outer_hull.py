@@ -29,6 +29,9 @@ RELATIVE_LIFT: Final = 1e-9
 def outer_hull(points: npt.ArrayLike) -> Polytope:
     """Build a convex body that contains points and has at most `MAX_POINTS` corners.
 
+    The exact hull if that has few enough corners; else planes are cut from a box,
+    farthest first, until nothing is `MIN_CUT_MM` outside or the number is reached.
+
     Args:
         points: (k, 3) [mm].
 
@@ -68,6 +71,9 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
 
 def _planes(solid: Polytope) -> FloatArray:
     """Compute the outward planes of the solid's largest faces, at most `MAX_PLANES`.
+
+    Faces in one plane (to 1e-6) count together; the offset is that of the farthest
+    vertex.
 
     Args:
         solid: convex.

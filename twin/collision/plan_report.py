@@ -140,6 +140,9 @@ def _contacts(search: PathSearch) -> list[Contact]:
 def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
     """Find the contacts of one pair; after each it must come free before it counts again.
 
+    It counts as free at margin plus two tolerances, looked for at the beginnings of
+    `MAX_LOOKS_IN_CONTACT` segments; else the search ends.
+
     Args:
         search: path and pairs.
         k: index of the pair.

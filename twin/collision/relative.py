@@ -110,6 +110,9 @@ def path_of(
     """Make the path of `axes` from `start` to `end`, cut wherever a motor changes its
     law.
 
+    Motors that stand have zero rates. At least one segment, of no length if `end` is not
+    later.
+
     Args:
         axes: names of the motors, in the order of the columns.
         tables: motor -> positions and velocities over time.

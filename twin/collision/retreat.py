@@ -100,7 +100,10 @@ def _deeper(
     motion: RelativeMotion, overlap: _Overlap, margin: float
 ) -> tuple[Moment, Moment] | None:
     """Find when the separation falls to its floor: (last look before, moment);
-    None for never."""
+    None for never.
+
+    The floor follows from the gap at the start and the margin.
+    """
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
     while (at := motion.next_at(look, level)) is not None:
@@ -158,6 +161,9 @@ class _Overlap:
     @classmethod
     def at(cls, a: Body, b: Body, q: FloatArray) -> _Overlap:
         """Find the directions in which two overlapping bodies are to come apart.
+
+        They are the inward face normals of the bodies' Minkowski difference, and one
+        refined direction.
 
         Args:
             a, b: the bodies.

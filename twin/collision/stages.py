@@ -232,6 +232,9 @@ def sample_bodies(
 def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatArray]:
     """Compute the offset of each anchor from the motors' readings (3,) [mm].
 
+    The anchors are world, source, object and detector; fixed quantities of the machine
+    are added.
+
     Args:
         machine: which motors move which anchor.
         profile: offsets of its motors.

@@ -184,6 +184,9 @@ class ScanRecord(ArrayValue):
     ) -> ScanRecord:
         """Make the record of a plan that is about to run; `complete` is False.
 
+        Camera and tube are those of the first projection, else of the settings. Previews
+        are no blocks; smooth if any projection is taken in motion.
+
         Settings are those at `write settings file`, or, for a script without that
         command, those at the first projection.
 
@@ -662,6 +665,8 @@ class DatasetDocument(_Model):
 
 def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
     """Parse and validate the text of `flexdt.json`.
+
+    Another schema than this version's is refused first.
 
     Args:
         text: its content.

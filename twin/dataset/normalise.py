@@ -121,6 +121,9 @@ def _neighbours(
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Float32Array]:
     """Find the live pixels before and after each dead one in its row.
 
+    In order of the dead pixels; (d,) each, empty without any. The nearest is searched in
+    the whole image, with weight 0.
+
     A row without a live pixel on one side uses the nearest one.
 
     Returns:

@@ -89,6 +89,8 @@ def rebuild(
 ) -> Rebuilt:
     """Compute poses of images 0 to count - 1 from the scanner's texts.
 
+    From the figures, heights come from motors and offsets where those are known.
+
     Motors and a profile that reproduces the printed figures are used where possible, else
     the figures alone.
 
@@ -238,6 +240,9 @@ def _profile(
 def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
     """Find the machine that the texts name or, without a name, whose motors they list.
 
+    By scanner name or type (also as the beginning of the stated one), in the given order;
+    a name that no machine has gives None.
+
     Returns:
         None if no machine fits, or several by their motors.
     """
@@ -266,6 +271,8 @@ def _positions(
     settings: ScanSettings, machine: Machine, angles: FloatArray
 ) -> tuple[dict[str, FloatArray], list[str]]:
     """Compute motor positions in the script's sign, with the rotation by the angle rule.
+
+    Motors that the texts lack are at home, with a note each.
 
     Returns:
         motor -> (n,) positions [mm, deg], and notes for the user.
@@ -338,6 +345,8 @@ def _figures_agree(ours: Figures, printed: Figures) -> bool:
 def _default_profile(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:
     """Find the default profile of a machine among `profiles`; zero offsets where it has
     none, None where it is missing.
+
+    Names of machine and profile must both agree.
     """
     if not machine.default_profile:
         return profile_of(machine)

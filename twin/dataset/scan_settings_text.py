@@ -185,6 +185,8 @@ def _motor(name: str, motor: MotorLine) -> str:
 def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
     """Read `scan settings.txt`.
 
+    Unknown lines are skipped; fields that are not there are None.
+
     Args:
         text: its content.
         file: name for error messages.
@@ -215,6 +217,8 @@ def _read_line(
     line: str, rest: list[str], values: dict[str, Any], motors: dict[str, MotorLine]
 ) -> None:
     """Read one line into `values` or `motors`; lines without anything known are skipped.
+
+    A date that cannot be read is skipped; "script cancelled" sets that field.
 
     Args:
         line: without its end.

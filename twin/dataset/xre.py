@@ -229,6 +229,8 @@ def _triple(vector: Sequence[float] | FloatArray) -> str:
 def _written(value: Value) -> str:
     """Format one value as the XRE file has its type: TRUE, whole number, six decimals,
     quoted text.
+
+    Quotes and backslashes in a text are escaped.
     """
     match value:
         case bool():

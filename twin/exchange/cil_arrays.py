@@ -75,6 +75,8 @@ def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 def read_cil(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert CIL's arguments to a geometry.
 
+    The origin, a corner of the image, determines the signs of its rows and columns.
+
     Args:
         arrays: name -> array, as from `cil_arrays`.
         file: for messages.

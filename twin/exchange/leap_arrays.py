@@ -57,6 +57,8 @@ def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 def read_leap(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert LEAP's arguments to a geometry.
 
+    The names of its arrays are those of `leap_arrays`; `file` is for messages.
+
     Raises:
         ExchangeError: an argument is missing or not valid.
     """

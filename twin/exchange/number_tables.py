@@ -72,6 +72,9 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
 def csv_text(geometry: ScanGeometry) -> str:
     """Format a geometry as CSV, one line a view: frame, file, stage angle [deg], then the
     twelve numbers [mm].
+
+    A comment with the detector's shape comes first if that is known; files are empty if
+    unknown.
     """
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")

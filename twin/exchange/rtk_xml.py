@@ -56,6 +56,8 @@ _ROOT = "RTKThreeDCircularGeometry"
 def rtk_text(geometry: ScanGeometry) -> str:
     """Format a geometry as RTK's XML, nine numbers and a matrix a view.
 
+    The panel's pixel size and shape are not in it.
+
     Args:
         geometry: of a flat panel with rectangular pixels.
 
@@ -81,6 +83,8 @@ def rtk_text(geometry: ScanGeometry) -> str:
 def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
     """Compute the nine numbers of one cone_vec row: three angles [deg], then six lengths
     [mm], in the order of `NAMES`.
+
+    The gantry angle is 0 to 360; of a horizontal panel the in-plane angle is set to 0.
 
     Args:
         row: (12,) [mm].
@@ -115,6 +119,8 @@ def matrix_of(values: tuple[float, ...]) -> FloatArray:
     """Compute RTK's projection matrix (3, 4), which maps RTK's (x, y, z, 1) to the panel
     [mm].
 
+    Angles in degrees, lengths in mm, in the order of `NAMES`.
+
     Args:
         values: the nine numbers of a view.
     """
@@ -140,6 +146,9 @@ def read_rtk(
     file: str = "<xml>",
 ) -> ScanGeometry:
     """Read RTK's XML.
+
+    Parallel views are refused, and distances that contradict each other; numbers before
+    the views hold for all.
 
     Args:
         text: the file.

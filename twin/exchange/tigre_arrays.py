@@ -53,6 +53,9 @@ ANGLES: Final = "angles"
 def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to the attributes of TIGRE's `Geometry`, and `angles` [rad].
 
+    Arrays of two are (rows, columns), of three (z, y, x); angles are unwrapped, one a
+    view.
+
     Args:
         geometry: with the detector's shape.
 
@@ -144,6 +147,8 @@ def _turns(axes: FloatArray) -> FloatArray:
 def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert TIGRE's attributes and angles to a geometry.
 
+    A COR of zeros is allowed; other attributes are ignored.
+
     Args:
         arrays: name -> array, as from `tigre_arrays`.
         file: for messages.
@@ -190,6 +195,8 @@ def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatA
 
 def _axes(turns: FloatArray) -> FloatArray:
     """Compute the rotations Rz Ry Rx of turns; the inverse of `_turns`.
+
+    Rotations about fixed axes: x first, then y, then z.
 
     Args:
         turns: about x, y and z (n, 3) [rad].

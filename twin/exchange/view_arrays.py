@@ -68,6 +68,9 @@ def numbers_of(
 ) -> FloatArray:
     """Read one array of finite numbers.
 
+    Integers are converted; the result is float64 of exactly `shape`. Truth values are
+    refused.
+
     Raises:
         ExchangeError: it has another shape or other content.
     """

@@ -107,6 +107,9 @@ class Follower:
     def hear(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
         """Update the mirror with a message: command, feedback, acknowledgement or error.
 
+        Feedback is a reading; RCV changes only when it was last heard; an end that was
+        not asked for may be of an unheard command.
+
         Args:
             mirror: before it.
             heard: the message.
@@ -215,6 +218,8 @@ class Follower:
     def ahead(self, mirror: Mirror, now: float) -> tuple[Alarm, ...]:
         """Check the moves under way and the rest of the script, as `flexdt check` does.
 
+        Of one line and code only the first is kept; clearances only without collisions.
+
         This takes as long as that. Motors without a reading are assumed at home, which
         each alarm mentions.
 
@@ -267,6 +272,9 @@ class Follower:
     def _begin_command(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
         """Update the mirror with a command: prediction, place in the script, command
         under way.
+
+        A command whose end came first is applied at once. An unknown axis is an alarm; a
+        stop ends all predicted paths. At most `MAX_WAITING` are kept.
 
         A command that was heard before changes nothing; one that another has waited for
         ends those.
@@ -529,6 +537,8 @@ class Follower:
     ) -> Mirror:
         """Update positions, limits and rates with the reply at the end of a move.
 
+        Without a readable position the motors are taken to be at their targets.
+
         Args:
             mirror: present state.
             waiting: record of the move.
@@ -574,6 +584,9 @@ class Follower:
         self, mirror: Mirror, name: str, motor: MotorReply, now: float
     ) -> Mirror:
         """Compare limits and rates of a motor's reply with those of the machine file.
+
+        Speed and acceleration become the reply's; only limits and maxima are compared, to
+        1e-6.
 
         Args:
             mirror: present state.
@@ -768,6 +781,9 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
     """Add log lines for the commands that the sender has not waited for, now that another
     follows.
 
+    Questions get none, and each command one only; a move with a trigger took the time
+    until now, any other 0 s.
+
     Args:
         mirror: present state.
         now: moment of the next command [s].
@@ -818,6 +834,9 @@ def _apply_settings(
 ) -> Mirror:
     """Apply the end of a command to the mirror's settings: camera, tube, X-rays or an
     axis's rates.
+
+    Rates of a virtual axis are set for its motors by their shares; a wait for X-rays
+    means that they are on and ready now.
 
     Args:
         mirror: present state.

@@ -942,6 +942,8 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
     """Check the sanity rules of thesis 4.8.3 (pitch, orthogonal sides, SDD above 0);
     return the argument, so it can guard an expression.
 
+    In that order; pitch and cosine within `PITCH_TOLERANCE`.
+
     Args:
         cone_vec: the geometry to check.
         pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or one for each.

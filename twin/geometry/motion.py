@@ -72,6 +72,9 @@ class Motion:
         """Return poses with the deviations added to axis, angle, source and detector,
         `sign` times.
 
+        Deviations are added in the world frame [mm], to the angle in rad; other fields
+        stay.
+
         Args:
             poses: of as many frames; not changed.
             sign: -1 removes the deviations to first order.

@@ -206,6 +206,9 @@ class Panel:
     def to_json(self) -> dict[str, Any]:
         """Convert to a document with the keys model, shape, borders, coefficients and, if
         any, lag; `from_json` is its inverse.
+
+        Coefficients are by name [px]; the model is always "cubic"; a lag of 0 is left
+        out.
         """
         return {
             "model": "cubic",

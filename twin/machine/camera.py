@@ -174,6 +174,8 @@ def without_number(mode: str) -> str:
 def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     """Check that `roi` is on the sensor and holds at least one binned pixel; return it.
 
+    Edges are inclusive and within 0 to size - 1; the first edge outside is named.
+
     Args:
         roi: region of interest, unbinned pixels.
         grid: pixels of the sensor.

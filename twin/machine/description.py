@@ -195,6 +195,8 @@ class VirtualAxis(_Frozen):
         """Check that factor and shares are not 0, and that the axis reads a motor that it
         moves, at the inverse share.
 
+        Returns the axis unchanged.
+
         Raises:
             PydanticCustomError: names the field, its value and the allowed ones.
         """
@@ -295,6 +297,9 @@ class DetectorSpec(_Frozen):
     def _fits(self) -> DetectorSpec:
         """Check that mode and ROI fit the panel, and that the response is physical: left
         energies below the photon's, energies rising.
+
+        Returns the detector unchanged; left energy is at most the photon's, energies rise
+        from above 0.
 
         Raises:
             PydanticCustomError: names the field, its value and the allowed ones.

@@ -83,6 +83,8 @@ async def list_all(
 async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.CorrectionResult:
     """Put the previous correction in force, or none; the answer warns of motion that was
     halted.
+
+    Without a correction in the history none is in force, and nothing is an error.
     """
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]

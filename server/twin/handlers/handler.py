@@ -230,6 +230,9 @@ async def change_stage(
         """Change stage, correction and settings together, and stop motion that would
         collide.
 
+        Raises, before anything changes, if the client has lost control. A halt also ends
+        a way around obstacles and interrupts a running job.
+
         Returns:
             the reason for stopping as a warning, or no warning.
         """

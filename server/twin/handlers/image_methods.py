@@ -35,6 +35,8 @@ async def get_projection(
 ) -> Encoded:
     """Compute an image at the present pose, or predict one for other poses or settings.
 
+    Too strong a binning is an error.
+
     A prediction has the public geometry and no noise; at the present pose the hidden
     truth and noise are in the image.
 
@@ -122,6 +124,9 @@ def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec)
 @answers(p.PROJECTION_RAY)
 async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult:
     """Compute path lengths on the ray of a pixel, in the public geometry.
+
+    The pixel may be fractional; pixel centres are whole numbers. The result has [mm] by
+    material.
 
     Raises:
         LimitError: the image has no such pixel.

@@ -198,6 +198,9 @@ def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
 def _source(params: ScanInput) -> ScanSource:
     """Make the requested scan from a script's text or bytes, or from poses.
 
+    Poses have no seedless defaults here: exposure, moments, seed and flats are the
+    request's.
+
     Raises:
         RpcError: -32602, no base64; -32008, the script is too large.
     """

@@ -29,6 +29,9 @@ from flexdt.twin.scanner.state import CameraChange
 async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
     """Start a move; the answer is sent at once, or with `wait` when the motors rest.
 
+    Warnings are targets limited to the travel and, with `wait`, motors that stopped
+    short; `arrived` is None without `wait`.
+
     A way around obstacles that is under way is cancelled. With `plan` a new one is found.
     """
     if params.plan:
@@ -91,6 +94,8 @@ async def _move_around_obstacles(
     """Find free moves to the targets and start them one by one; an earlier way ends with
     its present leg.
 
+    The result has the moves; `arrived` is None without `wait`.
+
     With `wait` the answer comes at the end of the way; else its failure is told in the
     log.
 
@@ -147,6 +152,8 @@ async def set_axis(
 ) -> p.AxisSetResult:
     """Set speed and acceleration of an axis's future motions; the answer has those in
     force.
+
+    Omitted ones stay; it needs an idle twin. Motion under way is not changed.
     """
 
     def change(scanner: ScannerTwin) -> None:

@@ -178,6 +178,8 @@ async def delete(
     """Delete an upload and its files, unless it is on the stage or in a scan that has not
     ended.
 
+    Returns the name and its size [bytes]; use is checked again when it is done.
+
     Raises:
         UnknownNameError: no such upload.
         LimitError, RpcError: it is in use.
@@ -258,6 +260,8 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
 def _unknown_upload(twin: TwinServer, name: str) -> UnknownNameError:
     """Make the error for an upload that does not exist, with the last names; returned,
     not raised.
+
+    At most `MAX_NAMED_UPLOADS` names and the number of older ones.
     """
     uploads = list(twin.samples.uploads)[-MAX_NAMED_UPLOADS:]
     older = len(twin.samples.uploads) - len(uploads)
