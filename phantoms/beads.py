@@ -285,6 +285,8 @@ def chiral_phantom() -> Phantom:
 def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> None:
     """Check that every bead is inside the body.
 
+    Each bead with its whole radius, to 1e-9 mm.
+
     Args:
         centers: (k, 3) [mm].
         radii: (k,) [mm].
@@ -310,6 +312,8 @@ def worst_overlap(
     centers: FloatArray, radii: FloatArray
 ) -> tuple[int, int, float] | None:
     """Find the two beads that overlap most.
+
+    The lower index is first; overlaps up to 1e-9 mm do not count.
 
     Args:
         centers: (k, 3) [mm].

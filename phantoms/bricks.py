@@ -181,6 +181,8 @@ class Brickwork:
         """Make the scene of the bricks, each turned by `turn_deg` against the one below,
         and beads (k, 3) [mm].
 
+        Holes are solids of negative attenuation; the plastic is the assumed one.
+
         Args:
             beads: centres (k, 3) [mm].
             radius_mm: of the beads.

@@ -142,6 +142,8 @@ def attenuating(phantom: Phantom) -> tuple[tuple[Body, float], ...]:
     """List the bodies whose projections, times a factor each, add up to the phantom's
     line integrals.
 
+    Factors are 1, or a mesh's attenuation [1/mm].
+
     Args:
         phantom: solids, surfaces and voxels.
 
@@ -205,7 +207,10 @@ def _exact(surface: Surface) -> TriangleMesh | None:
 
 def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
     """Convert a surface to a mesh, or to voxels where the mesh is not exact or
-    of another density."""
+    of another density.
+
+    Values are 1 where it has the material's own density.
+    """
     mesh = _exact(surface)
     if (
         mesh is not None
@@ -226,6 +231,9 @@ def _find(name: str) -> Material | None:
 
 def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]]:
     """List (material, amount) that a solid adds, 1 for the material's own density.
+
+    A material without composition is counted as so much of the stand-in; an amount within
+    `ATTENUATION_TOLERANCE` of 1 or -1 is exactly that.
 
     Args:
         solid: with its attenuation.
@@ -301,6 +309,9 @@ def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Ob
 def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
     """Sample a body on a coarse grid: the part of each voxel that it fills, float32 (z,
     y, x).
+
+    Solids and meshes are sampled by sub-columns, fine voxels by exact overlap; voxels are
+    cubes.
 
     Args:
         body: scene, mesh or fine voxels.

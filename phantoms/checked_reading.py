@@ -121,6 +121,8 @@ def string(value: object, where: str) -> str:
 def number(value: object, where: str) -> float:
     """Return `value` as a float if it is a number up to `MAX_NUMBER`; raise PhantomError
     otherwise.
+
+    Truth values and NaN are no numbers.
     """
     if (
         isinstance(value, bool)
@@ -268,6 +270,8 @@ _READERS: Final[Mapping[str, Reader]] = {
 def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
     """Convert a scene to a JSON-able document: `{solids: [{shape: {kind,
     ...}, material, mu_per_mm}]}`.
+
+    The fields of each shape are as in the dataclass [mm].
 
     Args:
         scene: solids of any shape.

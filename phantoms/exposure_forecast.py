@@ -198,6 +198,9 @@ def expose(
 ) -> Forecast:
     """Predict transmission, contrast to noise, dose, time and size of a circular scan.
 
+    Of the settings tried, only those within the panel's exposure times are in `best`, by
+    falling contrast to noise; each with the exposure that does not saturate.
+
     Args:
         sample: as for `flexdt.simulate`.
         kV: voltage; of several the first is the setting asked for and all are tried for
@@ -548,7 +551,10 @@ def _views(
     lit: ExposureSettings,
 ) -> tuple[Float32Array, npt.NDArray[Any], float, float]:
     """Simulate views: paths (k, n, rows, cols), transmission (n, rows, cols), saturated
-    and starved parts."""
+    and starved parts.
+
+    The parts are shares of all pixels, 0 to 1; without noise. Paths are by material [mm].
+    """
     paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
     images = radiographs(chain, paths, cone.rows, [lit] * len(cone))
     through = np.exp(-np.stack([image.integrals for image in images]))
@@ -573,6 +579,8 @@ class _Ray:
     ) -> _Ray:
         """Return the ray with a detail: so much of a substance more, or less of what
         attenuates most.
+
+        Most is by the mean attenuation over all energies times the path.
 
         Args:
             detail: substance and thickness [mm]; without a substance, a void of that

@@ -214,6 +214,9 @@ def assemble(
 ) -> Phantom:
     """Join several phantoms; attenuation adds up where they overlap.
 
+    The size is the largest of the parts' along each axis; beads and assumptions are
+    joined.
+
     Args:
         name: of the whole.
         parts: solids and meshes, in one object frame.

@@ -148,6 +148,8 @@ def size_about_origin(
 def bounds(shape: analytic.Shape) -> tuple[FloatArray, FloatArray]:
     """Compute the corners of the smallest axis-aligned box around the shape, (3,) each [mm].
 
+    Exact for cylinders and ellipsoids, too.
+
     Args:
         shape: any shape of a solid.
 

@@ -270,6 +270,9 @@ def _require_none(material: str | None, what: str) -> None:
 def _named(word: str, material: str | None, keep: bool) -> Phantom:
     """Make the phantom of a path or a shipped name.
 
+    In order: a mesh by its suffix (material `abs` unless stated), a shipped name, a text
+    file.
+
     Args:
         word: path of a file, or name.
         material: of a mesh.

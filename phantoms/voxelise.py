@@ -179,7 +179,10 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
 
 def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
     """Compute the lowest and highest z of the shape above each (x, y) [mm]; lowest >
-    highest: no hit."""
+    highest: no hit.
+
+    `x` and `y` broadcast; exact, not sampled.
+    """
     one = as_convex(shape)
     bottom, top = _between_slabs(one.slabs, x, y)
     if one.curved:

@@ -272,6 +272,8 @@ def _text(content: Mapping[str, object], name: str) -> str:
 def _plain(name: str, text: str) -> str:
     """Check a field's length and characters, and return the text unchanged.
 
+    Binary fields may hold anything but surrogates.
+
     Args:
         name: of the field, which has its own limit in `MAX_CHARS`; binary fields may hold
             control characters.
@@ -307,6 +309,8 @@ def _whole(value: object) -> int:
 
 def _uuid(value: object) -> int | float | str:
     """Return a UUID (a number below `MAX_UUID` or a text) unchanged, or 0 for null.
+
+    Truth values are refused; so is a number that is not finite.
 
     Raises:
         AcquilaError: another type, a greater number, or a text that no event can carry.

@@ -571,7 +571,10 @@ def unpack(body: memoryview) -> Message:
 
 
 def _large(data: object) -> memoryview | None:
-    """Return a view of `data` if it is binary and larger than `MAX_COPIED_BYTES`, else None."""
+    """Return a view of `data` if it is binary and larger than `MAX_COPIED_BYTES`, else None.
+
+    No copy is made.
+    """
     if not isinstance(data, (bytes, bytearray, memoryview)):
         return None
     view = memoryview(data)

@@ -24,7 +24,10 @@ MAX_SIDE_MM = 1e4
 
 def few(most: int) -> BeforeValidator:
     """Make a validator that rejects an object of more than `most` members
-    before it reads any."""
+    before it reads any.
+
+    Values that are no objects pass unchanged.
+    """
 
     def check(value: object) -> object:
         if isinstance(value, Mapping) and len(value) > most:

@@ -241,6 +241,8 @@ def _single(document: object) -> Single:
 def _request(document: dict[object, object], id: Id) -> Single:
     """Read a request, or a notification if the document has no id.
 
+    The checks, in this order: unknown members, method, params, names in params.
+
     Args:
         document: with the member `method`.
         id: its valid id, or None.
@@ -445,6 +447,9 @@ class Correlation(Generic[_W]):
     def receive(self, message: Message) -> list[Answered[_W] | Request | Notification]:
         """Match a message from the peer to the open requests, item by item for a batch.
 
+        Once a violation has happened it is raised at every call. An answer without an id
+        sets `reason`; a parse error without one fails all open requests.
+
         Answers to abandoned requests are dropped. A malformed message with an id counts
         as the answer to that request; on a server the caller must answer it with `reply`.
 
@@ -493,6 +498,8 @@ class Correlation(Generic[_W]):
         self, answer: Response | Failure
     ) -> list[Answered[_W] | Request | Notification]:
         """Match an answer to its request and close the request.
+
+        [] if the request was abandoned.
 
         Raises:
             ProtocolError: no such request is open.

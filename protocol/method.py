@@ -72,6 +72,8 @@ def compatible(protocol: str) -> bool:
 def require_compatible(protocol: str) -> None:
     """Reject a client of another protocol version.
 
+    A compatible one passes without a result.
+
     Raises:
         RpcError: -32602, with the version of this server.
     """
@@ -129,6 +131,9 @@ def parse_result(model: type[_M], given: object) -> _M:
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
     """Make the error -32602 of a validation error, with at most 50 problems; returned,
     not raised.
+
+    The message has the first problem and the number of others; texts are clipped to 80
+    characters.
 
     Each problem in the error's data has the keys path, message, asked and, where there
     are limits, allowed.

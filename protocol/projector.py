@@ -43,6 +43,8 @@ Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 def _rows(value: object) -> object:
     """Convert rows of cone_vec to a float64 array (n, 12), contiguous.
 
+    An array that is float64 and contiguous is not copied.
+
     Args:
         value: an image value {dtype, shape, data}, or a list of rows of numbers.
 

@@ -109,6 +109,9 @@ _L = TypeVar("_L", ConnectionLimits, TwinLimits, ViewerLimits)
 def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
     """Set limits from `NAME=VALUE` words.
 
+    Of a limit given twice the last counts; limits that are whole are cut to whole
+    numbers.
+
     Args:
         words: as on the command line.
         default: limits to change; not changed itself.

@@ -135,6 +135,8 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
     """Compile the missing groups, each in a process of its own, as many at a time as
     there are cores; block until done.
 
+    Nothing is noted if none is missing; a group that fails is not an error here.
+
     Args:
         groups: names, of `GROUPS`.
         note: called with a line about the groups, when one is done, and every `SILENT_S`.

@@ -273,6 +273,8 @@ def stop_signal() -> asyncio.Event:
     """Make an event that SIGTERM or SIGINT sets; a second signal does not
     interrupt the stopping.
 
+    It needs a running loop, and takes the place of earlier handlers.
+
     A console script that watches for signals learns from it that an orderly end has begun,
     which it ends where that gets stuck.
     """

@@ -34,6 +34,8 @@ def load_sleeping() -> str:
     """Load OpenMP with threads that sleep while they wait, unless the user chose or
     it is loaded.
 
+    Where OpenMP cannot be loaded, the kernels' own state is returned.
+
     The environment is then as it was: other libraries and child processes keep their
     defaults.
 

@@ -322,6 +322,8 @@ def _renamed(outer: _Work | None, what: str) -> Iterator[None]:
 def silence_shown(what: str) -> Iterator[Callable[[], None]]:
     """Show that a program works, from two seconds on until it has said something.
 
+    The end of the context ends it, too.
+
     Work that this thread shows meanwhile is shown in its place.
 
     Args:

@@ -122,6 +122,8 @@ class Supervisor:
         """Start everything, restart services that end until `stop` is set, then stop
         everything.
 
+        Stopping, in reverse order, happens after errors and cancellation, too.
+
         Args:
             stop: set from outside.
 
@@ -377,7 +379,10 @@ async def _unless_one_ends(
 
 async def _drained(process: Process) -> int:
     """Read the pipe until the process ends, so that printing never blocks; return
-    its exit code."""
+    its exit code.
+
+    What it prints is dropped.
+    """
     drain = asyncio.create_task(_drain(process))
     try:
         return await _ended(process)

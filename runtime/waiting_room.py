@@ -66,7 +66,11 @@ class WaitingList(Generic[_G]):
 
 def neighbourhood(host: str) -> str:
     """Return the address for a share: an IPv4 address, or the 64 bits of an IPv6
-    network (one owner's)."""
+    network (one owner's).
+
+    An IPv4 address written as IPv6 counts as IPv4; a zone is cut off; what is no address
+    is returned unchanged.
+    """
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

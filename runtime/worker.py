@@ -94,6 +94,9 @@ def peak_bytes() -> int:
 def answer(request: Sequence[bytes]) -> list[bytes]:
     """Do one piece of work within its processor time; errors are returned, not raised.
 
+    The processor limit is set anew before the call, with 2 s to spare; beyond it the
+    system ends the process.
+
     Args:
         request: seconds allowed, the pickled call, and its binary arguments.
 

@@ -88,6 +88,9 @@ class Worker:
     ) -> list[bytes]:
         """Have one piece of work done; a failure, or much memory, ends the process.
 
+        It is kept after an answer or a refusal unless its peak memory is above
+        `MAX_KEPT_BYTES`.
+
         Args:
             work: called there.
             arguments: that it takes first, pickled.
@@ -131,6 +134,8 @@ class Worker:
 
     def _wait(self, seconds: float) -> None:
         """Wait for the first byte of an answer.
+
+        Where processor time cannot be read, only the time without change counts.
 
         Args:
             seconds: of processor time that the work may take; doing nothing for so long
@@ -214,6 +219,9 @@ class Workers:
         """Have one piece of work done by an idle or a new worker; it is stopped if this
         is cancelled.
 
+        It waits for a free place first; the worker is kept idle afterwards if it may have
+        further work.
+
         Args:
             work: function that a worker calls.
             arguments: of the function.
@@ -246,6 +254,8 @@ class Workers:
 
     def _new(self) -> Worker:
         """Start a process.
+
+        The error is -32003; the caller may try again.
 
         Raises:
             RpcError: no process could be started.

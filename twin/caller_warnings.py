@@ -13,6 +13,8 @@ OWN_PREFIX: Final = "flexdt"
 def warn_caller(text: str, category: type[Warning] = UserWarning) -> None:
     """Warn about a call, at the innermost line that is not in flexdt.
 
+    Python's filters decide whether it is shown, as for any warning.
+
     Args:
         text: of the warning.
         category: of the warning.

@@ -165,6 +165,8 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
     """Read the settings that a scan's script requests.
 
+    A script without projections has only the targets; times of day and waits are ignored.
+
     Args:
         scan: with the commands of its script.
         machine: whose axes the script names.
@@ -202,6 +204,8 @@ def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
 def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> int:
     """Count the projections that a command saves; a sequence without a number of frames
     has one.
+
+    Names of dark and flat images, and paths without a name, count 0.
     """
     if isinstance(command, c.TakeSequence):
         names: Sequence[str | None] = sequence_names(
@@ -223,6 +227,8 @@ class Scanner(NamedTuple):
 
 def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
     """Identify the scanner of a scan: by its texts, or else by the limits of its motors.
+
+    By limits only if at least `MIN_SHARED_LIMITS` and half of the motors share theirs.
 
     Args:
         scan: with its texts and log.

@@ -407,6 +407,8 @@ def _check_ply(raw: bytes) -> None:
     """Check that a PLY header is there, small, and claims no more elements than there are
     bytes.
 
+    Lines that are not of elements are not looked at.
+
     Args:
         raw: content of the file.
 
@@ -512,6 +514,8 @@ def _check_stl(raw: bytes) -> None:
     """Compare the length of a binary STL file with the one that its head announces; text
     files pass.
 
+    Files shorter than a head, and heads that announce 0 triangles, pass, too.
+
     Args:
         raw: content of the file.
 
@@ -536,6 +540,9 @@ _CHECKS: Final = {"glb": _check_glb, "ply": _check_ply, "stl": _check_stl}
 
 def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
     """Merge vertices, check that the mesh is closed, and wind it outwards.
+
+    Triangles without area and unused vertices are removed. Closed means that each edge
+    has two triangles.
 
     Args:
         mesh: changed in place.
@@ -569,6 +576,8 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
 
 def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Turn faces so that neighbours agree, in each body the way most of its faces already are.
+
+    The mesh must be closed; a tie leaves them.
 
     Every face has two nodes, as it is and turned; neighbours link those that agree. A
     body then falls into two components, mirror images of each other, and either is a
@@ -605,6 +614,8 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | None:
     """Convert a mesh to half-spaces if it is convex and has at most `MAX_PLANES`.
+
+    Planes equal to 1e-7 count once.
 
     Args:
         mesh: closed, outward.

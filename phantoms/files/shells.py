@@ -17,6 +17,8 @@ Faces = npt.NDArray[Any]
 def filled_twice(vertices: FloatArray, faces: Faces) -> int:
     """Count the shells turned outwards inside other filled shells.
 
+    0 for one shell, or more than `MAX_SHELLS`; one point of each decides.
+
     Such a shell changes nothing: where bodies overlap, path counts once. Cavities turn
     inwards.
 
@@ -66,7 +68,10 @@ def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
 
 def _winding(point: FloatArray, triangles: FloatArray) -> float:
     """Compute the winding number of triangles (f, 3, 3) about a point, by their solid
-    angles (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125)."""
+    angles (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125).
+
+    1 inside an outward closed surface, 0 outside, -1 inside a cavity alone.
+    """
     a, b, c = (triangles[:, i] - point for i in range(3))
     la, lb, lc = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
     volume = np.einsum("ni,ni->n", a, np.cross(b, c))

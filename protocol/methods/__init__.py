@@ -93,6 +93,8 @@ def openrpc_document(
 def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
     """Describe one method as OpenRPC does.
 
+    The order of parameters is that of the model's fields.
+
     Args:
         method: the method.
         schemas: model's name -> its JSON schema.

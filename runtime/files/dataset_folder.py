@@ -244,6 +244,8 @@ def list_folder(path: Path) -> Folder:
 def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
     """Read a text file as UTF-8, else as the scanners' Western European code page.
 
+    A byte order mark is removed; bytes that neither has become a replacement character.
+
     Args:
         path: of the file.
         most: largest size [bytes].
@@ -276,6 +278,8 @@ def put_texts(files: Directory, record: ScanRecord) -> None:
 
 def read_document(folder: Directory) -> DatasetDocument:
     """Read the flexdt.json of a data set in a data directory.
+
+    The file must be UTF-8; a byte order mark is removed.
 
     Raises:
         FileNotFoundError: there is none.

@@ -229,6 +229,9 @@ class Directory:
         """Make a file of `size` bytes whose blocks are reserved on the disk, in
         place of its namesake.
 
+        The namesake is deleted first, also if this fails. The content is unspecified or
+        zero.
+
         Args:
             name: of the file.
             size: [bytes].
@@ -264,6 +267,8 @@ class Directory:
 
     def open(self, name: str) -> BinaryIO:
         """Open a regular file for reading; a link is not followed.
+
+        What is no regular file is closed again.
 
         Args:
             name: of the file.
@@ -386,7 +391,10 @@ class Directory:
 
     def names(self) -> set[str]:
         """List the names of the complete, regular files in it; none without
-        such a directory."""
+        such a directory.
+
+        Hidden (also temporary) files, links and folders are left out.
+        """
         with suppress(FileNotFoundError, NotADirectoryError), self.entries() as entries:
             return {
                 e.name
@@ -420,6 +428,8 @@ class Directory:
     def close(self) -> None:
         """Wait until no call is under way, then close the descriptor; later calls raise
         OSError.
+
+        Also for a folder below another, which has no descriptor of its own.
         """
         with self._idle:
             self._idle.wait_for(lambda: self._busy == 0)

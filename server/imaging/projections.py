@@ -442,6 +442,8 @@ class Imaging:
         """Divide the sample as it is now, in a thread, or reuse its pieces; with
         `_sending` held.
 
+        It becomes the most recently used; a new phantom under the name is divided anew.
+
         Args:
             sample: on the stage, or of a scan.
             pieces: "part" or "material", as in `_on_projector`.
@@ -537,6 +539,8 @@ class Imaging:
     async def _remove(self, name: str, left: int) -> None:
         """Remove all but the `left` newest versions of a body, here and on the projector;
         its errors are ignored.
+
+        The oldest first.
         """
         versions = self._versions[name]
         while len(versions) > left:

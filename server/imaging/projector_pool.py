@@ -253,6 +253,9 @@ class ProjectorPool:
         """Send a request to one projector; measure its pace, or let it rest for `REST_S`
         after a failure.
 
+        After an error of the wire it rests only if there are others; its kind is then
+        asked again. Its pace is a running mean [s a view].
+
         A new member's version and backend are asked first and compared with the others'.
 
         Args:
@@ -310,7 +313,10 @@ class ProjectorPool:
 
 async def _room_of(member: _Member) -> int | None:
     """Return the memory that a projector can have for a sample [bytes]; None if it
-    does not answer."""
+    does not answer.
+
+    None also for one that does not evict volumes; within `LATE_S`.
+    """
     try:
         health = await asyncio.wait_for(member.client.health(), LATE_S)
     except (ProjectorUnavailable, RpcError, TimeoutError):

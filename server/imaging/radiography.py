@@ -379,6 +379,9 @@ def marks_of(
 ) -> npt.NDArray[np.uint8]:
     """Mark every pixel with the sum of SATURATED, STARVED and CUT_OFF.
 
+    Without noise; CUT_OFF only on the image's edge. Rows and columns that do not fill a
+    binned pixel mark the last one.
+
     Args:
         radiography, radiograph, camera, exposure: as in `flags_of`.
         binning: pixels a side; a mark of any of them is a mark of their mean.

@@ -24,6 +24,8 @@ class LoopTurns:
     async def take(self, who: object, lane: int) -> None:
         """Wait for a turn of connection `who` in a lane; lower lanes go first,
         connections one after another.
+
+        One turn is given in each round of the loop.
         """
         loop = asyncio.get_running_loop()
         turn = loop.create_future()

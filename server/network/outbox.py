@@ -152,6 +152,8 @@ class Outbox:
     def resume(self) -> None:
         """Mark the transport as ready; write the queue, then the newest value of each
         slot, until it is full.
+
+        The queue is dropped if the transport is closing.
         """
         self.ready.set()
         while self.queue and self.ready.is_set():
@@ -183,6 +185,8 @@ class Outbox:
 
 def _not_finite(value: object, path: str = "$") -> str | None:
     """Find the path of the first number that JSON cannot represent, for the log.
+
+    Depth first, in order; None for other types.
 
     Args:
         value: of a message.

@@ -225,6 +225,8 @@ class _Link(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Register a new connection in the waiting room and start serving it.
 
+        The worker's failure aborts the connection.
+
         Without a token on the server, the application's session is opened at once; else a
         deadline for the client's hello starts.
 
@@ -251,6 +253,8 @@ class _Link(asyncio.BufferedProtocol):
     def _take_place(self) -> bool:
         """Give the connection a place if one is free, else a reserved one, for urgent
         requests alone.
+
+        It leaves the waiting room in any case.
 
         Returns:
             Whether it has a place of its own.
@@ -482,6 +486,8 @@ class _Link(asyncio.BufferedProtocol):
     def _lane(self, message: m.Message | parts.Frozen) -> int:
         """Determine the lane of a message: an E-stop's, an urgent one, the ordinary.
 
+        Before admission, and for unknown methods and answers, the ordinary.
+
         Args:
             message: a call or a batch, which has the lane of its most urgent item.
 
@@ -557,6 +563,9 @@ class _Link(asyncio.BufferedProtocol):
     ) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
         """Decode a message, a large one in another process; errors become `Malformed`,
         nothing is raised.
+
+        Before admission a large one is refused unread. A failure of the other process is
+        logged.
 
         Args:
             raw: bytes of one message.
@@ -727,6 +736,8 @@ class _Link(asyncio.BufferedProtocol):
     ) -> m.Response | m.Failure:
         """Check token, rate, place and parameters of a call, and have the session handle
         it.
+
+        Urgent calls need neither rate nor place; hello needs no place.
 
         `Hello` with the right token opens the session. Unexpected errors are logged.
 

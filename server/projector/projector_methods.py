@@ -160,6 +160,8 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
     """Compute line integrals, block of views by block; replace a waiting request of
     the same key.
 
+    Warnings about the geometry are in the result. The parts are sent before it.
+
     Args:
         context: of the server.
         client: that calls.

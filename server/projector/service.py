@@ -110,6 +110,8 @@ class ProjectorServer(ListeningServer):
     def _seat(self, client: JobClient) -> None:
         """Give a client a place; one that has been admitted may send full frames.
 
+        Nothing for one that has a place; a refused client is disconnected.
+
         Raises:
             RpcError: -32003, all places are taken.
         """

@@ -39,6 +39,8 @@ class _Upload:
     def whole(self) -> Volume | TriangleMesh:
         """Make the volume or mesh of the complete bytes.
 
+        Values are not copied; faces become int64.
+
         Raises:
             GeometryError: a mesh that does not close.
         """
@@ -86,6 +88,8 @@ class VolumeStore:
 
     def get(self, name: str) -> Body:
         """Look up the volume called `name`, which becomes the most recently used.
+
+        At most `MAX_LISTED_NAMES` names, and how many others.
 
         Returns:
             The volume, mesh or scene itself, not a copy.
@@ -197,6 +201,8 @@ class VolumeStore:
 
     def reserve(self, what: str, needed: int, replaced: str | None = None) -> None:
         """Make room for a volume by removing evictable ones, the least recently used first.
+
+        Uploads count as used; the one replaced is not removed here.
 
         Args:
             what: the volume, for the message.

@@ -150,6 +150,8 @@ class FrameLink(asyncio.BufferedProtocol):
         """Reserve memory for a frame; an empty one goes to `on_frame`, one that is too
         large to `on_broken`.
 
+        After one that is too large, nothing more is read.
+
         Args:
             size: of the frame, from its head [bytes].
         """
@@ -216,6 +218,9 @@ class FrameLink(asyncio.BufferedProtocol):
 
     def dismiss(self, message: m.Message) -> None:
         """Send a last message and end the connection; discard what still arrives.
+
+        The connection is cut `MAX_LAST_WORD_S` later at the latest; with TLS it is closed
+        at once. Nothing if it has ended.
 
         Closing at once with bytes unread would reset the connection and lose the message.
         """
@@ -294,6 +299,8 @@ class ProjectorLink:
         cls, host: str, port: int, ssl: tls.SSLContext | None = None
     ) -> Self:
         """Connect to a server.
+
+        Nothing is sent yet.
 
         Raises:
             OSError: no server answers.
@@ -390,7 +397,11 @@ class ProjectorLink:
 
     async def _until_answered(self, answer: asyncio.Future[Any]) -> None:
         """Wait as long as the projector is alive; close the connection to one that is
-        silent for `SILENT_S`."""
+        silent for `SILENT_S`.
+
+        Its health is asked every `ASK_AGAIN_S`, one request at a time; closing fails the
+        answer.
+        """
         loop = asyncio.get_running_loop()
         asked_at = loop.time()
         while not (await asyncio.wait([answer], timeout=ASK_AGAIN_S))[0]:

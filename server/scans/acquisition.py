@@ -146,6 +146,8 @@ class Acquisition:
         """Compute the charge in the panel's traps at a frame's start, from the first
         frame on.
 
+        Between frames charge decays by the plan's times, not the real ones.
+
         It is the same wherever a scan was interrupted, and empty after a change of the
         camera's settings. Charges of the last `KEPT_IMAGES` frames are remembered;
         missing images are projected again.

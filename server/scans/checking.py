@@ -429,6 +429,8 @@ def _pickled_pieces(plan: ScanPlan) -> list[bytes]:
     """Pickle a plan, without machine and profile, in pieces small enough to be read at
     once.
 
+    At most `PARTS_A_PIECE` parts in each; an empty tuple has one piece.
+
     Args:
         plan: of a scan.
 

@@ -174,6 +174,8 @@ class Jobs:
         """Cancel the automatic resume of a paused job for the manual command inside the
         context.
 
+        After a success, or a motion, only `resume` continues the job.
+
         If the command fails before anything has moved, the automatic resume is restored.
         """
         by_hand = self._manual
@@ -297,6 +299,8 @@ class Jobs:
     def enqueue(self, draft: Job) -> Job:
         """Put a drafted job at the end of the queue; a continued job stays the same
         object.
+
+        It is counted if new; old ended jobs are forgotten, and the change is published.
         """
         self._count += draft.id not in self._all
         job = self._all.setdefault(draft.id, draft)
@@ -589,6 +593,8 @@ class Jobs:
     async def _make_runner(self, job: Job, scan: JobInputs) -> ScanRunner:
         """Create the runner of a job in a thread, as it sorts the events of a long plan.
 
+        Frames that the data set has count as done.
+
         Args:
             job: whose progress the runner reports.
             scan: plan, data set and producer of frames.
@@ -614,6 +620,8 @@ class Jobs:
     def _mark_incomplete(self, job: Job, scan: JobInputs, reason: str) -> None:
         """Mark the data set of a job as incomplete, with the reason and the time reached;
         log a failure.
+
+        Without a runner the time is 0 s. Only TwinErrors are caught.
         """
         elapsed = 0.0
         if job.runner is not None:
@@ -660,6 +668,8 @@ class Jobs:
     def _copy_progress(self, job: Job) -> None:
         """Copy the runner's progress and error into the job, count frames, and publish if
         due.
+
+        The phase changes between running and paused only.
 
         A change of phase or error is published at once, progress every
         `PUBLISH_INTERVAL_S`. New frames reset the delay of automatic retries, and a job
@@ -716,6 +726,8 @@ def _logged(produce: Produce, job: str) -> Produce:
     async def work(batch: Sequence[Exposure]) -> None:
         """Produce a batch of frames under its trace; log a programming error and raise
         it.
+
+        Errors that users can cause are raised without a log line.
         """
         try:
             with traced(f"{job}.{batch[0].file}"):

@@ -42,6 +42,9 @@ class Rejoin:
         """Compute the motion of all axes from rest at `start`: a run-up, then the rest of
         the plan.
 
+        The run-up has constant acceleration and ends with the plan's position and
+        velocity.
+
         Returns:
             Axis -> trajectories, on a clock that is 0 when the motion begins [s]; the
             plan is joined at `run_up_s`. Axes that stay are left out.

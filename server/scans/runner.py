@@ -314,6 +314,8 @@ class ScanRunner:
         """Apply a command of the plan and show it in `progress`; after an error pause,
         and try again on resume.
 
+        Only TwinErrors pause it.
+
         Raises:
             Exception: the run is to end (`JobAborted`).
         """
@@ -370,6 +372,8 @@ class ScanRunner:
     async def _obey_requests(self, tau: float) -> None:
         """Obey requests: raise if the run is to end; else stop, wait for `resume`, and
         rejoin the plan.
+
+        At once without a request.
 
         After `resume` the settings of before the pause are restored. An error on the way
         back pauses again.
@@ -450,6 +454,9 @@ class ScanRunner:
     async def _rejoin(self, tau: float) -> None:
         """Move to the plan's pose at `tau` and start the swept motion from there; ends
         early on a pause or an abort.
+
+        After `MAX_SWEEPS` the last certificate is tried, and refused by the scanner if
+        outdated.
 
         A certificate that the stage or the motors have outdated is made again, up to
         `MAX_SWEEPS` times. The plan's zero on the twin's clock is set anew.

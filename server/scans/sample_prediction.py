@@ -46,6 +46,8 @@ async def predict_counts(
 ) -> Prediction:
     """Predict the counts of a scan's projections.
 
+    Without a sample only the open beam is judged. The result has exposures and problems.
+
     Args:
         radiography: how images are made.
         begin: conditions of the scan; its physics and its sample are used.

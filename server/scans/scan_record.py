@@ -187,6 +187,8 @@ class JobRecord:
         """Delete the record of a complete data set, which is not resumed; errors are
         logged
 
+        One that is not there is no error.
+
         A file that stays is harmless.
         """
         try:

@@ -87,6 +87,8 @@ class Stage:
         """Compute convex pieces that contain the sample, object frame [mm]; may take a
         second.
 
+        Pieces of a file that was replaced meanwhile are returned, not remembered.
+
         The pieces of the last `MAX_CACHED_SCENES` samples are remembered.
 
         Args:

@@ -127,6 +127,8 @@ class Submissions:
     ) -> Job:
         """Check a scan completely, write its record, and put it in the queue as a job.
 
+        The seed is the script's, else drawn (or that of the resumed scan).
+
         A name of an interrupted data set resumes that scan with its start conditions.
 
         Args:
@@ -238,6 +240,8 @@ class Submissions:
     ) -> Job:
         """Write the scan's and the job's records as one change, then put the job into the
         queue.
+
+        The requester must be allowed at that moment, too; else -32003 and no job.
 
         Args:
             job_record: record of the scan.
@@ -492,6 +496,8 @@ class Submissions:
 
     def _ensure_same(self, begin: StartConditions) -> None:
         """Check that a scan's sample, once read, has not changed since the scan began.
+
+        Nothing is checked while the scan's revision is not known.
 
         Raises:
             RpcError: -32003, another file has come under its name.

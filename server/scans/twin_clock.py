@@ -207,6 +207,8 @@ class TwinClock:
         """Set the time to the first awaited moment, and wake its task alone; for speed
         "max".
 
+        Cancelled waits are skipped; time never goes back.
+
         Args:
             patience: number of loop rounds to wait first, in which tasks that are ready
                 may still ask for earlier moments.

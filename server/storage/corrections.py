@@ -193,6 +193,8 @@ class Corrections:
     ) -> None:
         """Write a new correction; a known one stays as it is.
 
+        It is added to `changes`; nothing is known of it until `know`.
+
         Raises:
             DatasetWriteError: the system cannot write.
         """
@@ -229,6 +231,8 @@ class Corrections:
     def without(self, name: str) -> History:
         """Return the history as it is once the correction called `name` is deleted;
         changes nothing.
+
+        All its places in the history are left out.
 
         Raises:
             UnknownNameError: there is no such correction.

@@ -66,6 +66,9 @@ class UsedBytes:
     ) -> int:
         """Sum up a folder, reusing what is known of unchanged ones; record them in `there`.
 
+        A folder is unchanged if its time of modification is, and is not young; contents
+        that cannot be read count 0.
+
         Args:
             folder: that contains it.
             name: of the folder.

@@ -281,6 +281,8 @@ class StateStore:
         """Write state and changed jobs now, so that everything answered later survives a
         kill.
 
+        If some jobs are left to be written, another write is asked for.
+
         The outcome is kept in `problem`, and passed to `noticed`.
 
         Raises:

@@ -128,6 +128,8 @@ class PastScans:
 def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[bytes]:
     """Answer a request in the worker; return the encoded answer.
 
+    Only files below `root` are read; other errors are raised as they are.
+
     Raises:
         DatasetMissingError: a file that cannot be read.
     """
@@ -661,6 +663,8 @@ def _same_machine(scan: _Scan, context: TwinContext) -> bool:
 def _script(folder: files.Folder) -> str:
     """Read the script of a data set.
 
+    Bytes that are not UTF-8 become replacement characters.
+
     Raises:
         DatasetMissingError: there is none.
         RpcError: -32008, it is too large.
@@ -677,6 +681,9 @@ def _script(folder: files.Folder) -> str:
 
 def _measure(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
     """Compute mean counts and clearances of images; late ones come with the next request.
+
+    Late is after `MEASURE_S`. Without a document there are only counts; if the scene
+    cannot be built `clearance_of` has the reason.
 
     Args:
         scan: the data set.
@@ -847,6 +854,8 @@ def _existing_file(folder: files.Folder, file: str) -> str:
 def _line_integrals_of(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
     """Make the conversion of a data set's counts to line integrals; the last four are
     cached.
+
+    Without dark images the dark is 0.
 
     Args:
         scan: whose dark and flat images are averaged.

@@ -199,6 +199,8 @@ class Incoming:
     def _gap(self, name: str, start: int, received: int) -> LimitError:
         """Make the error for a chunk that does not follow the last one; returned, not
         raised.
+
+        It has the expected start and the limits of unfinished uploads.
         """
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "

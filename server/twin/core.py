@@ -350,6 +350,8 @@ class TwinServer:
         """End all services and workers, and write the state as that of a server that
         ended.
 
+        Before `start` no state is written.
+
         A running scan's data set is marked incomplete.
         """
         for task in self._tasks:
@@ -424,6 +426,8 @@ class TwinServer:
 
     def _apply_last(self) -> None:
         """Put the previous server's correction in force at the start.
+
+        The stage is empty then, and no guard is made.
 
         One that is lost or does not fit leaves none in force, with a warning in the log.
         """
@@ -667,6 +671,8 @@ class TwinServer:
     def _noticed_disk(self, problem: str | None) -> None:
         """Tell all clients, in log and state, that changes cannot be saved, or that they
         can be saved again.
+
+        Paths are relative to the data directory; the state is published.
 
         Args:
             problem: None when it is over.

@@ -128,6 +128,9 @@ def image_of(
 ) -> Projection:
     """Convert an image to its wire form.
 
+    Binned counts are rounded means; the flags are those of the unbinned image without
+    noise.
+
     Args:
         radiograph: the image without noise.
         cone: nominal geometry plus correction, n = 1, of the unbinned image.

@@ -57,6 +57,8 @@ class SceneParts:
         """Build the scene with the stages on the turntable fixed at the motors'
         `positions`.
 
+        Positions of other motors are not used.
+
         Args:
             positions: motor -> position [mm]; those left out are at home.
         """
@@ -140,7 +142,10 @@ class CollisionScene:
         self, trajectories: Mapping[str, Trajectory], start: float, end: float
     ) -> Path:
         """Make the path of all motors from `start` to `end` [s]; motors left out
-        are at home."""
+        are at home.
+
+        Names that are no motors of the scene are ignored.
+        """
         tables = {
             name: AxisPath.along(trajectories[name])
             if name in trajectories
@@ -186,6 +191,9 @@ class PairStack:
         cls, axes: int, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]
     ) -> PairStack:
         """Stack pairs of bodies as arrays, for bounds of all their clearances at once.
+
+        For each pair: relative slides, origins and boxes, and which motors move the two
+        against each other.
 
         Args:
             axes: number of motors that move them.
@@ -243,6 +251,9 @@ def build_scene(
 ) -> CollisionScene:
     """Build the scene of a machine with a sample.
 
+    Without components the scene has at most the sample and no pairs. Positions up to
+    `REACH_SLACK_MM` beyond the travel are covered.
+
     Args:
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
@@ -285,6 +296,10 @@ def scene_of(
     limits: Limits,
 ) -> CollisionScene:
     """Build a scene of any bodies: sort their pairs into near, distant and allowed.
+
+    Bodies of one group are no pair. Distant pairs are beyond the margin everywhere in
+    reach, and apart by construction: on one stage, or in a direction that no motor
+    changes.
 
     Args:
         axes: motors, in the order of the bodies' columns.

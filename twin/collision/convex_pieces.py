@@ -48,6 +48,8 @@ def convex_pieces(
 ) -> tuple[Polytope, ...]:
     """Divide a mesh into convex pieces that together contain its solid.
 
+    The piece of the largest volume is cut next, while that saves enough volume.
+
     Args:
         mesh: its surface [mm].
         rotation: (3, 3) turn of the sample on the stage, applied first.
@@ -101,6 +103,8 @@ class _Piece:
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
     """Find the halves of the least volume, from cuts at quarters along each axis.
 
+    Volumes are those of the hulls.
+
     Args:
         piece: with its triangles and hull.
 
@@ -129,6 +133,8 @@ def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
 
 def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArray:
     """Clip triangles at a plane, and close the cut with a convex cap.
+
+    Triangles that cross the plane are cut there; corners in the plane count as kept.
 
     Args:
         triangles: (n, 3, 3) corners [mm].

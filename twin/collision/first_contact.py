@@ -75,7 +75,10 @@ class PathSearch:
     @cached_property
     def _nearest_first(self) -> tuple[list[Pair], list[float]]:
         """Pairs that move relative to each other, and bounds of their
-        clearances, ascending [mm]."""
+        clearances, ascending [mm].
+
+        The bounds are of the whole path's box of positions, never too large.
+        """
         lower = self.path.q.min(axis=0)
         upper = self.path.q.max(axis=0)
         stack = self.scene.candidates(lower, upper)
@@ -146,6 +149,8 @@ class PathSearch:
 
     def refined(self, guess: SweepResult) -> SweepResult:
         """Refine the least clearance of a free path, from a guess.
+
+        The guess is returned if no pair can be nearer; evaluations add up.
 
         Args:
             guess: result of a sweep that found no contact.

@@ -32,6 +32,8 @@ class SceneGuard:
         """Find the first contact from `now` on; when nothing moves, the nearest pair that
         touches.
 
+        Motion without an end is looked at for `HORIZON_S`.
+
         Pairs that overlap already stop only motion that brings them closer.
 
         Args:

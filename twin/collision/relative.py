@@ -239,6 +239,8 @@ class _Bound:
         """Find the first moment from `at` on at which the bound, being `value`
         there, reaches `level`.
 
+        `lengths` and the bound's own arrays are not changed.
+
         Args:
             at: segment, and time in it [s].
             lengths: of all segments (n,) [s].
@@ -274,6 +276,8 @@ class _Bound:
 def _fall_time(above: float, rate: float, growth: float, length: float) -> float | None:
     """Solve for the first dt in [0, length] at which above + rate dt + growth dt^2 / 2 is
     0; None if there is none.
+
+    Rates are per second; a touching parabola counts.
     """
     if above <= 0.0:
         return 0.0
@@ -470,6 +474,8 @@ class RelativeMotion:
     def next_at(self, look: Look, level: float) -> Moment | None:
         """Find the first moment after a look at which the gap may have fallen to `level` [mm].
 
+        It is never too late: the gap is above `level` until then.
+
         `level` is below the look's gap. None if the gap stays above it to the end.
 
         Args:
@@ -504,7 +510,10 @@ class RelativeMotion:
     @cached_property
     def _travel(self) -> _Bound:
         """Bound that falls as travel is used up. Speeds are convex in a segment: the
-        chord is a bound."""
+        chord is a bound.
+
+        Sliding and turning (reach times angular speed) are added, [mm].
+        """
         lengths = self.lengths[:, None]
         begin = np.linalg.norm(self._velocity, axis=1)
         end = np.linalg.norm(self._velocity + self._acceleration * lengths, axis=1)
@@ -517,7 +526,10 @@ class RelativeMotion:
 
     def nearest_end(self, look: Look) -> Moment:
         """Find the segment end after a look that is farthest towards b along
-        its normal, unturned."""
+        its normal, unturned.
+
+        The normal is that of the look; a guess, not a bound.
+        """
         i = look.at.segment
         slide = self._slide(look.normal)
         lengths = self.lengths[i:]
@@ -576,6 +588,8 @@ def sweep_pair(
     until: float = math.inf,
 ) -> PairResult:
     """Sweep one pair until it touches, the motion ends, or `until`.
+
+    Without a contact the end nearest by a guess is evaluated, too.
 
     A pair that starts within the tolerance of the margin, or nearer, may move, but not
     below its floor.

@@ -69,6 +69,8 @@ def _pair_contact(scene: CollisionScene, path: Path, pair: Pair) -> Contact | No
     """Find the contact that stops one overlapping pair: coming closer, or touching again
     once free.
 
+    A pair that comes free is then swept alone for its next contact.
+
     Args:
         scene: the bodies.
         path: of all motors.

@@ -60,6 +60,9 @@ def separation_of(
     ) -> Separation:
         """Compute the separation of the two solids in a pose; thread-safe.
 
+        The gap is never more than the distance; the normal of touching solids has no
+        meaning.
+
         Args:
             offset: from b's origin to a's (3,) [mm].
             turn_a, turn_b: orientations (3, 3); None for a body that never turns.
@@ -103,6 +106,8 @@ def _improved(
 ) -> Separation:
     """Improve a certificate by Gilbert's search for the nearest point of the hull of all
     differences.
+
+    It stops within `MAX_DEFICIT_MM` of the distance or after `MAX_SEARCH_STEPS`.
 
     fcl is off by millimetres where two edges are parallel, as those of upright boxes are.
 

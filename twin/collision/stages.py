@@ -135,7 +135,10 @@ class Body:
     @cached_property
     def _levers(self) -> FloatArray:
         """Points, their velocities about the axis, and their distances from it, stacked
-        (3 k, 3)."""
+        (3 k, 3).
+
+        k is the number of vertices; none for a cylinder.
+        """
         if isinstance(self.solid, Polytope):
             points = self.solid.vertices
         else:
@@ -268,6 +271,9 @@ def _enlarged_by_stage(
     place: FloatArray | None = None,
 ) -> ConvexSolid:
     """Enlarge `solid` to all places to which a stage on the turntable brings it.
+
+    Places are corners of the stage's travel, horizontal, with the fixed part of `mount_x`
+    and `mount_y`.
 
     Args:
         machine: whose stage it is.

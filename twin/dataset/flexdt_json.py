@@ -291,6 +291,9 @@ class ScanRecord(ArrayValue):
         """Count the sections of projections that the texts' one pose and one angle rule
         cannot join.
 
+        At least 1; at least 2 if they are not joined. A section ends where a motor other
+        than the rotation moves by `POSITION_TOLERANCE`.
+
         With one section the texts alone give the geometry: all motors but the rotation
         are where the settings file states, and image i of N is at first + i * (last -
         first) / (N - 1).
@@ -692,6 +695,8 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
 
 def _validated(model: type[_M], content: object, file: str) -> _M:
     """Validate content of `file` as a model, and return the model.
+
+    The message has one line for each.
 
     Args:
         model: its class.

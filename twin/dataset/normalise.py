@@ -75,6 +75,8 @@ class LineIntegrals:
         """Convert an image of counts to line integrals; dead pixels are interpolated in
         their row.
 
+        Counts are taken less the dark, at least `MIN_COUNTS`; `counts` is not changed.
+
         Args:
             counts: (rows, cols).
 

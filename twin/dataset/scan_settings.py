@@ -250,6 +250,8 @@ def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
     """List the motors' lines of the settings file, virtual axes first, in the file's
     sign.
 
+    A virtual axis has the rates of the motor that it reads.
+
     Args:
         record: of the scan.
 

@@ -34,6 +34,8 @@ class XreSettings:
     def number(self, section: str, key: str) -> float | None:
         """Return a value as a number; None if absent.
 
+        Case of section and key does not count if it does not in `text`.
+
         Raises:
             DatasetFormatError: it is present and not a number.
         """
@@ -115,6 +117,8 @@ def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatErro
 
 def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
     """Parse `data settings XRE.txt`; of a key given twice in a section the first counts.
+
+    Lines before the first section, and lines without `=` or `:`, are skipped.
 
     Args:
         text: its content.

@@ -114,6 +114,11 @@ def flexdata_text(geometry: ScanGeometry) -> str:
 def _angles(axes: FloatArray) -> tuple[float, float, float]:
     """Compute roll about y, then yaw about the turned z, then pitch about the turned x
     [rad].
+
+    The columns of `axes` (3, 3) are x, y, z of the panel.
+
+    Raises:
+        ExchangeError: the rows run along the beam.
     """
     yaw = math.asin(max(-1.0, min(1.0, axes[1, 0])))
     if math.hypot(axes[0, 0], axes[2, 0]) < 1e-9:
@@ -203,6 +208,8 @@ def read_flexdata(
 
 def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
     """Read one of `_NUMBERS` from a file, or its default if absent.
+
+    Needed are pixel, angle range, and whatever the file states.
 
     Args:
         name: of the value.

@@ -121,6 +121,9 @@ def circle_of(
 ) -> CircularScan:
     """Find the circle that `cone_vec` describes.
 
+    Centre coordinates below a tenth of `SAME_MM` are set to 0; the rest is the mean over
+    the views.
+
     Args:
         cone_vec: at least one view.
         format_name: format that needs a circle, for the message.

@@ -228,6 +228,8 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
 def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
     """Parse the number of one XML element and put it into `values`.
 
+    Elements of `_PASSED_OVER` are skipped.
+
     Args:
         entry: the element; some are skipped.
         values: name -> number of a view, changed.

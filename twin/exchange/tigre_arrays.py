@@ -118,6 +118,8 @@ def _once(values: FloatArray) -> FloatArray:
 def _turns(axes: FloatArray) -> FloatArray:
     """Find the turns about x, y and z [rad] whose product, Rz Ry Rx, is `axes`.
 
+    Each is above -pi and at most pi.
+
     Two triples give the same product; the one whose turns about x and z are small is
     taken.
 

@@ -90,6 +90,8 @@ def counts_of(
 ) -> tuple[int, ...]:
     """Read one array of whole numbers above 0.
 
+    Returned flat, as ints; floats that are whole are allowed.
+
     Raises:
         ExchangeError: it has other content.
     """
@@ -115,6 +117,8 @@ def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> Fl
 
 def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArray:
     """Read an array (count, 3) of directions and normalise them.
+
+    Returns float64 unit vectors; the first view without a direction is named.
 
     Raises:
         ExchangeError: it has other content, or a vector of length zero.

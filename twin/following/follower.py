@@ -206,6 +206,8 @@ class Follower:
     def told(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
         """Return the mirror with the alarms of `ahead`: new ones are added, those that
         are over end.
+
+        Alarms of other origin stay; an active one is not added again.
         """
         found = tuple(alarms)
         still = {(a.kind, a.about) for a in found}
@@ -314,6 +316,8 @@ class Follower:
 
     def _end_overdue(self, mirror: Mirror, component: str, now: float) -> Mirror:
         """End the commands whose predicted time is over, and apply their settings.
+
+        A command without a prediction is over at once; each ends once.
 
         Args:
             mirror: present state.
@@ -766,7 +770,10 @@ def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
 
 def _bare(command: c.Command) -> c.Command:
     """Strip a command of its place in the text, its wait, its times and the
-    case of its axis."""
+    case of its axis.
+
+    Of a move also the trigger position; for comparing commands.
+    """
     bare = replace(
         command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None
     )

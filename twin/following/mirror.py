@@ -236,6 +236,8 @@ class Mirror:
     def asked(self, reply: Heard) -> Waiting | None:
         """Find the waiting command that `reply` belongs to: the one of its key; None if
         there is none.
+
+        Of several the one with the same first words, then the same tick.
         """
 
         def alike(asked: Waiting) -> tuple[bool, bool]:

@@ -563,6 +563,8 @@ class ConeVec:
     def of_shape(self, shape: Shape2 | None = None) -> Shape2:
         """Return the detector's (rows, cols): those given, or the geometry's own.
 
+        A given shape must be positive.
+
         Args:
             shape: (rows, cols); None: those of the geometry.
 

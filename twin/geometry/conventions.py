@@ -57,6 +57,8 @@ def as_numbers(
 ) -> npt.NDArray[Any]:
     """Convert to an array of real numbers.
 
+    Array-likes of that type are returned without a copy; finiteness is not checked.
+
     Raises:
         GeometryError: it holds something else.
 
@@ -101,6 +103,8 @@ def rotation_y(angle: float) -> FloatArray:
 
 def rotation_z(angle: float | FloatArray) -> FloatArray:
     """Compute the right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3).
+
+    One matrix for each angle.
 
     Example:
         >>> (rotation_z(np.pi / 2) @ [1, 0, 0]).round(9).tolist()

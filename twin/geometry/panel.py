@@ -89,6 +89,9 @@ class PanelModel:
     def terms(self, places: FloatArray) -> FloatArray:
         """Compute the shifts [px] that each coefficient of 1 causes at places.
 
+        Places are scaled by half the longer side about the middle; beyond a border its
+        gap shifts by 1.
+
         Args:
             places: (..., 2), column and row [px].
 
@@ -176,6 +179,8 @@ class Panel:
 
     def undistorted(self, image: Float32Array) -> Float32Array:
         """Resample an image as a panel without distortion would have taken it.
+
+        By Lanczos interpolation; beyond the edge the edge's values go on.
 
         Args:
             image: (rows, cols).

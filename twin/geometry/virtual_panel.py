@@ -59,7 +59,10 @@ def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
 
 def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
     """Move panels to `times` (n,) their distance from the source, with
-    pixels enlarged alike."""
+    pixels enlarged alike.
+
+    Unchanged, the same object, if all are 1; the image stays the same.
+    """
     moved = times != 1.0
     if not moved.any():
         return cone_vec

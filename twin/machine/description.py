@@ -113,6 +113,8 @@ _KEY_LIMITS: Final = {
 def _one_word(name: str) -> str:
     """Return a name if it is one printable word of at most 100 characters; raise
     PydanticCustomError otherwise.
+
+    No whitespace is allowed in it.
     """
     if not (
         0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)
@@ -431,6 +433,8 @@ class Component(_Frozen):
         """Check that size, centre and points agree with the shape: a round cylinder, a
         hull's own box.
 
+        Returns the component unchanged; points are for hulls alone.
+
         Raises:
             PydanticCustomError: names the field, its value and the allowed ones.
         """
@@ -672,6 +676,8 @@ class Machine(_Frozen):
 
     def _check_chains(self) -> None:
         """Check the kinematic chains of the components.
+
+        The first violation is raised.
 
         A name is used once and is not the sample's; parents come first; a part's axis is
         a motor of the machine that drives its anchor and occurs once in its chain; a
@@ -1060,6 +1066,9 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
 
 def _inherited(own: Raw) -> Raw:
     """Merge a machine's content into that of its base.
+
+    Without base and `without` the content is returned as it is. A new name loses the
+    base's default profile; bases may have bases.
 
     Args:
         own: content of a machine file; `base` and `without` are removed from it.

@@ -106,6 +106,8 @@ def ensure_idle(
 async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[View]:
     """Apply `view` to each item and return the results; other requests are handled
     between them.
+
+    Between each `ITEMS_A_TURN` items; in order.
     """
     views = []
     for at, item in enumerate(items, start=1):
@@ -163,6 +165,8 @@ async def change_stage(
 ) -> list[str]:
     """Put a sample on the stage and a correction in force: check, write, then change all
     at once.
+
+    A correction that cannot be applied is refused first.
 
     Hold `stage_turn` meanwhile. The sweep runs in a thread. Motion that is not free of
     the new stage is halted, and a running job interrupted.

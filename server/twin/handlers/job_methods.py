@@ -107,6 +107,9 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
 async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
     """End the job with X-rays off; its data set stays, marked incomplete with the reason.
 
+    It waits at most `PATIENCE_S` for the end. Without `job` it is the current or last
+    one.
+
     The answer waits until the state is on the disk and the job has ended; a disk that
     fails is a warning in it.
     """
@@ -160,6 +163,8 @@ async def forget(
     def take() -> list[Job]:
         """Remove the jobs from the list, except those that were resumed meanwhile; return
         them.
+
+        The state is marked as changed.
         """
         gone = [
             job for job in jobs if job.phase in ENDED_PHASES
@@ -198,8 +203,7 @@ def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
 def _source(params: ScanInput) -> ScanSource:
     """Make the requested scan from a script's text or bytes, or from poses.
 
-    Poses have no seedless defaults here: exposure, moments, seed and flats are the
-    request's.
+    Exposure and flats are those of the request, for poses only; moments and seed for both.
 
     Raises:
         RpcError: -32602, no base64; -32008, the script is too large.

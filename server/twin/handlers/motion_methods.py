@@ -75,6 +75,8 @@ async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> l
 def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
     """Cancel a way around obstacles if the command is accepted or halts the motors.
 
+    The change is published in any case.
+
     A refused command leaves the way running.
     """
     before = twin.scanner.programmes
@@ -184,6 +186,9 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Stop as the machine's E-stop does, X-rays off, and save that it is in force; a
     running scan pauses.
+
+    Also if it is in force already; then the state is not written at once. A way around
+    obstacles ends.
     """
     twin.detours.cancel()
     twin.interrupt("E-stop")

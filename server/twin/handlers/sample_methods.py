@@ -208,6 +208,8 @@ async def delete(
 def _ensure_unused(twin: TwinServer, name: str) -> None:
     """Check that no scan and no stage needs a sample.
 
+    In that order.
+
     Raises:
         LimitError: it is on the stage.
         RpcError: -32003, a scan of it has not ended; names the job.
@@ -241,6 +243,8 @@ def _sample_info(
 ) -> p.SampleInfo:
     """Describe a sample for the list; `head` is the description of an upload, None for a
     phantom.
+
+    Size [mm] and description are the phantom's.
     """
     return p.SampleInfo(
         name=name,

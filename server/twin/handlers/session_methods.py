@@ -28,6 +28,9 @@ document = cache(openrpc_document)
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
     """Answer a client's greeting; `network.shell_parts.TokenCheck` has checked its token.
 
+    A later hello does not change the program. The result has protocol, server, machine,
+    profile, session, physics and instance.
+
     The client's program is noted, as control goes by its name.
 
     Raises:
@@ -49,6 +52,9 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
 @answers(p.SESSION_CONTROL)
 def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlResult:
     """Take, release or force control; there is one controller at a time.
+
+    Release by another than the controller changes nothing; acquire renews the lease. The
+    result has the controller (None: nobody) and whether it is the client.
 
     A new controller cancels the last one's way around obstacles, and force is told in the
     log.
@@ -151,6 +157,8 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
     def ready() -> None:
         """Raise if motion was stopped meanwhile, a job runs, or the client has lost
         control.
+
+        In that order: stop, control, job.
         """
         if twin.scanner.stops != stops:
             raise SafetyError(
