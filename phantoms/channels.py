@@ -222,7 +222,10 @@ def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
 
 
 def _find(name: str) -> Material | None:
-    """Look up a material; None if it is unknown."""
+    """Look up a material by its name or FORMULA@DENSITY; None if that name is unknown.
+
+    A formula that cannot be parsed raises LimitError.
+    """
     try:
         return material(name)
     except UnknownNameError:

@@ -85,6 +85,8 @@ def parts_of(
 def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
     """Join copies of all parts into one mesh, holes turned inside out.
 
+    Parts that overlap are not united.
+
     Args:
         parts: meshes [mm] with their marks for holes.
 
@@ -114,6 +116,8 @@ def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
 
 def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
     """Make the closed outward mesh of one solid [mm].
+
+    Boxes and polyhedra are exact in both cases.
 
     Args:
         solid: the solid.

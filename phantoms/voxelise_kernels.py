@@ -17,6 +17,8 @@ from flexdt.twin.projection.kernels.compiling import linked, serial
 def _add_interval(data, iy, ix, low, high, value):
     """Add `value` times the covered fraction to the voxels of one column; heights in voxels.
 
+    Ends outside the grid are cut to it.
+
     Args:
         data: (z, y, x), changed.
         iy: row of the column.
@@ -135,6 +137,8 @@ def cross(triangles, starts, counts, heights, signs):
     """Count the surface crossings of every sub-column; write their heights and signs,
     too, unless `heights` is empty.
 
+    A sub-column is hit at its middle; vertical triangles give none.
+
     Args:
         triangles: (n, 3, 3), x and y in sub-columns, z in voxels.
         starts: (rows, cols), where in heights and signs those of a sub-column begin.
@@ -169,6 +173,8 @@ def cross(triangles, starts, counts, heights, signs):
 @serial
 def add_surface(data, starts, counts, heights, signs, oversample, value):
     """Fill between crossings of `data` wherever the winding number is not zero.
+
+    A column that does not close is filled as far as it closes.
 
     Overlapping bodies fill once, inward shells are cavities.
 

@@ -79,6 +79,8 @@ def write_json(document: object) -> bytes:
 def json_pieces(document: object) -> list[bytes]:
     """Encode like `write_json`, in pieces; large binary values bypass the encoder.
 
+    Below `MIN_PIECEWISE_BYTES` a binary value is base64 in the text.
+
     The encoder writes an unguessable mark in place of each large value; the marks are
     then replaced by the value's base64, so that the document is never copied as a whole.
 

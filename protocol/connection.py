@@ -173,6 +173,8 @@ class Connection:
     def receive_end(self) -> None:
         """End reception: the peer has ended the stream.
 
+        The connection is closed in any case, and messages not taken out are discarded.
+
         Raises:
             ProtocolError: it ended inside a message, so that message is lost.
         """
@@ -309,6 +311,8 @@ class Connection:
         """Take the next message's bytes, or an error, out of the queue; None if none
         waits.
 
+        Errors that are not fatal are returned in their place, and reception goes on.
+
         A fatal error closes the connection: nothing follows it.
         """
         if not self.whole:
@@ -416,6 +420,8 @@ class Connection:
 
     def batch(self, bodies: Sequence[Sequence[bytes]]) -> list[bytes]:
         """Join encoded messages into one batch document, without framing.
+
+        Without a codec it is JSON.
 
         Args:
             bodies: bodies of the messages, from `body`; at most 65 535.

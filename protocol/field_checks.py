@@ -40,6 +40,8 @@ def few(most: int) -> BeforeValidator:
 def payload(value: object) -> object:
     """Decode binary data: base64 text, or bytes.
 
+    The result is bytes, a copy.
+
     Raises:
         ValueError: anything else.
     """
@@ -83,6 +85,8 @@ def lines(value: str) -> str:
 
 def plain_name(value: str) -> str:
     """Check that a name can become a file's name, and return it.
+
+    An empty name passes here.
 
     Raises:
         ValueError: a slash, backslash or control character, or more than `MAX_STEM` bytes

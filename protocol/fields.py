@@ -136,6 +136,8 @@ class Params(BaseModel):
     def _few(cls, value: object) -> object:
         """Return the value unchanged; raise ValueError for an object with far more
         members than fields, before they are validated.
+
+        Far more is over `MAX_UNKNOWN`; values that are no objects pass.
         """
         fields = cls.model_fields
         if isinstance(value, Mapping) and len(value) > len(fields) + MAX_UNKNOWN:

@@ -69,6 +69,8 @@ def from_bytes(
 ) -> npt.NDArray[np.generic]:
     """View raw bytes as a read-only array of `shape`, without a copy.
 
+    An unknown type is -32602, too.
+
     Args:
         data: little-endian values in C order.
         dtype: name of `DTYPES`.

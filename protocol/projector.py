@@ -180,7 +180,11 @@ class VolumePut(f.Params):
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
         """Check that exactly one of scene, grid and mesh is given, and data
-        where it belongs."""
+        where it belongs.
+
+        Returns the value unchanged; raises ValueError otherwise. A scene has no data, the
+        others need it.
+        """
         if sum(one is not None for one in (self.scene, self.grid, self.mesh)) != 1:
             raise ValueError("give one of scene, grid, mesh")
         if (self.scene is None) != (self.data is not None):

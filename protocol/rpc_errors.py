@@ -79,6 +79,8 @@ def invalid_request(why: str) -> RpcError:
 def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
     """Make the error -32601 for an unknown method, with all methods in its data;
     returned, not raised.
+
+    The asked name is clipped.
     """
     names = sorted(allowed)
     return RpcError(

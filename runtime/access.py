@@ -208,6 +208,8 @@ def token_matches(given: str | None, token: str) -> bool:
 def read_token(file: Path | None) -> str | None:
     """Read the token that a server requires or a client brings.
 
+    Spaces around it are removed; an empty variable counts as none.
+
     Args:
         file: whose first line it is; None: the environment's FLEXDT_TOKEN.
 
@@ -259,6 +261,8 @@ def client_tls(
 
 def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
     """Make a server's TLS context from PEM files.
+
+    TLS 1.2 or newer; certificates of clients are not asked for.
 
     Args:
         certificate, key: the files; both or none.

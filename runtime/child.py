@@ -22,6 +22,9 @@ STOP_GRACE_S = 15.0
 def main() -> None:
     """Run the module named on the command line as `__main__`; a thread ends the process
     with its parent.
+
+    Without a module it exits with a usage line. Arguments after the module are the
+    module's.
     """
     if len(sys.argv) < 2:
         sys.exit("usage: python -m flexdt.runtime.child MODULE [ARGUMENT...]")

@@ -163,6 +163,8 @@ class _Server(ThreadingWSGIServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         """Register a connection as not admitted, which may end the oldest such, and start
         its thread.
+
+        Connections are grouped by address, see `WaitingList`.
         """
         visitor = _Visitor(request, neighbourhood(str(client_address[0])))
         with self._lock:
@@ -303,6 +305,8 @@ async def served_pages(
     pages: Pages, settings: ServerSettings
 ) -> AsyncIterator[dict[str, object]]:
     """Serve `pages`, in daemon threads, as long as the context lasts.
+
+    On the loopback no token is asked for. The server stops at the end.
 
     Without a port for them in the settings nothing is served.
 

@@ -36,6 +36,8 @@ def current() -> str:
 def traced(name: str) -> Iterator[None]:
     """Give all log lines within the context, and in tasks started in it, the trace
     `name`.
+
+    The earlier trace is restored at the end.
     """
     token = _CURRENT.set(name)
     try:

@@ -61,7 +61,10 @@ def load_sleeping() -> str:
 
 def _in_child() -> None:
     """Restrict a forked child to one thread if the parent had kernel threads, and
-    to no device."""
+    to no device.
+
+    Modules that were not loaded are left alone.
+    """
     gpu = sys.modules.get(DEVICE)
     if gpu is not None:
         gpu.leave_after_fork()

@@ -231,6 +231,8 @@ os.register_at_fork(after_in_child=_forget)
 def shown_work(what: str, progress: Progress = None) -> Iterator[Advance]:
     """Show the work that goes on inside the context, from when it takes seconds.
 
+    Within other work it is shown under that one's bar by name, without a fraction.
+
     Args:
         what: its name, such as "calibrating". Work of the same name within it is the same
             work.

@@ -101,6 +101,8 @@ def has_parameters(
 def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
     """Read settings from the words of a command line; `--help` is printed.
 
+    Repeated options are tuples.
+
     Args:
         settings: class of the process or command.
         words: of the command line, `sys.argv`'s where left out.

@@ -85,6 +85,9 @@ class Ends:
     def after(self, steady_s: float) -> float:
         """Count an end; return the pause before the next start [s].
 
+        The first end in a row has no pause; then it doubles from `FIRST_PAUSE_S` to
+        `LONGEST_PAUSE_S`. A service ready for `STEADY_S` begins a new row.
+
         Args:
             steady_s: for how long the service had been ready.
         """
@@ -400,7 +403,10 @@ async def _drain(process: Process) -> None:
 
 async def _ended(process: Process) -> int:
     """Wait for the end of a process alone, not of its children with the same pipes; return
-    its exit code."""
+    its exit code.
+
+    It looks every `CHECK_INTERVAL_S`.
+    """
     end = asyncio.create_task(process.wait())
     try:
         while process.returncode is None:

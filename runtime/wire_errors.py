@@ -78,6 +78,9 @@ def is_user_error(error: Exception) -> bool:
 def from_root(said: object, root: Path) -> object:
     """Replace paths below the folder `root` in nested values by relative ones.
 
+    The folder itself becomes "the data directory"; lists and tuples become lists; keys
+    stay.
+
     Args:
         said: text, mapping or list; other values stay.
         root: the data directory.

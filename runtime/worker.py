@@ -80,6 +80,8 @@ def limit(what: str, most: int) -> None:
 def peak_bytes() -> int:
     """Return the largest memory this process has taken so far [bytes].
 
+    Elsewhere that is what it returns.
+
     By Linux's own figure: `ru_maxrss` begins with the memory of the parent.
     """
     try:

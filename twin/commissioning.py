@@ -619,6 +619,8 @@ def _axis(
     """Compute the axis's column in the image, and how it depends on axs_tan and det_tan
     (linearly).
 
+    Offsets along the beam are the scan's own, if it has a profile.
+
     Args:
         machine: of the scan.
         scan: with positions and camera.

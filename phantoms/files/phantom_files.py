@@ -63,6 +63,9 @@ def load_phantom_file(
 ) -> Phantom:
     """Parse the phantom of a TOML or JSON text.
 
+    A byte order mark is removed. Errors of the phantom become PhantomErrors with the
+    file's name.
+
     Args:
         text: content; JSON if it starts with a brace.
         file: name for error messages.
@@ -91,7 +94,10 @@ def load_phantom_file(
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
     """Make the phantom of a document in any of the three forms;
-    raises as `load_phantom_file`."""
+    raises as `load_phantom_file`.
+
+    With `scene` a saved phantom, with `solid` or `mesh` a scene file, else a bead file.
+    """
     if "scene" in document:
         return Phantom.from_dict(document)
     if "solid" in document or "mesh" in document:
@@ -336,6 +342,8 @@ def _body(value: object, where: str) -> tuple[Vector, str]:
 def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
     """Read the beads of a bead file: position [mm], radius [mm], material (steel if left
     out) of each.
+
+    Other keys are errors.
     """
 
     def read(one: object, at: str) -> tuple[Vector, float, str]:

@@ -199,7 +199,10 @@ def confined(root: Directory) -> Iterator[None]:
 
 def _within(path: Path) -> Directory | None:
     """Return the directory at a path below the one that reading is confined to; None if
-    it is not."""
+    it is not.
+
+    None also if reading is not confined. Nothing is looked up on the disk.
+    """
     if _confined is None or not path.is_relative_to(_confined.path):
         return None
     directory = _confined
@@ -508,6 +511,8 @@ def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
 def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
     """Encode one uint16 image (rows, cols) as a baseline TIFF: little-endian, one
     strip, no metadata.
+
+    Other types are converted to uint16 without a check.
 
     The pixels begin at byte 8 and the tags follow them, as the scanner writes its files:
     some of its readers look for pixels there without reading the tags.

@@ -61,6 +61,8 @@ def writing(path: Path, refused: str) -> Iterator[None]:
     """Convert the system's errors inside to `DatasetWriteError`, for a full
     disk to `DiskFullError`.
 
+    The errors have path and number of the system's error; others pass.
+
     Args:
         path: of the written file.
         refused: the failed operation, for the message.
@@ -204,6 +206,8 @@ class Directory:
         """Write a file in place from its beginning, and flush it to the disk; its size
         stays, or grows.
 
+        Links are not followed.
+
         Args:
             name: of a file that exists.
             data: its new first bytes.
@@ -297,6 +301,8 @@ class Directory:
 
     def read(self, name: str, most: int = MAX_READ_BYTES) -> bytes:
         """Read the content of a regular file of at most `most` bytes.
+
+        Links are not followed; no more than its size at opening is read.
 
         Raises:
             OSError: as `open`, or it has more.
@@ -517,6 +523,8 @@ class Directory:
         """Write a file under a temporary name, flush it and rename it; nothing is left of
         a failure.
 
+        The file is flushed only with `sync`; the folder not here.
+
         Args:
             fd: descriptor of the folder; None where the system has none.
             name: of the file; one of that name is replaced.
@@ -607,6 +615,8 @@ def memory_bytes() -> int:
 
 def free_memory_bytes() -> int:
     """Estimate the memory that new work can have: free, or caching files [bytes].
+
+    In a container at most what its limit leaves; never below 0.
 
     Half of the memory is assumed to be free if the system does not report it (not Linux).
     """

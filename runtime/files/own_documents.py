@@ -35,6 +35,8 @@ def file_stem(name: str) -> str:
     """Encode `name` with percent signs as the stem of a file; different names
     give different stems.
 
+    At most `MAX_STEM` bytes.
+
     Raises:
         LimitError: it is too long for a file system.
     """
@@ -238,6 +240,8 @@ def _second_name(folder: Directory, name: str, second: str) -> bool:
 
 def read_json(data: bytes) -> object:
     """Parse a JSON document; all its numbers must be finite and its texts valid Unicode.
+
+    Names given twice are allowed; the last counts.
 
     Raises:
         ValueError: it is no such document.

@@ -39,6 +39,9 @@ class SpareFiles:
     def keep(self, name: str, data: bytes) -> None:
         """Write a document, safe when this returns, into a spare file if the disk is full.
 
+        Only a document of at most `SPARE_BYTES` fits, padded with spaces. Missing spare
+        files are then made, as far as there is room.
+
         Raises:
             DatasetWriteError: the system refuses, and there is no spare file.
         """
@@ -54,6 +57,8 @@ class SpareFiles:
 
     def _keep_in_spare(self, name: str, data: bytes) -> bool:
         """Write a document into a spare file and rename that to the document's name.
+
+        Spare files that are not usable are deleted.
 
         The document that it replaces becomes a spare where it has the size of one.
 

@@ -41,6 +41,9 @@ def require_bytes(path: Path, needed: int) -> None:
 def room_named(path: Path) -> Iterator[None]:
     """Have every library say alike that the disk is full, and name the file that was asked for.
 
+    An error without a number counts as a full disk if less than `FULL_BYTES` are free. An
+    error that names another file is raised as it is.
+
     Args:
         path: what shall be written; the file that is written may be a temporary one beside it.
 
@@ -72,6 +75,8 @@ def room_named(path: Path) -> Iterator[None]:
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a path to write; the file replaces `path` as a whole, and a failure leaves nothing.
+
+    It is a hidden file beside it.
 
     Raises:
         OSError: see `room_named`.

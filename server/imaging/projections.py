@@ -509,6 +509,9 @@ class Imaging:
         """Ensure that the projector has the present version of a body; old versions are
         removed.
 
+        At most `MAX_VERSIONS` of it stay; where there is no room old versions of all
+        bodies are removed first.
+
         Args:
             name: of the body here.
             body: scene, mesh or volume.

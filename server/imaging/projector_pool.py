@@ -202,6 +202,9 @@ class ProjectorPool:
     def _free_member(self, asked: set[_Member], now: float) -> _Member | None:
         """Choose the next projector: of the free ones that with least to do, then the
         fastest; None if none is free.
+
+        Those in `asked` and those that rest are not free; a single projector has no limit
+        of open requests. Unknown pace counts as fastest.
         """
         limit = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (

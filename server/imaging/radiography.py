@@ -273,6 +273,8 @@ class Radiography:
     async def predicted_shares(self, sample: Sample, probe: SampleProbe) -> CountShares:
         """Predict the saturated and starved parts of a setting's pixels behind a sample.
 
+        Without scatter.
+
         Args:
             sample: that the scan is to show; nominal geometry, nothing hidden.
             probe: setting, and the rays that are looked at.
@@ -472,6 +474,9 @@ def predict(
     phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
 ) -> list[bytes]:
     """Answer `exposure.predict`, in the worker.
+
+    At most `MAX_PROPOSALS` settings of the best; the infinite last edge of the histogram
+    is left out.
 
     Args:
         phantom: the sample.

@@ -35,6 +35,8 @@ async def answered(
     """Await the answer to a request, count it with its time, and log it at the level
     `debug`.
 
+    An exception of `work` is raised uncounted.
+
     Args:
         work: makes the answer.
         method: requested.

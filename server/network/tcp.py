@@ -715,6 +715,9 @@ class _Link(asyncio.BufferedProtocol):
     async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
         """Serve a call by `_handle`, and count and log it under a trace of its own.
 
+        The trace is the connection's number and that of the call. Returns the answer,
+        also for a notification.
+
         Args:
             id: of the request; None for a notification.
             name: of the method.

@@ -73,6 +73,8 @@ async def volume_put(
     """Store a scene, or a chunk of voxels or of a mesh; prepare and store a complete
     volume.
 
+    A scene is stored at once (received 0). An incomplete one is only kept.
+
     Args:
         context: of the server.
         client: that sends it.
@@ -141,6 +143,8 @@ async def volume_get(
 async def volume_list(context: Context, client: JobClient, id: Id, p: Params) -> object:
     """List the volumes and their memory as a dict: volumes, memory_used and memory_limit
     [bytes].
+
+    Each has name, kind, bytes and its sizes. The arguments are ignored.
     """
     return {
         "volumes": context.store.describe(),

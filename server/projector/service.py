@@ -87,6 +87,8 @@ class ProjectorServer(ListeningServer):
     def made(self, link: FrameLink) -> None:
         """Register a new connection in the waiting room; without a token its frames and
         time are limited.
+
+        The waiting room may displace another connection.
         """
         client = JobClient(link, self.context.token, self.context.lines)
         self.context.clients[link] = client
@@ -297,6 +299,8 @@ async def serve_projector(
     observe: Observe = unobserved,
 ) -> ProjectorServer:
     """Listen, run `begin` in the compute thread, then serve; connections wait until then.
+
+    Without facts they are "numba" and 0 threads. After an error everything is closed.
 
     Args:
         host, port: where (port 0: any free one); others than loopback need a token.

@@ -364,6 +364,9 @@ class ProjectorLink:
     ) -> tuple[object, npt.NDArray[np.float32] | None]:
         """Send a request and wait for its answer and parts; cancel it if this is cancelled.
 
+        Only a request that may have been sent can still be answered; such answers are
+        ignored.
+
         Args:
             method: its name on the wire.
             params: its parameters.

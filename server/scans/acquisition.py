@@ -188,6 +188,8 @@ class Acquisition:
     async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:
         """Project one view a frame, or several views of one frame taken in motion.
 
+        Without noise and trapped charge; as if X-rays were on.
+
         Args:
             batch: frames that share camera settings; one alone if it is taken in motion
                 and `moments` is above 1.

@@ -346,6 +346,8 @@ def _refusing_large(
 ) -> dry_run.CollisionCheck:
     """Wrap a sweep so that it refuses plans whose report would be too large.
 
+    Without a limit the sweep is only called.
+
     Args:
         sweep: finds the collisions of a plan.
         most: largest size of the report [bytes]; None for no limit.
@@ -491,6 +493,8 @@ def _rebuilt_plan(pieces: list[bytes], machine: Machine, profile: Profile) -> Sc
 @contextmanager
 def _no_collection() -> Iterator[None]:
     """Disable the collector of cyclic garbage within the context.
+
+    It goes on at the end only if it was on.
 
     A million new objects would start it repeatedly, and each pass holds the interpreter.
     """

@@ -146,6 +146,8 @@ class Jobs:
     def require_idle(self, what: str) -> None:
         """Refuse a command that would disturb a job that runs, opens or is being resumed.
 
+        Without a current job nothing is refused.
+
         A paused job disturbs nothing, and neither does one that was aborted while it
         opened.
 
@@ -698,6 +700,8 @@ class Jobs:
     def _schedule_resume(self) -> None:
         """Schedule a retry after a pause by a full disk or a projector, unless a user
         took over.
+
+        Only while it is paused by a passing error; once until it has run.
         """
         job = self.current
         if job is None or job.runner is None or self._manual:

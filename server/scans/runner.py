@@ -43,6 +43,8 @@ def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
     """Set tube, camera or an axis's rates as `command` has them; motion and images are not
     commands here.
 
+    X-rays come on without the warm-up after a long rest.
+
     Rates are limited to those that the axis allows now. Commands for components of other
     packages do nothing.
 
@@ -169,6 +171,8 @@ class ScanRunner:
     def pause(self, error: Exception | None = None) -> None:
         """Stop motion as soon as the run obeys, keep the settings in force, and wait for
         `resume`.
+
+        A second pause keeps the settings saved first; a single step is given up.
 
         Args:
             error: reason, shown in `progress`; None if a user requested the pause.
@@ -336,6 +340,8 @@ class ScanRunner:
     ) -> None:
         """Wait until plan time `moment`, obeying pause and abort; set the progress to it.
 
+        At once if it has passed; requests are obeyed before that.
+
         Args:
             moment: on the plan's clock [s].
             exposing_since: plan time [s] to which a run that is paused meanwhile goes
@@ -497,6 +503,8 @@ class ScanRunner:
         """Move the motors to where a programme begins and wait for rest; ends early on a
         pause or an abort.
 
+        Nothing if they rest there already.
+
         Args:
             start: axis -> position [mm, deg].
 
@@ -536,6 +544,8 @@ class ScanRunner:
 
     async def _await_clock_held(self, work: Awaitable[None], moment: float) -> None:
         """Await `work` with the clock held, obeying pause and abort meanwhile.
+
+        While paused the work goes on, with the clock running.
 
         Args:
             work: that takes real but no twin time; cancelled if the run ends.

@@ -136,6 +136,8 @@ class Stage:
         """Build the scene of bodies that may collide; the last `MAX_CACHED_SCENES` scenes are
         remembered.
 
+        Scenes are known by content and placement of the sample, and by parameters.
+
         Args:
             sample: on the stage.
             parameters: applied correction, which moves the bodies.
@@ -212,6 +214,8 @@ class Shapes:
 
     def of(self, name: str, revision: str | None, phantom: Phantom) -> Shape:
         """Compute the shape of `phantom`, or return it from the cache; may take a second.
+
+        Only the last one is kept; its file is binary STL.
 
         Raises:
             RpcError: -32008, it has more triangles than may be sent.
@@ -380,6 +384,8 @@ class ObstacleMoves:
         *warnings: str,
     ) -> Way:
         """Make the `Way` of legs from `start`, with its total time at the motors' rates.
+
+        A leg takes as long as its slowest motor; legs follow one another.
 
         Args:
             start: axis -> position [mm, deg].

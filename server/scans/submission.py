@@ -267,6 +267,8 @@ class Submissions:
         def take() -> Job:
             """Put the drafted job into the queue; raise if its name has been taken
             meanwhile.
+
+            It also raises if the requester has lost control.
             """
             ensure_allowed()
             [draft] = drafts
@@ -613,6 +615,8 @@ class Submissions:
 def name_conflict(name: str, why: str) -> RpcError:
     """Make the error -32602 for a data set's name that cannot be used; returned, not
     raised.
+
+    It has the name, the reason and what is allowed.
     """
     return invalid_params(
         f"the data set name {name!r} cannot be used: {why}",

@@ -123,6 +123,8 @@ class Corrections:
     def get(self, name: str) -> NamedCorrection:
         """Look up the correction called `name`.
 
+        It need not be in force.
+
         Raises:
             UnknownNameError: lists the names there are.
         """

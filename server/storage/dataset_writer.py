@@ -103,6 +103,8 @@ class DatasetWriter:
     def put(self, name: str, image: npt.NDArray[np.uint16]) -> None:
         """Write one image as a TIFF file, atomically, and count it as present.
 
+        An image of that name is replaced.
+
         Args:
             name: its file name; one of the record's.
             image: uint16 (rows, cols).

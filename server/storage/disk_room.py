@@ -99,6 +99,8 @@ class UsedBytes:
 def _read(folder: Directory, changed_ns: int) -> _Seen:
     """Read the names of a folder's folders, and the sum of its files' sizes.
 
+    Entries that cannot be read are skipped; links count with their own size.
+
     Args:
         folder: to be read, without what its folders contain.
         changed_ns: its time of modification [ns], kept with the result.
@@ -134,6 +136,8 @@ class DiskRoom:
 
     def require(self, what: str, size: int, there: int = 0) -> None:
         """Check that the disk and the quota have room for `size` and the reserve.
+
+        Unknown free space without a quota is no error.
 
         Args:
             what: that is about to begin, for the message.

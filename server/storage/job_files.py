@@ -105,6 +105,8 @@ class JobFiles:
     def write(self, name: str, job: JobMemory | None) -> None:
         """Write a job that has changed; None deletes its file.
 
+        The folder is made if it is missing; a missing file is no error.
+
         Raises:
             DatasetWriteError: the system refuses.
         """

@@ -140,6 +140,8 @@ def with_scanner_state(
 def read_memory(root: Directory) -> Memory | None:
     """Read the state of data directory `root`; None if there is none; a damaged file is
     set aside.
+
+    That is logged.
     """
     return documents.read_or_set_aside(
         root,
@@ -427,6 +429,8 @@ class StateStore:
         files: Callable[[documents.Changes], None] | None,
     ) -> None:
         """Write files and the document as undoable changes.
+
+        Blocks; the document after the files. The caller confirms or undoes `changes`.
 
         Raises:
             DatasetWriteError: the disk does not take them, or the server is ending.

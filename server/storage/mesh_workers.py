@@ -48,6 +48,8 @@ def scene_apart(raw: bytes, *, name: str) -> Phantom:
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
     """Read a mesh or scene from bytes in a worker process with limits; blocks.
 
+    The process ends in any case.
+
     Args:
         read: function of the worker.
         how: its keyword arguments.

@@ -840,6 +840,8 @@ def _frame(
 def _existing_file(folder: files.Folder, file: str) -> str:
     """Check that a file exists, and return its name.
 
+    By the listing of the folder, not by the disk.
+
     Raises:
         DatasetMissingError: it does not.
     """

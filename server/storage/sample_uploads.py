@@ -157,6 +157,8 @@ class Incoming:
         """Begin an upload, in place of its namesake and of the oldest beyond
         `MAX_UPLOADS`.
 
+        The file has no name.
+
         Raises:
             DiskFullError: no room for twice its size.
             DatasetWriteError: the folder or the file cannot be made.

@@ -140,7 +140,10 @@ class SampleStore:
 
     def revision(self, name: str) -> str | None:
         """Return an identifier of the appearance of an upload that has been read; None
-        for a shipped phantom."""
+        for a shipped phantom.
+
+        None also for one that has not been read yet.
+        """
         with self._lock:
             revision = self._revisions.get(name)
             head = self._heads.get(name)
@@ -198,6 +201,8 @@ class SampleStore:
         """Check an upload's size and name, and write one chunk of it, see
         `Incoming.receive`.
 
+        A name in use may be replaced beyond the number allowed.
+
         Args:
             head: description of the upload.
             start: place of the chunk [bytes].
@@ -252,6 +257,8 @@ class SampleStore:
     def store(self, changes: documents.Changes, upload: ReceivedSample) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.
 
+        It is added to `changes`: bytes first, then the description.
+
         Raises:
             DatasetWriteError: the system cannot write.
         """
@@ -292,6 +299,8 @@ class SampleStore:
         """Register another upload under a name and forget what was loaded under it; with
         the lock held.
 
+        Files of the earlier upload are only marked as replaced.
+
         Args:
             name: of the sample.
             new: description of the upload; None removes the name.
@@ -317,7 +326,10 @@ class SampleStore:
 
     def _settle(self) -> None:
         """Clean the folder at the start: delete the files of interrupted writers, and bytes
-        without an upload unless its damaged description is kept."""
+        without an upload unless its damaged description is kept.
+
+        Other files stay; errors leave a file.
+        """
         self._folder.sweep([TEMPORARY])
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         names = self._folder.names()

@@ -39,6 +39,8 @@ class TwinSession:
     async def handle(self, method: AnyMethod, params: Params) -> object:
         """Answer one call: take control where the method needs it, then call its handler.
 
+        A programming error is raised as it is.
+
         Methods that move by hand are refused while a job runs, and cancel the automatic
         resume of a paused one.
 

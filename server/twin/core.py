@@ -471,6 +471,9 @@ class TwinServer:
     async def _run_service(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run a service; after an exception log it and restart the service.
 
+        Repeatedly is `MAX_FAILURES` times within `FAILURE_WINDOW_S`; a pause of
+        `SERVICE_PAUSE_S` comes before each restart. It ends when the service does.
+
         A service that fails repeatedly ends the process, which its supervisor restarts:
         without the service the server would answer without acting.
         """

@@ -190,6 +190,8 @@ class Hub:
     def unsubscribe(self, listener: Peer, topics: Iterable[TopicName]) -> None:
         """End subscriptions of `listener`; topics that were not subscribed to are
         ignored.
+
+        Events that wait for the rate are dropped.
         """
         for topic in topics:
             subscription = self._listeners.get(topic, {}).pop(listener, None)

@@ -54,6 +54,8 @@ class Reader:
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
     """Decode a message or batch and validate its parameters; runs in the worker.
 
+    It never raises for a malformed message: that is pickled.
+
     Args:
         codec: of the connection.
         most: largest number of items in a batch.

@@ -39,6 +39,8 @@ def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
 def geometry_view(readout: Readout | None) -> w.GeometryState:
     """Convert the derived geometry to its wire form.
 
+    None stands for such a pose.
+
     Raises:
         GeometryError: the pose is impossible for a scanner.
     """

@@ -218,7 +218,10 @@ def touching(
 
 def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, float]]:
     """List every pair within the margin with the motors at `q` (axes,), with
-    its clearance [mm]."""
+    its clearance [mm].
+
+    Overlaps have clearance 0; in no order. Within the tolerance counts.
+    """
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
     near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()

@@ -97,6 +97,8 @@ class _Planner:
     ) -> Contact | None:
         """Sweep one move and count it; remember the bodies that it touches as obstacles.
 
+        All motors of the step start together at rest; others stand.
+
         Args:
             moved: motor -> position before the move, where it is not that of the start
                 [mm, deg].

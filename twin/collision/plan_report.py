@@ -70,6 +70,9 @@ def collision_check(
 def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     """Sweep a plan for its contacts and clearances.
 
+    Without pairs in motion the clearance is None; points where nothing is near are left
+    out of the trace.
+
     Args:
         plan: of a scan, with the paths of its axes.
         scene: bodies and pairs that must not touch.

@@ -449,6 +449,8 @@ class RelativeMotion:
     def look(self, at: Moment, separate: Separate) -> Look:
         """Compute the certified gap of the two bodies at a moment.
 
+        A body that never turns has None as orientation.
+
         Args:
             at: segment, and time in it [s].
             separate: certified separation of the two solids in a pose.

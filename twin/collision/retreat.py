@@ -203,6 +203,9 @@ class _Overlap:
         """Compute the widest slab between the bodies [mm] and its
         direction, as `relative.Separate`.
 
+        A body of very many corners is not taken as the one that the directions turn
+        against.
+
         The width is negative for an overlap, and never too large. Looked at are
         directions that turn with either body. How far that body reaches across them does
         not change, so that one of many corners costs no more than another.

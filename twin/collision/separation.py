@@ -149,6 +149,8 @@ def _improved(
 def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
     """Make fcl's shape of a solid.
 
+    Of a polytope it is the origin.
+
     Args:
         solid: in its own frame.
 

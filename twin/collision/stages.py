@@ -107,6 +107,8 @@ class Body:
         """Compute how far the body may turn before its support along `toward` grows
         by `allowance` [rad].
 
+        For a cylinder it follows from its reach alone; one way it is at most half a turn.
+
         Args:
             toward: (3,) unit direction in the body's turned frame.
             allowance: [mm], > 0.
@@ -167,6 +169,8 @@ def stage_bodies(
     machine: Machine, profile: Profile, parameters: Offsets = NOMINAL
 ) -> list[Body]:
     """Place the components of a machine as bodies.
+
+    In the order of the components; () components give none.
 
     Args:
         machine: its components and its linear map.

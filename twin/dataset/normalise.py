@@ -50,6 +50,8 @@ class LineIntegrals:
     def of(cls, dark: Float32Array, flat: Float32Array) -> LineIntegrals:
         """Prepare the conversion from mean dark and flat images (rows, cols) [counts].
 
+        Pixels less than `MIN_FLAT` brighter are dead.
+
         Raises:
             DatasetFormatError: no pixel of the flat is brighter than the dark image.
         """

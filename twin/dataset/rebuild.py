@@ -303,6 +303,8 @@ def _camera(
 ) -> CameraSettings | None:
     """Make camera settings for images of `shape` from the texts.
 
+    None also if they contradict each other.
+
     Args:
         settings: with ROI and mode.
         shape: of the images (rows, cols).
@@ -334,6 +336,8 @@ def _camera(
 def _figures_agree(ours: Figures, printed: Figures) -> bool:
     """Return whether figures agree with the printed ones, within `MATCH_MM`, `MATCH_PX`
     and 1e-5 mm of pitch.
+
+    SOD and SDD in mm, HC, VC and COR in pixels.
     """
     slack = {"sod_mm": MATCH_MM, "sdd_mm": MATCH_MM, "pixel_mm": 1e-5}
     return all(

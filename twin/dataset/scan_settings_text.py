@@ -69,6 +69,9 @@ def parse_number(text: str) -> float:
     """Read a finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`,
     `874.6E-9`.
 
+    One comma without a point is the decimal sign; what follows a space is dropped.
+    Infinity and NaN are errors.
+
     Raises:
         ValueError: it is not a number.
     """
@@ -270,6 +273,8 @@ def _split(line: str) -> tuple[str | None, str]:
 def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
     """Read a value into the field of `values`, unless it is there; a serial number is
     split off the type.
+
+    An empty value is skipped unless the field is a text.
     """
     if field == "scanner_type" and _SERIAL in value:
         value, serial = value.split(_SERIAL, 1)
@@ -281,6 +286,8 @@ def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
 
 def _is_motor(key: str, value: str) -> bool:
     """Return whether a line describes a motor.
+
+    The name must be one word that `_MOTOR_WORD` allows.
 
     It does if it has a speed, or a bare number after a name with an underscore.
     """

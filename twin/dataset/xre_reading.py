@@ -34,7 +34,7 @@ class XreSettings:
     def number(self, section: str, key: str) -> float | None:
         """Return a value as a number; None if absent.
 
-        Case of section and key does not count if it does not in `text`.
+        Case of section and key does not count; an empty value is absent.
 
         Raises:
             DatasetFormatError: it is present and not a number.

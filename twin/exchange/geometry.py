@@ -186,6 +186,8 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
 def require_each(what: str, off: FloatArray, most: float) -> None:
     """Check a figure of every view, (n,).
 
+    At least one view is needed.
+
     Raises:
         ExchangeError: one is above `most`; names the view with the largest.
     """

@@ -42,6 +42,9 @@ NAMES: Final = (*COUNTS, *SIZES, SOURCE, DETECTOR, ROWS, COLUMNS)
 def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to LEAP's arguments by name, in double precision.
 
+    Source and panel centre [mm], unit vectors of rows and columns, (n, 3) each; counts
+    and pixel sizes are scalars.
+
     Raises:
         ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
     """

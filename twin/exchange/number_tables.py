@@ -45,6 +45,8 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
     """Read twelve numbers a line, between blanks, tabs, commas or semicolons; # is a
     comment.
 
+    Blank lines are skipped; at least one view must be there.
+
     Raises:
         ExchangeError: names the line.
     """
@@ -194,6 +196,8 @@ def read_tomosipo(
 def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
     """Check rows that came from a file, and make a geometry of them.
 
+    The first such view is named.
+
     Args:
         numbers: (n, 12) [mm].
         file: for messages.
@@ -217,6 +221,8 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
 
 def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
     """Parse the twelve numbers of a row.
+
+    Infinity and NaN pass here.
 
     Args:
         words: the cells.

@@ -195,7 +195,10 @@ class Follower:
         self, mirror: Mirror, connected: bool, now: float, why: str = ""
     ) -> Mirror:
         """Update the mirror after the link has come up or gone down, which forgets
-        commands under way."""
+        commands under way.
+
+        Going down is an error alarm with the reason, and motors count as at rest.
+        """
         if connected:
             return replace(mirror.cleared("link"), connected=True)
         axes = {n: a.at_rest for n, a in mirror.axes.items()}
@@ -410,6 +413,9 @@ class Follower:
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
         """Return the mirror, with a warning (once) if a target is near a limit of its
         motor.
+
+        Near is less than `NEAR_LIMIT_DISTANCE`; a target beyond it counts, too. Not if a
+        limit alarm is active.
         """
         axis = self.machine.axes[name]
         left = min(target - axis.lower, axis.upper - target)
@@ -754,6 +760,8 @@ def _wider(found: Range) -> Range:
 def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
     """Return the mirror with the motors of a move at rest, except those that another move
     has sent on.
+
+    Unchanged for None.
     """
     for name in () if waiting is None else waiting.targets:
         if waiting is not None and _stays(mirror, name, waiting):
@@ -829,7 +837,7 @@ def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, 
 
 
 def _number(text: str) -> float | None:
-    """Parse a number; None if it is none."""
+    """Parse a text as a finite number, spaces around it dropped; None if it is none."""
     try:
         return number(text.strip(), "position")
     except ArgumentError:

@@ -180,6 +180,8 @@ class ConeVec:
     ) -> ConeVec:
         """Make a helical scan about the object frame's z axis: a circular one that rises.
 
+        Source and detector rise linearly with the accumulated angle, about `height`.
+
         Args:
             sod, sdd, shape, pixel, offset, tilts: as for `circular`.
             angles: a number of views, spread over `turns` from 0 on, or accumulated stage
@@ -906,6 +908,8 @@ def _span(values: FloatArray) -> str:
 
 def check_spread(cone_vec: ConeVec) -> ConeVec:
     """Check that each pixel of each view has a ray of its own; returns its argument.
+
+    Parallel, and in the plane, is within a sine of `MIN_SINE`.
 
     Args:
         cone_vec: n views.

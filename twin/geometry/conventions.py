@@ -126,6 +126,8 @@ def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
     """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions
     (..., 3) (Rodrigues).
 
+    Directions are normalised; one of length 0 gives NaN.
+
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
         True

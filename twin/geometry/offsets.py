@@ -85,6 +85,8 @@ NOMINAL: Final = Offsets()
 def require_plausible(parameters: Offsets, reach_mm: float) -> None:
     """Check offsets for slips of a unit, a sign or a digit (limits assumed).
 
+    The first is named; a value that is not a number is out of range.
+
     Args:
         parameters: the offsets to check; `alpha` may be any angle.
         reach_mm: the longest travel, the largest plausible shift.

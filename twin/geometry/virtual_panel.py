@@ -83,7 +83,11 @@ def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
 
 def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
     """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by
-    the original rows."""
+    the original rows.
+
+    Of detector and pixels they are times the stretch; the source's has a share of the
+    detector's.
+    """
     out = gradient.copy()
     many = times[:, None]
     out[:, :3] = gradient[:, :3] + (1.0 - many) * gradient[:, 3:6]

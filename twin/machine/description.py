@@ -1107,6 +1107,9 @@ def _inherited(own: Raw) -> Raw:
 def _drop(base: Raw, name: object) -> None:
     """Remove an axis or a component from a machine's content, and from all that names it.
 
+    Parts that the removed one carried go to its parent; a virtual axis that reads it
+    goes, too.
+
     Args:
         base: content of a machine file; changed in place.
         name: of the axis or component.
@@ -1144,6 +1147,9 @@ def _drop(base: Raw, name: object) -> None:
 
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
     """Merge a machine's content into that of its base, key by key.
+
+    In `geometry` each quantity, and the `moves` of an axis, are replaced whole;
+    components are merged by name.
 
     Args:
         base: content of the base.
@@ -1194,6 +1200,8 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
     """Write into `merged["source"]` which values come from this file and which from the
     base.
+
+    Nothing if this file has no values or a source of its own, or the base has none.
     """
     if own and isinstance(old.get("source"), str) and "source" not in own:
         keys = ", ".join(key for key in own if key != "name")

@@ -73,6 +73,8 @@ def motor_poses(
 ) -> Poses:
     """Compute nominal poses for motor positions as they were read, without limits.
 
+    The pixel's directions follow the profile's roll only; no correction is applied.
+
     Args:
         machine: whose motors these are.
         profile: zero offsets in force.
@@ -285,6 +287,8 @@ def places(machine: Machine) -> list[Place]:
 
 def place(machine: Machine, quantity: str) -> Place:
     """Describe one quantity by its name in the machine file.
+
+    The formula is text such as "600 + rot - 2 mag"; "0" if nothing moves it.
 
     Args:
         machine: the machine.

@@ -186,6 +186,9 @@ def new_machine_text(answers: Answers) -> str:
 def _detector(answers: Answers, base: Machine) -> dict[str, object]:
     """Collect the values of `[detector]`; None for those that stay.
 
+    With columns or rows also a model name and the whole panel as region; the pitch is
+    (column, row).
+
     Args:
         answers: columns, rows, pitch and bits, as far as they are known.
         base: machine that it begins with.

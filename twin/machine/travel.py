@@ -79,6 +79,8 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
     """Apply the rule to a speed or acceleration of `axis` that may be above its motors'
     maximum; raises nothing.
 
+    A value that is no number counts as above.
+
     Args:
         machine: whose motors these are.
         axis: motor or virtual axis.

@@ -89,6 +89,9 @@ def braked_apart(
 ) -> dict[str, Trajectory]:
     """Stop every motor as soon as it can; motors of one virtual axis stay in step.
 
+    Those that stand end where they are. A stop within rounding of the present target ends
+    exactly there.
+
     Args:
         machine: defines which motors belong together.
         drives: every motor with all that it is to follow.
@@ -131,6 +134,8 @@ def coasting(
     machine: Machine, drives: Drives, now: float, decelerations: Mapping[str, float]
 ) -> dict[str, Trajectory]:
     """Compute motion without power: each motor slows by friction, or ends at its hard stop.
+
+    At a hard stop the motor rests at once, at the limit.
 
     Args:
         machine: travel limits.
@@ -281,6 +286,8 @@ class _State:
     def slowing(self, rate: float, ahead: float) -> float:
         """Compute by how much programme time may slow without exceeding the motor's
         acceleration.
+
+        It may speed up or brake by itself meanwhile.
 
         Args:
             rate: of programme time, programme seconds a second.

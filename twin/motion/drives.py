@@ -175,6 +175,8 @@ def plan_jog(
 ) -> dict[str, Trajectory]:
     """Plan a jog: run until the lease ends, brake; brake in time for a travel limit.
 
+    Motors of a virtual axis brake together, when the first must for its limit.
+
     Args:
         machine: whose motors these are.
         drives: every motor.
@@ -241,6 +243,8 @@ def with_settings(
     acceleration: float | None = None,
 ) -> dict[str, Drive]:
     """Change speed and acceleration of the motors of `axis` for motions to come.
+
+    Motion under way is not changed. The limits of an axis are those of its slowest motor.
 
     Args:
         machine: whose motors these are.

@@ -107,6 +107,8 @@ class Trajectory:
     def law(self, time: float) -> tuple[float, float, float]:
         """Return velocity, acceleration, and the time until which the motor obeys them [s].
 
+        Before the start it rests until then.
+
         It also ends where the motor turns round; inf for a motor that rests for good.
 
         Args:
@@ -133,7 +135,10 @@ class Trajectory:
 
     def acceleration(self, time: float) -> float:
         """Return the largest acceleration after `time`, >= 0: the one that braking
-        was planned with."""
+        was planned with.
+
+        0 after the end.
+        """
         if time >= self.end:
             return 0.0
         return max(
@@ -173,6 +178,8 @@ class Trajectory:
 
     def time_at(self, position: float) -> float | None:
         """Find the first time at which the motor passes `position`.
+
+        A position within 1e-9 of the target is passed at the end at the latest.
 
         Args:
             position: of the motor [mm, deg].
@@ -341,6 +348,11 @@ def jog(
 ) -> Trajectory:
     """Plan a run at velocity `wanted` (signed) for `lease` seconds, then braking to rest.
 
+    A lease of 0 or less brakes at once; positions are not limited here.
+
+    Raises:
+        ValueError: the acceleration is not positive.
+
     If the lease is shorter than the ramp, the motor brakes from the velocity reached by
     then.
 
@@ -376,6 +388,8 @@ def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
 
 def continued(trajectory: Trajectory, at: float) -> Trajectory:
     """Cut off the part of `trajectory` before time `at`.
+
+    Before its start it is returned unchanged; after its end it is rest at the target.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)

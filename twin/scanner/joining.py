@@ -254,6 +254,8 @@ class Lookahead:
     ) -> dict[str, Trajectory] | None:
         """Shorten the motion of a single motor to its last free position.
 
+        It goes there as fast as it was planned to go.
+
         Args:
             new: motor -> requested trajectory.
             contact: ahead on it.
@@ -278,6 +280,8 @@ class Lookahead:
     ) -> dict[str, Trajectory] | None:
         """Slow `new` along its path as late as possible before the contact; the path is
         free up to there.
+
+        Braking is with the hardest accelerations allowed.
 
         Args:
             new: motor -> requested trajectory.
@@ -305,6 +309,8 @@ class Lookahead:
         """Slow `new` by itself as late as possible while the others carry on; each trial
         is swept.
 
+        At most `SWEPT_HALVINGS` trials follow the first moment that holds.
+
         Args:
             new: motor -> requested trajectory.
             contact: ahead on it.
@@ -330,6 +336,9 @@ class Lookahead:
         self, holds: Callable[[float], bool], contact: Contact, halvings: int
     ) -> float | None:
         """Find a late moment before the contact for which `holds`.
+
+        Not necessarily the latest: steps begin at `FIRST_LEAD_S`, and never go before
+        now.
 
         Steps back from the contact double until it holds, then bisection.
 
@@ -365,6 +374,8 @@ class Lookahead:
     def stopped(self, most: Most = None) -> StopMotion:
         """Stop everything: along the path, or quicker where a sweep shows that free.
 
+        An error of the sweep gives the stop along the path.
+
         Args:
             most: motor -> greatest acceleration; None: those that the motion was planned
                 with.
@@ -383,6 +394,9 @@ class Lookahead:
     ) -> dict[str, Trajectory] | None:
         """Find a quicker stop: along the path for a while, then each motor by
         itself, if free.
+
+        Tried at `QUICKER_STOP_SHARES` of its duration, as long as at least `MIN_GAIN_S`
+        is gained; it must stay within travel.
 
         Args:
             along: motor -> trajectory of the stop along the path.
@@ -616,6 +630,8 @@ class StageChange:
         """Judge whether what is under way may carry on with the new stage, or how it is
         halted.
 
+        Moves of a scene need that what is under way is free.
+
         Returns:
             The halting motion and its contact, both empty where motion carries on.
 
@@ -669,6 +685,8 @@ class StageChange:
         self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]
     ) -> CollisionError:
         """Make the error for a change that brings parts together; returned, not raised.
+
+        It names sample and correction, and that nothing changes.
 
         Args:
             pair: the two parts.

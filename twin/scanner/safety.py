@@ -104,6 +104,8 @@ def require_ready(safety: Safety, what: str) -> None:
     """Check that motion is allowed; a contact alone does not forbid motion that brings
     parts apart.
 
+    A ready state passes, and so does a block by a contact that lasts.
+
     Args:
         safety: state in force.
         what: command, for the message.
@@ -127,6 +129,8 @@ def require_ready(safety: Safety, what: str) -> None:
 
 def after_contact(safety: Safety, contact: Contact) -> Safety:
     """Count a blocked attempt; at the maximum the state becomes blocked. An E-stop stays.
+
+    Blocked once more it also counts as a stop, and has a reason with the two parts.
 
     Args:
         safety: state before the attempt.
@@ -173,6 +177,8 @@ def estopped(safety: Safety, by: str) -> Safety:
 def released(safety: Safety, stop: int | None) -> Safety:
     """Release an E-stop or a block; a contact remains one, and is the next stop.
 
+    Blocked attempts count from 0 again.
+
     Args:
         safety: before it.
         stop: number of the stop that it is to release; None for whichever there is.
@@ -205,6 +211,8 @@ def released(safety: Safety, stop: int | None) -> Safety:
 
 def with_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
     """Record that `pair` is in contact, or (None) that nothing is any more.
+
+    A new contact of a ready scanner counts as a stop.
 
     Parts that have come apart leave the state blocked until a reset. An E-stop stays one.
 

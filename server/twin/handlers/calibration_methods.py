@@ -148,6 +148,8 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.Correcti
 async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> Encoded:
     """Run a method on the data directory in a worker process and return its encoded
     result.
+
+    The worker is told which data set a job writes.
     """
     job = twin.jobs.current
     running = ""

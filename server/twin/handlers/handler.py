@@ -94,7 +94,10 @@ def ensure_idle(
     twin: TwinServer, client: Client, method: str, what: str
 ) -> Callable[[], None]:
     """Return a check that neither control has changed hands nor a job begun since the
-    request."""
+    request.
+
+    It raises RpcError -32003; `method` and `what` are for its messages.
+    """
 
     def check() -> None:
         twin.control.ensure_allowed(client.name, method)

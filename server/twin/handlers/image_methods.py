@@ -86,6 +86,8 @@ def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Sh
     """Return the shot with the requested positions, tube and camera in place of the
     present ones.
 
+    X-rays switched on have no warm-up; what is not requested stays as in `shot`.
+
     Raises:
         LimitError, UnknownNameError: the machine does not have a motor or a setting.
     """

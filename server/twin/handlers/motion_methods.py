@@ -58,6 +58,8 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
 async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
     """Wait until the motors rest, and list a warning for each that rests elsewhere.
 
+    Positions must agree exactly.
+
     Args:
         twin: whose motors.
         wanted: motor -> target [mm, deg].
@@ -138,6 +140,8 @@ async def _move_around_obstacles(
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
     """Run an axis until the lease ends (`twin.motion.drives.plan_jog`), or as far as it
     is free; a way around obstacles is cancelled.
+
+    The result has the duration [s] and a warning if the jog is cut short; no moves.
     """
     with _cancelling_detour(twin):
         jogged = twin.scanner.jog(
@@ -174,6 +178,8 @@ async def set_axis(
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Bring the motors to rest; a running scan pauses, a way around obstacles is
     cancelled.
+
+    Also if nothing moves: it counts as a stop. X-rays stay as they are.
     """
     twin.detours.cancel()
     twin.interrupt("stop")
