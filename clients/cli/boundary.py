@@ -45,6 +45,10 @@ LIMIT_CODES: Final = ("limit", "collision")
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     """Return the lines to print for an error, and its exit code.
 
+    Usage errors exit with USAGE, limits and collisions with LIMIT, refusals and lost
+    connections with REFUSED, the rest with INVALID; errors of the twin's wire as
+    `wire_code` has it.
+
     Args:
         error: of any kind; one that is not expected is called a defect of flexdt.
 
@@ -94,8 +98,10 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
 
 
 def _usage(error: Exception) -> tuple[str, ...]:
-    """Return the lines that explain a wrong use of the command line: the error, and where help
-    is.
+    """Return the lines on a wrong use of the command line: the error, and where help is;
+    the help page itself if no command was given.
+
+    For an unknown option that may be set elsewhere, this place is added.
     """
     message = str(error.format_message())  # type: ignore[attr-defined]
     if message.startswith("Usage:"):  # no command was given: the message is the help page
@@ -152,8 +158,9 @@ def _named_file(file: object) -> str:
 
 
 def positions(data: object, file: str = "") -> list[str]:
-    """List `file:line:column: message` for the problems in an error's data, if it has
-    any."""
+    """List `file:line:column: severity: message` for the problems in an error's data;
+    empty without any. Without a file it is "script".
+    """
     if isinstance(data, Mapping):
         data = data.get("problems", data.get("errors"))
     if not isinstance(data, Sequence) or isinstance(data, str):

@@ -226,6 +226,8 @@ class InSections(TyperGroup):
 def build(words: Sequence[str] | None = None) -> typer.Typer:
     """Build the command line with all its commands.
 
+    Returns an app of typer, not run yet.
+
     Args:
         words: of the command line, after the program's name. Of other distributions'
             commands only the named one is loaded, the others are listed. None loads all.
@@ -380,6 +382,9 @@ def run(argv: Sequence[str]) -> int:
 
 def _run(argv: Sequence[str]) -> int:
     """Run one command line as `run`; Ctrl-C is not handled here.
+
+    Errors are printed by `describe`, with a traceback first if FLEXDT_TRACEBACK is set.
+    Removed commands give USAGE. A reader of our output that has gone is no error.
 
     Args:
         argv: words after the program's name.

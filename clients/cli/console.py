@@ -233,8 +233,9 @@ class ProgressBar:
         self._alone = ExitStack()
 
     def __enter__(self) -> ProgressBar:
-        """Start the bar on a terminal, else print the title; do nothing where output
-        is quiet."""
+        """Start the bar on a terminal, else print the title; do nothing where output is
+        quiet. Returns the bar.
+        """
         if _quiet:
             return self
         _end_silence()

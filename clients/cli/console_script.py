@@ -196,8 +196,10 @@ def _not_lost(unraisable: object) -> None:
 
 
 def main() -> None:
-    """Run the command line of this process; an interrupt ends it without a traceback, even
-    while it is stuck.
+    """Run the command line of this process; an interrupt ends it without a traceback,
+    even while it is stuck.
+
+    Where interrupts are ignored (as after a shell's `&`), they stay ignored.
     """
     if (
         signal.getsignal(signal.SIGINT) != signal.default_int_handler

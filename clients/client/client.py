@@ -343,6 +343,8 @@ class ClientMethod(Generic[_P, _R]):
         """Make the blocking and the asynchronous method of a function, with its
         signature.
 
+        Awaited in a coroutine, a call shows no progress bar unless asked to.
+
         Args:
             make: returns the flow of a call; see `twin_methods`.
         """

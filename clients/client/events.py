@@ -56,6 +56,8 @@ class Projection:
     def from_wire(cls, value: WireProjection) -> Projection:
         """Convert the wire's model.
 
+        Image and marks (None without any) become arrays.
+
         Raises:
             RpcError: shape and data do not match.
         """

@@ -145,6 +145,9 @@ class TcpTransport:
     async def open(self) -> None:
         """Connect to the server; an earlier connection is closed.
 
+        Also raised after `timeout_s`; the message names the cause, and `flexdt up` if the
+        connection was refused.
+
         Raises:
             ConnectionLost: no server answers at the address.
         """

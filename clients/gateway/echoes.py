@@ -130,6 +130,10 @@ class Echoes:
     ) -> Iterator[AcquilaEvent]:
         """Yield the events for the lines that a job has reached.
 
+        Yields nothing while the job is queued or its text is not there. Each line's event
+        begins when the job reaches its step; the one before then ends. A job that ends
+        otherwise than "done" makes its line fail.
+
         Args:
             status: of the job.
             script: returns a job's text, called once; None if it is not to be sent or

@@ -109,8 +109,10 @@ class Gateway:
         """Components on which commands of clients run."""
 
     async def run(self) -> None:
-        """Serve until cancelled: receive events, and echo what others do; then close recording
-        and sockets.
+        """Serve until cancelled: receive events, and echo what others do; then cancel
+        tasks, close recording and sockets.
+
+        An event that fails is logged, and serving goes on after `PAUSE_S`.
         """
         echoes = asyncio.get_running_loop().create_task(self._echo())
         self._tasks.add(echoes)
@@ -183,6 +185,9 @@ class Gateway:
     async def _echo(self) -> None:
         """Send clients the commands of others: over the twin's wire, from the viewer, by a
         script. Runs until cancelled, also after errors.
+
+        After a refusal or an error it waits `PAUSE_S`. Notes in `twin.lively` whether
+        anything moves or a job is known.
         """
         clock = asyncio.get_running_loop().time
         while True:
@@ -221,6 +226,10 @@ class Gateway:
     async def _execute(self, event: AcquilaEvent, kind: ComponentType) -> None:
         """Run a command of the scanner with its replies: RCV, FDB while it runs, ACK or
         ERR.
+
+        Refusals and errors are answered with ERR, not raised; the control of the twin is
+        released before the last reply. If cancelled, the command is cancelled and
+        answered with ERR.
 
         Args:
             event: the command.

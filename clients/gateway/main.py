@@ -36,6 +36,8 @@ EVENTS_HZ = 20.0
 async def run(options: GatewaySettings) -> int:
     """Serve until SIGTERM or SIGINT.
 
+    Announces the ports, once open, in a line on standard output.
+
     Args:
         options: addresses, token, certificate, folders and files of the process.
 

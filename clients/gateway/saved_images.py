@@ -232,6 +232,8 @@ class Recording:
     def _record(self) -> ScanRecord | None:
         """Build the record of the images so far: blocks, settings, times and correction.
 
+        Without a projection the record is incomplete, with that reason.
+
         Returns:
             The record; None where machine or profile is unknown.
         """
@@ -318,8 +320,9 @@ def _correction(state: State) -> NamedCorrection | None:
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
-    """Split a document's frames into runs of equal settings; times count from `start`
-    [s]."""
+    """Split a document's frames into runs of equal kind, camera setting and X-rays; times
+    count from `start` [s].
+    """
 
     def settings(f: FrameEntry) -> tuple[object, ...]:
         return (f.kind, f.mode, f.roi, f.exposure_ms, f.averages, f.xrays_on)

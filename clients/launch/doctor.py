@@ -149,8 +149,9 @@ def kernels() -> CheckOutcome:
 
 
 def threads() -> CheckOutcome:
-    """Check the number of numba threads against the cores; report layer and waiting
-    policy."""
+    """Report usable cores, numba's threads, layer and (of OpenMP) waiting policy; a
+    warning if threads are fewer than usable cores.
+    """
     import numba
 
     usable = os.cpu_count()

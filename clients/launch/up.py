@@ -66,8 +66,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         return ("flexdt.server.projector.main", *words(given))
 
     def twin(known: Addresses) -> Sequence[str]:
-        """Return module and options of the twin server; started again it goes on from its
-        state.
+        """Return module and options of the twin server, with the projector's address;
+        started again, it continues from its stored state, even if it was begun
+        `fresh`.
         """
         own = {
             "port": port_of("twin", options.port, known),
@@ -174,6 +175,9 @@ def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Check ports and packages, then run the servers until stopped.
+
+    INVALID if the gateway's package is missing, REFUSED if a port is taken (both before
+    any start), else the failed server's, or 0.
 
     Args:
         argv: command-line arguments; None for those of the process.

@@ -148,6 +148,8 @@ def title_of(state: State | None, what: str) -> str:
 def beside(state: State | None, image: ShownImage | None) -> str:
     """Format a radiograph and its values as HTML over a scene.
 
+    Values are distances [mm], magnification, voxel [um], beam and correction.
+
     Args:
         state: of the twin; None gives "".
         image: None for none.

@@ -239,6 +239,8 @@ class Front:
         """Answer an admitted request with a page, a file of the page, a download or an
         error.
 
+        A download can be fetched once. Unknown paths give 404.
+
         Args:
             request: of the browser.
             url: its parts.
@@ -347,8 +349,8 @@ class Front:
     # -- WebSockets --------------------------------------------------------------------------
 
     async def _serve(self, connection: ServerConnection) -> None:
-        """Serve a WebSocket: a page, or a view up to the largest number of views; further views
-        are closed.
+        """Serve a WebSocket: a page, or a view (closed with 1013 if the largest number of
+        views is open); returns when it ends.
         """
         assert connection.request is not None
         path = urlsplit(connection.request.path).path

@@ -101,6 +101,8 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
 def viewer_pages(viewer: Viewer) -> Pages:
     """Make the pages for monitoring of a running viewer.
 
+    Returns pages with health and metrics; failed if the viewer has failed.
+
     Args:
         viewer: started.
     """
@@ -113,8 +115,9 @@ def viewer_pages(viewer: Viewer) -> Pages:
         }
 
     def figures() -> list[Metric]:
-        """List the metrics: pages, views, dropped messages, drawn states, connection, wrong
-        tokens.
+        """List the metrics: open pages and views, pages ever opened, dropped messages,
+        drawn states, connection to the twin, wrong tokens; 0 for what the front counts
+        while there is none.
         """
         front = viewer.front
         return [

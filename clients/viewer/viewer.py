@@ -423,8 +423,10 @@ class Viewer:
             page.show("state", text)
 
     async def _ready_lab(self) -> LabScene:
-        """Return the scene of the twin's machine and profile, built anew in a thread if they
-        have changed; pages get its layers.
+        """Return the scene of the twin's machine and profile (the given ones first,
+        "flexray" while no twin is known).
+
+        It is built anew in a thread if they have changed; pages then get the layers.
         """
         hello = self.link.hello
         machine = self._machine or builtin_machine(
@@ -513,8 +515,9 @@ class Viewer:
                 page.show("image", content)
 
     async def still(self, asked: Mapping[str, str]) -> bytes | None:
-        """Draw the present scene as a JPEG (see `Stills`); None: the view is not
-        known."""
+        """Draw the present scene as a JPEG (see `Stills`), once it has been placed or
+        `STILL_S` has passed; None if nothing is placed or the view is not known.
+        """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._placed.wait(), STILL_S)
         lab = self.lab
@@ -551,6 +554,10 @@ class Viewer:
 
     async def _page(self, id: str, connection: ServerConnection) -> None:
         """Serve a page until it ends, or reject it where too many are open.
+
+        A page in excess is logged and closed with TRY_AGAIN. A page's name is cut at 40
+        characters ("a visitor" without one). At its end the cameras are forgotten, and
+        volume and feeds stopped if no page wants them.
 
         Args:
             id: of the page.

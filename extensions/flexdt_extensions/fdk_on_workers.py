@@ -95,6 +95,8 @@ def levels(grid: Grid) -> list[tuple[int, int, int]]:
 def create(path: Path, grid: Grid) -> Any:
     """Create the group with its empty arrays, one for each resolution.
 
+    An existing group is overwritten; all voxels are nan until written.
+
     Args:
         path: of the group.
         grid: of the volume.

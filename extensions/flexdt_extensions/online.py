@@ -237,8 +237,9 @@ def _prediction_sigma(state: Online, pose: Poses) -> float:
 
 
 def _rows(state: Online, poses: Poses) -> FloatArray:
-    """Compute d(pixels)/d(parameters, edge units) of all beads in some poses, (2 n k,
-    p)."""
+    """Compute d(pixels)/d(parameters), in edge units, of all beads in some poses at the
+    present fit, (2 n k, p). The state must have a fit.
+    """
     assert state.fit is not None
     shape = state.detections[-1].shape
     n = len(poses)

@@ -120,6 +120,8 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
 def show(report: CheckReport, file: str) -> Answer:
     """Yield the plan and the figures of a check.
 
+    Yields the table of steps, if any, the summary, and "ok" or "not ok".
+
     Args:
         report: of the check.
         file: name of the script, for the last line.

@@ -185,6 +185,10 @@ def _check_together(
 ) -> None:
     """Check that options go together.
 
+    Checked: preview, the ending of `out`, kV, options that the algorithm lacks, SLURM
+    with a scheduler, workers for FDK only, and correction with a geometry. The first
+    wrong one is raised.
+
     Args:
         given: options by name.
         out: file of the volume.

@@ -107,6 +107,8 @@ def _transmission_lines(found: Forecast | Measured) -> Answer:
 def _forecast_lines(forecast: Forecast) -> Answer:
     """Yield the forecast as text: counts, contrast, dose and the best settings.
 
+    Shows the first `SHOWN_SETTINGS` of the best settings.
+
     Args:
         forecast: of the exposure.
     """

@@ -173,8 +173,9 @@ async def _run(
 
 
 async def _status(session: FollowSession) -> None:
-    """Print every `STATUS_S` seconds the age of the last message and the commands
-    under way."""
+    """Print every `STATUS_S` seconds, until cancelled: connection, age of the last
+    message, commands under way, number of alarms, and what is unread.
+    """
     while True:
         await asyncio.sleep(STATUS_S)
         mirror = session.mirror

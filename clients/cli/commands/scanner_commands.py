@@ -51,8 +51,8 @@ def state(twin: Twin) -> Answer:
 
 
 def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
-    """Return the cells of an axis: name, position, target, velocity, limits, unit and what it
-    does.
+    """Return the cells of an axis: name, position, target, velocity, limits, unit, and
+    "moving", "virtual" or "".
     """
     lower, upper = axis.limits
     if axis.moving:

@@ -66,6 +66,9 @@ def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str
 def shadow(part: Component, top_mm: float) -> bytes:
     """Make the shadow of a part as a GLB file [m], in the part's own frame.
 
+    A transparent rectangle with soft edges, slightly larger than the part, just above the
+    surface.
+
     Args:
         part: that casts it.
         top_mm: height of the surface below [mm].

@@ -81,6 +81,9 @@ class Gizmos:
     def _add(self, server: viser.ViserServer, stage: str) -> _Handle:
         """Add the handle of a stage, with arrows for its motors.
 
+        Only arrows of coordinates that a motor moves are active, and rotations for the
+        object alone. Returns the handle.
+
         Args:
             server: to draw in.
             stage: source, object or detector.

@@ -443,6 +443,9 @@ class LabScene:
     def wear(self, look: SampleLook) -> None:
         """Put a sample on the stage.
 
+        Nothing is done if the look is there already. A look that is not exact is drawn as
+        wires.
+
         Args:
             look: its meshes; the former ones are removed.
         """
@@ -522,6 +525,9 @@ class LabScene:
 
     def draw_ranges(self, state: State) -> None:
         """Draw the remaining travel of each stage as a line through its position.
+
+        Only linear axes that carry a part are drawn, with marks at their limits; without
+        any, the former lines stay.
 
         Args:
             state: of the twin.

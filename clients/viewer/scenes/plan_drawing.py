@@ -48,6 +48,8 @@ class PlanDrawing:
     ) -> None:
         """Show some clients the moving parts at other motor positions.
 
+        Made at the first call, moved later; bodies that no axis moves are left out.
+
         Args:
             clients: that get the ghost.
             positions: motor -> [mm, deg].

@@ -125,6 +125,8 @@ class LiveReconstruction:
         """Run a process for a volume: pass its lines on, and its answers to their
         requests.
 
+        The newest line is kept in `newest`. However this ends, the process is killed.
+
         Args:
             asked: the words of its first line.
         """

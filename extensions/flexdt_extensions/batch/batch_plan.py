@@ -105,6 +105,9 @@ def _number(value: object) -> bool:
 def parse(value: object) -> Draw:
     """Parse a draw from a value of TOML.
 
+    A `Draw` is returned as it is. A list must fit its kind: two numbers, the lower first,
+    for all but "choice" and "normal" (mean and standard deviation).
+
     Args:
         value: a number, a text, or a table of one kind and its list.
 

@@ -155,6 +155,9 @@ class Store:
     def _read(self) -> bool:
         """Read the log of finished items; a line that a crash cut off is dropped.
 
+        Fills `records`; items of a shard whose lines are incomplete are dropped, to be
+        computed again.
+
         Returns:
             Whether there was a log of this plan.
 
@@ -197,6 +200,9 @@ class Store:
     def _open(self, known: bool) -> dict[str, Any]:
         """Open the arrays of the batch, or create them.
 
+        Arrays that are incomplete are created anew; empty items are nan (0 in uint16).
+        Files that a crash left are removed.
+
         Args:
             known: whether the folder has a log of this plan.
 
@@ -231,6 +237,9 @@ class Store:
 
     def _tables(self, items: list[dict[str, Any]]) -> None:
         """Write figures as arrays too, so that readers need not parse the manifest.
+
+        Written are "done", the true errors ("truth") and, of calibrations, values,
+        errors, sigmas and "identifiable"; missing numbers as `_table` has them.
 
         Args:
             items: records of all items, in order.

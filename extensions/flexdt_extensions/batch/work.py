@@ -379,6 +379,9 @@ def _plan(text: str) -> Plan:
 def run_item(text: str, index: int) -> ItemOutcome:
     """Compute one item.
 
+    A TwinError makes an outcome "failed" with its text and without arrays; else it has
+    the arrays, their SHA-256, figures and warnings of the exposure.
+
     Args:
         text: the plan, as `Plan.text`.
         index: which item.
@@ -552,6 +555,8 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
 
 def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
     """Calibrate an item, from noisy bead points or from rendered images.
+
+    Points get noise from the item's own seed; images are rendered with noise.
 
     Args:
         plan: of the batch.

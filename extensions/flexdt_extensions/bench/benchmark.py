@@ -138,8 +138,9 @@ def ball(side: int) -> Volume:
 
 
 def peer_cases() -> list[Case]:
-    """List the cases that have targets: C1, C2, C3, tilted, from above, one row,
-    small."""
+    """List the cases that have targets: C1, C2, C3 in one or several views, tilted, from
+    above, one row, small and tilted.
+    """
     c1 = partial(noise, C1_SHAPE)
     c2 = partial(noise, C2_SHAPE)
     above = [
@@ -546,6 +547,8 @@ def _some_pixels(exact: np.ndarray[Any, np.dtype[np.float32]]) -> np.ndarray[Any
 
 def machine(missing: Mapping[str, str | None]) -> Document:
     """Describe the machine of the figures: time, processor, load, versions, peers.
+
+    Returns them as one document, with the GPU and the load at the start.
 
     Args:
         missing: peer -> why it takes no part, or None.

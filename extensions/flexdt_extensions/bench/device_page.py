@@ -194,6 +194,9 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
 def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
     """Measure one volume for each number of views a call.
 
+    On the device without copies: "kernel_ms", "adjoint_ms"; calls with copies: "call_ms",
+    "back_there_ms"; bound, ASTRA and, for some numbers of views, the processor.
+
     Args:
         name: of `SIZES`.
         tell: called with a line of text for each number of views.

@@ -268,6 +268,8 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
     def __init__(self, link: LabConnection, where: PathProvider, name: str = "") -> None:
         """Make the settings as signals and join the detector's parts.
 
+        Signals are exposure [ms], averages, mode and region ("left top right bottom").
+
         Args:
             link: to the twin.
             where: gives folder and names of the files.

@@ -292,8 +292,10 @@ class TwinLab(Device, AsyncStageable):
         name: str = "",
         collisions: bool = True,
     ) -> None:
-        """Make the devices of a machine's axes, tube, camera and scans; arguments: see the
-        class.
+        """Make the devices of a machine's axes (also virtual ones), tube, camera and
+        scans, as attributes; arguments: see the class.
+
+        Not connected yet.
         """
         if isinstance(machine, str):
             scanner = builtin_machine(machine)

@@ -72,8 +72,8 @@ class LabConnection:
         ssl: tls.SSLContext | None = None,
         transport: Transport | None = None,
     ) -> None:
-        """Prepare a connection, which is made when it is first needed; arguments: see the
-        class.
+        """Prepare a connection, which is made when it is first needed; no state is known.
+        Arguments: see the class.
         """
         if transport is None:
             self.address = f"{host}:{port}"

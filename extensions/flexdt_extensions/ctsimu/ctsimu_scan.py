@@ -770,8 +770,12 @@ class _ScanReader(ScenarioReader):
         return value or None
 
     def _texts(self, given: object, where: str) -> list[str | None]:
-        """Return a text for each frame; a drift's text holds until the next one's
-        frame."""
+        """Return a text for each frame (n); drifts are lists or files of texts, spread
+        evenly over the frames.
+
+        Only the last drift counts. Raises if it is neither. Without drifts every frame
+        has the same text.
+        """
         drifts = drifts_of(given)
         if not drifts:
             return [self._text(given, where)] * self._count

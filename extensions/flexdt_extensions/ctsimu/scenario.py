@@ -213,8 +213,9 @@ class ScenarioImages:
 
     @cached_property
     def _scatter(self) -> ScanScatter | None:
-        """Scatter of all frames by the samples on the stage; None where it is not
-        simulated."""
+        """Scatter of all frames by the samples on the stage, with the first spectrum;
+        None where the scenario has none or no sample.
+        """
         scan = self.scan
         if not scan.scattering or not scan.samples:
             return None
@@ -370,6 +371,8 @@ class ScenarioImages:
 
     def projections(self) -> Iterator[Counts]:
         """Yield the projections in order.
+
+        With lag each frame keeps a part of the frame before; the first has none.
 
         Yields:
             uint16 (rows, cols); corrected by dark and flat where the scenario has it.

@@ -186,6 +186,8 @@ def needles(files: list[Path]) -> Iterator[Told]:
     """Compare CaTE: marks in radiographs of the FleX-ray itself, of objects of unknown
     shape.
 
+    A scan whose views are not known is yielded as not read.
+
     Args:
         files: of marks, one for each scan.
 
@@ -196,6 +198,9 @@ def needles(files: list[Path]) -> Iterator[Told]:
 
     def of_scan(file: Path) -> Iterator[Told]:
         """Calibrate one scan and compare the detector's shift and the residual.
+
+        Keeps the found marker shapes. A scan whose views are not known is yielded as not
+        read.
 
         Args:
             file: of its marks.
@@ -364,6 +369,8 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
     """Compare two views of a C-arm by their matrices: planes through both sources have
     one integral.
 
+    The shifted matrix must not agree, which shows that the check can fail.
+
     Args:
         files: of the two images, with matrices.
 
@@ -424,6 +431,8 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
 
     def of_scan(file: Path) -> Iterator[Told]:
         """Reconstruct one sinogram and compare it with the published image.
+
+        Yields that it is not read if the published image is missing.
 
         Args:
             file: of the sinogram.

@@ -33,10 +33,10 @@ COUNTS: Final = ("frames", "attempts")
 
 
 def require_positive(*, or_zero: bool = False, **values: float) -> None:
-    """Check an environment's settings; `COUNTS` are integers.
+    """Check that an environment's settings are finite and positive (or zero, with
+    `or_zero`), and whole numbers for those in `COUNTS`.
 
-    Raises:
-        LimitError: names the argument.
+    Raises: LimitError: names the argument and what is allowed.
     """
     for name, value in values.items():
         counted = name in COUNTS

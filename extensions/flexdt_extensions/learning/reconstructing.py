@@ -64,6 +64,8 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     ) -> None:
         """Check the settings and make the spaces; see the class.
 
+        Nothing is reconstructed before `reset`.
+
         Raises:
             LimitError: a setting outside its range.
         """

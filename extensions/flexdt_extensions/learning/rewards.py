@@ -290,8 +290,9 @@ def random_object(rng: np.random.Generator) -> Phantom:
 
 
 def random_plates(rng: np.random.Generator) -> Phantom:
-    """Draw one or two parallel upright plates, turned by any angle: a few views see
-    them edge-on."""
+    """Draw one or two parallel upright plates of twice water's attenuation, turned by any
+    angle about z: a few views see them edge-on.
+    """
     water = material("water").mu_per_mm
     axes = _turned_axes(rng.uniform(0.0, math.pi))
     count = int(rng.integers(1, 3))

@@ -80,6 +80,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     ) -> None:
         """Check the settings and make the scanner and the spaces; see the class.
 
+        No episode runs before `reset`.
+
         Raises:
             UnknownNameError: no such action, observation or task.
             LimitError: a setting outside its range.

@@ -127,6 +127,9 @@ class SeatTable:
         """Compute the table of places for beads of a radius; each frame counts `weight`
         times.
 
+        Information is in units of the tolerances; spots and their sizes are projected
+        without offsets.
+
         Args:
             places: (m, 3) [mm].
             radius: of the beads [mm].

@@ -496,6 +496,9 @@ def brick_drawings(
 ) -> Iterator[Drawing]:
     """Draw each brick, seen from below, lowest brick first.
 
+    Each comes with its steps: for every bead distances from the outer faces and the lower
+    edge [mm]; or that there is none.
+
     Args:
         work: the stack.
         beads: centres (k, 3) in the object's frame [mm].

@@ -116,6 +116,10 @@ def iterate(
 ) -> Iterated:
     """Run the iteration of Algorithm 2 on any residuals.
 
+    Stops after `MAX_ITERATIONS`, when steps stay alike (stalled) or become small
+    (converged), or when the equations are singular. Damping falls after a better step and
+    grows after a worse, which is not taken.
+
     Args:
         residual: parameters (p,) [mm, deg] to residuals (m,) [px]; inf where there are none.
         x: the start.

@@ -127,12 +127,13 @@ def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) 
 
 
 def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
-    """Fit exact or noisy points with all numbers of projections of a task (identities
-    known)."""
+    """Fit exact or noisy points, with identities known, for each number of projections of
+    a task; returns a run each, also of a failure.
+    """
 
     def solve(n: int) -> Run:
-        """Fit to the points of `n` projections, noisy ones from a generator of this run, and
-        compare with the truth.
+        """Fit to the points of `n` projections and compare with the truth; noise, if the
+        task has it, depends on seed, phantom, scenario and n alone.
         """
         parts, truth = geometry_of(task, n)
         poses = Poses.concatenate(parts)

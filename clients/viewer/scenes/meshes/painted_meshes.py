@@ -109,8 +109,9 @@ def _standing(
 
 
 def glb(pieces: Iterable[PaintedMesh]) -> bytes:
-    """Write one binary glTF of the pieces, in metres; pieces of one paint share a
-    mesh."""
+    """Write one binary glTF of the pieces, in metres, as bytes; pieces of one paint share
+    a mesh.
+    """
     groups: dict[Paint, list[trimesh.Trimesh]] = {}
     for piece in pieces:
         groups.setdefault(piece.paint, []).append(piece.mesh)

@@ -80,6 +80,8 @@ def pieces_of(part: Component) -> list[PaintedMesh]:
 def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
     """Build one piece of a look, once for each of its turns, about the middle of a box.
 
+    Boxes, cylinders and else bodies of revolution; sizes are shares of the box plus mm.
+
     Args:
         piece: of `data/parts.toml`.
         sides: of the box (3,) [mm].
