@@ -82,6 +82,9 @@ def _calibrate(
 ) -> Outcome[DataSet]:
     """Open the data sets, and calibrate them.
 
+    A geometry in place of data needs `markers` as well, else TwinError. A geometry
+    replaces that of each data set.
+
     Args:
         data, phantom, geometry, options: as for `calibrate`.
     """

@@ -181,6 +181,9 @@ def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
 def write_comparison(comparison: Comparison, out: Path) -> None:
     """Write report.html, compare.json and the difference images into a folder.
 
+    Also a verdict on the tolerance, residuals by frame, and pictures before and after
+    correction.
+
     Args:
         comparison: of a data set with the twin.
         out: the folder, made if needed; images are float32 TIFF.

@@ -114,6 +114,9 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
 def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
     """Plot motors, X-rays and exposures, and the smallest clearance over time [s].
 
+    Only motors that move are drawn, rotations on an axis of their own; collisions are red
+    lines.
+
     Args:
         plan: gives the motors' paths.
         report: of its dry run, for clearance and collisions.

@@ -36,6 +36,10 @@ LEAST_TYPICAL_PX: Final = 0.3
 def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibration:
     """Identify the bead of each spot, scan by scan until one fails.
 
+    A scan whose spots are identified already is taken as it is. Frames with wrong numbers
+    are left out, and the scan identified again. Where frames may move, a failed one is
+    tried with a wide gate.
+
     Args:
         state: scans with their spots.
         request: gives the start.

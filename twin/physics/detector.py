@@ -317,6 +317,8 @@ class Detector:
     def figures(self) -> dict[str, float]:
         """List its figures by name, for data sets; without the camera's settings.
 
+        Lag is left out if it is zero. The scintillator is named by a figure of 1.
+
         Example:
             >>> Detector(bits=12).figures()["bits"]
             12.0

@@ -246,6 +246,10 @@ def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]
 def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
     """Yield a warning if numbers are missing between others of one step.
 
+    Nothing for fewer than 4 names, several texts, several numbers that vary, or steps
+    that are not mostly even. "Gap" is the finding's kind; its figure is the number of
+    missing images.
+
     Args:
         names: in order.
         keys: their sort keys.

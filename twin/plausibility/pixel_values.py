@@ -33,6 +33,9 @@ so low."""
 def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
     """Find images given as line integrals that are none.
 
+    Yields at most one finding: counts (refusal), whole numbers (warning) or transmission
+    (warning), from type and values.
+
     Args:
         images: some of the scan's, (k, rows, cols).
     """
@@ -92,6 +95,9 @@ def _beam(images: npt.NDArray[Any]) -> float | None:
 
 def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
     """Find volumes given as attenuation that are none.
+
+    Warns of values that are not finite; then refuses values as low as Hounsfield units,
+    or warns of values above any element's. Nothing for other types or without voxels.
 
     Args:
         values: of the voxels (nz, ny, nx).

@@ -31,6 +31,9 @@ MIN_OPEN_VIEWS_SHARE: Final = 0.8
 def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[Finding]:
     """Find flat images of different beams.
 
+    Yields at most one warning, its figure the difference of levels as a share; nothing
+    for one flat image or without signal.
+
     Args:
         flats: (k, rows, cols) [counts].
         dark: (rows, cols) [counts].

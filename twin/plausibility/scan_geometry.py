@@ -80,6 +80,10 @@ def geometry_findings(
 ) -> Iterator[Finding]:
     """Find rows of a geometry that no scanner has.
 
+    Yields at most one finding: pixels too large for their distance or a source that
+    stands still (refusals), or a panel seen under too wide an angle (a warning, needs
+    `shape`).
+
     Args:
         cone_vec: n views.
         shape: detector (rows, cols), or None.
@@ -250,6 +254,9 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
 
 def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[Finding]:
     """Find laminography: a beam inclined to the plane of rotation, of which FDK knows nothing.
+
+    Yields at most one finding, a warning or, from a larger inclination, a refusal;
+    nothing if grid and panel are on different sides of the plane.
 
     Args:
         cone_vec: views of a circle about z.

@@ -26,6 +26,9 @@ PIXEL_TOLERANCE: Final = 0.02
 def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Finding]:
     """Compare a file's angles with the geometry's, whatever their zero and sense are.
 
+    Yields at most one warning: a wrong unit, another order, or that they differ. Nothing
+    if they agree, numbers differ, or the geometry does not turn about z.
+
     Args:
         geometry: n views.
         stated_rad: (n,) [rad].

@@ -169,6 +169,8 @@ def bias_of(
 def _bias_of(scan: CoarseScan) -> Bias:
     """Reconstruct a coarse scan and bound its errors, cause by cause.
 
+    If images and geometry contradict each other, only that is returned, without causes.
+
     Args:
         scan: few views and pixels of the whole scan.
 

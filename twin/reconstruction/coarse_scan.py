@@ -345,6 +345,9 @@ class CoarseScan:
     def ladder(self) -> list[Rung]:
         """List scans from parallel rays of a centred panel to the real scan.
 
+        Returns [] if there is none. A rung has its flaw's name, its geometry and its
+        panel's shape.
+
         Flaws that the scan does not have are left out.
         """
         rows, cols = self.images.shape[1:]

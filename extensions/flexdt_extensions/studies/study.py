@@ -92,6 +92,9 @@ def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
 def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
     """Run all methods on all draws of a cell; the start is the truth plus the error.
 
+    Each draw has a shift of `cell.mm` in a random direction and a turn of +-`cell.deg`. A
+    run that fails has no errors and no success; success is a mean error below LIMIT.
+
     Args:
         cell: size of the error, draws and noise.
         model: the beads.

@@ -44,6 +44,9 @@ def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> 
 def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, str]:
     """Plot errors by setting and number of projections, and by setting and parameter.
 
+    "mae" over setting and number of projections, "parameters" over setting and parameter;
+    good below 0.2.
+
     Args:
         document: of the study.
         runs: its runs.
@@ -163,6 +166,8 @@ def real_lines(document: Mapping[str, Any]) -> list[str]:
     """Describe in sentences how the logged fits of real scans are explained; none where
     not studied.
 
+    The first sentence is of all scans, then one for each scan.
+
     Args:
         document: of the study.
     """
@@ -191,8 +196,8 @@ def real_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def curve_table(curve: Mapping[str, Any]) -> str:
-    """Make a table of one scan against N: logged, simulated as the author fits, with right
-    angles; HTML.
+    """Make an HTML table of one scan against N: logged, simulated as the author fits,
+    with right angles; residuals and iterations.
     """
     names = ("alpha", "dO_z", "tau_x", "tau_z")
     return table(

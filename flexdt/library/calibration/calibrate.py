@@ -599,6 +599,9 @@ def _is_sharp(fit: FitResult) -> bool:
 def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> list[str]:
     """List commands that would determine more, or settle an error; most useful first.
 
+    With an error, those that settle the first one. Else "reconstruct" if the geometry is
+    sharp, and two scans at different SOD unless it is sharp and not limited by priors.
+
     Args:
         result: of the calibration.
         data: folders of its data sets.

@@ -117,6 +117,8 @@ class Scale:
     def of(cls, text: str) -> Scale:
         """Parse A-B=MM, or A-B=MM+-SIGMA.
 
+        Sizes must be above 0 and at most `LONGEST_MM`; sigma is the class's if not given.
+
         Raises:
             TwinError: the text has another form.
         """
@@ -184,6 +186,9 @@ def _of_array(path: Path, views: int) -> Markers:
 
 def _of_table(path: Path, views: int) -> Markers:
     """Read markers of a CSV file whose first line names its columns.
+
+    Empty lines are skipped; an empty column or row is nan; without a sigma column sigma
+    is None.
 
     Args:
         path: of the file.

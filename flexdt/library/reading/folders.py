@@ -249,6 +249,10 @@ def _from_document(
 ) -> DataSet:
     """Read a data set by its flexdt.json.
 
+    Warns if its geometry does not follow from its motor positions, and of doubts
+    predicted at submission. The stored geometry is used unless machine or profile is
+    given.
+
     Args:
         content: the folder.
         machine, profile: in place of the document's, or None.
@@ -350,7 +354,7 @@ def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
 
 def _from_geometry(content: Folder) -> DataSet:
     """Read the data set that `DataSet.save` wrote for a scan without a machine: images
-    and geometry.
+    and geometry; the stored notes become warnings, except that on missing dark images.
     """
     _require_one_each(content)
     path = content.path / GEOMETRY

@@ -103,6 +103,8 @@ def _read(
 def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
     """Find the group that holds images and their keys.
 
+    The first group is taken; other scans in the file are a doubt.
+
     Returns:
         Its name, and doubts about it.
 

@@ -225,6 +225,8 @@ def _reference(
 def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]]:
     """Read the geometry, and list doubts about it.
 
+    Doubts: values that are not applied, and a CenterShift that is.
+
     Args:
         file: its streams.
         views: that were taken.

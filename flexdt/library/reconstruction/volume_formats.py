@@ -186,6 +186,9 @@ def _blocks(slab: Float32Array) -> Iterator[Float32Array]:
 def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     """Write a page for each layer, with voxel and place in the first page's description.
 
+    Yields the function that takes the slabs, lowest first; BigTIFF above
+    `BIG_TIFF_BYTES`.
+
     Args:
         part: the unfinished file.
         places: of the voxels.

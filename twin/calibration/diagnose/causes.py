@@ -218,6 +218,9 @@ class Candidates:
     def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
         """List the causes of the table: shape, beads, arc, panel, borders, motion and priors.
 
+        Exact beads have no cause of shape or position; beads need enough of them; panel
+        and borders only where the problem has a panel.
+
         Args:
             everything: problem with a column for each cause.
 
@@ -605,6 +608,8 @@ def _with_every_column(
     problem: FitProblem, x: FloatArray, panel: PanelModel | None
 ) -> tuple[FitProblem, FloatArray]:
     """Add a column for every cause to a problem.
+
+    Layout: the fit's parameters, beads, strain, arc, panel.
 
     Args:
         problem: of the fit.

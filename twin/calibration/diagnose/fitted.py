@@ -232,8 +232,11 @@ def _other_size(ratio: float) -> Finding:
 
 
 def judge_body(measured: Sequence[Refined]) -> Finding | None:
-    """Judge whether the phantom's body has its described place and attenuation; a warning if
-    not in some scan, else None.
+    """Judge whether the phantom's body has its described place and attenuation; returns
+    None if so, else one warning: the body is not seen at all in some scan, or in the
+    first scan with a difference how it differs.
+
+    Scans without an estimate are left out.
     """
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):
@@ -327,8 +330,8 @@ def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
-    """List warnings: the strongest drift or jump, and errors that beads of a frame or turns of
-    a bead share.
+    """List warnings: the strongest drift or jump of a parameter, and errors that the
+    beads of a frame (vibration), or a bead in each turn, share; empty without any.
     """
     certificate = fit.certificate
     out = []

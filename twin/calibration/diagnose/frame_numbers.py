@@ -72,6 +72,9 @@ class FrameNumbers:
     def judged(self, name: str) -> Finding | None:
         """Make the finding on wrong numbers of frames.
 
+        An error where frames are lost or repeated (all later numbers are wrong); a
+        warning where single frames do not fit and are left out.
+
         Args:
             name: of the scan.
 

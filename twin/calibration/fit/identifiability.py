@@ -226,6 +226,10 @@ class Forecast:
 def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
     """Predict the certificate of a fit to the data of a problem, at its start.
 
+    Returns sigmas of the asked parameters, those in images (infinite where not
+    determined), covariance and spectrum. With nuisance parameters, rank and condition are
+    of the asked ones, all else given.
+
     Args:
         problem: the planned data, with priors.
         bound: as of `identifiability`.

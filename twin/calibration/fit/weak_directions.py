@@ -90,6 +90,8 @@ def tolerance_of(column: str) -> float:
 def advise(names: Sequence[str], beads: int) -> str:
     """Advise on data that would determine a direction.
 
+    Returns one sentence, of the first case that holds.
+
     Args:
         names: its columns.
         beads: number of beads seen.

@@ -228,6 +228,9 @@ class _Level:
     def solve(self, start: FloatArray) -> Symmetry:
         """Find the root of the estimating equation.
 
+        Stops after `ROUNDS`, at a step well below the uncertainty (converged), at values
+        that are not finite, or if the slopes are singular; the last estimate is returned.
+
         Args:
             start: of the parameters, (k,).
 
@@ -408,6 +411,8 @@ class _MirrorPairs:
 
     def covariance(self, inverse: FloatArray) -> FloatArray:
         """Compute the covariance of the parameters from noise and doubts.
+
+        Errors of steps at edges, and of systematic doubts, are added.
 
         The noise is widened where blocks scatter more or residuals are larger.
 

@@ -236,6 +236,9 @@ class _Level:
     def solve(self, start: FloatArray) -> Symmetry:
         """Find the root of the estimating equation.
 
+        Stops after `ROUNDS`, at a step well below the first sigma (converged), or if
+        pairs are too few or have too little signal.
+
         Args:
             start: of the parameters, (k,).
 

@@ -59,6 +59,8 @@ def _choose(module: ir.Module) -> None:
     """Change a module so that its parallel loops call the threading layer only where `ALONE` is
     0; otherwise they run in the calling thread.
 
+    The module is changed in place.
+
     A module without parallel loops stays as it is.
     """
     layer = module.globals.get(LAYER)

@@ -502,6 +502,8 @@ def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
 def prefetch_slab(flat, spans, grid, fan, j, transposed):
     """Prefetch the voxel columns of slab j on the reference line and, transposed, those beside
     it that are to be opened.
+
+    Columns (or parts of them) that hold nothing are left out.
     """
     x = grid.sl + fan.m0 * (j - grid.st)
     w0, w1 = levels_between(grid, fan, j, j + 1)

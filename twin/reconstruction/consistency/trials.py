@@ -202,8 +202,12 @@ class Trial:
         return self._tried(Suspect("offset", self.scan.images, moved_panel, said))
 
     def _beside(self, far: bool) -> list[Tried]:
-        """Try panels moved along their rows towards the side where images fit better, and on
-        either side until they fit worse."""
+        """Try panels moved along their rows (offset axis): towards the side where images
+        fit better, in doubled steps until they fit worse; then between the best.
+
+        With `far` larger steps are tried if small ones do not help. For a whole scan both
+        sides are tried until one is evident. Returns all that were tried.
+        """
         known = {0.0: 1.0}
         tried: dict[float, Tried] = {}
 

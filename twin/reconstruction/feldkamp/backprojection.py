@@ -69,8 +69,10 @@ class OnProcessor:
         self.meter: NoiseMeter | None = None
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume and to the noise meter, if there
-        is one.
+        """Weigh and filter views, and add them to the volume, in place, and to the noise
+        meter, if there is one.
+
+        Memory for filtered columns is kept for the next views of the same size.
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 

@@ -150,6 +150,9 @@ class FdkPlan:
     def views_of(self, part: Float32Array, done: int) -> Views:
         """Take the images of some views up to the filter.
 
+        They are turned and rectified to an upright panel, continued beyond a truncated
+        one, and get their weights.
+
         Args:
             part: (k, rows, cols) line integrals as recorded.
             done: views before these.

@@ -130,8 +130,8 @@ class Views:
 
 
 def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Compute the kernel's table of upright views, (n, 11); see
-    `fdk_kernels.backproject`.
+    """Compute the kernel's table of upright views, (n, 11): source, horizontal normal and
+    row direction, scales and foot in columns and rows; see `fdk_kernels.backproject`.
     """
     rows, cols = shape
     pitch_u = np.linalg.norm(cone_vec.u, axis=1)

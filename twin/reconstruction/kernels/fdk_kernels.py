@@ -199,8 +199,8 @@ def add_line(acc, line, first, count, start, step):
 
 @kernel
 def add_line_wide(acc, line, first, count, start, step):
-    """Apply `add_line`, with its arguments, to LANES at a time while that fits; `line` needs
-    MARGIN samples after its end.
+    """Apply `add_line`, with its arguments, to LANES voxels at a time while that fits and
+    steps are not too steep; `line` needs MARGIN samples after its end. Adds to `acc`.
     """
     k = np.int64(0)
     if abs(step) < STEEPEST:
@@ -446,6 +446,8 @@ def _add_tile(
     volume,
 ):
     """Add all views to one tile of voxel columns.
+
+    The sum is added to `volume` in place; panels of few rows have a way of their own.
 
     Args as for `backproject`; besides first_x, first_y: the tile's first voxel column; line,
     at, parts: room.
