@@ -130,8 +130,9 @@ def emit(document: object) -> None:
 
 
 def as_json(document: object) -> str:
-    """Convert a document to JSON; numbers that are not finite become null, unknown
-    objects text."""
+    """Convert a document to indented JSON; numbers that are not finite become null,
+    arrays lists, and unknown objects text.
+    """
     from pydantic_core import to_jsonable_python
 
     def plain(value: Any) -> object:

@@ -274,8 +274,9 @@ class ConnectedTwin:
 
 
 def _one_line(error: RpcError) -> str:
-    """Format an error of the twin as one line, with the problems of a script and their
-    lines."""
+    """Format an error of the twin as one line: its message, then the first five errors
+    (not warnings) of a script with their lines.
+    """
     data = error.data
     if isinstance(data, Mapping):
         data = data.get("problems")

@@ -241,6 +241,9 @@ class Echoes:
 def told(state: State) -> Mapping[Key, str]:
     """Return all values that commands can set, in the scanner's words and decimals.
 
+    Axes have their target as a move, and speed and acceleration where these are known;
+    virtual axes are left out.
+
     Returns:
         (component, command) -> argument; `xrays` has the command itself.
     """

@@ -134,8 +134,8 @@ class Gateway:
             self._context.destroy(linger=LINGER_MS)
 
     def _receive(self, frames: list[bytes]) -> None:
-        """Read an event from a message and begin its command; malformed ones are rejected with
-        an event.
+        """Read an event from a message and begin its command; malformed messages are
+        rejected with an event, a failure is logged and answered with ERR.
         """
         try:
             if len(frames) != 1:
@@ -264,8 +264,8 @@ class Gateway:
         self._send(end)
 
     async def _carry_out(self, event: AcquilaEvent, progress: CommandProgress) -> str:
-        """Carry out a command, after those of its component that came before; returns the
-        reply.
+        """Carry out a command and return its reply; it waits for earlier commands of its
+        component unless it is one of `AT_ONCE`.
         """
         if not self.twin.axes:
             await self.twin.state()
@@ -280,8 +280,8 @@ class Gateway:
     async def _act(
         self, event: AcquilaEvent, command: c.Command, progress: CommandProgress
     ) -> str:
-        """Run a command's action, and note its line in the recording's transcript unless it
-        fails.
+        """Run a command's action and return its reply; its line is in the recording's
+        transcript meanwhile, and stays unless it fails (or is cancelled).
         """
         line = transcript_line(event, command)
         lines = self.twin.record().transcript
@@ -328,8 +328,11 @@ class Gateway:
         self._send(event)
 
     async def _adopt(self, component: str) -> None:
-        """Store the state after a client's command, so that it is not echoed; end the
-        component's busy mark."""
+        """Store the state after a client's command, so that it is not echoed, and count
+        one command less in the component's busy mark.
+
+        A refusal is ignored, a failure logged.
+        """
         try:
             if self.twin.link.connected:
                 self._echoes.adopt(await self.twin.state(), component)

@@ -118,6 +118,8 @@ class Servers:
     def stop(self) -> int | None:
         """Stop all processes, wait for them and close the log.
 
+        They get SIGTERM, and are killed if they have not ended after `STOP_TIMEOUT_S`.
+
         Returns:
             The supervisor's exit code; None if it was not running.
         """

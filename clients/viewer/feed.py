@@ -154,6 +154,8 @@ class ImageFeed:
 def radiograph(params: Mapping[str, object], twin: str = "") -> ShownImage:
     """Read the image of a `projection` event, made by that run of the twin.
 
+    Time is the event's where the image has none; flags and origin are None where unknown.
+
     Args:
         params: of the event.
         twin: run of the twin.

@@ -284,8 +284,12 @@ class Front:
         return _kept(request, content, f"{kind}; charset=utf-8")
 
     def _foreign(self, request: Request) -> Response | None:
-        """Check that a request is not from another site's page; returns the error, or
-        None."""
+        """Check that a request is not from another site's page; returns the error (403),
+        or None.
+
+        On the loopback address the Host must be a local one; an Origin must equal the
+        Host.
+        """
         host = request.headers.get("Host", "")
         if self._loopback and is_rebound(host):
             return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {host}")
@@ -375,8 +379,9 @@ class Front:
                 self.scenes -= 1
 
     async def _relay(self, browser: ServerConnection, path: str) -> None:
-        """Pass messages between a browser and viser; `MessageFilter` filters those to
-        viser."""
+        """Pass messages between a browser and viser until either ends; `MessageFilter`
+        filters those to viser. Lost connections are not raised.
+        """
         with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
             async with self._connect(path, browser.subprotocol) as viser:
                 pumps = [

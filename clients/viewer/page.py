@@ -219,8 +219,11 @@ class Page:
                     await self._connection.send(content)
 
     def _next(self) -> str | bytes | None:
-        """Select the next message: answers and notes, then the newest content, then a
-        part of an image."""
+        """Select the next message: answers and notes, then the newest content of a slot,
+        then a part of an image (first byte 1: its last).
+
+        None if nothing waits or too much is on the way.
+        """
         if self._notes:
             return self._notes.popleft()
         for slot in self._newest:
@@ -246,8 +249,9 @@ class Page:
         return True
 
     def _took(self, slot: str) -> None:
-        """Note that the page has taken a message of a slot; quick pages get larger parts of
-        images.
+        """Note that the page has taken a message of a slot, and wake the sender; quick
+        pages get larger parts of images, slow ones small parts. Ignored if none was
+        sent.
         """
         if not (sent := self._sent_at[slot]):
             return

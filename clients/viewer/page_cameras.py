@@ -218,6 +218,8 @@ class SceneClients:
     def _connected(self, client: viser.ClientHandle) -> None:
         """Register a new client: its page and view, camera and theme.
 
+        Ignored if its path names none. Then `joined` is called.
+
         Args:
             client: of viser; its path names page and view.
         """

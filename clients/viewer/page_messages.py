@@ -118,8 +118,9 @@ def admitted(raw: str | bytes) -> bytes:
 
 
 def _small_picture(data: bytes) -> bool:
-    """Check that a PNG's header states a small size; empty bytes report a failure and
-    pass."""
+    """Check that a PNG's header states sides of at most `LARGEST_SIDE` pixels; empty
+    bytes report a failure and pass. The content is not decoded.
+    """
     if not data:
         return True
     if (

@@ -386,6 +386,8 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
     """Show this page the images of a data set instead of live ones; None shows live ones
     again.
 
+    The plan of the page is replaced by the data set's positions if it is of this machine.
+
     Returns:
         The result of `dataset.get`; empty for None.
     """
@@ -413,6 +415,9 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
 async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> object:
     """Show this page an image of its data set, and in its scenes the machine at that
     moment.
+
+    Without a usable virtual image `problem` states why, and the recorded one is shown
+    alone.
 
     Returns:
         The image's entries, `geometry`, `tube` and `problem` of the virtual image.
@@ -486,8 +491,11 @@ async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 async def live(viewer: Viewer, page: Page, params: Live) -> object:
-    """Start to grow a volume of a data set from the images so far, for all pages that
-    want one."""
+    """Start to grow a volume of a data set from its images so far, for all pages that
+    want one; without a name, end that for this page. Returns {}.
+
+    Raises INVALID_PARAMS if there is no such data set (links do not count).
+    """
     page.live = params.name is not None
     if params.name is None:
         viewer.ungrow()

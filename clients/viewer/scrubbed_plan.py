@@ -150,6 +150,8 @@ def plan_text(
 def document(plan: ScanPlan) -> dict[str, Any]:
     """Make the data of a page's time line.
 
+    Images are thinned to at most `MAX_STEPS`; of steps the first `MAX_STEPS` are there.
+
     Args:
         plan: of the script.
 

@@ -458,8 +458,10 @@ class Viewer:
             self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
 
     async def _fetch(self, lab: LabScene, sample: SampleState) -> None:
-        """Fetch the mesh of an upload, and show it if the sample is still on the stage; a box
-        is drawn until then. A failure is logged.
+        """Fetch the mesh of an upload, and show it if the sample is still on the stage; a
+        box is drawn until then.
+
+        Nothing is shown if the twin has none; a failure is logged.
         """
         try:
             stl = await sample_looks.fetch(self.link.request, sample)
@@ -599,8 +601,9 @@ class Viewer:
             self.refresh_feeds()
 
     def refresh_feeds(self) -> None:
-        """Subscribe to the images that pages show; the panel in the scenes shows line
-        integrals."""
+        """Subscribe to the images that pages show, and to line integrals for the panel if
+        there is any page; stop other feeds.
+        """
         wanted = {page.kind for page in self.pages.values()}
         if self.pages:
             wanted.add("line_integral")

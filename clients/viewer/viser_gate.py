@@ -67,6 +67,9 @@ class Scenes:
         """Start viser's server on a Unix socket in a private folder, without its ways to
         the outside.
 
+        Sockets of viewers that were killed are removed first; on a failure the folder is
+        removed.
+
         Args:
             label: of the server.
         """

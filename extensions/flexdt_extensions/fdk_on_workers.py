@@ -184,8 +184,9 @@ def mark(path: Path, slab: int) -> Path:
 
 
 def halved(values: Float32Array) -> Float32Array:
-    """Compute means of 2 x 2 x 2 voxels; where a side is odd, its last layer counts
-    twice."""
+    """Compute means of 2 x 2 x 2 voxels, (z, y, x) rounded up; where a side is odd, its
+    last layer counts twice.
+    """
     odd = [(0, n % 2) for n in values.shape]
     if any(n for _, n in odd):
         even = np.pad(values, odd, "edge")

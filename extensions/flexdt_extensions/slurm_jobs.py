@@ -68,6 +68,8 @@ class SlurmJobs:
     def submit(self) -> None:
         """Start the missing jobs with sbatch.
 
+        Jobs are named and kept; those submitted before an error stay.
+
         Raises:
             CommandError: sbatch refuses, in its own words.
         """

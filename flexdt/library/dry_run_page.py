@@ -33,6 +33,8 @@ from flexdt.twin.script.problems import ScriptProblem
 def html_report(report: CheckReport, name: str = "script") -> str:
     """Make one self-contained HTML page of a report.
 
+    It has the verdict, summary, problems, clearance, steps and, if known, the script.
+
     Args:
         report: from `check_script`.
         name: of the script.

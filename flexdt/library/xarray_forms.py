@@ -13,6 +13,9 @@ from flexdt.twin.projection.volume import Volume
 def images_to_xarray(data: ImageSet) -> Any:
     """Convert a data set's line integrals to a DataArray; see `DataSet.to_xarray`.
 
+    Dimensions are view, row, column; geometry vectors [mm], angles [deg] and file names
+    are coordinates of each view, not attributes.
+
     Raises:
         TwinError: xarray is not installed.
     """

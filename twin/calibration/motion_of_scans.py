@@ -59,6 +59,9 @@ def settle_motion(
 ) -> tuple[Calibration, list[Finding]]:
     """Widen the sigmas of the motion by the change that the last fit would make to it.
 
+    Findings are a warning if it changes by more than a sigma, and an error if an asked
+    parameter is determined worse than `request.bound`.
+
     Args:
         state: with a motion.
         request: the parameters that may move.

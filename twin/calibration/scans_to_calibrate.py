@@ -34,6 +34,8 @@ def require_scans(scans: Sequence[Scan]) -> None:
 def require_seen_from_source(scan: Scan) -> None:
     """Check that rows are counted downwards, and columns from left to right.
 
+    Names the first view that is wrong.
+
     Raises:
         GeometryError: they are not.
     """

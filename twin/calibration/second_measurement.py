@@ -108,8 +108,8 @@ def _measured(
 
 
 def _judge_confirmation(state: Calibration) -> list[Finding]:
-    """Judge whether the second measurement of every scan finds the spots of the first; returns
-    an error for each scan where it does not.
+    """Judge whether the second measurement of every scan finds the spots of the first;
+    returns an error for each scan where too few (or none) are confirmed.
     """
     out = []
     scans = zip(state.scans, state.identifications, state.measured, strict=True)

@@ -295,6 +295,8 @@ class LabScene:
     def update(self, state: State, world: World) -> None:
         """Move everything to a state.
 
+        Changes parts, sample, beam, panel and drag handles in one message.
+
         Args:
             state: of the twin; its motors and X-rays.
             world: geometry of the state.
@@ -473,6 +475,9 @@ class LabScene:
 
     def _stand(self, look: SampleLook) -> None:
         """Draw a thin rod from the mount to the sample; X-rays do not see it.
+
+        A former rod is removed; none is drawn if the machine has no mount or the sample
+        touches it.
 
         Args:
             look: the sample; without meshes there is no rod.

@@ -107,8 +107,9 @@ def names_of_image(world: World) -> list[Name]:
 def names_of_parts(
     machine: Machine, poses: Mapping[str, tuple[float, ...]]
 ) -> list[Name]:
-    """List parts that move or have a role, at a corner, from their poses (w, x, y, z,
-    place [m])."""
+    """List parts that move or have a role, with the place [m] of a corner; from their
+    poses (w, x, y, z, place [m]), those without one left out.
+    """
     out = []
     for part in machine.components:
         if (pose := poses.get(part.name)) is not None and (

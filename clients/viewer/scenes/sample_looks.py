@@ -149,6 +149,8 @@ def _skins(phantom: Phantom) -> SampleLook:
     """Make a phantom's look: one skin for each material, smooth up to a number of
     triangles.
 
+    Holes are turned inside out; steel among other materials is marked as dense.
+
     Args:
         phantom: with parts and beads.
     """

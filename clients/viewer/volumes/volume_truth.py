@@ -175,8 +175,9 @@ def told(value: float) -> float | None:
 
 
 def main_level(truth: Float32Array) -> float:
-    """Find the attenuation of most of the sample [1/mm]; partly filled voxels all
-    differ."""
+    """Find the attenuation of most of the sample [1/mm]: the median of the fullest
+    logarithmic bin; partly filled voxels all differ. nan for an empty volume.
+    """
     there = np.log(truth[truth > VACUUM_PER_MM].astype(np.float64))
     if not there.size:
         return math.nan

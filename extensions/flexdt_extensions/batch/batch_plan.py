@@ -424,6 +424,8 @@ class Plan(_Table):
         """Check tables against each other: errors' names, kind, phantom, images and
         camera.
 
+        Returns the plan itself.
+
         Raises:
             ValueError: two of them do not go together.
         """

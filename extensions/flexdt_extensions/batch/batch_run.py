@@ -91,8 +91,9 @@ class Store:
         return (i for i in range(self.plan.batch.items) if i not in self.records)
 
     def put(self, outcome: ItemOutcome) -> None:
-        """Keep an item; write its shard as soon as that is complete: arrays first,
-        then log lines."""
+        """Keep an item; once its shard is complete, write that: arrays first (blank for
+        failed items), then log lines.
+        """
         self._waiting[outcome.index] = outcome
         shard = self._shard(outcome.index)
         if any(i not in self._waiting for i in shard):
@@ -113,6 +114,8 @@ class Store:
 
     def finish(self) -> dict[str, Any]:
         """Write tables and manifest, after all items are done.
+
+        The log is sorted by item.
 
         Returns:
             The manifest: plan, arrays, counts, figures, items and their checksum.

@@ -44,6 +44,8 @@ class Augment:
     def __post_init__(self) -> None:
         """Check the settings.
 
+        `photons` are (low, high); None is allowed.
+
         Raises:
             LimitError: photons or shift out of their range.
         """

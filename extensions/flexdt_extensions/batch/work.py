@@ -343,6 +343,9 @@ class ItemOutcome:
 def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
     """List the arrays of every item of a plan: name -> (shape, dtype).
 
+    Projections are uint16 (counts) or float32; volumes only if the plan reconstructs;
+    calibrations have geometries alone.
+
     Raises:
         TwinError: no such machine, mode or ROI.
     """

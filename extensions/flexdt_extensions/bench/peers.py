@@ -91,6 +91,8 @@ class DiffDrr:
     def __init__(self, volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> None:
         """Copy the volume and the rays of all views to PyTorch.
 
+        The result is zeros until `run`.
+
         Args:
             volume: with attenuation [1/mm].
             geometry: views.

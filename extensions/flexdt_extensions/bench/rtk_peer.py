@@ -135,6 +135,8 @@ def joseph(
 def rtk_geometry(rows: FloatArray) -> Any:
     """Convert cone_vec rows (n, 12) to RTK's geometry object.
 
+    Panel directions are normalised: pitches are not part of it.
+
     Raises:
         ValueError: RTK rejects a view.
     """

@@ -68,6 +68,9 @@ class AxisLogic(MovableLogic[float]):
     async def check_move(self, new_position: float) -> None:
         """Check a move from the current position to a target; nothing moves.
 
+        Collisions are checked by the twin only if this axis wants it and the move is not
+        tiny.
+
         Args:
             new_position: target [mm, deg].
 

@@ -234,6 +234,8 @@ class TwinFlyer(
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
         """Wait for the job's end.
 
+        Also raised if the scan was not started. The number of written images follows.
+
         Yields:
             Progress: frames done and in all, time remaining [s].
 
@@ -531,8 +533,10 @@ def fly_scan(
         yield from bpp.rewindable_wrapper(flight(prepared is not None), False)  # type: ignore[no-untyped-call]
 
     def flight(live: bool) -> MsgGenerator[None]:
-        """Declare the streams, start the scan, and collect its images; `live` is False in a
-        simulator.
+        """Declare the streams, start the scan, wait until it has started, and collect its
+        images, with the frame events at the end, also after an error.
+
+        `live` is False in a simulator, which answers nothing.
         """
         for device, name in ((flyer, STREAM), (flyer.frames, FRAMES)):
             declared = None

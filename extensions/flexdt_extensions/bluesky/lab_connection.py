@@ -335,8 +335,8 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 def _changes(
     get: Get[_T], callback: Callable[[Reading[_T]], None]
 ) -> Callable[[State], None]:
-    """Return a watcher of states that calls `callback` with a reading when the value has
-    changed.
+    """Return a watcher of states that calls `callback` with a reading at the first state
+    and whenever the value has changed.
     """
     last: list[_T] = []
 

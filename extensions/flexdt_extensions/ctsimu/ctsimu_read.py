@@ -300,6 +300,9 @@ class ScenarioReader:
     def _deviation(self, value: object, where: str) -> _Deviation:
         """Read a deviation: a translation [mm] or a rotation [rad] about a pivot.
 
+        It is unknown to the reconstruction only where `known_to_reconstruction` is false.
+        Pivot is the sample's centre by default.
+
         Args:
             value: its object in the scenario.
             where: its place, for errors.

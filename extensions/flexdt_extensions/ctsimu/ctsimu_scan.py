@@ -475,6 +475,9 @@ class _ScanReader(ScenarioReader):
     def _spectra(self) -> tuple[tuple[FloatArray, ...], tuple[int, ...]]:
         """Compute the spectra behind the filters.
 
+        From files, or else of a tungsten tube by voltage [kV] (window included), or of
+        one energy. Raised too if filters let nothing through.
+
         Returns:
             Photons per cm2 and mAs at 1 m of each spectrum that occurs, and the index of
             each frame's.
@@ -516,6 +519,8 @@ class _ScanReader(ScenarioReader):
 
     def _check_target(self) -> None:
         """Check that the target is of tungsten, and note that its angle is not heeded.
+
+        No material passes as well.
 
         Raises:
             ExchangeError: another material.
@@ -566,6 +571,8 @@ class _ScanReader(ScenarioReader):
     def _spot(self) -> tuple[float, float]:
         """Compute the focal spot's standard deviations along u and v [mm].
 
+        A spot of a size is replaced by a Gaussian of the same width, which is noted.
+
         Returns:
             Those of a Gaussian that ends with the spot, or of a complete one.
         """
@@ -596,6 +603,9 @@ class _ScanReader(ScenarioReader):
 
     def _response(self) -> FloatArray:
         """Compute the energy that a photon leaves in the detector on average.
+
+        By the efficiency file, the scintillator (of type "real"), or all of it, which is
+        noted for a missing scintillator.
 
         Returns:
             (e,) [keV] at the tables' energies, behind the detector's filters and window.

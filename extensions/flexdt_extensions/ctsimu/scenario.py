@@ -411,6 +411,9 @@ class ScenarioImages:
         """Collect all images in a data set in memory, with the geometry that
         reconstruction knows.
 
+        Where the scenario corrects projections, dark images are zero and flat ones
+        uniform.
+
         Without dark or flat images in the scenario the data set has none either.
         """
         scan = self.scan

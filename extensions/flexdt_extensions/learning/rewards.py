@@ -78,8 +78,8 @@ class InformationTask:
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """Draw new offsets of a few millimetres and degrees, and forget what was measured: only
-        the prior is known.
+        """Draw new true offsets of a few millimetres and degrees, and forget what was
+        measured: only the prior is known. `lab` is ignored.
         """
         shift = rng.normal(0.0, 2.0, 3)
         tau = rng.normal(0.0, 1.0, 2)
@@ -139,6 +139,8 @@ class InformationTask:
 
     def _of(self, lab: Lab, poses: Poses, at: Offsets) -> FloatArray:
         """Compute the information of each frame, (n, p, p), parameters in tolerances.
+
+        Spots that overlap or are not visible give none.
 
         Args:
             lab: its detector.
@@ -206,6 +208,8 @@ class QualityTask:
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
         """Take one frame, improve the reconstruction by SIRT and return its gain in
         quality.
+
+        All frames so far are used, from the present volume on; the noise is of `PHOTONS`.
 
         Args:
             lab: the scanner.

@@ -268,8 +268,10 @@ class _TurnEnv(ScanEnv):
         return TurnedLab(turntable(self.task.size_mm, self._exposure_s))
 
     def measure(self, action: Action) -> SharedQuality | None:
-        """Take the frame of an action that is to come; the task, if that can be solved
-        ahead."""
+        """Take the frame of an action that is to come, and return the task, to be solved
+        with others; None (and no frame) if the task is not shared or the move would
+        collide.
+        """
         if not isinstance(self.task, SharedQuality) or not isinstance(
             self.lab, TurnedLab
         ):

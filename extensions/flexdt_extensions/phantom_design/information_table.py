@@ -194,8 +194,9 @@ class SeatTable:
         return np.asarray(self.marginal(summed).sum(axis=0))
 
     def marginal(self, summed: FloatArray) -> FloatArray:
-        """Reduce beads' summed blocks (..., q q) to (..., p, p), the beads' own places
-        marginalised."""
+        """Reduce beads' summed information (..., q q) to the parameters' (..., p, p): the
+        beads' own places are marginalised with their prior, if it is not 0.
+        """
         p = len(self.names)
         q = p + (3 if self.prior > 0 else 0)
         full = summed.reshape(*summed.shape[:-1], q, q)

@@ -391,8 +391,10 @@ def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom
 def _spiral(
     body: BeadHolder, request: DesignRequest
 ) -> tuple[npt.NDArray[np.float64], str]:
-    """Return the thesis's beads (k, 3) for the same body and number, and the name of
-    the set."""
+    """Return the thesis's beads (k, 3) [mm] for the same body and number, and the name of
+    the set: its LEGO phantom for that stack and five beads, else a spiral within the
+    walls.
+    """
     if body.bricks == Brickwork() and request.beads == 5:
         return lego_phantom().beads, "lego (thesis 6.5.1)"
     size = body.size_mm
@@ -421,6 +423,8 @@ def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
 
 def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -> str:
     """Make the page of the building instructions.
+
+    With verdict, table of sigmas, drawings, bead places, criterion and assumptions.
 
     Args:
         phantom: the design.
@@ -565,8 +569,9 @@ def level_drawings(
 
 
 def _sheet(wide: float, deep: float, top: str, bottom: str) -> Axes:
-    """Draw the outline of a brick or block, its edges named, on axes that fill a
-    figure."""
+    """Draw the outline of a brick or block [mm] on axes that fill a new figure, y
+    downwards, its edges named; returns the axes.
+    """
     w = wide + 2 * MARGIN_MM
     h = deep + 2 * MARGIN_MM
     figure = blank(w * SCALE_PX_MM, h * SCALE_PX_MM)

@@ -67,6 +67,9 @@ def tubes_at(work: Brickwork) -> FloatArray:
 def seats_of(work: Brickwork, radius_mm: float) -> Seats:
     """List every seat for beads of this radius.
 
+    On the half-stud grid and at the walls, not in the tubes; at the walls on three
+    levels, elsewhere under the roof.
+
     Args:
         work: the stack.
         radius_mm: of the beads.

@@ -212,8 +212,9 @@ def _rotate(x: float, z: float, angle: float | FloatArray) -> FloatArray:
 
 
 def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
-    """Compute centroids (..., 2) of the pixels whose centres are within a radius of
-    each centre [px]."""
+    """Compute centroids (..., 2) [px] of the pixels whose centres are within a radius of
+    each centre, each pixel counted alike.
+    """
     base = np.floor(centres)
     x, y = np.moveaxis(centres - base, -1, 0)[..., None]
     rows = np.arange(-math.ceil(radius_px), math.ceil(radius_px) + 2)

@@ -275,6 +275,9 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     def solve(n: int) -> Run:
         """Calibrate from `n` of the images; without a result the note gives the reason.
 
+        They are spread evenly; offsets have no prior. A run with errors has no problem to
+        judge.
+
         Raises:
             ValueError: `n` does not divide the largest number.
         """

@@ -373,8 +373,8 @@ def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
 
 
 def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
-    """Make the JSON of `flexdt study`: experiment, fidelity, rows, runs, thesis_source and
-    assumed.
+    """Make the JSON of `flexdt study`: experiment, fidelity, rows, runs, thesis_source
+    and assumed (noise [px] of noisy points, else None).
     """
     return {
         "experiment": experiment,

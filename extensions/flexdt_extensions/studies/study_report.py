@@ -106,6 +106,8 @@ def _basin_charts(document: Mapping[str, Any]) -> list[str]:
 def _real_charts(document: Mapping[str, Any]) -> list[str]:
     """Plot the logged fits with their simulation: alpha against N for each scan, tables.
 
+    Missing values are gaps in the curve (nan).
+
     Args:
         document: of the study.
 

@@ -355,6 +355,8 @@ def saturation(dataset: ImageSet) -> Finding | None:
 def find_phantom(phantom: str | Phantom) -> Phantom:
     """Return a phantom that has beads, by value, name or file.
 
+    A name that does not ship is read as a file if there is one.
+
     Raises:
         TwinError: there is no such phantom, or it has no beads.
     """
@@ -539,7 +541,7 @@ ADVISED: Final[Sequence[tuple[re.Pattern[str], str]]] = (
 
 def settling_commands(finding: Finding) -> Sequence[str]:
     """Return the commands that would settle a finding, with places for the data set's
-    words.
+    words: those of its code, else those that its text advises, else one for a report.
     """
     if finding.code in NEXT:
         return NEXT[finding.code]

@@ -59,6 +59,9 @@ def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
 def report(outcome: Outcome[ImageSet]) -> str:
     """Make the HTML report of a calibration.
 
+    Without a fit only verdict, next commands and findings; ellipses only where the
+    geometry is determined in full.
+
     Args:
         outcome: of the calibration.
 

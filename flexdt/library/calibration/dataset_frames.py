@@ -88,8 +88,8 @@ class DatasetFrames:
         out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
 
         def one(index: int) -> None:
-            """Fill the windows of one frame with line integrals; none of a frame that cannot be
-            read.
+            """Fill the windows of one frame in `out` with line integrals; they stay as
+            they are if it cannot be read. Counts below `MIN_COUNTS` count as that.
             """
             counts = self._counts(index)
             if counts is None:

@@ -26,6 +26,8 @@ def squared(data: Images) -> Images:
     """Resample rows to the columns' pitch where pixels are not square, with a warning in the
     data set.
 
+    A copy has resampled images, dark and flat, and the geometry of it.
+
     Args:
         data: a data set; itself is returned if its pixels are square.
     """

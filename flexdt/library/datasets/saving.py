@@ -187,8 +187,8 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
 
 
 def _geometry(data: ImageSet) -> tuple[str, bytes]:
-    """Return name and bytes of the geometry's file: the document as it was if it still
-    describes the data, or else the geometry.
+    """Return name and bytes of the geometry's file: the document, with the present
+    correction, if it still describes frames and poses, or else the geometry.
     """
     files = tuple(frame.file for frame in data.frames)
     document = data.document

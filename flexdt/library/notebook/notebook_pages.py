@@ -153,6 +153,8 @@ def data_page(data: ImageSet) -> NotebookPage:
 def geometry_page(cone_vec: ConeVec) -> NotebookPage:
     """Draw source, panel and sample of each view, with one scale along all axes.
 
+    A slider chooses among at most `MOST_PICTURES` views.
+
     Args:
         cone_vec: views in the object's frame; without a detector's shape the panel is a point.
     """
@@ -199,6 +201,8 @@ class _Drawing:
     @classmethod
     def of(cls, cone_vec: ConeVec) -> _Drawing:
         """Choose the scale at which sources, panels and sample fit into the drawing.
+
+        The sample's radius is what a view's fan sees at the axis.
 
         Args:
             cone_vec: all views.

@@ -57,6 +57,9 @@ def _read(
 ) -> DataSet:
     """Read the images of an open file, and their geometry.
 
+    Invalid images and those with unknown keys are left out, with a doubt. Raises
+    DatasetFormatError if no image is a projection.
+
     Args:
         file: open.
         path: for messages.

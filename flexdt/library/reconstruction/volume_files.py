@@ -135,6 +135,8 @@ def save_volume(volume: Volume, file: File) -> None:
 def read_volume(file: File) -> Volume:
     """Read a volume with its place, from a file that `volume_writer` made.
 
+    Volumes with cubic voxels get one edge, others three.
+
     Raises:
         OSError: it cannot be read.
         LimitError: it is not such a file.

@@ -297,6 +297,8 @@ def _nifti_header(places: VoxelPlaces) -> bytes:
 def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     """Write one data set, `volume`, with its place as attributes.
 
+    Yields the function that takes the slabs, lowest first. Raises if h5py is missing.
+
     Args:
         part: the unfinished file.
         places: of the voxels.

@@ -53,6 +53,9 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     """Judge the backgrounds of windows: how far they are from smooth ones, whether they bend,
     and their planes.
 
+    Windows with too few free blocks count as smooth (ratio 1). The bend is None unless
+    most windows bend.
+
     Args:
         flat: (m, side, side) line integrals, nan outside the image.
         alone: (m, side, side) the beads alone, rendered there.

@@ -272,6 +272,8 @@ class Candidates:
     def judged(self, choice: Choice) -> Judged | None:
         """Judge a choice.
 
+        Columns of causes that are chosen or always hold are free within their widths.
+
         Args:
             choice: width of each cause.
 
@@ -407,6 +409,9 @@ class Candidates:
 
     def border(self, choice: Choice) -> Border | None:
         """Find a tile's border that a choice's residuals suggest.
+
+        Also None if the images have several shapes. Borders known already are not found
+        again.
 
         Args:
             choice: width of each cause.

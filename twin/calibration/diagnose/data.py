@@ -286,8 +286,11 @@ def _without_bad_frames(found: Identification) -> Identification:
 
 
 def _missing(found: Identification) -> list[int]:
-    """List beads without a spot where every spot fits one of the others, at least three
-    of them.
+    """List beads without a spot where nearly every spot fits one of the others, at least
+    three of them; empty if the identification is poor or a bead has spots in a part of
+    the frames.
+
+    A bead that is hidden at times counts as seen.
     """
     if found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
         return []
@@ -437,6 +440,9 @@ def _in_motion(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> Finding | None:
     """Check whether the spots are those of the phantom, up to a motion.
+
+    None too if the spots do not fit the beads even with a wide gate, or frames are too
+    few.
 
     Args:
         detections: spots of each frame.

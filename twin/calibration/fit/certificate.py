@@ -286,8 +286,8 @@ class Certificate:
 
     @property
     def limited(self) -> dict[str, str]:
-        """Requested parameter that owes most of its sigma to priors -> the limit, and the
-        measurement that would reduce it.
+        """Requested parameters that owe most of their sigma to priors: name -> words on
+        the limit, and the measurement that would reduce it; empty without any.
         """
         out = {}
         for name, e in self.estimates.items():

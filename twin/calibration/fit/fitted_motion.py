@@ -565,8 +565,8 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
         return known[whole]
 
     def climbed(i: int, at: tuple[int, int]) -> tuple[int, int]:
-        """Find the best place (width, smoothness) of the grid for parameter `i` that is reached
-        uphill from `at`.
+        """Find the best place (width, smoothness, as indices) of the grid for parameter
+        `i` that is reached uphill from `at`, by steps to the eight neighbours.
         """
         while True:
             around = [

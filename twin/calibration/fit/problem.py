@@ -355,8 +355,8 @@ class FitProblem:
 
     @cached_property
     def _columns_of_kernel(self) -> FloatArray | None:
-        """(kernel's columns, columns) by which kernel columns follow from those of the layout;
-        None: they are the same.
+        """Matrix (kernel's columns, columns) by which the kernel's columns follow from
+        those of the layout; None where they are the same (without strain).
         """
         if self.layout.strain_column < 0:
             return None
@@ -469,6 +469,8 @@ class FitProblem:
         huber: float = math.inf,
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Evaluate column values by `fit_kernels.evaluate`.
+
+        With `want` 0 the last four are zero.
 
         Args:
             x: (c,) column values.

@@ -168,6 +168,8 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
 def cluster_covariance(left: Residuals) -> FloatArray | None:
     """Compute the covariance that allows for errors all beads of a frame share.
 
+    Judged by the parameters that may move from frame to frame.
+
     Args:
         left: residuals with their derivatives, covariance and noise.
 

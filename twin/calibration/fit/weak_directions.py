@@ -190,8 +190,8 @@ def weak_direction(
 
 
 def _sparse(basis: FloatArray) -> FloatArray:
-    """Transform a basis so that each vector lacks the others' leading parameter (echelon
-    form).
+    """Transform a basis so that each vector lacks the others' leading parameter (reduced
+    echelon form, with pivots), of unit length; returns a new one.
     """
     m = basis.T.copy()
     r = len(m)

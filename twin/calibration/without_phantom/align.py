@@ -49,8 +49,9 @@ NEEDS_TURN: Final = (
 
 
 def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
-    """Wrap a search so that the error of a scan that is not identifiable becomes refusals in
-    its result.
+    """Wrap a search so that it does not raise NotIdentifiableError: it then returns an
+    alignment that refuses all parameters, with the error's message as reason. Other
+    errors are raised.
     """
 
     @wraps(find)
@@ -190,6 +191,9 @@ def _motion(
 
 def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]:
     """List doubts about the scan: gap of the panel, repeated and missing frames, a jump.
+
+    First that opposite rays disagree; "gap" is one between tiles of the panel, found or
+    not excluded.
 
     Args:
         plane: of symmetry.

@@ -138,8 +138,10 @@ class Profile:
         return cls(at, _basis(radius, weight, place, at, soft), shift, sigma)
 
     def best(self) -> Step:
-        """Return the step that is least likely by chance; up to a part of the bins, which
-        fit it worst, is left out, and `least` contains the effect of that choice.
+        """Return the most significant step; up to a part of the bins, which fit it worst,
+        is left out in turn, and `least` contains the effect of that choice.
+
+        NO_STEP if none is narrow and clear of the bins left out.
         """
         sigma = self.sigma
         found = [NO_STEP]

@@ -281,6 +281,8 @@ class _Level:
     def _mirrored(self, values: FloatArray, at: FloatArray) -> FloatArray:
         """Compute mirror images (2, k) of pixels, across a gap if there is one.
 
+        The gap is that between two panel tiles: fixed, or the last parameter.
+
         Args:
             values: parameters.
             at: (2, k) columns and rows.
@@ -307,8 +309,8 @@ class _Level:
         return np.asarray(image)
 
     def _pairs(self, here: FloatArray) -> _MirrorPairs | None:
-        """Collect the pixels with a mirror image on the panel, each pair once; None if
-        they are too few.
+        """Collect the pixels with a mirror image well on the panel, each pair once, away
+        from a tile's border; None if they are too few.
         """
         image = self._mirrored(here, self.at)
         room = 4.0 * self.sigma + self.margin

@@ -93,6 +93,9 @@ def local_gaps(
 ) -> list[Gap]:
     """Return the border, or the two, whose likelihood of a gap is significant.
 
+    A border is one between panel tiles. Empty for few columns, without edges, or if no
+    border stands out.
+
     Args:
         frames: line integrals of `averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
