@@ -34,6 +34,8 @@ def number(word: str, what: str) -> float:
 def assignments(words: Iterable[str]) -> dict[str, float]:
     """Read AXIS=VALUE words as axis -> value, in order.
 
+    Values are numbers, of any unit.
+
     Raises:
         typer.BadParameter: a word of another form, or an axis given twice.
     """

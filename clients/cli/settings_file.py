@@ -121,6 +121,9 @@ def config_file(environ: Mapping[str, str]) -> Path:
 def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
     """Read the defaults in force.
 
+    The environment's values replace the file's; token and token file replace each other,
+    but both together in one place are an error. Empty values count as not given.
+
     Args:
         environ: the environment; this process's if left out.
 

@@ -206,6 +206,8 @@ class TcpTransport:
     async def receive(self) -> list[Message]:
         """Wait for messages and return them; an empty list at the end of the connection.
 
+        A lost connection ends it as well, without an error.
+
         Raises:
             ProtocolError: the server ended the connection inside a message.
         """

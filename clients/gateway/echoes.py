@@ -48,8 +48,8 @@ def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
 
 
 def _texts(row: CodeLine) -> tuple[str, ...]:
-    """Split a row into component, command and two arguments, also in the space-padded form;
-    missing ones are empty.
+    """Split a row into component, command and two arguments, also in the space-padded
+    form; missing ones are "", further ones are dropped.
     """
     texts = [f.text for f in (row.columns if row.columns is not None else row.words())]
     if row.columns is not None:
@@ -89,6 +89,9 @@ class Echoes:
         self, state: State, own: Collection[str], now: float
     ) -> Iterator[AcquilaEvent]:
         """Yield the events for changes of the state.
+
+        Nothing is yielded at the first call, and no changes while a script of a job is
+        echoed. A move ends when its axis rests; a new target makes the former one fail.
 
         Args:
             state: of the twin.

@@ -69,8 +69,9 @@ _FIXED: Final[dict[str, ComponentType]] = {
 
 
 def component_type(component: str, axes: Collection[str]) -> ComponentType | None:
-    """Return the type of `component`, or None if neither scanner nor twin has one of
-    that name."""
+    """Return the type of `component`: a fixed one, "motor" for axes and reserved names,
+    "other" for "sc"; None if neither scanner nor twin has it.
+    """
     name = grammar.own_name(component, axes)
     if name in _FIXED:
         return _FIXED[name]
@@ -89,6 +90,8 @@ def known_commands(component: str) -> tuple[str, ...]:
 
 def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
     """Read the command of an event.
+
+    Also raised for an unknown component, arguments in excess and wrong ones.
 
     Args:
         event: from a client.

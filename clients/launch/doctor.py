@@ -218,6 +218,9 @@ def listening(what: str, port: int) -> CheckOutcome:
 def disk(data: Path) -> CheckOutcome:
     """Check that data sets can be written: free space, rights, time to flush 1 MiB.
 
+    An error if it cannot be written, a warning with little room or a slow disk; nothing
+    stays there.
+
     Args:
         data: the data directory; a temporary file is written there, or in its nearest
             parent.

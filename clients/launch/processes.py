@@ -93,6 +93,9 @@ class Servers:
         """Start the processes under `flexdt.runtime.child` and wait for their `ready`
         line.
 
+        `ready` then holds their addresses; after an error all are stopped. The processes
+        end with this one.
+
         Raises:
             ServersError: they did not start; carries the end of their log.
         """
@@ -249,6 +252,9 @@ class LocalTwin:
 
     def start(self) -> TwinClient:
         """Start the servers, unless they run already; they run until `stop` or Python's end.
+
+        Returns the connected client. A temporary folder holds the log, and the data if no
+        folder was given.
 
         Raises:
             ServersError: they did not start; carries the end of their log.

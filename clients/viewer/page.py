@@ -160,8 +160,9 @@ class Page:
         return task
 
     async def _read(self) -> None:
-        """Read the page's messages until it closes: acknowledgements, and requests, each
-        answered in a task.
+        """Read the page's messages until it closes: acknowledgements free their slots,
+        requests are each answered in a task; bytes are ignored. At the end the page is
+        over.
         """
         with contextlib.suppress(ConnectionClosed):
             async for message in self._connection:
@@ -194,8 +195,8 @@ class Page:
             self._dragging = self._start(self._follow(), "dragging")
 
     async def _follow(self) -> None:
-        """Send the axes' newest dragged targets to the twin, one request at a time, until none
-        is left; the page shows a refusal.
+        """Send the axes' newest dragged targets to the twin, one request at a time with a
+        pause, until none is left; a refusal is shown to the page and goes on.
         """
         while (targets := self._dragged) is not None:
             self._dragged = None

@@ -329,6 +329,9 @@ async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
 async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
     """Compute the tube's spectrum behind the machine's filters at a voltage.
 
+    The photons are relative, behind the filters; limits are voltage [kV], power [W],
+    exposure [ms].
+
     Returns:
         `energy_keV`, `photons`, `mean_keV`, `filters`, and `limits` of tube and camera.
     """

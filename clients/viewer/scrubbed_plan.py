@@ -47,8 +47,10 @@ class RecordedPositions:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> RecordedPositions | None:
-        """Build from a result of `dataset.get`; None where poses are not known. Images
-        without times are a second apart."""
+        """Build from a result of `dataset.get`, ordered by time; None where poses are not
+        known. Images without times are a second apart; those without a position are
+        left out.
+        """
         motors = {
             n: np.array(values, dtype=float) for n, values in told["positions"].items()
         }
@@ -119,6 +121,8 @@ def work(parts: Sequence[bytes]) -> list[bytes]:
 
 def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
     """Plan a script, and compute the source's path and the time line.
+
+    Without a state there is no path.
 
     Raises:
         RpcError: it takes too many images.

@@ -216,6 +216,9 @@ class Viewer:
         """Take an event of the twin: a state to draw, or a job or log entry to pass to
         all pages.
 
+        Repeated log entries, and those on jobs (which come under their own topic), are
+        not passed on.
+
         Args:
             topic: of the event.
             params: data and number of the event.
@@ -482,6 +485,9 @@ class Viewer:
     def _image(self, image: ShownImage, coarse: bool) -> None:
         """Show one image on the panel and send it to the pages that want its kind; in a
         worker thread.
+
+        Only line integrals are shown on the panel; nothing before the scene is there. If
+        no page is open the feeds end.
 
         Args:
             image: to show.

@@ -19,6 +19,8 @@ def watched(
 ) -> asyncio.Task[None]:
     """Run `work` as a task.
 
+    An error is logged, not raised; `died` is not called if the task is cancelled.
+
     Args:
         work: the coroutine.
         what: name of the work, for the log.

@@ -206,6 +206,8 @@ class VolumeFormat:
         """Yield a function that takes the layers in order; at the end `part` is complete
         and becomes `path`.
 
+        After an error `part` does not become `path`.
+
         Args:
             part: temporary path.
             path: of the volume.

@@ -339,6 +339,8 @@ def _fit_machine(
 ) -> tuple[d.Machine, str, Fit | None]:
     """Fit a machine to the texts' signs and rates and to the executed scripts.
 
+    The file's text is the shipped one with the changed axes. Rotations keep their rates.
+
     Args:
         scans: past scans.
         shipped: the machine to begin with.

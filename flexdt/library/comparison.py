@@ -150,8 +150,9 @@ def virtual(
 def _figures(
     residual: FloatArray, images: Float32Array | None
 ) -> dict[str, float | None]:
-    """Compute rms and largest length of residuals (n, k, 2) [px], and the rms of differences of
-    images, None without; by the names of FIGURES.
+    """Compute rms and largest length of residuals (n, k, 2) [px], and the rms of the
+    images of differences (None without images), by the names of FIGURES; nan is
+    ignored in the lengths.
     """
     length = np.linalg.norm(residual, axis=2)
     if images is None:

@@ -108,8 +108,8 @@ def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
 
 
 def _clearance(found: Clearance | None) -> list[str]:
-    """Make the section with the plot of the clearance, as HTML parts; empty without a trace, a
-    sentence without matplotlib.
+    """Make HTML parts with the plot of the clearance; empty without a trace, a sentence
+    in place of the plot without matplotlib.
     """
     if found is None or not found.trace:
         return []

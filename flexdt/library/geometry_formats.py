@@ -118,6 +118,8 @@ def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
 def from_tomosipo(geometry: Any) -> ConeVec:
     """Convert a cone geometry of tomosipo, or its arrays by name; see `ConeVec.from_tomosipo`.
 
+    Other geometries of tomosipo are converted by their `to_vec`.
+
     Raises:
         GeometryError: no cone geometry; the message names what it lacks.
     """
@@ -327,6 +329,8 @@ def _format(path: Path, among: Iterable[Format]) -> str:
 
 def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
     """Convert one pixel edge, or two along columns and rows, to two floats [mm].
+
+    Also raised for anything but one or two numbers.
 
     Raises:
         GeometryError: they are not above 0.

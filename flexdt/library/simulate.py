@@ -143,6 +143,8 @@ class Truth:
     def radiographs(self) -> Iterator[Radiograph]:
         """Simulate the noise-free radiograph of each view, in batches that fit the memory.
 
+        With several spot points the focal spot is not blurred once more.
+
         Rays per pixel and focal spot points are averaged, and scatter is added.
 
         Yields:
@@ -482,6 +484,9 @@ def _panel(
 ) -> tuple[Detector, CameraSettings]:
     """Make detector and camera settings for a geometry's pixels.
 
+    Without a given one, the machine's: binned by a whole number, its region in the middle
+    if the panel is larger.
+
     Args:
         detector: as given, or None.
         machine: whose detector is used otherwise.
@@ -535,6 +540,8 @@ def _panel(
 def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
     """Yield a warning if the flat image, valid for views of one distance, differs between
     views.
+
+    Differences up to 0.1 % pass; at most one text.
 
     Args:
         shape: (rows, cols).

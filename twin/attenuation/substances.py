@@ -119,6 +119,8 @@ class Substance:
     def __post_init__(self) -> None:
         """Check density and mass fractions, which must add up to 1.
 
+        The sum may be off by 0.002.
+
         Raises:
             LimitError: a value is not allowed.
             UnknownNameError: an element without tables.

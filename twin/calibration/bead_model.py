@@ -96,6 +96,8 @@ class BeadModel:
 def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
     """Make the bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm).
 
+    A bead model is returned as it is; the contrast comes from the phantom's scene.
+
     Raises:
         TwinError: it has no beads.
     """

@@ -73,8 +73,9 @@ class ExposureSettings:
 
 
 def ideal_response(machine: Machine) -> IdealResponse:
-    """Make the response of `machine`: at its own settings an open beam fills
-    3/4 of its depth."""
+    """Make the ideal response of `machine`: at the machine's own voltage, power and
+    exposure an open beam fills 3/4 of the detector's depth of bits.
+    """
     model = IdealResponse()
     tube = machine.tube
     scale = 2.0 ** (machine.detector.bits - model.bits)

@@ -158,8 +158,9 @@ class ScatterImage:
 
 
 def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
-    """Interpolate values at nodes, (v, u), at every pixel: cubic splines,
-    float32 (rows, cols)."""
+    """Interpolate values at nodes, (v, u), at every pixel: cubic splines (lower ones for
+    fewer than 4 nodes), float32 (rows, cols).
+    """
     from scipy.interpolate import RectBivariateSpline
 
     rows, cols = shape

@@ -68,6 +68,9 @@ def ordered(names: Sequence[str]) -> Ordered:
 def _numbered(names: list[str]) -> Ordered | None:
     """Check whether sorted names differ by a whole number of fixed width alone, without a gap.
 
+    A number next to a sign, point or exponent does not count; fewer than two names give
+    None.
+
     Args:
         names: sorted.
 

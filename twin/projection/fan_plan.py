@@ -108,6 +108,9 @@ def plan_fans(
 ) -> FanPlan:
     """Cut views into fans.
 
+    Views whose panel faces the source badly are not planned: `alone` lists them; level
+    views need no cut along rows.
+
     Args:
         views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the box.
         counts: (nx, ny, nz) voxels of the box.
@@ -340,8 +343,8 @@ def plan_turns(
 
 
 def _cuts(width: FloatArray) -> list[int]:
-    """List ends of runs of jobs that are at least MIN_UNIT_WIDTH wide; a remainder joins the
-    last run.
+    """List bounds of runs of jobs that are at least MIN_UNIT_WIDTH wide together,
+    beginning with 0; a remainder joins the last run.
     """
     cuts = [0]
     gathered = 0.0

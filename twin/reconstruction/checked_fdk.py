@@ -169,6 +169,9 @@ def checked_fdk(
 def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
     """List warnings about uniform regions that may deviate, or of which nothing is known.
 
+    At most one cause is told: accuracy unknown (no bias, voxels too large), a
+    contradiction, or what the accuracy warns of; empty if nothing.
+
     Args:
         bias: of the scan.
         grid: of the volume.

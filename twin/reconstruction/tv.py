@@ -155,8 +155,8 @@ def minimise_tv(
     with long_work.during("minimising total variation", progress) as advance:
 
         def minimise(problem: LinearSystem) -> Minimised:
-            """Minimise for a problem on the processor or on a device, with the regulariser
-            where the problem is.
+            """Minimise a problem on the processor or on a device, with the regulariser
+            copied to where the problem is.
             """
             there = isinstance(problem, DeviceProblem)
             kept = DeviceRegular.of_host(regular, problem.like) if there else regular

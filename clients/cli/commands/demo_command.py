@@ -286,8 +286,8 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
 def _reconstruct_preview(
     dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
 ) -> dict[str, object]:
-    """Reconstruct a small volume with the calibrated geometry into the file `out`; returns its
-    report.
+    """Reconstruct a small volume with the calibrated geometry into the file `out`; prints
+    the time and returns its report. The calibration must have a fit.
     """
     from flexdt.library.reconstruction.reconstruct import preview
 

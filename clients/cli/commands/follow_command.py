@@ -157,8 +157,8 @@ async def _run(
     seconds: float | None,
     beside: tuple[Path, FramesBeside] | None,
 ) -> None:
-    """Follow the scanner for some seconds, or until it ends, with a status line and images from
-    `beside`; raise the session's error.
+    """Follow the scanner for some seconds (None: without end), or until it ends, with a
+    status line and images from `beside`; raises the session's error, if it has one.
     """
     work = asyncio.create_task(session.run(address))
     more = [asyncio.create_task(_status(session))]

@@ -111,6 +111,8 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     def show(status: JobStatus) -> None:
         """Update the progress bar, and report why a job is paused.
 
+        A reason is shown once; only an own job raises.
+
         Raises:
             CommandError: the job is paused, and nobody else can resume it.
         """

@@ -90,8 +90,8 @@ def _size(text: str) -> tuple[float, float, float]:
 
 
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:
-    """Describe a phantom for `--json`: name, size_mm, beads, bead_radius_mm, description and
-    assumed.
+    """Describe a phantom for `--json`: name, size [mm], number of beads, their radii
+    [mm], description, and what is assumed of it.
     """
     return {
         "name": name,

@@ -128,6 +128,9 @@ class Gizmos:
     def _moved(self, handle: _Handle, event: Any) -> None:
         """Convert the handle's shift and turn to motor targets and pass them on.
 
+        Ignored before the drag has begun; only motors that the stage has get targets. The
+        turn takes the shorter way.
+
         Args:
             handle: being dragged.
             event: of viser, with its client.

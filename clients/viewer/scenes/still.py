@@ -86,6 +86,8 @@ def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
 def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
     """Make the shape of the panel's image, in front of the panel.
 
+    Reduced to the number of cells, two triangles each; not lit.
+
     Args:
         rgb: (rows, cols, 3); drawn as IMAGE_CELLS.
         world: place of the panel.
@@ -121,6 +123,9 @@ def drawn(
     shapes: Sequence[Shape], camera: Standpoint, size: tuple[int, int], dark: bool
 ) -> npt.NDArray[np.uint8]:
     """Draw the picture (height, width, 3), RGB.
+
+    Small pictures are drawn finer and averaged; the background is shaded from top to
+    bottom.
 
     Args:
         shapes: visible ones; the translucent ones are drawn over the others in their

@@ -120,6 +120,8 @@ class Fitted:
     def fits(self, camera: Standpoint, aspect: float) -> bool:
         """Check that a camera holds all points and wastes no room.
 
+        False as well if a point is behind it.
+
         Args:
             camera: its present place.
             aspect: the pane's width over its height.

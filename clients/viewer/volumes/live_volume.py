@@ -212,8 +212,8 @@ def grow(
             yield binned_mean(normalise(read_image(path, data.shape)), factor)[None]
 
     def progress(done: float) -> None:
-        """Report the number of images at most every TELL_S, with the surface at longer
-        intervals and at the end.
+        """Report the number of images at most every TELL_S seconds, with the surface
+        every `SURFACE_INTERVAL_S` and at the end; the end is always reported.
         """
         nonlocal told, drawn
         if done < 1.0 and time.monotonic() < told + TELL_S:
@@ -401,8 +401,8 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 
 
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
-    """Do work, and report an error of any kind as `problem`, so that the page does not wait for
-    ever.
+    """Do work, and report an error of any kind as `problem`, so that the page does not
+    wait for ever; unexpected errors with their type. Nothing is raised.
     """
     try:
         work()

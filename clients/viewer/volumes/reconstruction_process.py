@@ -60,8 +60,9 @@ class LiveReconstruction:
             self._spare = asyncio.create_task(_started())
 
     def grow(self, folder: Path, side: int, past: bool = False) -> None:
-        """Start to grow the volume of a data set; if that runs already, its last line
-        is sent again."""
+        """Start to grow the volume of a data set, ending another one; if the same runs
+        already, its newest line is sent again.
+        """
         asked = wish(folder, side, past)
         if asked == self._asked:
             if self.newest:

@@ -382,6 +382,8 @@ class Calibrate(_Table):
     def _known(self) -> Calibrate:
         """Check the names of free parameters, and the priors.
 
+        Returns the table itself.
+
         Raises:
             ValueError: an unknown name, or priors that do not fit.
         """

@@ -217,6 +217,8 @@ def _phantom(
 ) -> tuple[Phantom, dict[str, Any]]:
     """Draw an item's phantom as the plan says.
 
+    One by name, a cuboid with beads, or spheres (these with a generator of their own).
+
     Returns:
         The phantom, and the drawn values by name for the manifest.
     """
@@ -514,6 +516,8 @@ def _logarithm(
 
 def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     """Make images with spectrum, panel and noise, as counts or as line integrals.
+
+    Line integrals are of a noisy image and a noise-free open beam of the same pose.
 
     Args:
         plan: of the batch.

@@ -427,6 +427,8 @@ def timed(
 def plain(name: str, ms: float, what: str) -> Entry:
     """Make an entry of one time, without errors or peers.
 
+    All its errors are None, its peers empty; it has one view and the number of threads.
+
     Args:
         name: of the case.
         ms: time [ms].
@@ -499,6 +501,9 @@ def run_bench(
 
 def run_case(case: Case, contestants: Sequence[Peer]) -> Document:
     """Run one case: accuracy first, then all contestants turn by turn.
+
+    The entry has ms per view, errors of flexdt and peers against the exact images, ratios
+    to peers, the check of the reference, and ns per ray.
 
     Args:
         case: volume, views and detector.

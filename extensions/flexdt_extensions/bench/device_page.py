@@ -340,8 +340,9 @@ def why_no_astra() -> str | None:
 
 
 def astra_ms(volume: Volume, scan: ConeVec, algorithm: str) -> float | None:
-    """Measure ASTRA's time with its data on the device; None where it is missing
-    (`why_no_astra`)."""
+    """Measure ASTRA's time [ms] with its data on the device; None where ASTRA does not
+    load (`why_no_astra`). Raises GeometryError without a CUDA device.
+    """
     try:
         prepared = Resident(volume, scan, PANEL, algorithm)
     except ImportError:
@@ -355,6 +356,9 @@ def astra_ms(volume: Volume, scan: ConeVec, algorithm: str) -> float | None:
 def bound(volume: Volume, scan: ConeVec) -> float | None:
     """Compute the least possible time [ms]; None where the device's speed is unknown
     (simulator).
+
+    The larger of the time to read the volume at measured speed, and of the instructions
+    for all voxels passed.
 
     Args:
         volume: to read once.

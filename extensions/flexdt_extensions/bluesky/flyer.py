@@ -95,8 +95,9 @@ class FrameEvents(Device, EventCollectable):
         super().__init__()
 
     async def describe_collect(self) -> dict[str, DataKey]:
-        """Describe an event: angle of the stage in mid-exposure, and planned start of
-        the exposure."""
+        """Describe an event: angle of the stage in mid-exposure [deg], and planned start
+        of the exposure [s].
+        """
         flyer = self._flyer()
         source = flyer.source("script.check")
         return {

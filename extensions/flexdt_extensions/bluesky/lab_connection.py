@@ -92,6 +92,8 @@ class LabConnection:
     async def connect(self) -> None:
         """Connect, once.
 
+        Fetches a state and starts to listen; does nothing while it listens.
+
         Raises:
             ConnectionLost: no server answers.
             RpcError: the server refuses the client.

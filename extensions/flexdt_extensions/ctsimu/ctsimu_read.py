@@ -119,6 +119,9 @@ class ScenarioReader:
     def geometry(self) -> ScanGeometry:
         """Compute the geometry of the scenario's frames, known and real.
 
+        Geometry is that known to reconstruction; the real one is kept beside it, None if
+        both are the same.
+
         Returns:
             Views of the binned pixels in the stage's frame; a note where known and real
             differ.

@@ -698,8 +698,8 @@ class _ScanReader(ScenarioReader):
         return "unsharpness"
 
     def _reference(self, name: str) -> Reference:
-        """Read how dark or flat images are taken: number, averages, and whether they are ideal
-        and correct the projections.
+        """Read how dark or flat images are taken: number (at least 1 if they correct the
+        projections), averages, and whether they are ideal and correct the projections.
         """
         at = ("acquisition", name)
         correction = self._flag(*at, "correction")

@@ -275,6 +275,8 @@ class ScenarioImages:
     def _blur(self, image: Float32Array) -> Float32Array:
         """Apply the detector's blur, a Gaussian or the file's MTF.
 
+        Edges are continued outwards; frequencies beyond the file's are removed.
+
         Args:
             image: (rows, cols), unbinned.
 

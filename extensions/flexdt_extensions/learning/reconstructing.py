@@ -219,8 +219,8 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return volume, work
 
     def _observe(self) -> Observation:
-        """Return the observation (13,), from 0 to 1: views, photons, attempts left, and the
-        last attempt.
+        """Return the observation (13,), clipped to 0 to 1: number of views, photons
+        (logarithmic), attempts left, and ten figures of the last attempt.
         """
         low, high = (math.log(p) for p in PHOTONS)
         head = [

@@ -254,8 +254,9 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.asarray(worth - self.time_weight * seconds)
 
     def _observe(self) -> Observation:
-        """Return the last projection as grey values, or the state as a vector from -1 to 1:
-        angle, place, frames left, time, the task's state and the sectors seen.
+        """Return the last projection as grey values (rows, cols, 1), or the state as a
+        vector clipped to -1 to 1: sine and cosine of the angle, places, frames left,
+        time, the task's state and the sectors seen.
         """
         if self._shows:
             return self._grey()[..., None]
@@ -285,8 +286,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.asarray(np.clip(image * (255.0 / 3.0), 0.0, 255.0), dtype=np.uint8)
 
     def _info(self, worth: float, seconds: float) -> dict[str, Any]:
-        """Return the step's figures: worth, frames, seconds, clock_s, dose, collision (False),
-        and those of the task.
+        """Return the figures of a step of `worth` and `seconds`: worth, frames, seconds,
+        clock_s, dose, collision (always False here), and those of the task.
         """
         return {
             **self.task.info(),

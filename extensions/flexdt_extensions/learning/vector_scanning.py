@@ -343,6 +343,9 @@ class ScanVectorEnv(SyncVectorEnv):
     ]:
         """Run one step of each environment.
 
+        Frames that can be taken ahead are solved together first; environments that are
+        reset by this step have none.
+
         Args:
             actions: (num_envs,), one of 36 angles each.
 

@@ -243,6 +243,8 @@ def forecast(
 ) -> BeadForecast:
     """Compute the predicted uncertainties, touching spots left out.
 
+    Returns sigmas of parameters and of image quantities, score, and share of spots used.
+
     Args:
         model: the beads.
         planned: the scans.
@@ -419,6 +421,8 @@ def _random_set(
     table: SeatTable, rules: _Rules, count: int, rng: np.random.Generator
 ) -> npt.NDArray[np.int64]:
     """Draw seats for `count` beads that the rules allow together; returns their numbers.
+
+    Each is drawn among the seats that are left.
 
     Raises:
         TwinError: no seat is left for a bead.

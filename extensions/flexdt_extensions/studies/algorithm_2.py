@@ -84,6 +84,8 @@ class Algorithm2(Iterated):
 def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
     """Run Algorithm 2.
 
+    Impossible geometries have infinite residuals.
+
     Args:
         problem: tracks with known identities and the free parameters (beads fixed).
         lam: initial damping; 0 is Gauss-Newton and stays 0.

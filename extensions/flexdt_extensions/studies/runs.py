@@ -393,6 +393,8 @@ def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, ob
 def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
     """Compute the mean MAE over scenarios.
 
+    Runs without errors are left out.
+
     Returns:
         Settings, numbers of projections, and (settings, counts) means; nan without runs.
     """

@@ -187,8 +187,8 @@ def _solve_by_fit(draw: _Draw) -> _Found:
 
 
 def _solve_unidentified(draw: _Draw) -> _Found:
-    """Identify a draw's points in random order, and fit to them; offsets are None if they stay
-    ambiguous.
+    """Identify a draw's points in random order, and fit to them; returns offsets and
+    iterations, (None, 0) if they stay ambiguous.
     """
     # Points in random order, as if detected.
     seen = [

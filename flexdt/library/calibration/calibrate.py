@@ -133,6 +133,9 @@ class Outcome(Generic[Images_co]):
     def correction(self) -> NamedCorrection:
         """The correction, for `DataSet.with_correction` and `calibration.apply`.
 
+        It is named by the present time (UTC), with parameters and the panel's distortion
+        and lag, if any.
+
         Raises:
             TwinError: the calibration is not to be used.
         """
@@ -555,6 +558,9 @@ def settling_commands(finding: Finding) -> Sequence[str]:
 
 def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> str:
     """Return one sentence on use, and one on the limit of the calibration.
+
+    Not to be used: with the first error, weak direction or lack of a fit. The second
+    sentence is left out if no length was asked for.
 
     Args:
         result: of a calibration.

@@ -258,6 +258,8 @@ def write_geometry(geometry: ScanGeometry, out: str | PathLike[str], format: str
 def save_geometry(geometry: ScanGeometry, out: str | PathLike[str]) -> None:
     """Write a geometry file: .json (everything) or .npy (cone_vec alone).
 
+    The file appears only when complete.
+
     Raises:
         ExchangeError: another ending.
     """

@@ -100,6 +100,8 @@ def _write_rtk(geometry: ScanGeometry, out: Path) -> Content:
 def _read_rtk(path: Path, given: Given) -> ScanGeometry:
     """Read a geometry of RTK, with the pitch and shape of `given`.
 
+    The pitch [mm] is not in RTK's file.
+
     Raises:
         ExchangeError: the file is invalid, or the pitch unknown.
     """

@@ -66,6 +66,8 @@ def text_of(path: Path) -> str:
 def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
     """Read the arrays of an .npz by name, or the array of an .npy as `array`.
 
+    Pickled objects are not read.
+
     Raises:
         ExchangeError: it is no such file.
     """

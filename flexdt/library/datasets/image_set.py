@@ -312,6 +312,9 @@ class ImageSet:
     ) -> Float32Array | Self:
         """Return line integrals (rows, cols) of one projection, or the data set of several.
 
+        Several keep dark and flat images, warnings and, where it can be selected, the
+        truth; an empty selection keeps the shape.
+
         Args:
             index: of a projection, or a slice or indices of several.
         """
@@ -490,6 +493,8 @@ class ImageSet:
     @cached_property
     def flat(self) -> Float32Array:
         """Mean of the flat images, (rows, cols).
+
+        Dark is not subtracted.
 
         Raises:
             DatasetMissingError: there is no flat image.

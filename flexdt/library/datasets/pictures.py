@@ -50,8 +50,8 @@ def round_length(most: float) -> float:
 def windowed(
     image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """Convert an image to 8 bits: percentiles, of `like` if given, to black and white;
-    NaN is black.
+    """Convert an image to 8 bits: the percentiles of the finite values, of `like` if
+    given, become black and white; NaN is black. All black if they are equal.
     """
     seen = image if like is None else like
     seen = seen[np.isfinite(seen)]
@@ -68,7 +68,7 @@ def coloured(
     grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]
 ) -> npt.NDArray[np.uint8]:
     """Draw the marked pixels of a grey picture (rows, cols) in colour, (rows, cols, 3)
-    red first.
+    red first; later marks over earlier ones, those of outermost pixels as a band.
     """
     picture = np.repeat(grey[:, :, None], 3, axis=2)
     values = np.asarray(marks, dtype=np.uint8)

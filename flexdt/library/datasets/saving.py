@@ -144,6 +144,8 @@ def _read_note(path: Path) -> Mapping[str, object]:
 def stated_settings(data: ImageSet) -> ScanSettings | None:
     """Return the settings in the scanner's texts of a data set in memory.
 
+    Tube and camera figures are None where the data set does not know them.
+
     Returns:
         None where they cannot express its geometry: they have one circle in the plane of
         the sample's reference point, with equal steps and an upright panel of square

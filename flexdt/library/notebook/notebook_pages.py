@@ -116,6 +116,9 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
 def data_page(data: ImageSet) -> NotebookPage:
     """Show the projections of a data set behind a slider, and the sinogram of its middle row.
 
+    At most `MOST_PICTURES` images, all in one grey window. Raises TwinError without
+    projections.
+
     Args:
         data: line integrals are shown, or counts where there is no flat image.
 
@@ -268,6 +271,8 @@ class _Drawing:
 
     def view(self, cone_vec: ConeVec, index: int) -> str:
         """Draw one view: source, central ray and panel.
+
+        Without a panel's shape the panel is a point.
 
         Args:
             cone_vec: all views.

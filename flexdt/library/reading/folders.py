@@ -496,6 +496,8 @@ def _require_one_each(content: Folder) -> None:
 def _require_one_circle(content: Folder) -> None:
     """Check that the scan has one circular section; others need flexdt.json.
 
+    Nothing is checked if the texts are missing or cannot be read.
+
     Raises:
         DatasetFormatError: the texts state more than one section.
     """

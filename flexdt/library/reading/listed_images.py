@@ -168,6 +168,8 @@ def nothing_in(blank: Sequence[str]) -> str:
 def markers_alone(geometry: ConeVec, name: str) -> DataSet:
     """Make a data set without images: geometry for markers.
 
+    Its frames are named views and marked as missing.
+
     Raises:
         TwinError: the geometry does not state the detector's size.
     """

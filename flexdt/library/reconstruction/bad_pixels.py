@@ -49,6 +49,8 @@ def _bad_pixels(
 ) -> BadPixels | None:
     """Find pixels that differ from their neighbours in all views.
 
+    For a panel on its side rows and columns are exchanged meanwhile.
+
     Args:
         dataset: with its flat image.
         cone_vec: of all views.

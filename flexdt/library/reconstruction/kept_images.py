@@ -63,6 +63,8 @@ class ImagesOnDisk:
     def put(self, number: int, image: Float32Array) -> None:
         """Keep an image, as `ImagesInMemory.put`.
 
+        An image kept under this number before is overwritten.
+
         Raises:
             OSError: it cannot be written; names the folder.
         """
@@ -77,6 +79,8 @@ class ImagesOnDisk:
 
     def get(self, number: int, rows: slice = ALL_ROWS) -> Float32Array:
         """Return rows of a kept image, as `ImagesInMemory.get`.
+
+        Raises KeyError for a number that was not kept.
 
         Raises:
             OSError: it cannot be read; names the folder.
@@ -134,8 +138,10 @@ class CountsOnce:
         return self._looked_at[index]
 
     def __getitem__(self, index: int) -> Counts:
-        """Return counts and hold them until two others have been read: a lag takes the frame
-        before."""
+        """Return counts of an image, and hold the newest two images, as a correction of
+        detector lag takes the frame before; images looked at earlier are not read
+        again.
+        """
         if index not in self._latest:
             counts = self._looked_at.pop(index, None)
             newest = list(self._latest.items())[-1:]

@@ -815,6 +815,8 @@ def _source(
 ) -> tuple[float, TubeModel, float | None]:
     """Return voltage, tube and single energy, as requested or as the data set names them.
 
+    The request is taken first; single energy only from its tube.
+
     Raises:
         LimitError: neither states the voltage.
         TwinError: the data set's images have no beam hardening.

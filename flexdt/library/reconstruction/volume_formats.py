@@ -143,6 +143,8 @@ def _write_headed(
 ) -> Callable[..., Iterator[Sink]]:
     """Return a writer of a header and the values after it.
 
+    The file gets its path only when complete.
+
     Args:
         header: makes the header of a volume.
         compress: by gzip.

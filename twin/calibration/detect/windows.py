@@ -72,6 +72,9 @@ class Windows:
 def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
     """Plan windows around the expected spots of all beads.
 
+    All windows have one odd side, for the largest spot; spots that touch are crowded, and
+    only complete, uncrowded ones are `whole`.
+
     Args:
         model: the beads.
         cone: geometry of the n frames, as well as it is known.

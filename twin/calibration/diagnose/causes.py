@@ -153,6 +153,8 @@ class Candidates:
         """Tabulate the residuals' derivatives with respect to all causes, residuals of bad
         spots weighted less.
 
+        Nothing is judged yet; the last rows are of motions.
+
         Args:
             fit: of the geometry.
             known: statements on the phantom and the positions.

@@ -270,6 +270,8 @@ def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
 def _without_bad_frames(found: Identification) -> Identification:
     """Drop single frames that the others contradict from an assignment.
 
+    Returned unchanged without such frames, or if they are more than a fifth.
+
     After the fit they are listed; they do not suggest another phantom.
     """
     seen = (found.index >= 0).sum(axis=1)
@@ -490,6 +492,9 @@ def _in_parts(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> Finding | None:
     """Check whether the first or the last frames alone fit the phantom.
+
+    Tried are halves, thirds and quarters until both ends fit. One end that fits: frame
+    numbers; both: a turn or drift between them.
 
     Args:
         detections: spots of each frame.

@@ -146,8 +146,8 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
 
 
 def judge_offsets(fit: FitResult) -> Finding | None:
-    """Judge whether the fitted place is within the possible errors of mount and motors; an
-    error if not, else None.
+    """Judge whether the fitted place is within the possible errors of mount and motors:
+    an error if `dO_z` of some group exceeds a share of the SOD, else None.
     """
     sod = float(np.median(fit.problem.poses.sod))
     for parameters in fit.group_parameters:

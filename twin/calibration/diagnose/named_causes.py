@@ -43,6 +43,8 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
     """Report the causes of a fit as findings: certain ones by name, doubtful ones together with
     their rivals.
 
+    Empty if there is none. Rivals of a strained phantom are named in its own finding.
+
     Args:
         fit: with the causes as columns.
         plain: without them.
@@ -80,6 +82,8 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
 def _strained(found: Found) -> Finding | None:
     """Make the warning on the phantom's shape, apart from its scale, which images do not
     determine.
+
+    Only parts beyond `SIGNIFICANT` sigmas are named, the largest.
 
     Args:
         found: the causes, with mean and covariance of the strain.

@@ -350,6 +350,9 @@ def widened(
 ) -> Certificate:
     """Add a covariance to a certificate.
 
+    A covariance widens the images' share of each sigma too, a mapping (of systematic
+    errors) does not. Intervals are 95 %.
+
     Args:
         certificate: of a fit.
         more: (p, p) covariance that the images leave open, edge units; or column -> its

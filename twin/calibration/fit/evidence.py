@@ -69,6 +69,8 @@ class Table:
     ) -> Judged | None:
         """Judge a model; None if its columns are not separable.
 
+        The noise is estimated along, in at most `PASSES` rounds.
+
         Args:
             columns: that it has.
             widths: (c,) standard deviations of their priors; inf without one.

@@ -585,6 +585,8 @@ def fit_geometry(*args: Any, **options: Any) -> FitResult:
 def require_identifiable(result: FitResult) -> FitResult:
     """Return `result` if every parameter is determined.
 
+    The message lists the open directions.
+
     Raises:
         NotIdentifiableError: otherwise; data has rank, parameters and the directions.
     """

@@ -699,6 +699,8 @@ def curvature(
 def frame_shapes(shape: Shape, frames: int) -> FloatArray:
     """Return the detector (rows, cols) of each frame, (n, 2).
 
+    None: the default machine's.
+
     Raises:
         TwinError: `shape` is neither (2,) nor (n, 2).
     """

@@ -371,6 +371,8 @@ class ConjugateRays:
     def profile(self, values: FloatArray) -> Profile | None:
         """Read the distance between both ends of rays at each distance from the axis.
 
+        Bins with too little correlation are left out.
+
         Args:
             values: parameters in the order of `circular_scan.FREE`, (k,).
 

@@ -95,6 +95,8 @@ class _System:
     def __init__(self, pairs: PlanePairs, at: FloatArray, shifts: FloatArray) -> None:
         """Set up the normal equations of shifts of all frames.
 
+        A weak prior about no shift keeps them solvable.
+
         Args:
             pairs: of views.
             at: parameters of the geometry.

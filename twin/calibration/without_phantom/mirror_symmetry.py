@@ -330,6 +330,9 @@ class _MirrorPairs:
     def __init__(self, level: _Level, here: FloatArray, at: FloatArray) -> None:
         """Mirror places and read both ends, their weights and slopes.
 
+        Weights are less where noise, or steps between panel parts, are larger; odd
+        polynomials are taken out of the slopes.
+
         Args:
             level: smoothed images.
             here: (p,) parameters of the geometry.

@@ -127,8 +127,11 @@ class OppositeRays:
             )
 
     def first(self) -> tuple[FloatArray, float]:
-        """Find the parameters about which rays agree best, and their ratio to the next
-        best column; see `first_column`.
+        """Find the start parameters, with the axis column about which opposite rays agree
+        best, and the ratio of its disagreement to the next best column's; see
+        `first_column`.
+
+        Columns within `REACH` of the start are tried.
         """
         cols = self.shape[1]
         level = _Level(self, cols / LEVELS[0])

@@ -165,8 +165,9 @@ class TurnPlanes:
         return self._as_motion(find_shifts(self._pairs(1), at, angle, random))
 
     def _as_motion(self, shifts: Shifts) -> Motion:
-        """Convert shifts on the detector into motions of the object, `dO_x` and `dO_y` [mm], of
-        all frames.
+        """Convert shifts on the detector [px] into motions of the object, `dO_x` and
+        `dO_y` [mm], of all frames; frames that were not used get motion 0 and the
+        shifts' rms as sigma.
         """
         pose = self.poses[self.sorted[:1]]
         scale = self.factor * float(pose.sod[0] / pose.sdd[0])

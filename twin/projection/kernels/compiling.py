@@ -128,8 +128,8 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 @contextmanager
 def _linking(codegen: Any) -> Iterator[None]:
-    """Link all libraries made within the context, except existing ones, under numba's
-    compiler lock.
+    """Link all libraries made within the context to one another, except existing ones,
+    under numba's compiler lock; nothing within another such context.
     """
     if "_library_class" in vars(codegen):
         yield

@@ -554,8 +554,8 @@ def settle(rays, work, n):
 
 @inline
 def share_out(rays, work, n):
-    """Sum the values of the rays in each level, which are added to the voxels of that
-    level.
+    """Sum the rays' values and their first moments in each level, in place in `work`, to
+    be added to the voxels of that level.
     """
     acc, ratio, level = rays.acc, rays.ratio, rays.level
     total, moment = work.total, work.moment

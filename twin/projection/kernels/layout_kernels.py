@@ -81,8 +81,9 @@ SIZE_BITS, INFINITE = np.uint32(0x7FFFFFFF), np.uint32(0x7F800000)
 
 @parallel
 def unfit_parts(bits):
-    """Count the runs of `CHECKED` float32 numbers, given as uint32, with one that is not
-    finite."""
+    """Count the runs of `CHECKED` float32 numbers, given as uint32 bits, in which any is
+    not finite; 0 if all are finite.
+    """
     runs = (bits.size + CHECKED - 1) // CHECKED
     unfit = 0
     for run in prange(runs):

@@ -32,7 +32,7 @@ from flexdt.twin.projection.kernels.fan_types import Box
 @inline
 def clip(s, d, n, enter, leave):
     """Cut [enter, leave] down to the t where s + t d is in [0, n]; (1, 0) if there are
-    none.
+    none. With d 0, s = n lies outside.
     """
     if d != 0.0:
         a, b = -s / d, (n - s) / d

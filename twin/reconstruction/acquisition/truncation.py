@@ -90,8 +90,8 @@ class Prism:
         return cls(x[:2] * field, to_disc, float(np.exp(x[5])))
 
     def integrals(self, source: FloatArray, rays: FloatArray) -> FloatArray:
-        """Compute line integrals (...) in the plane, of `rays` (..., 2) from `source`
-        (..., 2) [mm].
+        """Compute line integrals (...) of the prism in the plane of rotation, of `rays`
+        (..., 2) from `source` (..., 2) [mm]; 0 for rays that miss it.
         """
         start = (source - self.centre) @ self.to_disc.T
         along = rays @ self.to_disc.T
@@ -361,6 +361,9 @@ def _fit_truncation(
     helix: bool,
 ) -> Truncation | None:
     """Fit the object beyond the edges of upright panels; see `truncation_of`.
+
+    Returns None without an open beam's opposite: if no view is cut off at an edge that
+    counts, or the images show nothing. A helix gets no prisms.
 
     Args:
         images: line integrals of some views.

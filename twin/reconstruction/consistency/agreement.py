@@ -189,6 +189,9 @@ class Comparison:
     def undecided(self, claimed: float) -> Contradiction | None:
         """Find an explanation that fits as well and would change the volume.
 
+        None if the scan is truncated or no rival has too little evidence against it. The
+        result's `change` is None where the rival is clearly better.
+
         Args:
             claimed: largest relative error that is claimed of nine of ten uniform regions.
         """

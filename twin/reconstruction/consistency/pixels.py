@@ -329,8 +329,8 @@ class _Usual:
         self._largest: list[Float32Array] = []
 
     def add(self, square: Float32Array) -> None:
-        """Add one image of squares (rows, cols) to the sum, and keep the largest values of each
-        pixel apart.
+        """Add one image of squares (rows, cols) to the sum, and keep the largest values
+        of each pixel apart: one more for every `VIEWS_AN_OUTLIER` images.
         """
         self.count += 1
         if self._total is None:
@@ -388,6 +388,8 @@ def _neighbours_range(view: Float32Array) -> Float32Array:
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
     """Compute the distance of pixels above or below all but one neighbour in the row.
+
+    0 for pixels within them; towards the ends of a row slopes are continued.
 
     One neighbour may be bad as well. Returns (rows, cols).
     """

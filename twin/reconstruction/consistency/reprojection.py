@@ -95,8 +95,9 @@ class Reprojection:
 
     @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean squares of residual, images and noise: of the values, and of their changes,
-        (2,)."""
+        """Mean squares (2,) of residual, images and noise: first of the values, then of
+        their changes from view to view; noise is estimated from neighbours.
+        """
         rest = self.again - self.images
         # Differences between neighbours in both are the object's.
         noise = NOISE_VARIANCE_RATIO * max(

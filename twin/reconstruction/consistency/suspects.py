@@ -114,8 +114,8 @@ def moved(cone_vec: ConeVec, along: float, down: float = 0.0) -> ConeVec:
 
 
 def _orders(scan: CoarseScan) -> Iterator[Suspect]:
-    """Yield scans whose images belong to other angles: in another order, or over half or twice
-    the span.
+    """Yield suspected scans whose images belong to other angles: in another order, or
+    over half or twice the span; each with its views turned.
     """
     angle = scan.circle.angle
     count = len(angle)
@@ -132,7 +132,8 @@ def _orders(scan: CoarseScan) -> Iterator[Suspect]:
 
 def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp], str]]:
     """Yield kinds of orders, the view whose angle each image has, (n,), and a
-    description.
+    description: interlaced passes and names for steadily growing angles, else sorted
+    angles ("listed").
     """
     count = len(angle)
     listed = np.arange(len(angle))

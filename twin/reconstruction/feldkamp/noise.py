@@ -106,6 +106,8 @@ class NoiseMeter:
     def __init__(self, like: Volume, circle: Circle, table: FloatArray) -> None:
         """Make a coarse grid in which views are added with alternating signs.
 
+        By angle the signs alternate; the last of an odd number has sign 0.
+
         Args:
             like: the volume's grid.
             circle: of the sources.
@@ -135,8 +137,8 @@ class NoiseMeter:
         self._response: FloatArray = np.zeros(0)
 
     def note(self, views: Views) -> Float32Array:
-        """Record values and positions of views; returns each one's sign in the
-        alternating sum, (n,).
+        """Record values and positions of the next views in their order; returns each
+        one's sign in the alternating sum, (n,).
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -153,8 +155,9 @@ class NoiseMeter:
         return signs
 
     def add(self, views: Views, columns: Float32Array) -> None:
-        """Add views whose filtered columns are at hand, (n, cols, rows); the columns are
-        lost."""
+        """Add the next views by their filtered columns (n, cols, rows) to the alternating
+        volume; `columns` are overwritten.
+        """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         signs = self.note(views)

@@ -77,6 +77,8 @@ def room_of(machine: Machine) -> Room:
 def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
     """Compute the box of all that the machine's drawn parts reach over their travel.
 
+    A part that turns is taken at any angle about z.
+
     Args:
         machine: with axes and components.
 
