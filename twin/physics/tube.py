@@ -80,6 +80,8 @@ class TubeModel:
     def of_figures(cls, figures: Mapping[str, float]) -> TubeModel:
         """Make the tube that `figures` describe; the default tube if they do not.
 
+        "Do not": they lack the smallest spot. Without a number of spot points it is 1.
+
         Args:
             figures: name -> number, as `figures` of a data set has them.
         """
@@ -181,6 +183,8 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
 
 def monochromatic(energy_keV: float) -> Spectrum:
     """Make a spectrum with all photons in the bin that holds `energy_keV`.
+
+    Its fluence there is one photon.
 
     Raises:
         LimitError: outside the tables.

@@ -48,6 +48,9 @@ def distance_findings(
 ) -> Iterator[Finding]:
     """Refuse distances and pixels that no scanner has.
 
+    Yields (does not raise) at most one refusal: wrong distances, wrong pixels, or pixels
+    too large for the distance.
+
     Args:
         sod, sdd: source to axis and to panel [mm].
         pixel: pitches [mm].

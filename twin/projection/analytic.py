@@ -260,6 +260,8 @@ class TriangleMesh:
     def __post_init__(self) -> None:
         """Check the mesh and store its vertices and faces as read-only arrays.
 
+        The arrays are copies.
+
         Raises:
             GeometryError: wrong shapes, a face with an unknown vertex, or a mesh that is not
                 closed.

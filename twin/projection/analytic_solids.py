@@ -288,6 +288,9 @@ def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArr
 def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
     """Compute the corner points of an intersection of half-spaces, (m, 3) [mm].
 
+    Also raised for fewer than four half-spaces, or if numbers of normals and offsets
+    differ.
+
     Raises:
         GeometryError: a normal is not of unit length, or the half-spaces enclose no
             bounded solid.

@@ -62,6 +62,9 @@ def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, boo
 def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True) -> None:
     """Fill out (n, rows, cols) with line integrals.
 
+    Views on their side are walked with rows and columns exchanged; those that no fan
+    fits, ray by ray.
+
     Args:
         box: the volume.
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.

@@ -106,8 +106,8 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
-        """Compute gradients with respect to the volumes and to the rows of cone_vec; None where
-        none is needed.
+        """Compute gradients with respect to the volumes and to the rows of cone_vec, None
+        where none is needed, and None for the operator.
         """
         x, rows = ctx.saved_tensors
         if ctx.needs_input_grad[0]:
@@ -138,8 +138,8 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
-        """Compute gradients with respect to the images and to the rows of cone_vec; None where
-        none is needed.
+        """Compute gradients with respect to the images and to the rows of cone_vec, None
+        where none is needed, and None for the operator.
         """
         y, rows = ctx.saved_tensors
         if ctx.needs_input_grad[0]:
@@ -159,8 +159,9 @@ class _ByRows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
-        """Compute the gradient of the images' inner product with `y` with respect to cone_vec,
-        (n, 12), summed over the batch.
+        """Compute the gradient of the images' inner product with `y` with respect to
+        cone_vec, (n, 12), summed over the batch; on the processor, returned on the
+        device of `rows`.
         """
         cone_vec = _cone_vec(rows)
         total = np.zeros((len(rows), 12))

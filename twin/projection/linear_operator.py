@@ -153,6 +153,9 @@ class Operator:
         """Compute line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm] or of a
         volume.
 
+        Tensors are projected with gradients, and arrays in batches. Raises GeometryError
+        for a volume on another grid.
+
         Those of a `DeviceVolume` stay on the device.
         """
         if isinstance(x, (Volume, DeviceVolume)):

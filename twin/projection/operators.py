@@ -502,6 +502,8 @@ def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
 def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32Array:
     """Return `out` if it fits, or a new array if it is None.
 
+    The new array is not initialised.
+
     Raises:
         GeometryError: out has another shape, type or memory order.
     """

@@ -223,6 +223,8 @@ class Polychromatic:
 def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
     """Check that there are materials, and that a volume separates them.
 
+    Apart are attenuations `mu` that differ by the share `APART`.
+
     Raises:
         LimitError: it does not.
     """

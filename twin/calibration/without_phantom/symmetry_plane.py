@@ -234,6 +234,9 @@ def _first_in_rays(
 ) -> FirstColumn:
     """Search for the axis in opposite rays.
 
+    Roll, yaw and the distances have the given priors; the axis column has none. Sets the
+    roll's scale of `scan.scales` by the columns.
+
     Args:
         scan: to align.
         no_turn: why there is no turn; the messages of errors begin with it.
@@ -346,6 +349,8 @@ def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
 
 def _require_symmetric(found: Symmetry, preface: str) -> None:
     """Check that a plane was found, and that the images are symmetric about it.
+
+    They are allowed an asymmetry of `MOST_ASYMMETRY` of the mean.
 
     Raises:
         NotIdentifiableError: they are not.

@@ -157,8 +157,9 @@ class _EntryPoint(_Linked):
     silent = False
 
     def _compile_core(self) -> Any:
-        """Compile the function into a cacheable library of its own, with a progress line; the
-        first time, log that it takes long.
+        """Compile the function into a cacheable library of its own, with a progress line;
+        returns its compiled result. The first time in this process a warning logs that
+        it takes long.
         """
         name = self.state.func_id.func_name
         if not _EntryPoint.silent:

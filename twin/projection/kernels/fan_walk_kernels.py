@@ -69,8 +69,8 @@ def mix(out, right, left, right_before, left_before):
 
 @inline
 def part_of(rays, first, last):
-    """Select the arrays that the correction at a vertex changes, of rays first to last -
-    1 of a sorted fan.
+    """Select the arrays that the correction at a vertex changes (acc, weight, tilt,
+    level, picked), as views, of rays first to last - 1 of a sorted fan.
     """
     some = slice(first, last)
     return (
@@ -149,8 +149,8 @@ def levels_between(grid, fan, t0, t1):
 
 @inline
 def difference(flat, grid, j, i, a, b):
-    """Compute level a minus level b in voxel column (l = i, t = j); 0 outside. Level k + 1 is
-    voxel z = k.
+    """Compute level a minus level b in voxel column (l = i, t = j); 0 for a column
+    outside, and levels outside count as 0. Level k + 1 is voxel z = k.
     """
     if i < 0 or i >= grid.nl:
         return ZERO
@@ -271,8 +271,8 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
 
 @inline
 def add_pair(flat, grid, j, i, a, b, value):
-    """Apply the transpose of `difference`, with its arguments: add value to level a, subtract
-    it from level b.
+    """Apply the transpose of `difference`, with its arguments: add value to level a of
+    `flat`, subtract it from level b; outside nothing is changed.
     """
     if i < 0 or i >= grid.nl:
         return

@@ -230,6 +230,8 @@ class Sharing:
     def table(self, views: slice, rows: tuple[int, int]) -> Float32Array:
         """Compute the shares of rows at each depth.
 
+        Shares of a voxel's rays from several turns of a helix add up to 1.
+
         Args:
             views: a slice of the views, n of them.
             rows: first row, and the one after the last; rows off the panel repeat its edge.

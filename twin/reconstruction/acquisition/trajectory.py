@@ -336,11 +336,10 @@ def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
 
 
 def _check_covered(circle: Circle, widest: float) -> None:
-    """Check that the lines which gaps leave out, up to an angle of the fan, are seen from
-    behind.
+    """Check that the lines which arcs without views ("gaps") leave out, up to an angle of
+    the fan, are seen from the opposite side.
 
-    Raises:
-        GeometryError: some are not.
+    Raises: GeometryError: some are not; names the arcs and the span that is needed.
     """
     if _unseen(circle.gaps, widest) > 1e-6:
         covered = TURN - float(np.diff(circle.gaps).sum())

@@ -284,6 +284,9 @@ def truncation_of(
 ) -> Truncation | None:
     """Estimate the object beyond the panel's edges from some views of a scan.
 
+    Repeated angles are averaged, and tilted panels rectified. A panel moved to one side
+    may hide an object beyond its far edge: then `beyond` is set.
+
     Args:
         image: gives the line integrals of a view, (rows, cols), by its number.
         cone_vec: of all views.
@@ -334,6 +337,8 @@ def truncation_of(
 def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
     """Check whether some columns of the views show more than noise.
 
+    Smoothed by blocks; noise is estimated from the same images.
+
     Args:
         images: n views (rows, cols).
         there: (n, cols) the columns to check.
@@ -362,8 +367,8 @@ def _fit_truncation(
 ) -> Truncation | None:
     """Fit the object beyond the edges of upright panels; see `truncation_of`.
 
-    Returns None without an open beam's opposite: if no view is cut off at an edge that
-    counts, or the images show nothing. A helix gets no prisms.
+    Returns None if both edges show an open beam, or no band of rows is cut off at an
+    edge that counts. Bands of a helix, and even ones, get no prism.
 
     Args:
         images: line integrals of some views.

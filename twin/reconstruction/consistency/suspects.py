@@ -151,6 +151,8 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
 def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
     """Compute where the source's foot on the axis falls, from the middle of the panel.
 
+    Averaged over about eight views.
+
     Returns:
         offset along rows and down columns, over all views [coarse pixels].
     """

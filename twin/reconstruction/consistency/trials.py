@@ -272,8 +272,8 @@ def _turned_onto(values: Float32Array, other: Float32Array) -> Float32Array:
 
 
 def _around(values: Float32Array) -> FloatArray:
-    """Sample the mean layer on circles about its middle, (radii, angles), weighted by
-    their lengths.
+    """Sample the mean layer on circles about its middle, (radii, TURN_STEPS), weighted by
+    the roots of their lengths.
     """
     from scipy.ndimage import map_coordinates
 

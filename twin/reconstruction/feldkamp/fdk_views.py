@@ -89,6 +89,8 @@ class Views:
         """Compute the prisms' share of rows beyond the panel's edges, (n, bands, columns)
         [1/mm].
 
+        Empty (0 bands) without prisms.
+
         See `truncation_kernels.prism_lengths`.
         """
         from flexdt.twin.reconstruction.kernels import truncation_kernels

@@ -171,6 +171,9 @@ class NoiseMeter:
     def _points(self) -> tuple[FloatArray, FloatArray]:
         """Place points on a spiral about the centre.
 
+        Radii grow geometrically from a quarter of a pixel's size at the axis to the
+        grid's corner; the first is 0.
+
         Returns:
             Radii (POINTS,) and places (POINTS, 2) [mm].
         """
