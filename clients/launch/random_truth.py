@@ -44,6 +44,8 @@ def write(truth: Mapping[str, float], path: Path) -> None:
 def read(path: Path) -> dict[str, float]:
     """Read a truth file.
 
+    All problems of the file are in one error.
+
     Args:
         path: of a TOML file, parameter = value.
 

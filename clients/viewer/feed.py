@@ -118,8 +118,10 @@ class ImageFeed:
             self._due.set()
 
     async def _work(self) -> None:
-        """Take each new image coarse at once, and in full once no other follows within
-        `SETTLE_S`. Runs until cancelled; an image that cannot be shown is logged.
+        """Take each new image coarse at once, and once more in full when no other follows
+        within `SETTLE_S` seconds.
+
+        Runs until cancelled; an image that cannot be shown is logged, once until one can.
         """
         shown_coarse = False
         sound = True

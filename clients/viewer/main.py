@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 async def run(options: ViewerSettings, out: TextIO) -> int:
     """Serve until SIGTERM or SIGINT, or until an essential part has failed.
 
+    `FAILED` if such a part has failed, else `OK`; the viewer is stopped in any case.
+
     Args:
         options: addresses, token, certificates, limits and files of the process.
         out: receives the ready line.

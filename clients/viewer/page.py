@@ -84,6 +84,8 @@ class Page:
     ) -> None:
         """Prepare the page's state and its connection to the twin; `run` serves.
 
+        It shows line integrals live, with the default layers.
+
         Args:
             id: of the page.
             connection: to the browser.

@@ -49,6 +49,8 @@ class SceneClients:
     def __init__(self, scenes: Scenes) -> None:
         """Register for viser's clients as they connect and leave.
 
+        No client, camera or theme is known yet.
+
         Args:
             scenes: viser's server.
         """

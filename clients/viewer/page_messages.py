@@ -89,6 +89,8 @@ class Unwanted(ValueError):
 def admitted(raw: str | bytes) -> bytes:
     """Validate a page's message and encode it again for viser.
 
+    Only the kinds in `ALLOWED` pass; pictures must be small PNGs.
+
     Args:
         raw: as received.
 

@@ -109,8 +109,11 @@ class Viewer:
         limits: ViewerLimits | None = None,
         looks: Mapping[str, bytes] | None = None,
     ) -> None:
-        """Prepare link, feeds, viser's server and the pages' state; `start` listens.
-        See the class."""
+        """Prepare link, feeds, viser's server and the pages' state; see the class.
+
+        viser's server runs from now on, on a private socket; `start` connects to the twin
+        and listens.
+        """
         self.twin_address = address
         self._token = token
         self._machine = machine
@@ -371,6 +374,9 @@ class Viewer:
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
         """Draw a state: sample, cameras, scene and pages.
+
+        Then the pages get it with framing, nearest parts and time. Travel ranges are
+        drawn only if a page shows them.
 
         A new machine or sample is built first; the first state starts the images.
 

@@ -216,6 +216,8 @@ def parted(html: bytes) -> tuple[bytes, bytes]:
 def _listening_at(path: Path) -> Iterator[None]:
     """Make a server that viser starts meanwhile listen at a path and nowhere else.
 
+    Only one at a time. After an error the socket is closed.
+
     Args:
         path: of the Unix socket.
 

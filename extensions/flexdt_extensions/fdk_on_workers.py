@@ -317,6 +317,9 @@ def fdk_on_workers(
 ) -> list[str]:
     """Make the missing slabs, then the file.
 
+    Slabs that exist already, of the same data and request, are kept; the only doubt is a
+    mixture of devices and processors.
+
     Args:
         views: the frames, of a data set in a folder.
         grid: of the volume.

@@ -148,6 +148,9 @@ def begin(
 def feed(state: Online, pose: Poses, detections: Detections) -> Online:
     """Add one more frame.
 
+    Until the geometry is known, attempts to distinguish all beads are repeated; then the
+    spots are assigned to the beads that the fit predicts, and the fit renewed.
+
     Args:
         state: before the frame.
         pose: nominal pose of the frame (one).
@@ -209,7 +212,9 @@ def _first(state: Online) -> Online:
 
 
 def _renew(state: Online, start: Offsets) -> Online:
-    """Fit the geometry to all frames so far, from `start`; return the state with the fit."""
+    """Fit the geometry to all frames so far, from `start`; return the state with the fit
+    and one update more. The priors are about the state's own start.
+    """
     assert state.poses is not None
     shapes = np.array([d.shape for d in state.detections], dtype=np.float64)
     fit = estimate_geometry(

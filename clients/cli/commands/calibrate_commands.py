@@ -362,6 +362,9 @@ def push_correction(client: TwinClient, correction: NamedCorrection, source: str
 def show(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield a calibration's document as text: its use first, then images and offsets.
 
+    Without a fit only the verdict, next steps and what was seen are shown; without a
+    scale no markers.
+
     Args:
         document: of a calibration report.
 

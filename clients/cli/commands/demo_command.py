@@ -331,6 +331,8 @@ def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
 def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
     """Print the verdict, the files and the next commands.
 
+    The next commands are to reconstruct and to open the lab; all paths are quoted.
+
     Args:
         document: of the demonstration.
         out: folder of its files.

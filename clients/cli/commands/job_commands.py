@@ -94,6 +94,8 @@ def failure_code(status: JobStatus) -> int:
 def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     """Show a job's progress until it ends.
 
+    A paused job of another client is waited for, and the reason printed.
+
     Returns:
         Its last status.
 

@@ -73,11 +73,11 @@ def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
 
 
 def _facts(state: State) -> list[tuple[str, str]]:
-    """List the facts of a state for its table: geometry, view, tube, camera, sample, safety,
-    clock, correction and controller; image and job if there are any.
+    """List the facts of a state for its table: geometry, view, tube, camera, sample,
+    safety, clock, correction and controller; then image (saturated, starved, cut off)
+    and job, if there are any.
 
-    Returns:
-        (label, text) of each.
+    Returns: (label, text) of each.
     """
     g = state.geometry
     c = state.camera

@@ -42,6 +42,9 @@ def laid_out(
 ) -> FloatArray:
     """Place the names' boxes.
 
+    From top to bottom, each at the place that covers fewest points; then names are
+    exchanged so that leaders do not cross.
+
     Args:
         anchors: (n, 2) named points [px]; NaN or outside the picture: no name.
         sizes: (n, 2) widths and heights of the boxes [px].
@@ -132,6 +135,9 @@ class NameTags:
     def draw(self, client: viser.ClientHandle, names: Sequence[Name]) -> None:
         """Put the names where they have room now; nothing is sent while nothing has
         moved.
+
+        No names are drawn in a picture narrower than `LEAST_PX`; names behind the camera
+        are left out.
 
         Args:
             client: with its camera.

@@ -229,6 +229,8 @@ def _filled(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
     """Fill the pixels with the nearest triangles.
 
+    Triangles seen from behind, and with points that are not finite, are left out.
+
     Args:
         corners: (n, 3, 3) column, row [px] and inverse depth [1/m].
         width, height: of the picture [px].

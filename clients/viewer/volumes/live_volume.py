@@ -173,6 +173,8 @@ def grow(
 ) -> None:
     """Reconstruct a data set while it is taken.
 
+    At most `MAX_VIEWS` views are used, binned. The process exits if the viewer has gone.
+
     Args:
         held: gets the volume, which exists before the first image.
         folder: of the data set.
@@ -234,6 +236,9 @@ def grow(
 def reconstruct(held: Held, folder: Path, side: int) -> None:
     """Reconstruct the volume of a past scan, as `flexdt reconstruct` does from binned
     images.
+
+    At the end it gets accuracy or doubts, the part of voxels that no view sees, the
+    surface, and then the volumes of errors, if any.
 
     Args:
         held: gets the volume and the progress.

@@ -38,6 +38,9 @@ ALIKE_SHARE: Final = 0.1
 def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     """Compute the sample's attenuation [1/mm] on the grid of a volume.
 
+    Known are the phantoms that ship. Solids are averaged over two half voxels a side; the
+    sample's place on the stage is that of the data set's folder.
+
     Args:
         dataset: its sample, and its place on the stage.
         like: the grid.

@@ -97,6 +97,8 @@ class Item:
 def draw_item(plan: Plan, index: int) -> Item:
     """Draw item `index` of a plan.
 
+    Projections are also checked for place, tube and distances of the machine.
+
     Args:
         plan: of the batch.
         index: number of the item; with the plan's seed it determines all draws.
@@ -169,6 +171,9 @@ def _camera(
     plan: Plan, machine: Machine
 ) -> tuple[CameraSettings | None, tuple[int, int], float, tuple[float, float]]:
     """Determine the camera of a plan.
+
+    A made-up detector has a shape and a pixel size; else mode and region of the machine's
+    are replaced by the plan's, if given.
 
     Args:
         plan: its camera table and averages.

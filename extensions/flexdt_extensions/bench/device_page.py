@@ -252,6 +252,9 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
 def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) -> None:
     """Measure FDK and SIRT onto the second volume's grid.
 
+    Ratios to ASTRA's and the kernels' times, None without ASTRA, and FDK's time from host
+    to host [s], with and without errors.
+
     Args:
         line: adds a target: name, measured, accepted and wanted value.
         cases: of `case`, by name.

@@ -233,6 +233,8 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
     def __init__(self, link: LabConnection, name: str = "") -> None:
         """Make voltage, power and the switch of X-rays as signals.
 
+        Writing the switch waits until X-rays are ready (or off).
+
         Args:
             link: to the twin.
             name: of the device.

@@ -245,6 +245,8 @@ class ScenarioReader:
         """Read source, detector, stage (u, w) or sample (r, t), in one of the `allowed`
         references.
 
+        Its parameters `u` and `w` need not be of unit length, but at right angles.
+
         Args:
             part: its object in the scenario.
             where: its place, for errors.
@@ -378,6 +380,9 @@ class ScenarioReader:
 
     def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> PerFrame:
         """Read a parameter with its drifts at every frame.
+
+        Drifts are spread over the frames; those unknown to reconstruction are in the real
+        values alone.
 
         Args:
             value: number, or object with value, unit and drifts.

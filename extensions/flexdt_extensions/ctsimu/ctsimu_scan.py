@@ -246,6 +246,8 @@ class _ScanReader(ScenarioReader):
     def scan(self) -> ScenarioScan:
         """Read the scenario: samples, spectra, currents, detector and references.
 
+        Samples of vacuum are left out.
+
         Returns:
             The scan; its notes list values that are not used.
 
@@ -321,6 +323,8 @@ class _ScanReader(ScenarioReader):
 
     def _sample(self, given: object, where: str, poses: list[Pose]) -> MeshSample | None:
         """Read a sample: mesh, scale, substance and place in every frame.
+
+        Its place on the stage is None if it moves against the stage.
 
         Args:
             given: its object in the scenario.
@@ -635,6 +639,9 @@ class _ScanReader(ScenarioReader):
 
     def _grey(self) -> GreyValues:
         """Read the detector's grey values, noise, blur, lag and bits.
+
+        By range, factor and offset, or a file; photons of one energy need a range, unless
+        they are from a file.
 
         Returns:
             The conversion from energy to grey values.

@@ -69,6 +69,9 @@ def scenario_of(
 ) -> dict[str, Any]:
     """Convert a data set to a CTSimU scenario.
 
+    Tube, exposure, date and machine are None where the data set does not know them.
+    Raises for frames of several shapes.
+
     Args:
         dataset: from `load_dataset`.
         parameters: correction, known to reconstruction; None is the one in force, if any.

@@ -314,6 +314,9 @@ class ScenarioImages:
     ) -> FloatArray:
         """Compute the grey values of the binned pixels.
 
+        By blur, grey values, noise, clipping to the detector's bits, and mean over each
+        binned pixel; no noise either without a seed.
+
         Args:
             energy, variance: (rows, cols), unbinned.
             averages: frames in the image.

@@ -260,6 +260,8 @@ def delft(files: list[Path]) -> Iterator[Told]:
     """Compare three sources about one stage: each calibrated on its own, then their
     arrangement.
 
+    The SDD must be refused (three views are too few), else the figure does not agree.
+
     Args:
         files: of marks, one for each source.
 
@@ -420,6 +422,8 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
 def helsinki(files: list[Path]) -> Iterator[Told]:
     """Compare HTC 2022: fan-beam reconstructions with the images that their authors
     published.
+
+    What cannot be read is yielded as such.
 
     Args:
         files: of the sinograms.

@@ -128,6 +128,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Run one attempt.
 
+        The reward is the gain over the best quality so far, less the work. The fourth
+        result (truncated) is always False.
+
         Args:
             action: algorithm, strength, nonnegative; an index each.
 
@@ -185,6 +188,9 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         self, algorithm: int, strength: int, nonnegative: bool
     ) -> tuple[Volume, float]:
         """Reconstruct by an algorithm.
+
+        FDK works once, SIRT and CGLS twice each iteration. FDK and CGLS are clipped after
+        the end.
 
         Args:
             algorithm: index into ALGORITHMS.

@@ -145,6 +145,8 @@ class Rays:
     def __init__(self, table: Turntable) -> None:
         """Compute voxels, lengths and sums of all rays of the 36 angles.
 
+        Lengths are in [mm]; rays are listed by view, with the voxels that they pass.
+
         Args:
             table: poses and detector.
         """
@@ -172,6 +174,8 @@ class Rays:
     def solve(self, tasks: Sequence[SharedQuality]) -> None:
         """Run SIRT with all frames of each object, as `QualityTask` does, for many
         objects at once.
+
+        Frames number differently for each object.
 
         Args:
             tasks: with at least one frame each; their volumes and residuals are updated.

@@ -276,6 +276,8 @@ def real_runs(
 ) -> tuple[list[Run], dict[str, Any]]:
     """Fits of one scan's simulated spots at every N, the author's and ours.
 
+    Estimates are [mm, deg]; ours are None where they are not determined.
+
     Args:
         name: of the scan.
         model: the beads.

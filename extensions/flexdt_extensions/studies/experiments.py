@@ -177,6 +177,9 @@ def tasks(
 ) -> list[WorkUnit]:
     """List all tasks of an experiment.
 
+    Each has a setting in a scenario; the order of "damping" lets rendered images serve
+    all dampings.
+
     Args:
         experiment: one of EXPERIMENTS.
         fidelity: one of FIDELITIES.

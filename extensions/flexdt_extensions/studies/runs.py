@@ -213,6 +213,8 @@ def fitted_run(
 ) -> Run:
     """Compare a fit to n projections with the truth.
 
+    A failed run has no errors or sigmas, and a note.
+
     Args:
         setting, scenario: which.
         n: number of projections.

@@ -234,6 +234,8 @@ def _mean(values: Sequence[float]) -> float:
 def report(document: Mapping[str, Any], *charts: str) -> str:
     """Build one HTML page.
 
+    Columns that are empty in all rows are left out, except the first three.
+
     Args:
         document: of the study.
         charts: SVG or HTML.

@@ -98,6 +98,9 @@ def report(outcome: Outcome[ImageSet]) -> str:
 def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
     """Make the tables of parameters, spectrum and correlations of a fit.
 
+    Quantities in the images, weak directions, held parameters and correlations are there
+    only where known.
+
     Args:
         fit: of the geometry.
         document: of the calibration.

@@ -53,6 +53,8 @@ def save_nxtomo(data: ImageSet, file: File) -> None:
 def _write(data: ImageSet, out: Any) -> None:
     """Write a data set into an open HDF5 file: counts, keys, angles, exposure and cone_vec.
 
+    Dark and flat images come first; their angles are that of the first view.
+
     Args:
         data: with all its images.
         out: root of the file.

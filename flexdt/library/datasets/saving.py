@@ -41,6 +41,9 @@ REFERENCES: Final = ("di", "io")
 def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
     """Write a data set into a folder; see `DataSet.save`.
 
+    Projections that are there are not written again; missing ones are left out. The note
+    of unfinished saving is removed last.
+
     Args:
         data: the data set.
         folder: new or empty.

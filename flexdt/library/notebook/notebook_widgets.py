@@ -25,6 +25,8 @@ def volume_widgets(
 ) -> Any:
     """Make three linked slices of a volume: a slider for each axis, and one for the window.
 
+    None chooses the window by the values.
+
     Args:
         widgets: the package ipywidgets.
         volume: is seen from above, from the front and from the right.

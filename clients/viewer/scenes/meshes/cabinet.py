@@ -110,6 +110,8 @@ def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
 def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
     """Build the cabinet around all that the machine's parts reach.
 
+    Walls, floor, door and what is on it are seen from within only.
+
     Args:
         room: of the machine.
 
