@@ -66,6 +66,9 @@ def _scattering() -> dict[str, FloatArray]:
 def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     """Compute the cross-sections of substances at their densities; the arrays are read-only.
 
+    Total, coherent and incoherent ones [1/mm] (m, e), with form factors and shells over
+    the momentum transfer.
+
     Args:
         substances: m materials, at least one.
 

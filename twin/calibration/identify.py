@@ -157,6 +157,9 @@ def identify(
 ) -> Identification:
     """Assign spots to beads.
 
+    Start angles are tried all around, first roughly. If the best leaves large residuals,
+    or with `loose`, roll, tilts and others are fitted too.
+
     Args:
         detections: of each of the n frames.
         phantom: the beads.
@@ -361,6 +364,8 @@ def assign(
 
 def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
     """Shift dO_x and dO_y in `x` so that prediction and spots overlap most.
+
+    They are shifts on the panel, converted by the median magnification.
 
     Args:
         problem: gives the prediction.

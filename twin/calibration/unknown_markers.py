@@ -46,6 +46,9 @@ def link(
 ) -> tuple[Index, FloatArray, Offsets]:
     """Find the marker of each spot.
 
+    Tried from the axis centred on the spots and from `start`; the better one is refined
+    with narrower gates, and markers seen too seldom are left out.
+
     Args:
         detections: spots of each of the n frames.
         poses: nominal geometry; angles must be right, distances may be off by centimetres.
@@ -182,6 +185,9 @@ def _found(
     points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, int]
 ) -> FloatArray:
     """Find positions of markers, those with most spots first, (k, 3).
+
+    Candidates are where rays of two frames nearly meet; each takes its spots away from
+    the others. (0, 3) for fewer than three frames with spots.
 
     Args:
         points: (n, m, 2) pixels, inf beyond each frame's count.

@@ -51,6 +51,9 @@ class Deposited(NamedTuple):
 def deposited(screen: Filter) -> Deposited:
     """Compute the part of a photon's energy that a layer keeps.
 
+    Fluorescence and scattered photons that leave the layer take their energy along. Zero
+    for no thickness.
+
     Args:
         screen: the layer.
 

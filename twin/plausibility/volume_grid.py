@@ -38,6 +38,9 @@ def grid_findings(
 ) -> Iterator[Finding]:
     """Find grids outside the field of view.
 
+    Yields at most one finding: a refusal if no view sees any of it, or a warning if more
+    than `MOST_UNSEEN` of it is seldom seen. Nothing for panels of one pixel.
+
     Args:
         cone_vec: n views.
         shape: detector (rows, cols).

@@ -121,6 +121,9 @@ class Convex:
 def as_convex(shape: Shape) -> Convex:
     """Convert one shape to its quadric and slabs, with its corners or semi-axes [mm].
 
+    Corners hold solids without semi-axes; boxes and polyhedra have no quadric (zeros),
+    spheres no slabs.
+
     Raises:
         GeometryError: a size is not positive, axes are not orthonormal, or a polyhedron is not
             bounded.
@@ -187,6 +190,8 @@ def shadows(
     shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]
 ) -> IntArray:
     """Find the pixels that each solid can darken.
+
+    A solid that is not wholly before the source can darken all.
 
     Args:
         shapes: the k solids.

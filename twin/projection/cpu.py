@@ -153,6 +153,9 @@ def _spread(
     """Add the transpose of the projection of `values` to the box's voxels: fans first, then
     single rays.
 
+    Slices of the box are added to by one thread each, so that sums do not depend on their
+    order.
+
     Args:
         box: the layout's voxels, changed in place.
         views: (n, 12) rays in voxels.

@@ -83,8 +83,9 @@ class DeviceArray(NDArrayOperatorsMixin):
         return replace(self.grid, layout=replace(self.grid.layout, flat=self.flat))
 
     def __getitem__(self, views: slice | npt.NDArray[np.intp]) -> DeviceArray:
-        """Copy the images of some views; a slice over all views returns this array
-        itself.
+        """Copy the images of some views, by their indices, into a new array on the
+        device; any slice returns this array itself (only slices over all views are
+        used).
         """
         if isinstance(views, slice):
             return self

@@ -175,6 +175,9 @@ def _plan_tilted(
     """Plan fans between images of vertical planes for the `chosen` views that can have
     them.
 
+    `alone` lists those that cannot: steep planes, a pole near the panel, or more fans
+    than are worth it.
+
     Args:
         chosen: indices of views.
         views: (n, 12) in voxel units of the box.

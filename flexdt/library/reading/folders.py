@@ -379,6 +379,9 @@ def _from_texts(
 ) -> DataSet:
     """Read a data set by the scanner's settings texts.
 
+    Also raised if neither text gives the geometry. Projections that the texts do not
+    count are read with a warning; a cancelled script makes the data set incomplete.
+
     Args:
         content: the folder.
         machine, profile: in place of those that the texts name, or None.

@@ -40,6 +40,9 @@ DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     """Read a scan of Nikon's.
 
+    The white level of the file serves as flat image, the dark one is zero; offsets that
+    are not applied become warnings. Distances are checked unless `geometry` is given.
+
     Args:
         path: the .xtekct file.
         geometry: one view for each projection, in place of the file's.

@@ -151,6 +151,8 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
 def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     """Return the images as an unread dataset of HDF5, and their keys (n,).
 
+    Files with the images of a virtual or external dataset must be there.
+
     Args:
         group: with `data` and `image_key`.
         path: of the file, for messages.

@@ -149,6 +149,9 @@ class _Streams:
 def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
     """Read the images, reference and geometry of an open file into a data set.
 
+    Images of floats are divided by the reference and given as line integrals. Fewer
+    images than planned make it incomplete; a missing reference is a warning.
+
     Args:
         file: its streams.
         geometry: in place of the file's, or None.

@@ -330,6 +330,9 @@ class ReconstructionTask:
     def plan(self, memory: int | None, *, slabs: bool = True) -> MemoryPlan:
         """Decide on the use of memory and disk.
 
+        Iterative methods make the volume as a whole. With a CUDA device all images may be
+        read again, as it may fail.
+
         Args:
             memory: to use; None for half of the free memory [bytes].
             slabs: whether the volume may be made in slabs.

@@ -197,6 +197,9 @@ def _candidates(
 ) -> tuple[list[_Candidate], list[_Candidate]]:
     """Find compact bright blobs: those entirely inside, and those at the image's edge.
 
+    Empty for images under 3 x 3. Blobs are sought at several thresholds above the noise,
+    on a background opened by a window wider than a bead.
+
     Args:
         coarse: (rows, cols) line integrals, averaged.
         factor: of the averaging.
@@ -390,6 +393,9 @@ def _fitted_cut(
     image: Float32Array, x: float, y: float, radius: float, peak: float
 ) -> FloatArray | None:
     """Fit a ball of a given radius and contrast to a spot at the edge.
+
+    Its variances are larger, by the part of the spot that is cut off; None too if less
+    than 0.3 of it is inside.
 
     Args:
         image: (rows, cols) line integrals.

@@ -120,6 +120,9 @@ def measure_beads(
 ) -> Refined:
     """Measure every bead in its window.
 
+    Only complete, free windows are measured; the others stay nan. The body is subtracted
+    where the images show it, and tells its place.
+
     Args:
         images: (n, k, side, side) line integrals from `crop`.
         windows: their places.

@@ -467,6 +467,9 @@ def explained_by_causes(
 ) -> tuple[FitResult, Found]:
     """Fit with the most likely causes as columns, and average sigmas over those left open.
 
+    Causes, borders between panel tiles among them, are searched again after each new fit,
+    until they stay the same or for `MOST_ROUNDS`.
+
     Args:
         fit: of the geometry, the phantom's strain with its prior.
         known: statements on the phantom and the positions.

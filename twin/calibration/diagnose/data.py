@@ -73,6 +73,9 @@ def judge_frames(
 ) -> list[Finding]:
     """Judge missing and dark frames, and frames without a spot like the `sought` ones.
 
+    In the order missing, dark and repeated frames, then frames without beads (an error if
+    none has any).
+
     Args:
         scan: gives the name.
         looks: spots and state of each frame.

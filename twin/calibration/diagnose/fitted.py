@@ -476,6 +476,9 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
 def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding | None:
     """Fit a motion, and name the moving parameter if that explains the residuals.
 
+    The finding is an error: wrong angles or a named turn for alpha, else a drift, or a
+    vibration if it goes from frame to frame. None too for few or very many frames.
+
     Args:
         fit: without motion.
         refit: the fit to poses with a motion.

@@ -113,6 +113,9 @@ def spectrum(
 ) -> Conditioning:
     """Analyse whitened Jacobian rows (m, p) in internal units (prior rows included).
 
+    Returns covariance (infinite or nan for what is open), rank, condition, and the null
+    and weak directions in words.
+
     Args:
         jacobian: rows.
         names: columns.

@@ -87,6 +87,8 @@ def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
 def frame_matrix(p, geo, pivot, matrix, foot):  # type: ignore[no-untyped-def]
     """Compute the projection matrix of a frame.
 
+    Angles are [rad], lengths [mm]; complex numbers serve for derivatives.
+
     Args:
         p: (17,) complex parameters.
         geo: (18,) complex, see `Data`.

@@ -454,6 +454,9 @@ class _Mixed:
     def solved(self, choice: _Choice) -> _Answer:
         """Solve for the deviations of a choice.
 
+        Deviations (n, parameters) are from their mean; sigmas of parameters that do not
+        move are nan, and their deviations 0.
+
         Args:
             choice: width and smoothness of each parameter.
 

@@ -292,6 +292,8 @@ class _Level:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Compute differences and slopes of pairs, and those of noise.
 
+        Odd polynomials across the panel are taken out; sets `structure`.
+
         Args:
             values: parameters, (k,).
             pairs: of views, (q, 2).

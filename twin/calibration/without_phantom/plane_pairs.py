@@ -75,6 +75,8 @@ class PlanePairs:
         """List pairs of views whose sources' connection is clear of the object, and the planes
         through it.
 
+        Also raised if the object reaches beyond the panel in most pairs' planes.
+
         Args:
             frames: (n, rows, cols) line integrals, binned.
             mean: image over the turn, not binned.
@@ -365,6 +367,8 @@ def _support(
     frames: Float32Array, mean: FloatArray, view: FloatArray
 ) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray]]:
     """Measure the extent of the object.
+
+    Raises NotIdentifiableError if the images show nothing but air.
 
     Args:
         frames: line integrals (n, rows, cols).

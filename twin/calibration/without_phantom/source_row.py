@@ -136,6 +136,9 @@ def _first(
 ) -> float:
     """Find the height on a grid at which the views agree best.
 
+    A minimum at the grid's end, or in a spike, does not count. Of the levels the surest
+    one is taken.
+
     Args:
         pairs: of views.
         grid: trial heights [px].

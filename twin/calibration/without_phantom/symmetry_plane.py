@@ -379,6 +379,9 @@ def _plane(
 ) -> SymmetryPlane:
     """Collect the results, with the uncertainty that the fit does not contain.
 
+    Added are half of a step, doubts of the axis column, an open or hidden gap between
+    panel tiles, and a floor of the roll. With opposite rays the roll in force is kept.
+
     Args:
         scan: the scan.
         first: start of the fit.
@@ -517,6 +520,9 @@ def _opposite_rays(
     random: np.random.Generator,
 ) -> OppositeRays:
     """Collect the rays near the plane of the source that two views see from opposite ends.
+
+    At most `MOST_VIEWS` views are read, by angle; rows far from the plane of the source
+    are refused.
 
     Args:
         scan: the scan.

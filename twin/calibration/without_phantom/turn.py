@@ -104,6 +104,9 @@ def read_turn(
 ) -> Turn:
     """Read the frames, twice where some are repeated.
 
+    Repeated ones are found in the first reading unless they are given. The result has the
+    mean, the noise, sample frames, bands of rows and the largest step.
+
     Args:
         image: line integrals of a frame, (rows, cols).
         angle: of the stage in every frame, (n,) [rad].

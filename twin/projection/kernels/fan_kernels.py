@@ -189,6 +189,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
     def project_fans(box, fans, shadows, workers, out):
         """Fill out with line integrals, but for views without a job.
 
+        Rows and columns that the box cannot reach get zero.
+
         Args:
             box: voxels.
             fans: of the plan, see `FanPlan.fans`.

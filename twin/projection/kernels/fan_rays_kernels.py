@@ -207,8 +207,12 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
 
 @kernel
 def describe(grid, found, n):
-    """Compute the `Fan` of n collected rays: its reference line, slabs, and whether its rays
-    can be walked together.
+    """Compute the `Fan` of n (at least one) collected rays: slope of its reference line,
+    range of slopes and rises, slabs, whether it spreads, and whether its rays can be
+    walked together.
+
+    They cannot with the source in the box, rays that end within it, nearly along an axis,
+    or drifting far apart.
     """
     slope = found.slope[:n]
     rise = found.rise[:n]
@@ -305,6 +309,8 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
 @kernel
 def start(grid, fan, rays, work, n):
     """Initialise n sorted rays for their walk, and list their first z crossings by slab.
+
+    Only crossings before the last slab are listed.
 
     Args:
         grid: the box as seen along the fan.

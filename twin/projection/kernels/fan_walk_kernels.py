@@ -286,8 +286,11 @@ def add_pair(flat, grid, j, i, a, b, value):
 
 @inline
 def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
-    """Apply the transpose of `cross_levels`, with the same arguments: total and moment of
-    `work`, and voxels beside the line, receive each level's share.
+    """Apply the transpose of `cross_levels`, with the same arguments: `total` and
+    `moment` of `work`, and voxels of `flat` beside the line, are added each level's
+    share.
+
+    Crossings of the rays and their lists are changed too, as by `cross_levels`.
     """
     cross, pace, slope, weight, ratio = (
         rays.cross,

@@ -108,6 +108,8 @@ def ray_of(box, g, r, c):
 def walk_ray(box, g, r, c, value, transposed):
     """Compute the line integral of the ray to pixel (r, c), voxel by voxel.
 
+    0 for a ray that misses the box.
+
     Args:
         box: voxels; transposed, changed in place, and its spans are the marks of `open_column`,
             two for each voxel column.

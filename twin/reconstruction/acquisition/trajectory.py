@@ -101,6 +101,9 @@ def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
 def circle_of(cone_vec: ConeVec) -> Circle:
     """Fit the circle or helix of a scan's sources.
 
+    "Gaps" are arcs without views. Also raised if the sources lie on a line or leave the
+    circle, or the helix rises unsteadily.
+
     Args:
         cone_vec: n views.
 
@@ -213,6 +216,8 @@ def _helix(
     azimuth: FloatArray, height: FloatArray, centre: FloatArray, radius: float
 ) -> Circle | None:
     """Fit a helix that rises steadily for a turn or more without a gap.
+
+    None too if it hardly rises or has an arc without views.
 
     Args:
         azimuth: (n,) of the sources [rad].

@@ -483,8 +483,8 @@ def _add_tile(
 
 
 def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
-    """Compile `backproject` for a number of `lanes`, which is part of the disk cache's key;
-    return it.
+    """Compile `backproject` for a number of `lanes`, which is part of the disk cache's
+    key, and return it; nothing is run.
     """
 
     @parallel

@@ -230,6 +230,8 @@ def _cost(x, source, rays, length, seen, scale):
 def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient):
     """Compute curvature and gradient of `_cost`, whose arguments come first.
 
+    Rays that miss the prism add nothing; large residuals count less.
+
     Args:
         x: (6,) of `Prism.of`.
         source: see `_cost`.
