@@ -307,6 +307,8 @@ def _add_others(
 ) -> None:
     """Add other distributions' commands, which take no name of ours.
 
+    One that is known but not installed gets a placeholder that tells how to install it.
+
     Args:
         app: the command line.
         groups: its groups of commands, by name.
@@ -353,7 +355,7 @@ def _add(
 
 
 def _version(asked: bool) -> None:
-    """Print the version and exit, if requested."""
+    """Print flexdt's version and exit, if requested; else do nothing."""
     if asked:
         from importlib.metadata import version
 
@@ -366,6 +368,8 @@ REMOVED_COMMANDS = ("backup", "restore")
 
 def run(argv: Sequence[str]) -> int:
     """Run one command line.
+
+    Ctrl-C, or an aborted prompt, gives INTERRUPTED.
 
     Args:
         argv: words after the program's name.

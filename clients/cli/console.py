@@ -214,6 +214,8 @@ class ProgressBar:
     ) -> None:
         """Prepare a bar, which nothing draws yet.
 
+        None for `terminal` finds that out.
+
         Args:
             title: of the work.
             unit: of `done` and `total`.

@@ -122,6 +122,8 @@ class Event:
     def from_wire(cls, params: Mapping[str, object]) -> Event:
         """Validate the params of an event and build it.
 
+        The data become a `Projection`, state, job status or log entry, by the topic.
+
         Args:
             params: topic, seq, time and data, as decoded from the wire.
 
@@ -208,6 +210,9 @@ class AsyncSubscription:
 
     async def next(self, timeout_s: float | None = None) -> Event:
         """Wait for the next event and return it; reconnect after a lost connection.
+
+        Subscribes first, unless that has happened. The time limit is for each wait, and
+        not for reconnecting.
 
         Args:
             timeout_s: time limit [s]; None waits for ever.

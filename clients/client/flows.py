@@ -146,6 +146,8 @@ async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> o
 async def adrive(flow: Flow[_R], call: Callable[[Ask], Awaitable[object]]) -> _R:
     """Run a flow to its end, and return its result.
 
+    Errors of an effect are thrown into the flow, which may handle them.
+
     Args:
         flow: yields effects, and gets their results or errors.
         call: sends a request to the server.

@@ -153,6 +153,9 @@ class FollowSession:
     def replay(self, recording: bytes, ahead: bool = True) -> None:
         """Replay a recording as if it came now; the clock is the recording's.
 
+        While something waits or is due, the session ticks every `TICK_S` of the
+        recording's time.
+
         Args:
             recording: see `flexdt.clients.following.recording`.
             ahead: whether current moves and the rest of the script are checked as well.

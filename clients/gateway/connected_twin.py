@@ -79,6 +79,8 @@ class ConnectedTwin:
     ) -> None:
         """Take the connection and what commands of clients change.
 
+        Nothing is recorded or known of the twin yet.
+
         Args:
             link: to the twin.
             root: folder for saved images.

@@ -79,6 +79,8 @@ class Gateway:
     ) -> None:
         """Bind both sockets.
 
+        Raises too if `host` is not an address of this machine alone. `run` serves.
+
         Args:
             twin: connection and state.
             host: address, of this machine alone.
@@ -401,6 +403,8 @@ class Gateway:
         self, port: int, inbound: int | None
     ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
         """Bind PUB and SUB; if any free port will do, find two neighbouring ones.
+
+        Raises zmq.ZMQError if a port is in use, or after `PAIR_TRIES` pairs.
 
         Args:
             port: of PUB; 0 is any free port.

@@ -181,6 +181,8 @@ class Recording:
         """Open the recording's folder, made at the first use, and check that names are
         free.
 
+        The name is made free in the data directory at the first use.
+
         Args:
             names: of files to be written.
 

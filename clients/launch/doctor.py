@@ -192,6 +192,8 @@ def gpu() -> CheckOutcome:
 def listening(what: str, port: int) -> CheckOutcome:
     """Check that a port is free for a server, or find the twin that listens there.
 
+    A warning if something else listens; a twin that answers is "ok".
+
     Args:
         what: name of the server; "twin" is greeted where the port is in use.
         port: on the loopback.

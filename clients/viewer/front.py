@@ -161,6 +161,8 @@ class Front:
     ) -> None:
         """Start to listen; port 0 is any free one.
 
+        Connections come one at a time, uncompressed; the token is that of the front.
+
         Args:
             host, port: to listen on.
             ssl: a server's TLS context; None for plain TCP.
@@ -304,6 +306,9 @@ class Front:
         self, connection: ServerConnection, request: Request, url: SplitResult
     ) -> Response | None:
         """Check the token or the cookie of a request.
+
+        Without a token of the viewer all are admitted. At the path / the response is a
+        form.
 
         A valid token sets the cookie; a wrong one is logged and answered slowly.
 

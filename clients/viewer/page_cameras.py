@@ -156,6 +156,8 @@ class SceneClients:
     def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
         """Turn a page's view towards a ball, from where it looks.
 
+        The preset's direction is kept. Raises KeyError for a view without a preset.
+
         Args:
             page: its id.
             view: name of the view.

@@ -580,6 +580,8 @@ def scan_request(
 ) -> ScanRequest:
     """Make the request of a scan: as wished, and for the rest as the twin stands.
 
+    Distances [mm] are rounded; a wished voxel [um] sets the SOD.
+
     Args:
         params: the wish.
         machine, profile: the twin's.
@@ -702,6 +704,8 @@ async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
 
 async def export(viewer: Viewer, page: Page, params: Export) -> object:
     """Export the scene, or a replay of this page's plan, as one file: html or viser.
+
+    Without an open view of this page the scene is seen from the preset.
 
     Returns:
         The download's `url` and name.

@@ -170,6 +170,8 @@ class Viewer:
     async def start(self, host: str, port: int, ssl: Any = None) -> None:
         """Start to listen and to work.
 
+        A part that fails sets `failed`.
+
         Args:
             host, port: to listen on.
             ssl: a server's TLS context; None for plain TCP.

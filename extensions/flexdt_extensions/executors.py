@@ -314,6 +314,8 @@ def _same_signals() -> Iterator[None]:
 def _cluster(wanted: Slurm) -> Any:
     """Make dask-jobqueue's cluster, without workers.
 
+    One process for each core, each library with one thread.
+
     Args:
         wanted: size, queue and set-up of each job; workers leave before its walltime
             ends.

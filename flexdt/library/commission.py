@@ -275,6 +275,8 @@ def _nothing(question: Question) -> None:
 def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
     """Read a scan's settings texts, the names of its images, and the shape of the first one.
 
+    What follows an unreadable text is not read.
+
     Args:
         folder: of the scan.
         ask: takes each warning, and a text that cannot be read, as a question.
@@ -382,6 +384,8 @@ def _with_rates(
     axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine
 ) -> d.Axis:
     """Return an axis with the rates of the last settings text, and the sign of most of them.
+
+    Maximum rates are raised to what was seen. Returned as it is if nothing differs.
 
     Args:
         axis: of the shipped machine.

@@ -51,6 +51,8 @@ MAX_CUBE_DIFFERENCE: Final = 1e-6
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
     """Convert a geometry of ASTRA; see `ConeVec.from_astra`.
 
+    Angles and vectors are checked for a plausible spread. Angles of `cone` are [rad].
+
     Args:
         geometry: ASTRA's dictionary (`cone` or `cone_vec`), or rows (n, 12).
         shape: detector (rows, cols), where ASTRA's is missing or to be checked.

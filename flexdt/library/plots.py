@@ -81,6 +81,8 @@ def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
 def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
     """Plot the middle layer of a volume.
 
+    Places are in [mm], +y up.
+
     Args:
         volume: to plot.
         axes: matplotlib's, to draw into; a new figure's without.

@@ -236,6 +236,8 @@ def _mass_at(row: int, energy_keV: float) -> float:
 def parse_formula(formula: str) -> dict[str, float]:
     """Parse a formula to symbol -> number of atoms. Parentheses and decimal counts are allowed.
 
+    Counts must be above 0; nothing may stay open.
+
     Args:
         formula: such as CaSO4(H2O)2.
 

@@ -23,6 +23,8 @@ def fit_with_motion(
 ) -> tuple[Calibration, FitResult]:
     """Put the motion of the scans into their poses, and fit to them.
 
+    An earlier motion is taken out of the poses first.
+
     Args:
         state: the scans and their measurements.
         request: the free parameters, and those that may move.

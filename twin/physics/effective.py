@@ -92,6 +92,8 @@ def effective_beam(
 ) -> EffectiveBeam:
     """Choose effective energies.
 
+    The variance has the same energies, less exactly.
+
     Args:
         signal: (e,) contribution of each bin to the open beam's signal.
         noise: (e,) contribution of each bin to its variance.

@@ -172,6 +172,8 @@ def _numbers(key: Key) -> tuple[float, ...]:
 def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
     """Split a file's stem into texts and numbers, in turns.
 
+    The first and the last part are texts, perhaps "".
+
     Args:
         stem: name without its ending.
         signed: a hyphen before a number is its sign.

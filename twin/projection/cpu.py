@@ -153,8 +153,7 @@ def _spread(
     """Add the transpose of the projection of `values` to the box's voxels: fans first, then
     single rays.
 
-    Slices of the box are added to by one thread each, so that sums do not depend on their
-    order.
+    No voxel is added to by two threads at once.
 
     Args:
         box: the layout's voxels, changed in place.

@@ -164,6 +164,8 @@ def _combine(
 ) -> DeviceArray:
     """Apply a function of the kernel elementwise to `a` and an array or a number `b`.
 
+    Raises GeometryError for arrays of different shapes, and if the device fails.
+
     Args:
         name: name of the function in the kernel.
         a, b: operands; b is an array or a number.

@@ -307,6 +307,8 @@ def plan_turns(
 ) -> Turns:
     """Order the jobs of a plan so that threads never add to the same voxel at a time.
 
+    Views with little to share are added by one thread; fans of others in two halves.
+
     Args:
         plan: of these views.
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.

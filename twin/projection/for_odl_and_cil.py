@@ -73,8 +73,7 @@ def cil_operator(
     """Make a `LinearOperator` from `ImageData` (vertical, horizontal_y, horizontal_x) to
     `AcquisitionData` (angle, vertical, horizontal).
 
-    Containers are filled in float32; `out` is filled if given, else a new one is
-    returned.
+    `out` is filled if given, else a new container is returned.
 
     Args:
         project, spread: projector and transpose.

@@ -237,7 +237,9 @@ def finish() -> None:
 
 
 def zeros(count: int, kind: Any = np.float32) -> Any:
-    """Create a flat array of zeros on the device; nothing is transferred."""
+    """Create a flat array of `count` zeros on the device by a kernel; nothing is
+    transferred.
+    """
     from numba import cuda
 
     from flexdt.twin.projection.kernels import gpu_kernels

@@ -113,8 +113,8 @@ def level_axes(
 ) -> npt.NDArray[np.intp]:
     """Choose an index into ORDERS for each view, or NO_FANS, by estimated time.
 
-    Fans must be clearly faster than the first order to be chosen, and the panel must face
-    their planes.
+    Orders other than the first must be clearly faster to be chosen, and the panel
+    must face the planes of fans.
 
     Args:
         rays: (n, 12) source relative to the volume's centre, first pixel minus source, u,

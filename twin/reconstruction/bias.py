@@ -102,6 +102,8 @@ class Bias:
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
         """Compute the accuracy of the object's uniform regions in a grid.
 
+        Relative errors. Regions too uneven are left out, if there are others.
+
         Args:
             grid: place and size.
 

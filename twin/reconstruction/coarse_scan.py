@@ -97,6 +97,8 @@ class CoarseScan:
         """Reduce a scan to few views and pixels, by choosing views and averaging pixels; images
         of repeated angles are averaged.
 
+        A panel on its side is turned; a helix gets its outermost rows twice.
+
         Args:
             image: gives an image by its number, (rows, cols).
             cone_vec: of all views.

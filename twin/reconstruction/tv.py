@@ -489,6 +489,8 @@ class DeviceRegular(Regular):
     def _run(self, name: str, *arguments: Any) -> None:
         """Launch a kernel with a thread for each voxel.
 
+        The name is that of the kernel; the device works on, the host does not wait.
+
         Raises:
             gpu.DeviceError: the device fails.
         """

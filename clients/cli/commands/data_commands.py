@@ -342,6 +342,8 @@ class Report:
 def read_report(path: Path) -> Report:
     """Read a report of `flexdt calibrate`, or a plain object of parameters.
 
+    A report's correction is its "correction". An empty one counts as none.
+
     Args:
         path: of a JSON file.
 
@@ -371,6 +373,8 @@ def read_report(path: Path) -> Report:
 def apply_motion(data: DataSet, report: Report) -> DataSet:
     """Apply the motion that a report of `flexdt calibrate --per-frame` has for the data
     set.
+
+    Returned as it is without a motion, and if nothing moves.
 
     Args:
         data: the data set; a motion of another one is left out with a warning.

@@ -258,6 +258,8 @@ def _scan(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
 def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     """Calibrate from the data set alone.
 
+    The phantom is the example's; the progress line has the time, beads seen and rms.
+
     Args:
         dataset: of the example scan.
         tell: called with each line of progress.

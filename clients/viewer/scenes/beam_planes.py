@@ -74,6 +74,8 @@ def _fan(
 ) -> BeamPlane:
     """Draw the rays to a line of pixels through the image's middle.
 
+    Pixels are as opaque as transmission says, transparent where no ray passes.
+
     Args:
         world: geometry.
         across: direction and length of the line of pixels (3,) [mm].

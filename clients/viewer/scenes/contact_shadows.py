@@ -35,6 +35,9 @@ TOUCHING_MM: Final = 12.0
 def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str, float]:
     """List the parts that rest on another one, with the height of its top.
 
+    Only parts that touch within `TOUCHING_MM` and do not rise against each other; the
+    highest counts.
+
     Args:
         parts: of a machine.
         bodies: part -> its place and travel.

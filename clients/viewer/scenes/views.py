@@ -180,6 +180,8 @@ def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArr
     """Compute points (n, 3) [mm] around the cylinder in which the sample turns; None
     without a sample.
 
+    At its lower and upper end, a polygon outside the circle.
+
     Args:
         world: pose of the sample.
         vertices_m: of its meshes, in its own frame.

@@ -64,6 +64,9 @@ def otsu(values: npt.NDArray[np.generic]) -> float:
 def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Faces]:
     """Find the surface of the part above a level.
 
+    One vertex for each cell through which the surface passes, at the mean of its
+    crossings.
+
     Args:
         data: on a grid of points, none of those at its border above the level.
         level: in the unit of `data`.

@@ -82,6 +82,8 @@ Tell = Callable[[dict[str, Any]], None]
 def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], bytes]:
     """Encode a volume for a page.
 
+    Code 0 is not a number. Voxels beyond whole cubes are left out.
+
     Args:
         data: (z, y, x) [1/mm]; not a number where no data cover.
         most: voxels at most; a larger volume becomes means over cubes.
@@ -380,6 +382,9 @@ class Served:
 
 def answer(held: Held, served: Served, asked: list[str]) -> None:
     """Answer one line of standard input.
+
+    "block" sends the codes, "voxel" the values of all volumes there, "compare" an empty
+    answer at once and the figures later; anything else gets an empty answer.
 
     Args:
         held: volumes of the process.

@@ -388,6 +388,9 @@ def run_batch(
 def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> None:
     """Compute the missing items on the pool and store each outcome as it comes.
 
+    Results that run out of order are stored as they come; few are in flight, by their
+    size. Calls that have not begun are cancelled at an error.
+
     Args:
         store: of the batch.
         pool: entered executor.

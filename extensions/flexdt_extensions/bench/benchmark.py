@@ -349,6 +349,8 @@ def sorted_crossings(
 ) -> FloatArray:
     """Compute line integrals by another way: all crossings of a ray, sorted, in NumPy.
 
+    Shares no code with the projector; double precision.
+
     Args:
         volume: to project.
         geometry: of the views.

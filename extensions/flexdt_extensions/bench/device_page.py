@@ -82,6 +82,8 @@ def _best(
 ) -> float:
     """Measure the best of several calls; the first is not counted.
 
+    In the unit of `apart`.
+
     Args:
         work: call to measure.
         rounds: counted calls.

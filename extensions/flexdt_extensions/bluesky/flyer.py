@@ -181,6 +181,9 @@ class TwinFlyer(
     async def prepare(self, value: FlyScan) -> None:
         """Check a complete scan; nothing moves.
 
+        A former job and its images are forgotten. A request is composed to a script for
+        the machine.
+
         Args:
             value: the scan; it is kept for `kickoff`.
 
@@ -508,6 +511,8 @@ def fly_scan(
     flush_s: float = 0.5,
 ) -> MsgGenerator[str]:
     """Run one smooth scan; its images are announced while it goes on.
+
+    Run as a plan of bluesky; the flyer is staged and unstaged.
 
     The stream `frames` then has an event for each image with the stage's angle, in their
     order, also where the scan did not end well.

@@ -393,6 +393,8 @@ class _ScanReader(ScenarioReader):
     def _material_of(self, given: object, where: str) -> tuple[str, Substance | None]:
         """Read a material: density and mass fractions of its elements.
 
+        Fractions are normalised to 1; a density or composition of 0 is vacuum.
+
         Args:
             given: its object in the scenario.
             where: its place, for errors.
@@ -546,6 +548,9 @@ class _ScanReader(ScenarioReader):
 
     def _read_spectrum(self, name: object, where: str) -> Spectrum:
         """Read the spectrum of a file into the tables' bins.
+
+        Photons below the tables' energies are left out with a note; above them they are
+        an error.
 
         Args:
             name: of the file: energy [keV] and photons / (s sr mA) about it.

@@ -203,6 +203,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def targets(self, action: Action) -> dict[str, float]:
         """Convert an action to motor targets [deg, mm].
 
+        Values outside -1 to 1 are clipped.
+
         Args:
             action: of the kind of this environment.
 

@@ -446,6 +446,9 @@ def _exchange_beads(
 ) -> tuple[npt.NDArray[np.int64], float]:
     """Replace beads one at a time by the best seat until no exchange helps.
 
+    An ambiguous set to begin with has an infinite score, so that any allowed one is
+    better.
+
     Args:
         table: of the seats.
         rules: distances, slots and likeness.

@@ -173,6 +173,9 @@ def run_design(
 ) -> dict[str, Any]:
     """Search a design, compare it with the spiral, check both by fits, and write `out`.
 
+    `gain` is the spiral's score over the design's; None if the spiral does not determine
+    the geometry. Raises too if pictures are wanted without matplotlib.
+
     Args:
         body: holder of the beads.
         scans: planned.
@@ -293,6 +296,8 @@ def write(
 ) -> list[str]:
     """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json.
 
+    Existing files of these names are overwritten.
+
     Args:
         out: folder, made if need be.
         phantom: the design.
@@ -333,6 +338,8 @@ def write(
 def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
     """Search for the best bead places in a body: seats of its bricks, or a grid in the block.
 
+    In a block the grid has a step of `GRID_STEP_MM`, a bead's radius from the faces.
+
     Args:
         body: bricks or block.
         scans: planned ones.
@@ -362,6 +369,8 @@ def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> De
 
 def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom:
     """Build the phantom of a design: a stack of bricks, or a block.
+
+    Its name is "designed-K"; materials are noted as assumed.
 
     Args:
         body: holder of the beads.

@@ -124,6 +124,8 @@ def stack_phantom(
 ) -> Phantom:
     """Build the stack with beads in its cavities.
 
+    All beads must be on seats of this stack.
+
     Args:
         work: the stack.
         name: of the phantom.

@@ -115,6 +115,8 @@ def poses_of(name: str, angle: FloatArray) -> Poses:
 def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
     """Read a fit of the thesis's logs.
 
+    Estimates are [mm, deg].
+
     Args:
         name: of the scan.
         used: number of projections.
@@ -173,6 +175,8 @@ def authors_fit(
     name: str, seen: FloatArray, model: BeadModel, radius_px: float | None = None
 ) -> Iterated:
     """Fit spots as the author's code does.
+
+    Starts from zero offsets and the nominal start angle.
 
     Args:
         name: of the scan.
@@ -464,6 +468,8 @@ def found_beads(
     images: Sequence[Float32Array], cone: ConeVec, model: BeadModel
 ) -> BeadModel:
     """Reconstruct a scan near the model's beads and find their centres in the volume.
+
+    Their tolerance is `TOLERANCE_MM`.
 
     Args:
         images: line integrals of a full turn.

@@ -416,6 +416,8 @@ def _real(
 ) -> tuple[list[Run], Document]:
     """Compare the author's 242 fits of real scans with their simulation and ours.
 
+    Curves are in the order of the results.
+
     Args:
         spread: `map`, or that of an executor.
         say: called with a line of text after each scan.

@@ -99,6 +99,9 @@ class Aligned(Generic[Images_co]):
 def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     """Estimate the geometry of a scan without a phantom, with warnings about the images.
 
+    An earlier correction is the start. Found panel and motion are in the document and the
+    data set.
+
     Args:
         data: a data set with a flat image; frames may be missing.
         per_frame: whether shifts of single frames are looked for too.

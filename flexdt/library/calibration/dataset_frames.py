@@ -76,6 +76,8 @@ class DatasetFrames:
     def windows(self, plan: Windows) -> Float32Array:
         """Cut the windows of every frame; only their pixels are normalised.
 
+        Also NaN in frames that cannot be read.
+
         Args:
             plan: corners and side of the windows.
 

@@ -160,6 +160,8 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
 def _of_array(path: Path, views: int) -> Markers:
     """Read markers of a NumPy file.
 
+    Markers are named 0, 1, ...; their sigma is assumed.
+
     Args:
         path: of an array (views, markers, 2) of pixels, nan where unseen.
         views: that the scan has.
@@ -271,6 +273,8 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
 
 def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     """Collect marks into a table, markers in the order of their names.
+
+    Without a sigma `ASSUMED_PX` is taken; decimal names come first, by number.
 
     Args:
         marks: each with its place in the source, for messages.

@@ -342,6 +342,8 @@ def _sliding(
 ) -> str:
     """Write pictures, of which a slider shows one.
 
+    Returns HTML with the pictures as PNG; each is scaled to `SIDE_PX`.
+
     Args:
         pictures: name and pixels of each.
         what: name of the pictures.

@@ -108,6 +108,9 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
 def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     """List the names of the projections by their numbers, missing ones included.
 
+    Names of missing numbers are made like the others, if the file states more views; else
+    those found are returned. Names of another form are left out with a doubt.
+
     Args:
         folder: of the images.
         views: that the file states.

@@ -216,6 +216,8 @@ def _geometry(
 ) -> tuple[ConeVec, list[str]]:
     """Take the geometry from the file's cone_vec, or from its angles, pixel and distances.
 
+    A cone_vec of the file is taken without assumptions.
+
     Args:
         file: with the entry.
         name: of the group that holds the images.

@@ -37,6 +37,8 @@ GEOMETRY_HINT: Final = ", or give it: geometry=ConeVec"
 def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
     """Read a scan of Zeiss's into memory.
 
+    Raises too if the package olefile is missing.
+
     Args:
         path: the .txrm file.
         geometry: one view for each projection, in place of the file's.

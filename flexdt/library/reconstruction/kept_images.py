@@ -192,6 +192,8 @@ class KeptImages:
     def image(self, number: int, *, again: bool) -> Float32Array:
         """Return an image as it was read.
 
+        An image that was kept is not read again.
+
         Args:
             number: of the image.
             again: keep it.

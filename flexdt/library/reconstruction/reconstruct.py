@@ -481,6 +481,9 @@ def _reconstruct_in_process(
 ) -> tuple[ScanFrames, Bias | None, list[str]]:
     """Reconstruct into a file in this process.
 
+    Doubts are voxels that are not seen; of other algorithms none. The disk must have room
+    for kept images.
+
     Args:
         task: the reconstruction.
         plan: of memory and disk.
@@ -656,6 +659,9 @@ def _task(
     """Check a request, and make its task: views without bad pixels, not yet corrected, and
     grid.
 
+    Raises too for several materials with an algorithm that takes one; doubts are kept in
+    the views.
+
     Args:
         dataset: its images are read for bad pixels and doubts.
         request: the defaults without.
@@ -729,6 +735,9 @@ def preview(
 
 def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     """Prepare the requested corrections: scatter, rings and beam hardening.
+
+    Several materials are corrected within an iterative algorithm; a single energy has no
+    beam hardening.
 
     Args:
         views: uncorrected frames; kept images are read once, in order, where the detector lags.
@@ -913,6 +922,8 @@ def _iterative(
     views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress
 ) -> Volume:
     """Reconstruct by an iterative algorithm, after checking that the memory suffices.
+
+    Options that are None are the algorithm's own.
 
     Args:
         views: to reconstruct.

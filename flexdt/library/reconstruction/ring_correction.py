@@ -48,6 +48,8 @@ def _axis_column(
 ) -> float | None:
     """Return the column of the axis of a full turn.
 
+    Raises nothing: None too if the sources are on no circle.
+
     Args:
         cone_vec: of all views.
         shape: (rows, cols).

@@ -68,6 +68,9 @@ class StandingImages:
     ) -> StandingImages:
         """Make the upright images of a scan.
 
+        For a leaning panel columns are resampled finer, unless that is done when FDK
+        stands them up.
+
         Args:
             cone_vec: of all views.
             shape: of the images as recorded, (rows, cols).

@@ -72,6 +72,8 @@ class VoxelPlaces:
     def grid(self) -> Grid:
         """Grid of cubes.
 
+        Same shape and centre, with the one edge.
+
         Raises:
             GeometryError: they are no cubes.
         """

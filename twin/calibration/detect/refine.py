@@ -120,8 +120,9 @@ def measure_beads(
 ) -> Refined:
     """Measure every bead in its window.
 
-    Only complete, free windows are measured; the others stay nan. The body is subtracted
-    where the images show it, and tells its place.
+    Complete, free spots get their centroid, cut ones a fit if enough of them is
+    inside; what fails the checks is nan. The body is subtracted if the images show
+    it.
 
     Args:
         images: (n, k, side, side) line integrals from `crop`.
@@ -304,6 +305,9 @@ def _accept(
     results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp
 ) -> Refined:
     """Keep the results that pass the checks of place, size, contrast and likeness.
+
+    What fails is nan (bias 0): a spot too far from its place, of another size or
+    contrast, or a fit with too large a misfit.
 
     Args:
         results: (n, k, RESULTS).

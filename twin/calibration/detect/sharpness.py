@@ -50,6 +50,9 @@ _Tried = tuple[FloatArray, FloatArray, FloatArray]
 def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
     """Make a scene of the beads alone.
 
+    Each attenuates so that its line integral through the centre is the contrast, at least
+    0.001.
+
     Args:
         model: the phantom's beads.
         contrast: (k,) line integrals through their centres.
@@ -186,6 +189,8 @@ def _as_rendered(
 
 def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
     """Estimate blur, veil and apparent size from some complete spots, by the best fit.
+
+    The assumed ones are returned (as not seen) too if no fit succeeds.
 
     A bead of another size than described shows here too; a spot cut by the edge has its
     centre where its radius puts it.

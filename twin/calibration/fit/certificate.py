@@ -565,6 +565,8 @@ def spread_of_residuals(
 def _determined(told: FloatArray, weight: FloatArray) -> float:
     """Count the columns that the images determine.
 
+    A column that its prior determines counts as little; the result is no whole number.
+
     Args:
         told: (c, c) normal equations of the images.
         weight: (c,) of the priors.

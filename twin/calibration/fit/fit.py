@@ -801,6 +801,8 @@ def _axis_at(problem: FitProblem, x: FloatArray, group: int) -> FloatArray:
 def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArray:
     """Compute the values of IN_IMAGES, in its order, of one pose.
 
+    Axis column [px], its angle to the columns [deg], and pixel size at the axis [mm].
+
     Args:
         pose: one frame.
         offsets: of the geometry.

@@ -153,6 +153,8 @@ def identifiability(
     ) -> tuple[Forecast, npt.NDArray[np.bool_]]:
         """Predict what a fit to a planned scan would determine.
 
+        Beads count where they are visible; their places are free if there is a tolerance.
+
         Args:
             beads: the phantom's k beads.
             plan: poses of n frames.

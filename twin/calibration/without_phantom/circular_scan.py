@@ -131,7 +131,9 @@ class CircularScan:
 
     @property
     def scales(self) -> FloatArray:
-        """Change of each parameter that moves the ends of the image by about a pixel, (5,)."""
+        """Change of each parameter (those of `FREE`, in [mm] and [rad]) that moves the
+        ends of the image by about a pixel, (5,).
+        """
         rows, cols = self.shape
         pitch = self.pitch_mm
         sdd = self.sdd_mm

@@ -135,6 +135,10 @@ def hidden_gap(
 ) -> HiddenGap | None:
     """Judge the gaps that both ends of rays do not reveal; None for images of too few columns.
 
+    A gap is one between panel tiles. The result has the range of columns in which one may
+    be hidden, its probability, the error of the axis column [px], and the likeliest gap
+    if it is likely enough.
+
     Args:
         frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
@@ -316,6 +320,8 @@ class Judged(NamedTuple):
 
 def _beside_others(gains: FloatArray, count: FloatArray) -> Judged:
     """Judge a gap at each border by comparison with other borders.
+
+    Positive evidence is for a gap; it is taken as little where the model does not fit.
 
     Args:
         gains: in log likelihood of a gap over none, by frame and border, (n, c).

@@ -159,6 +159,8 @@ class OppositeRays:
     ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Locate the other's source in each view of pairs.
 
+        Only columns are checked for the panel's range.
+
         Args:
             values: parameters, (k,).
             pairs: of views, (q, 2).

@@ -222,6 +222,8 @@ class PlanePairs:
     def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
         """Estimate standard deviations of `total`.
 
+        The widest of the estimates counts.
+
         Args:
             parts: (..., q + distances * BLOCKS).
             blocks: whether sums over heights and over distances count too.

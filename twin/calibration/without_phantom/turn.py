@@ -192,6 +192,8 @@ def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
 def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
     """Check that angles cover a full turn.
 
+    Repeated angles count as one direction.
+
     Args:
         angle: (n,) of the frames [rad].
 

@@ -119,6 +119,9 @@ class TurnPlanes:
     def row(self, random: np.random.Generator) -> tuple[Offsets, AlignEstimate]:
         """Estimate the panel's height and the row of the source's plane.
 
+        Refused unless the images tell it clearly better than the priors. The offsets hold
+        the height as `dD_y` [mm].
+
         Args:
             random: for the images of noise.
 

@@ -141,6 +141,8 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
     """Collect the pixels of a fan, with slope, rise and span of their rays; returns their
     number.
 
+    Pixels that the box cannot reach are left out.
+
     Args:
         found: filled.
         grid: the box as seen along the fan.
@@ -257,6 +259,8 @@ def describe(grid, found, n):
 def sort_by_slope(grid, fan, found, rays, bins, n):
     """Sort the rays that meet the box by slope (in bins) into `rays`, and fill `bins`; returns
     their number.
+
+    Within a bin the order is that of the pixels; rays that miss the box are left out.
 
     Args:
         grid: the box as seen along the fan.

@@ -198,6 +198,8 @@ class Truncation:
     ) -> Continuation:
         """Say how the rows of some views go on beyond the panel's edges.
 
+        Bands between two estimated ones are mixed; a band without a prism has zeros.
+
         Args:
             cone_vec: of widened images, (n).
             first_row: of the panel, which is the images' first.

@@ -168,6 +168,9 @@ class _Pattern:
     ) -> Float32Array:
         """Compute the pixels' share of the pattern, (rows, cols).
 
+        What other pixels share with them is the object's; only what exceeds the noise is
+        left.
+
         Args:
             ways: functions from values (rows, cols) to those of other pixels, to which an
                 object adds the same.

@@ -214,6 +214,8 @@ class OnDevice:
     def _transformed(self, views: Views, order: npt.NDArray[np.intp], length: int) -> Any:
         """Weigh and filter columns of the images by a Fourier transform on the device.
 
+        The host does not wait. The filter's tables are made at the first call.
+
         Args:
             views: n views with their weights and response.
             order: (n,) order in which the images are uploaded.

@@ -50,6 +50,8 @@ class ImageUpload:
     ) -> Any:
         """Upload some rows of images, (n, rows.stop - rows.start, cols).
 
+        Uploads in portions, without waiting for the last; the result is on the device.
+
         Args:
             images: (n, rows, cols).
             order: number of the image for each place, (n,).

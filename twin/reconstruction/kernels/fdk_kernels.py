@@ -268,6 +268,9 @@ def _column(g, cols, x, y):
 def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
     """Add one view to the voxels above one another at (x, y); see `backproject`.
 
+    Nothing is added where the column is beyond the image or behind the source; only
+    voxels whose rows are on the panel.
+
     Args:
         acc: (nz,) voxels, changed in place.
         image: (cols, rows) filtered.

@@ -129,6 +129,8 @@ def glb(pieces: Iterable[PaintedMesh]) -> bytes:
 def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh:
     """Join meshes [mm] of one paint to one mesh [m], smooth but for sharp edges.
 
+    The mesh has the paint as its material, and no metadata.
+
     Args:
         meshes: of one paint.
         paint: colour, metal, roughness and glow.
