@@ -444,7 +444,7 @@ class ScanScatter:
 
     @cached_property
     def _stack(self) -> dict[str, FloatArray]:
-        """Stack the arrays mean, error and spread of the simulated views by name, (k, v,
+        """Arrays mean, error and spread of the simulated views by name, (k, v,
         u).
         """
         names = ("mean", "error", "spread")

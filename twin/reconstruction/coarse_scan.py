@@ -180,7 +180,7 @@ class CoarseScan:
 
     @cached_property
     def ends(self) -> tuple[float, float]:
-        """Return the largest distances from the axis that the panel sees on its two
+        """Largest distances from the axis that the panel sees on its two
         sides, signed, low and high [mm].
         """
         fan = fan_angles(circle_of(self.cone_vec), self.level, self.images.shape[2])

@@ -100,7 +100,7 @@ class Shown:
 
     @property
     def told(self) -> dict[str, object]:
-        """Return what the page gets: "shown" (layer -> bool, of all layers) and
+        """What the page gets: "shown" (layer -> bool, of all layers) and
         "opacity".
         """
         return {

@@ -193,7 +193,7 @@ class MiddleSlices:
 
     @property
     def images(self) -> dict[str, npt.NDArray[np.float32]]:
-        """Return the middle slices by name, first row at the top: xy (seen from above, +y
+        """Middle slices by name, first row at the top: xy (seen from above, +y
         up), xz and yz (+z up).
         """
         return {

@@ -59,7 +59,7 @@ class FrameNumbers:
 
     @property
     def _settled(self) -> npt.NDArray[np.int64]:
-        """Return the shift of frame numbers (n,) without changes that last one frame, or
+        """Shift of frame numbers (n,) without changes that last one frame, or
         that only the last frame has.
         """
         out = self.shift.copy()

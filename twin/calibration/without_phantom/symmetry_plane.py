@@ -103,7 +103,7 @@ class OppositeColumn(NamedTuple):
 
     @property
     def floor_px(self) -> float:
-        """Compute the systematic part missing in the mean's sigma, as far as opposite
+        """Systematic part missing in the mean's sigma, as far as opposite
         rays show it [px]; the mean's own sigma if theirs is infinite.
         """
         if not math.isfinite(self.sigma_px):

@@ -93,7 +93,7 @@ class Contradiction:
 
     @property
     def _explanations(self) -> str:
-        """Join the possible explanations by ", or ", each with its figure unless that is
+        """Possible explanations, joined by ", or ", each with its figure unless that is
         empty.
         """
         words = [
