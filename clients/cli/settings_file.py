@@ -157,6 +157,8 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
 def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     """Read the configuration file and check its keys and plain values.
 
+    A table without a dictionary as its value counts as a plain key.
+
     Args:
         path: of the TOML file.
         required: whether a missing file is an error; else it is empty.

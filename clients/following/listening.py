@@ -87,6 +87,9 @@ async def listen(
         """Read messages and changes of the connection, and pass them to the event loop,
         until `ended`.
 
+        `passed` is called every `TICK_S` seconds with a time before which all has been
+        read, `link` with up or down, `message` with data, time and delay [s].
+
         Args:
             socket: of messages.
             monitor: of the connection's events.

@@ -184,6 +184,9 @@ class FollowSession:
     async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
         """Write each new frame of a folder with its radiograph, until cancelled.
 
+        Looks every `FRAMES_S` seconds at the newest frame; one that is there at the
+        beginning is left out.
+
         Args:
             folder: of the scanner's frames; a frame counts once it is no longer written.
             beside: writer of image pairs; its errors become alarms.
@@ -208,8 +211,9 @@ class FollowSession:
                 self._take(self.mirror.alarmed(alarm))
 
     async def _look_ahead(self) -> None:
-        """Check current moves and the rest of the script, again whenever either
-        changes."""
+        """Check current moves and the rest of the script, again whenever either changes,
+        and keep the findings as alarms; until cancelled.
+        """
         while True:
             await asyncio.sleep(TICK_S)
             if self._is_new():

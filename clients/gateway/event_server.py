@@ -299,6 +299,8 @@ class Gateway:
     async def _await_other_answer(self, event: AcquilaEvent) -> None:
         """Wait for another subscriber to answer a command that is not for the scanner.
 
+        Commands with one key share their wait.
+
         Args:
             event: the command; ERR is sent where no answer comes within `FOREIGN_S`.
         """

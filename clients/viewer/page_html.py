@@ -33,6 +33,8 @@ def page_file(name: str) -> bytes:
 def token_form(wrong: bool) -> bytes:
     """Make the page with the form for the viewer's token.
 
+    Returns HTML as bytes; it says so if a wrong one was given.
+
     Args:
         wrong: whether a wrong one was given.
     """

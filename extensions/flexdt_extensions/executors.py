@@ -180,6 +180,8 @@ def _readable_error(
 ) -> CommandError | None:
     """Convert an error of dask's into one for people.
 
+    A lost scheduler, or workers that died of one task.
+
     Args:
         error: of any kind.
         address: of the scheduler.

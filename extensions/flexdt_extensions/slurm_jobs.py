@@ -113,8 +113,9 @@ class SlurmJobs:
         self.jobs = []
 
     def _queue(self) -> tuple[dict[str, str] | None, list[str]]:
-        """Read job -> its state and reason from squeue; None and its message where it
-        fails."""
+        """Read job id -> its state and reason from squeue, with no messages; (None, [its
+        message]) where it fails.
+        """
         said = _run("squeue", "--noheader", "--me", "--format=%i %T (%r)")
         if said.returncode:
             return None, [f"squeue: {_words(said)}"]

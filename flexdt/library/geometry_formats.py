@@ -192,6 +192,8 @@ def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
 def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
     """Make a model of LEAP; see `ConeVec.to_leap`.
 
+    LEAP must be installed. Raises too for voxels that are no cubes.
+
     Args:
         cone_vec: the geometry.
         like: grid or volume whose voxels it gets; None for LEAP's default volume.

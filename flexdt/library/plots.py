@@ -35,6 +35,8 @@ PANELS = 12
 def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
     """Plot sources, panels and central rays in the object's frame [mm], in three dimensions.
 
+    At most `PANELS` panels and rays are drawn; a panel only if its shape is known.
+
     Args:
         cone_vec: the geometry.
         axes: three-dimensional axes of matplotlib; None makes a figure.

@@ -79,6 +79,8 @@ def tables() -> Tables:
 def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Load the arrays of a file of this package by name, numbers as float64, read-only.
 
+    Texts stay as they are.
+
     Args:
         file: its name in the package's folder `data`.
 

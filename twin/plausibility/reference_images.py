@@ -62,6 +62,9 @@ def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[F
 def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
     """Find an open beam at the object's side that differs from the flat image.
 
+    Yields at most one warning, its figure the highest level; nothing if few views show
+    the beam, or for a beam that is only darker and does not drift.
+
     Args:
         levels_seen: of the open beam in some views (`open_beam`), relative to the flat image.
     """
@@ -96,6 +99,8 @@ def open_beam(
 ) -> float | None:
     """Compute the open beam's level at an image's left and right edges, relative to the
     flat.
+
+    Also None for small images or unequal edges.
 
     Args:
         counts: the image (rows, cols).

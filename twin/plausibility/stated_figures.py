@@ -73,6 +73,8 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
 def pixel_findings(geometry: ConeVec, stated_mm: float) -> Iterator[Finding]:
     """Compare a file's pixel with the geometry's, on the panel or at the axis.
 
+    Yields at most one warning; nothing for a stated pitch that is not a positive number.
+
     Args:
         geometry: the views.
         stated_mm: pitch of the pixels [mm].

@@ -170,6 +170,8 @@ def room_like(volume: Volume) -> Float32Array:
 def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
     """Make the layout of the full grid of `volume`, for an adjoint to write into.
 
+    Nothing is copied.
+
     Args:
         volume: its grid is used, not its values.
         room: an array of `room_like`, used with its content; None for new zeros.

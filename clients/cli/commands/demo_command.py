@@ -90,6 +90,9 @@ def run_demo(
 ) -> dict[str, Any]:
     """Run all stages.
 
+    The servers run meanwhile; kernels compile at the same time. `demo.json` and the
+    calibration are written into `out`.
+
     Args:
         out: folder for all files, made if need be.
         truth_file: hidden misalignment; None draws one.

@@ -333,6 +333,8 @@ class LabScene:
         """Move edges, spot, lamp, cross and axis to a state, and colour them by X-rays on
         or off.
 
+        Positions become [m]; the spot is hidden while X-rays are off.
+
         Args:
             state: of the twin.
             world: geometry of the state.

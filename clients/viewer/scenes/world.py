@@ -133,6 +133,9 @@ def motors(machine: Machine, state: State) -> dict[str, float]:
 def world_of(machine: Machine, profile: Profile, state: State) -> World:
     """Compute the geometry of a state.
 
+    With the correction in force, the motors' positions and the sample's offset on the
+    stage.
+
     Args:
         machine, profile: the twin's.
         state: as the twin sends it.
@@ -152,6 +155,9 @@ def placed(
     offset: StagePlacement | None = None,
 ) -> World:
     """Compute the geometry for motor positions.
+
+    Returns view, source, panel, axis, stage and sample in the world's frame [mm], and how
+    far source and panel are shifted by the correction.
 
     Args:
         machine, profile: the twin's.

@@ -116,6 +116,8 @@ def placement(folder: Path) -> StagePlacement:
 def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:
     """Measure figures of a volume, and the same of the truth.
 
+    Voxels that no data cover are left out.
+
     Args:
         values: (z, y, x) [1/mm], not a number where no data cover.
         truth: of the same shape.

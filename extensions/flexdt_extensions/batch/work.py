@@ -450,6 +450,8 @@ def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
 def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
     """Compute an item's projections and, if the plan has it, their reconstruction.
 
+    FDK uses the true or the nominal geometry, as the plan says.
+
     Args:
         plan: of the batch.
         item: drawn.

@@ -94,6 +94,8 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         """Start an episode: draw an object, number of views and dose; nothing
         reconstructed.
 
+        All three figures are 0.
+
         Args:
             seed: of the episode; None goes on with the present random numbers.
             options: not used.

@@ -154,6 +154,9 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move, take a frame and score it.
 
+        After a collision, or the last frame, the episode is over; a collision costs a
+        penalty and gives no frame.
+
         Args:
             action: see the class.
 

@@ -153,6 +153,8 @@ def _simulate_detections(
 ) -> tuple[list[Detections], list[npt.NDArray[np.intp]]]:
     """Simulate noisy detections in random order.
 
+    Hidden and overlapping spots are left out.
+
     Args:
         model: the beads.
         planned: scans to simulate.

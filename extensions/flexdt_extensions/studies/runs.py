@@ -102,6 +102,8 @@ def clean(value: float) -> float | None:
 def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) -> Run:
     """Run `solve`; an error becomes a run without a result, with the error as its note.
 
+    Any Exception counts; the run is marked as failed.
+
     Args:
         setting, scenario: of the run.
         n: number of projections.
@@ -312,6 +314,8 @@ def _algorithm_2(
 def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
     """Sum up the runs: one row a setting, in order of first appearance, with the thesis's
     figures.
+
+    Means are over the runs with a result; None without one.
 
     Args:
         experiment: its table of the thesis.

@@ -22,6 +22,8 @@ from flexdt_extensions.studies.runs import Run, grid
 def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
     """Write everything about a study into a folder (made if need be).
 
+    summary.json and report.html, and for errors by setting the charts as SVG.
+
     Args:
         out: the folder.
         document: the JSON of `flexdt study`.

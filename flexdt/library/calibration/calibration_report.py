@@ -267,6 +267,8 @@ def _maps(
 ) -> list[str]:
     """Draw residuals over the detector, one map a scan, enlarged to be visible.
 
+    At most `MAP_FRAMES` frames each; returns SVG maps, enlarged by a power of ten.
+
     Args:
         outcome: gives the data sets.
         fit: gives the measured positions [px].

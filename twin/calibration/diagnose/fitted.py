@@ -565,6 +565,8 @@ def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
 def _shape(curve: FloatArray) -> tuple[str, int | None]:
     """Describe how a parameter moves over the frames.
 
+    Words: at a frame (a jump), from frame to frame, steadily, or to and fro.
+
     Args:
         curve: (n,) values of the frames.
 

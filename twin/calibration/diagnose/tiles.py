@@ -33,6 +33,9 @@ def likely_border(
     """Find the border whose shift explains most of the residuals of columns; None if it
     is chance.
 
+    A border is one between two panel tiles, along columns or rows; it leaves every tile
+    its least width and enough positions on either side.
+
     Args:
         rows: (2 m, c) of the columns.
         values: (2 m,) to be explained.

@@ -306,6 +306,8 @@ class _Mixed:
     ) -> None:
         """Sum up the normal equations.
 
+        Columns are scaled to unit length.
+
         Args:
             rows: (m, g).
             residual: (m,).

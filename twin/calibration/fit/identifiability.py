@@ -292,6 +292,8 @@ def _worst(sigmas: dict[str, float]) -> float:
 def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Plan]:
     """List changes worth trying.
 
+    Placements at two other SODs, to the side, or both; twice the frames; two beads more.
+
     Args:
         model: the beads.
         poses: the planned frames.

@@ -305,6 +305,8 @@ def _excess(
 ) -> FloatArray | None:
     """Compute squared amplitudes of some columns beyond noise.
 
+    Also None for too few residuals. Else (number judged,), 0 where noise explains it.
+
     Args:
         gram: (c, c) products of the columns.
         push: (c,) products with the residuals.

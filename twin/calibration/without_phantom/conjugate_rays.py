@@ -520,6 +520,8 @@ def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
 def _evenly(band: FloatArray, azimuth: FloatArray) -> tuple[FloatArray, float]:
     """Sort views by their azimuth, and interpolate them at even steps over a turn.
 
+    Nearly even ones are returned sorted, not interpolated.
+
     Args:
         band: (n, groups, cols).
         azimuth: (n,) [rad].

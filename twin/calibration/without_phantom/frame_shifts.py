@@ -45,6 +45,8 @@ def find_shifts(
 ) -> Shifts:
     """Estimate the shifts of all frames, without those that an offset of the object explains.
 
+    Values are reduced by the part that noise has in them.
+
     Args:
         pairs: the frames' pairs.
         at: arguments of their geometry.
@@ -132,6 +134,8 @@ class _System:
     def _slopes(self, sums: Float32Array) -> FloatArray:
         """Compute the change of the differences with both shifts of the first view, then of the
         second.
+
+        For each of q pairs, right and down.
 
         Args:
             sums: running sums of the images.

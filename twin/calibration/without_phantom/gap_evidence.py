@@ -52,6 +52,9 @@ def find_gap(
 ) -> GapFound:
     """Find the gap between two tiles of the panel, if there is one.
 
+    The gap is marked as beside the axis if its place leaves the width to the prior.
+    Hidden ones are judged only if none was found and none is closed.
+
     Args:
         rays: both ends of rays of a turn.
         values: parameters of the plane of symmetry in the order of `circular_scan.FREE`, (k,).

@@ -266,6 +266,8 @@ def _evidence_of(
 ) -> Evidence:
     """Judge gaps by some of the differences of neighbouring columns.
 
+    Zero evidence if no difference counts.
+
     Args:
         around: differences about each border, (m, c, 2 SIDE - 1).
         power: their sums of squares, (m, c).

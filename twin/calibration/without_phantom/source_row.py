@@ -180,6 +180,9 @@ def _first(
 def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
     """Evaluate slope, curvature and sigma of all levels' costs about a height.
 
+    Sigmas are widened where one part of the heights decides, and inf where the curvature
+    is not sure.
+
     Args:
         pairs: of views.
         at: height [px].

@@ -172,6 +172,9 @@ def find_plane(
 ) -> SymmetryPlane:
     """Find the plane of symmetry.
 
+    A gap between two panel tiles is fitted along, unless the fit shows that there is
+    none. Also raised if the axis column is too uncertain.
+
     Args:
         scan: its images, without distortion.
         panel: the distortion that is undone in them.
@@ -263,6 +266,8 @@ def _first_in_rays(
 
 def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
     """Check that the images are symmetric about one column.
+
+    As good: `ratio` below `LEAST_RATIO`.
 
     Args:
         scan: gives the shape.

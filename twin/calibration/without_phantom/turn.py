@@ -224,6 +224,9 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
 def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArray:
     """Compute the weight of each frame in the mean and in the doubts, (1 + k, n).
 
+    Row 0 is the mean, row 1 half the difference of even and odd views, the others what
+    wide arcs without views may do.
+
     Args:
         angle: sorted, (n,) [rad].
         gaps: after each, (n,) [rad].

@@ -184,6 +184,8 @@ class Sharing:
         """Compute the shares of upright panels for a grid, and check that every voxel is seen
         from every side.
 
+        Also raised if the helix rises too steeply for panel and grid.
+
         Args:
             circle: the sources' helix.
             cone_vec: n upright views.
