@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from flexdt.clients.client.client import TwinClient
-    from flexdt.protocol.methods.scanner_messages import LengthUnit
+    from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleResult
     from flexdt.protocol.state_model import (
         AxisState,
         ImageFlags,
@@ -417,7 +417,7 @@ def sample(
     yield f"on the stage: {now.sample.name or 'nothing'}"
 
 
-def _named_sample(client: TwinClient, name: str) -> State:
+def _named_sample(client: TwinClient, name: str) -> SampleResult:
     """Put a sample on the stage by its name.
 
     Args:
@@ -425,7 +425,7 @@ def _named_sample(client: TwinClient, name: str) -> State:
         name: of a sample of the twin.
 
     Returns:
-        The twin's state.
+        What stands on the stage, with warnings.
 
     Raises:
         CommandError: the twin has no such sample, and the name is that of a file, which is
