@@ -16,8 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from flexdt.clients.cli.command_tree import run
+from flexdt.library.datasets.labelled_pictures import FOOT_ROWS, HEAD_ROWS
 from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.geometry.offsets import Offsets
 
@@ -56,7 +58,16 @@ def test_it_ends_well_and_says_what_it_did(
     assert document["truth"] == TRUTH
     verdict = document["calibration"]["verdict"]
     assert f"verdict: {verdict}" in process.stderr
-    assert (out / "demo.png").read_bytes().startswith(b"\x89PNG")
+    picture = np.asarray(Image.open(out / "demo.png"))
+    assert picture.shape[0] == HEAD_ROWS + 380 + FOOT_ROWS
+    for strip in (picture[:HEAD_ROWS], picture[-FOOT_ROWS:]):
+        for half in np.array_split(strip, 2, axis=1):
+            assert half.min() < 100, "letters"
+    head = next(line for line in process.stderr.splitlines() if "calibrated  " in line)
+    assert head.split()[-1] == "meaning"
+    assert re.search(
+        r"^dO_x .* sample with axis, to the right$", process.stderr, re.MULTILINE
+    )
     assert document["picture"] == str(out / "demo.png")
     assert not re.search(r"still .*\(0 s", process.stderr)
 

@@ -78,6 +78,27 @@ UNITS: Final[Mapping[str, str]] = {
 
 NAMES: Final[tuple[str, ...]] = tuple(UNITS)
 
+MEANINGS: Final[Mapping[str, str]] = {
+    "dO_x": "sample with axis, to the right",
+    "dO_y": "sample with axis, upwards",
+    "dO_z": "sample with axis, along the beam",
+    "alpha": "sample, turned",
+    "tau_x": "axis within the sample, to the right",
+    "tau_z": "axis within the sample, along the beam",
+    "dD_x": "panel, to the right",
+    "dD_y": "panel, upwards",
+    "dD_z": "panel, along the beam",
+    "dS_x": "source, to the right",
+    "dS_y": "source, upwards",
+    "det_roll": "panel roll",
+    "det_pitch": "panel pitch",
+    "det_yaw": "panel yaw",
+    "axis_tilt_x": "axis tilt about x",
+    "axis_tilt_z": "axis tilt about the beam",
+    "angle_scale": "turn per degree of rot_obj",
+}
+"""Meaning of every parameter in words, for tables that people read."""
+
 NOMINAL: Final = Offsets()
 """No offset at all."""
 

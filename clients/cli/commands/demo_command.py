@@ -33,6 +33,8 @@ from flexdt.library.failure import CommandError
 from flexdt.twin import long_work
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.launch.processes import Servers
     from flexdt.library.calibration.calibrate import Outcome
@@ -45,7 +47,9 @@ PROGRAM: Final = "flexdt"
 CALIBRATION: Final = "calibration.json"
 PICTURE: Final = "demo.png"
 PICTURE_ROWS: Final = 380
-"""Height of the picture [pixels]."""
+"""Height of the images in the picture [pixels]."""
+PICTURE_GAP: Final = 8
+"""Distance of the images in the picture [pixels]."""
 STAY_S: Final = 3600.0
 """Longest sleep while the lab stays up; Ctrl-C ends it at once."""
 Tell = Callable[[str], None]
@@ -306,7 +310,10 @@ def _reconstruct_preview(
 
 def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
     """Draw the first radiograph and the middle layer of a volume side by side, equally
-    high.
+    high, each with a title and a scale.
+
+    The radiograph is dark where the sample is dense, as one of `flexdt snap`; the layer is
+    bright there.
 
     Args:
         dataset: of the radiograph.
@@ -318,19 +325,43 @@ def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
     """
     import numpy as np
 
+    from flexdt.library.datasets.labelled_pictures import labelled
     from flexdt.library.datasets.pictures import png_of, windowed
     from flexdt.library.reconstruction.volume_files import read_volume
 
-    layers = read_volume(volume).data
-    images = dataset.line_integrals(0), layers[len(layers) // 2][::-1]
-    drawn = []
-    for image in images:
-        places = (np.arange(PICTURE_ROWS) * image.shape[0]) // PICTURE_ROWS
-        cols = round(PICTURE_ROWS * image.shape[1] / image.shape[0])
-        across = (np.arange(cols) * image.shape[1]) // cols
-        drawn.append(windowed(np.asarray(image)[np.ix_(places, across)]))
-    out.write_bytes(png_of(np.hstack(drawn)))
+    found = read_volume(volume)
+    view = dataset.geometry[:1]
+    to_axis = np.linalg.norm(view.source[0])
+    to_panel = np.linalg.norm(view.detector[0] - view.source[0])
+    pixel_mm = float(np.linalg.norm(view.v[0]) * to_axis / to_panel)
+    layer = found.data[len(found.data) // 2][::-1]
+    radiograph = _scaled_to(dataset.line_integrals(0))
+    section = _scaled_to(layer)
+    drawn = [
+        labelled(
+            255 - windowed(radiograph),
+            "first radiograph, dark: much attenuation (scale: at the axis)",
+            pixel_mm * dataset.shape[0] / PICTURE_ROWS,
+        ),
+        labelled(
+            windowed(section),
+            "horizontal layer of the volume, bright: much attenuation",
+            found.voxel_xyz[1] * layer.shape[0] / PICTURE_ROWS,
+        ),
+    ]
+    gap = np.full((drawn[0].shape[0], PICTURE_GAP), 255, np.uint8)
+    out.write_bytes(png_of(np.hstack([drawn[0], gap, drawn[1]])))
     return out
+
+
+def _scaled_to(image: npt.NDArray[Any], rows: int = PICTURE_ROWS) -> npt.NDArray[Any]:
+    """Return an image at `rows` rows, by its nearest pixels."""
+    import numpy as np
+
+    places = (np.arange(rows) * image.shape[0]) // rows
+    cols = round(rows * image.shape[1] / image.shape[0])
+    across = (np.arange(cols) * image.shape[1]) // cols
+    return np.asarray(image)[np.ix_(places, across)]
 
 
 def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
@@ -377,12 +408,14 @@ def _compare_with_truth(
         Whether the truth is inside the joint 95 % ellipsoid.
     """
     from flexdt.library.calibration.calibrate import inside_95
+    from flexdt.twin.geometry.offsets import MEANINGS
 
     rows = []
-    for name, value, sigma, _, unit in parameter_rows(outcome.document):
-        true = truth.get(name.strip("()"), 1.0 if name == "angle_scale" else 0.0)
-        rows.append((name, f"{true:.5f}", value, sigma, unit))
-    tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit")))
+    for shown, value, sigma, _, unit in parameter_rows(outcome.document):
+        name = shown.strip("()")
+        true = truth.get(name, 1.0 if name == "angle_scale" else 0.0)
+        rows.append((shown, f"{true:.5f}", value, sigma, unit, MEANINGS[name]))
+    tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit", "meaning")))
     inside = inside_95(outcome, truth)
     if inside:
         tell("the truth lies inside the joint 95 % ellipsoid")
