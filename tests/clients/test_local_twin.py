@@ -105,3 +105,5 @@ def test_what_does_not_hold_is_refused_before_a_process_starts(
     [[option, value]] = given.items()
     assert run(["up", f"--{option}", value]) == 1
     assert not begun
+    # A viewer reads a data folder, if it can.
+    assert option != "data" or (run(["viewer", "--data", value]), len(begun)) == (0, 1)

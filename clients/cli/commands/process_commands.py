@@ -35,8 +35,11 @@ COMPLETED: Final = {
     "sample": value_completion.sample_names,
 }
 """Option of `up` -> function that gives the values that a shell completes."""
-CHECKED_BEFORE_START: Final = ("machine", "profile", "sample", "data")
-"""Options whose values are checked before any process starts."""
+WRITERS: Final = ("up", "twin")
+"""Processes that write the data folder; viewer and gateway read it."""
+WRITER_OPTIONS: Final = ("machine", "profile", "sample", "data")
+READER_OPTIONS: Final = ("machine",)
+"""Options whose values are checked before a process starts, of writers and of readers."""
 Only = Annotated[
     Literal["twin", "projector", "viewer", "gateway"] | None,
     typer.Option(
@@ -119,12 +122,16 @@ def start(name: str, more: Sequence[str]) -> None:
     settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}
-        _check(given)
+        _check(given, WRITER_OPTIONS if name in WRITERS else READER_OPTIONS)
         become(MODULES[name], given)
 
 
-def _check(given: Mapping[str, Any]) -> None:
-    """Check options against each other, and machine, profile, sample and data folder.
+def _check(given: Mapping[str, Any], named: Sequence[str]) -> None:
+    """Check options against each other, and names and folders by themselves.
+
+    Args:
+        given: option -> value.
+        named: options whose values are checked by themselves, where there are such options.
 
     Raises:
         typer.BadParameter: options that do not go together.
@@ -137,9 +144,7 @@ def _check(given: Mapping[str, Any]) -> None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
     from flexdt.clients.launch.start_checks import require_startable
 
-    require_startable(
-        **{name: given[name] for name in CHECKED_BEFORE_START if name in given}
-    )
+    require_startable(**{name: given[name] for name in named if name in given})
 
 
 def become(
