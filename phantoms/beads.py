@@ -44,6 +44,8 @@ def spiral_positions(
 ) -> FloatArray:
     """Compute bead centres on the elliptic spiral that fits a cuboid.
 
+    At most `MAX_BEADS`; beads may overlap.
+
     Unity's y_k = (k/(K-1) - 1/2)(H - 2r) at angle 2 pi k / K on semi-axes W/2 - r (x) and
     B/2 - r (z); a single bead sits at mid-height, angle 0 (the thesis describes the
     spiral but not its formula: assumed).
@@ -224,6 +226,9 @@ def cuboid_with_beads(
     assumed: tuple[str, ...] = (),
 ) -> Phantom:
     """Make a cuboid about the origin (or nothing) with beads anywhere inside it.
+
+    A bead's solid has its material's attenuation less the body's, as attenuation adds up;
+    overlaps are not checked.
 
     Args:
         name: the phantom's name.

@@ -505,6 +505,9 @@ class _SeenDetail:
         """Split a setting's time into as many read-outs as keep the open beam below
         saturation.
 
+        Without detail and sample, at the brightest pixel, up to `BRIGHTEST_FILL` of
+        saturation; the averages become as many.
+
         Args:
             layer: name of the filter.
             asked: the setting; its total time stays.
@@ -520,6 +523,9 @@ class _SeenDetail:
 
 def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
     """Warn of a plan's projections whose pixels will be saturated or starved.
+
+    Without scatter, by the machine's detector and tube; those that the open beam has
+    already are left out.
 
     Args:
         plan: of the scan.

@@ -157,6 +157,8 @@ def _teeth(
 def _closed(rings: Sequence[Ring]) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     """Build a closed surface through rings, each joined to the next and the last to the first.
 
+    All rings have as many points.
+
     Args:
         rings: (n, 3) each, counter-clockwise seen from above; up outside, down inside.
 

@@ -50,6 +50,8 @@ def check_distances(
     """Check that the machine has an exposure and distances, by composing a script of
     them.
 
+    The script is thrown away; the region of the camera is not checked here.
+
     Args:
         machine: whose camera and motors these are.
         camera: mode and region.
@@ -75,6 +77,8 @@ def check_distances(
 
 def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
     """Check that source and panel are outside the sample, and that some ray meets it.
+
+    Other findings about the geometry are ignored.
 
     Args:
         phantom: about the origin.

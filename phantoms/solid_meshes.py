@@ -54,6 +54,9 @@ def parts_of(
 ) -> tuple[SurfacePart, ...]:
     """Make one closed mesh of each piece of a phantom; voxels become the box around them.
 
+    In that order; meshes of surfaces are not changed, and the box has the material
+    "voxels".
+
     Args:
         scene: analytic solids.
         surfaces: triangle meshes.

@@ -37,6 +37,8 @@ def voxelise(
 ) -> Volume:
     """Sample the attenuation [1/mm] of a scene and of meshes on a grid about the origin.
 
+    The grid is rounded up to whole voxels. Overlaps add up; negative solids take away.
+
     Args:
         scene: analytic solids, added up.
         surfaces: triangle meshes to add.
@@ -224,6 +226,8 @@ def _quadric(
 
 def _between_slabs(slabs: FloatArray, x: FloatArray, y: FloatArray) -> _Interval:
     """Compute the interval along z where low <= n . p <= high for all slabs.
+
+    A slab parallel to z leaves all or nothing of a column.
 
     Args:
         slabs: (k, 5): normal (3), low, high [mm].

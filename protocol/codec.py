@@ -100,6 +100,8 @@ def json_pieces(document: object) -> list[bytes]:
     def default(value: object) -> object:
         """Encode a value that JSON lacks; a large binary one goes to `large`, and a mark
         in its place.
+
+        A value that no encoder knows raises TypeError.
         """
         if not isinstance(value, (bytes, bytearray, memoryview)):
             return _plain(value)

@@ -472,6 +472,8 @@ def encoded(result: object, codec: Codec) -> Encoded:
 def _body(codec: Codec, message: Message) -> list[bytes]:
     """Encode a message without framing; an `Encoded` result is inserted as it is.
 
+    The pieces of an `Encoded` result must be of this codec.
+
     Args:
         codec: of the connection.
         message: an answer, a call or a batch.
@@ -531,6 +533,8 @@ def frame_head(size: int) -> bytes:
 def pack(message: Message) -> tuple[bytes, memoryview | None]:
     """Encode a message as a frame: its length and head, and the payload that follows
     without a copy.
+
+    Large is above `MAX_COPIED_BYTES`; the message is not changed.
 
     Args:
         message: its innermost `data` may be bytes of any size.

@@ -44,6 +44,8 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
     """Convert an image value to an array, read-only, without a copy where `data` is
     bytes.
 
+    Base64 text is decoded to a copy.
+
     Args:
         value: a mapping with dtype (one of `DTYPES`), shape (up to four sizes) and data
             (bytes, or base64 text).

@@ -165,6 +165,8 @@ def to_plain(message: Message) -> object:
 def finite(data: object) -> object:
     """Replace NaN and infinities in the `data` of an error by text; JSON has no such numbers.
 
+    Dicts and lists are copied, tuples become lists; names stay.
+
     An error repeats the value that it is about, and that may have overflowed.
     """
     match data:
@@ -564,6 +566,8 @@ def hello_params(client: str, token: str | None) -> dict[str, object]:
 def _require_text_names(value: object, where: str) -> None:
     """Check that all names in nested data are text, which JSON would silently make of
     numbers.
+
+    Lists are looked into; other values pass.
 
     Args:
         value: parameters of a call.

@@ -184,6 +184,9 @@ def clip(value: object, limit: int = 200) -> str:
 def _brief(value: object, limit: int) -> str:
     """Format plain data like `repr`, but skip the parts that would be cut off.
 
+    Each level down has a quarter of the limit; a whole number of over 4096 bits is
+    described.
+
     Args:
         value: plain data, of any size.
         limit: number of characters that are needed; the text may be longer.

@@ -240,6 +240,8 @@ def client_tls(
     """Make a client's TLS context that trusts the certificates of a PEM file alone;
     None without one.
 
+    TLS 1.2 or newer; the system's own authorities are not trusted.
+
     Args:
         authority: the file.
         any_name: the certificate is the server's own, by whatever name it is reached.

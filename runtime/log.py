@@ -194,6 +194,9 @@ class Sparing:
         """Write a line like `log`, or count it if there were too many of its kind; its
         kind is the event unless given.
 
+        A kind has a burst of lines, and one more each `EVERY_S`. Kinds that have been
+        quiet are forgotten.
+
         The next line of the kind states the number left out.
 
         Args:
@@ -225,6 +228,8 @@ def set_up(
 ) -> None:
     """Send this program's log to `stream` as JSON lines, in place of earlier targets (for
     a process's main).
+
+    Lines go nowhere else afterwards.
 
     Args:
         stream: where to.

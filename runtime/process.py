@@ -185,6 +185,8 @@ class ListeningServer:
     ) -> None:
         """Take an address and accept connections on it.
 
+        At most one connection is accepted in a turn of the loop.
+
         Args:
             made: makes the protocol of a connection.
             host, port: where; port 0 is any free one.
@@ -349,6 +351,9 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
     """Run the work of a process to its end in an event loop of its own; print an error on
     standard error.
 
+    USAGE after an AccessError (INVALID for one of its files), INVALID after a TwinError,
+    ValueError or an OSError of a file, REFUSED after another OSError.
+
     The limit on open descriptors is raised first.
 
     SIGINT ends the process at once until the work calls `stop_signal`: nobody has been
@@ -432,6 +437,9 @@ def process_seconds(pid: int) -> float | None:
 def session_seconds(session: int) -> float | None:
     """Sum up the processor time of the processes of a session so far [s];
     None as `process_seconds`.
+
+    Processes that have ended are not counted; None where the system has no /proc or no
+    such session.
 
     Args:
         session: its number, which is the process id of its first process.

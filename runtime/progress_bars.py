@@ -36,6 +36,8 @@ def shown_on(log: logging.Logger) -> Shown:
     """Choose where work is shown: the handlers of a log, a notebook, a terminal, standard
     error.
 
+    In that order; on a standard error that is no terminal, lines.
+
     Args:
         log: whose handlers a program may have set.
     """
@@ -104,6 +106,8 @@ class TerminalBar:
         self, what: str, done: float | None, seconds: float, left_s: float | None
     ) -> None:
         """Draw the bar over the one drawn before.
+
+        Cut to the terminal's width, unless that is unknown or tiny.
 
         Args:
             what: name of the work.

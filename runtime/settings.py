@@ -149,6 +149,8 @@ def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
 def words(given: Mapping[str, object]) -> list[str]:
     """Convert options to words of a command line; the inverse of `read`.
 
+    Underscores become dashes; values are texts by `str`.
+
     Args:
         given: name -> value; None and False are left out, True is a bare flag, a list or
             tuple is given once for each item.

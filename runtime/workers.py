@@ -269,6 +269,8 @@ class Workers:
     def _keep(self, worker: Worker) -> None:
         """Return a process to the idle ones if it may work again, and end them all after
         `MAX_IDLE_S` without work.
+
+        The time counts anew from each end of work.
         """
         if worker.kept:
             self._idle.append(worker)

@@ -651,6 +651,9 @@ def _fit(
     """Fit by weighted least squares of rows, of which the first `scans` belong to a scan
     each.
 
+    The covariance is enlarged where the residuals are above what the sigmas allow; enough
+    is `FOR_A_LINE` degrees of freedom.
+
     The scan that contradicts the others most is left out while it does so by `MAX_SIGMAS`
     sigmas and enough remain.
 

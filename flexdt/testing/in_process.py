@@ -306,6 +306,8 @@ class InProcessTwin:
         """Run a coroutine on the twin's loop, and return its result; virtual time passes
         meanwhile.
 
+        From another thread it waits while the loop runs there.
+
         Raises:
             Deadlock: no event is left that could end the wait.
             RuntimeError: called in an event loop, where it would wait for itself.

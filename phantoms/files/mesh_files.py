@@ -432,6 +432,8 @@ def _check_glb(raw: bytes) -> None:
     """Check that a GLB file refers to no other, claims no more than it holds, and puts
     each node in one place.
 
+    Only the JSON part is parsed, at most `MAX_GLB_DOCUMENT` bytes.
+
     trimesh allocates the claimed memory, and copies a mesh to each of its places.
 
     Args:

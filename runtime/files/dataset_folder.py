@@ -227,6 +227,8 @@ def list_folder(path: Path) -> Folder:
     """List the files of a folder; where reading is `confined`, links to files are left
     out.
 
+    Not confined, links to files are in it. Folders are not.
+
     Args:
         path: of the folder.
 
@@ -426,6 +428,8 @@ def _check_kind(
     """Check that a TIFF holds one image of counts or, where `kinds` has an f, of other
     values.
 
+    Counts are whole numbers of `COUNTS`, in either byte order.
+
     Args:
         path: of the file, for the message.
         shape: that its head states.
@@ -556,6 +560,8 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
 
 def free_name(root: Directory, wanted: str) -> str:
     """Find the first of `wanted`, `wanted-2`, `wanted-3`... that `root` does not have.
+
+    A name is taken by any file, folder or link. It is not reserved.
 
     Raises:
         DatasetNameError: `wanted` is not plain.

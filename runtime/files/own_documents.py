@@ -115,6 +115,9 @@ class Changes:
         """Write a file like `Directory.keep`, and keep the one it replaces until `done`
         or `undo`.
 
+        A full disk without room for the second name keeps the old content in memory
+        instead, only with `keep`.
+
         Args:
             folder, name, data: directory, file name and content.
             keep: writes it instead, and may do so on a full disk; spaces may follow the
@@ -211,6 +214,8 @@ class Changes:
 
 def _second_name(folder: Directory, name: str, second: str) -> bool:
     """Give a file a second name, as a link or else as a copy.
+
+    A copy only where the system refuses links.
 
     Args:
         folder: of the file.
@@ -312,7 +317,10 @@ def settle(root: Directory, folders: Sequence[str]) -> None:
 
 def ours(folder: Directory) -> list[str]:
     """List the names of JSON documents in a folder, links among them, except
-    those set aside."""
+    those set aside.
+
+    Sorted by name; [] if there is no such folder.
+    """
     with suppress(FileNotFoundError), folder.entries() as entries:
         names = sorted(e.name for e in entries if e.name.endswith(".json"))
         return [n for n in names if not n.endswith(f"{ASIDE}.json")]

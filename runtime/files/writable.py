@@ -9,6 +9,9 @@ from pathlib import Path
 def require_writable(path: Path | None) -> None:
     """Check that an output path can be written.
 
+    Nothing is made at `path` itself, and whether an existing file may be replaced is not
+    checked.
+
     A file without a name is made in the folder, or in the nearest one above it that
     exists, and is gone at once.
 

@@ -251,6 +251,9 @@ class Imaging:
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
         """Compute paths through each material of `sample` at n nominal poses.
 
+        An empty stage has m = 0 materials. The geometry is checked; `truth` None is the
+        hidden one.
+
         Args:
             sample, poses, camera, truth: as for `line_integrals`.
             spot: size of the focal spot [mm] and number of its points from which rays
@@ -412,6 +415,8 @@ class Imaging:
     ) -> AsyncIterator[_DividedSample]:
         """Divide a sample, send it to the projector where it is new, and keep it there
         within the context.
+
+        A sample that cannot be sent raises before the context begins.
 
         Old samples beyond the limits are dropped, here and there.
 

@@ -153,6 +153,8 @@ class ProjectorClient:
     ) -> _T:
         """Call `work` with a connection, which is made if there is none.
 
+        Connections are made one at a time, and `work` is called once.
+
         Args:
             method: for the message.
             work: sends requests and awaits their answers.

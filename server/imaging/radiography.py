@@ -330,7 +330,11 @@ class Radiography:
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
         """Compute the expected counts above dark as if X-rays were on, not
-        clipped, (rows, cols)."""
+        clipped, (rows, cols).
+
+        Shape (rows, cols), without noise and dark; X-rays count as on whatever `exposure`
+        has.
+        """
         if radiograph.expected is not None:
             return expected_counts(self.panel, camera, radiograph.expected.mean_e)
         lit = replace(exposure, xrays_on=True)

@@ -70,6 +70,8 @@ class Batch:
     ) -> None:
         """Keep the answer to the item that was taken out last; a notification has none.
 
+        The error counts with the size of the answer that it replaces.
+
         An answer that would make the batch too large is replaced by an error.
         """
         if answer is None:

@@ -595,6 +595,8 @@ class _Link(asyncio.BufferedProtocol):
         """Answer one message or batch and send the answer; an urgent one waits for a turn
         first.
 
+        A notification has no answer.
+
         Args:
             message: decoded, or read in another process (a tuple is a batch).
             urgent: whether it was taken out of the queue before its turn.

@@ -90,6 +90,8 @@ class ComputeJob:
     async def run(self, compute: ComputeThread, step: Step) -> object:
         """Compute a step in its turn on the compute thread and return its value.
 
+        A job that has been given up raises its error at once.
+
         Args:
             compute: the thread.
             step: function without arguments.

@@ -338,6 +338,8 @@ def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | Tria
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
     """Compute a back projection on a grid; blocks.
 
+    float32, without filter or weights; `old` must be of the same grid.
+
     Args:
         p: projections, cone_vec and grid.
         old: volume of that grid to which it is added, in a copy; None for none.

@@ -137,6 +137,9 @@ class VolumeStore:
     ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
         """Receive a chunk of voxels or of a mesh.
 
+        A chunk at 0 begins anew; room for the whole is reserved then. An empty chunk is
+        refused unless the whole is empty.
+
         Chunks come in order. The complete volume is not stored: `put` does that.
 
         Args:

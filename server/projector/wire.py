@@ -205,6 +205,8 @@ class FrameLink(asyncio.BufferedProtocol):
     async def send(self, message: m.Message) -> None:
         """Send a message; return when the transport has taken it.
 
+        Messages are sent one at a time; large payloads are not copied.
+
         Raises:
             ConnectionResetError: the connection has ended.
             RpcError, ValueError, TypeError: the message cannot be encoded.
@@ -334,6 +336,8 @@ class ProjectorLink:
         self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
     ) -> npt.NDArray[np.float32]:
         """Request a float32 array, which comes in one piece or in parts.
+
+        Another type or shape counts as no such array: -32603.
 
         Args:
             method: its name on the wire.

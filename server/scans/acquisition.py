@@ -94,6 +94,8 @@ class Acquisition:
         """Project a batch of frames; remember the last `KEPT_IMAGES` where the panel has
         lag or traps.
 
+        The images of a panel without memory are not kept.
+
         Args:
             batch: frames that share camera settings; with `moments` above 1 each is
                 projected alone.

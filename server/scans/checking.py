@@ -212,6 +212,9 @@ class Checks:
     async def probes(self, check_input: CheckInput) -> tuple[SampleProbe, ...]:
         """Choose rays of a scan's projections from which its counts are predicted.
 
+        A light check is planned in a thread here, others in a worker; collisions are not
+        looked for.
+
         Raises:
             RpcError: -32008, planning takes too long.
         """
@@ -317,6 +320,8 @@ def _encoded(
 ) -> list[bytes]:
     """Compute a dry-run report and encode it in pieces of `ANSWER_PIECE` bytes; runs in a
     worker.
+
+    A report with errors gets no problems of the sample.
 
     Args:
         check_input: the scan to be checked.

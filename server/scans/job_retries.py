@@ -82,6 +82,8 @@ class Retry:
     async def _wait(self, error: Exception, go: Callable[[], None], pause: float) -> None:
         """Pause, again and again while the disk is full, then call `go`.
 
+        Before another error than a full disk it pauses once.
+
         Args:
             error: for which it waits.
             go: resumes the job.

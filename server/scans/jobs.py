@@ -266,6 +266,8 @@ class Jobs:
         """Make a queued job, new or as the next state of one that has ended; nothing
         knows it yet.
 
+        The job's number is the next one, a continued job keeps its own.
+
         `enqueue` puts it in the list and in the queue.
 
         Args:

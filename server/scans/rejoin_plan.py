@@ -71,6 +71,9 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
     """Compute from which pose at rest, and with which run-up, a scanner joins `plan` at
     time `tau`.
 
+    An axis starts behind where it is by its braking distance; the run-up lasts as long as
+    that of the slowest.
+
     Args:
         plan: the scan.
         tau: time on the plan's clock [s].
@@ -93,6 +96,8 @@ def _remaining(
 ) -> tuple[Trajectory, ...]:
     """Select the part of an axis's motion from plan time `tau` on; the current trajectory
     is cut there.
+
+    Times stay the plan's; () once all has ended.
     """
     begun = [t for time, t in trajectories if time <= tau]
     later = tuple(t for time, t in trajectories if time > tau)

@@ -302,6 +302,8 @@ class ScanRunner:
     def _not_made(self, error: Exception) -> None:
         """Pause after an error that may pass; end the run if the same frames would fail
         again.
+
+        It then ends with that error.
         """
         if hopeless(error):
             self._end = error
@@ -427,6 +429,8 @@ class ScanRunner:
 
     async def _wait_for_request(self, tau: float) -> None:
         """Show the run as paused and wait for resume, step or abort.
+
+        At once if it is no longer paused.
 
         Args:
             tau: plan time at which it pauses [s].
@@ -592,6 +596,8 @@ class _Settings:
 
     def restore(self, scanner: ScannerTwin) -> None:
         """Put them back.
+
+        Rates, camera, tube, in that order; those set before an error stay set.
 
         Raises:
             SafetyError: X-rays were on, and an E-stop is in force.

@@ -213,6 +213,8 @@ class JobRecord:
     def read(cls, root: Directory, name: str) -> JobRecord:
         """Read the record of the data set `name`; a damaged one is set aside.
 
+        Set aside means renamed and logged.
+
         Raises:
             FileNotFoundError: there is no record, or no valid one.
         """

@@ -121,6 +121,8 @@ class Stage:
     def size(self, sample: Sample) -> SampleSize | None:
         """Compute the cylinder about the axis that contains the sample; None for an empty
         stage.
+
+        Diameter and height [mm]; the offset enlarges it.
         """
         phantom = self.phantom(sample)
         if phantom is None:
@@ -273,6 +275,9 @@ class ObstacleMoves:
     ) -> Way:
         """Plan a free way from where the motors will rest.
 
+        With a warning if it goes around something. `shortest` lets rotations turn the
+        shorter way.
+
         Raises:
             UnknownNameError, LimitError, SafetyError: as a move.
             CollisionError: no free way was found; nothing moves.
@@ -407,6 +412,8 @@ class ObstacleMoves:
 
 async def wait_for_way(task: asyncio.Task[None]) -> list[str]:
     """Wait for the end of the task that moves along a way.
+
+    The task is not cancelled if this wait is.
 
     Returns:
         Warnings if it was cancelled or refused a leg; empty if it arrived.

@@ -119,6 +119,8 @@ class TwinClock:
     def at(self, moment: float) -> asyncio.Future[None]:
         """Return a future that is done once the clock has reached `moment` [s].
 
+        At once for a moment that has passed; equal moments in the order of the calls.
+
         Its owner may finish or cancel it early; the clock then drops it.
         """
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()

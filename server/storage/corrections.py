@@ -143,6 +143,8 @@ class Corrections:
     ) -> NamedCorrection:
         """Make a correction from edge values [mm, deg]; nothing is stored yet.
 
+        Values that are left out are nominal; the note of a known one stays.
+
         Args:
             values: parameter -> value [mm, deg].
             name: of the correction; None: one that follows from its date.

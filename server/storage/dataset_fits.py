@@ -118,6 +118,8 @@ def _dataset_path(root: Directory, name: str) -> Path:
 def _text(root: Directory, name: str) -> str:
     """Read a phantom file of the data directory, which may name no other files.
 
+    A name that is no plain file name raises DatasetNameError.
+
     Raises:
         DatasetMissingError: no such file.
     """

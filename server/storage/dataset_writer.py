@@ -164,6 +164,8 @@ class DatasetWriter:
         """Check that the folder is empty or holds this scan, and remove unfinished files
         from it.
 
+        Only headers of the images are read. `record` adopts what the document states.
+
         Args:
             resume: whether the folder may have files.
 
@@ -266,6 +268,8 @@ class DatasetWriter:
     def _write_end(self, complete: bool, reason: str, duration_s: float | None) -> None:
         """Write the texts with the end of the scan, after the images are safe on the
         disk.
+
+        Both are on the disk when this returns; `record` has the end.
 
         Args:
             complete: whether all images are there.

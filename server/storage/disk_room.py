@@ -51,6 +51,8 @@ class UsedBytes:
         """Sum up the bytes of all files in the directory and its folders; links are not
         followed.
 
+        0 if the directory cannot be read.
+
         Folders that have not changed since the last call are not read again.
         """
         with suppress(OSError):
@@ -164,6 +166,8 @@ class DiskRoom:
 
 def require_last(folder: Path, what: str, size: int) -> None:
     """Check that writing leaves `LAST_BYTES` of room for the state.
+
+    Nothing is checked where free space is unknown.
 
     Args:
         folder: on the disk.

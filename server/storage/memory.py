@@ -94,6 +94,9 @@ def remember(
 ) -> Memory:
     """Record the scanner at twin time `now`: where its motors are, not where they are bound.
 
+    Rates, tube, camera, sample and correction are in the scene, and whether an E-stop is
+    in force.
+
     Args:
         scanner: as it is.
         now: twin time [s].
@@ -121,6 +124,8 @@ def with_scanner_state(
     memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
 ) -> Memory:
     """Replace the settings, sample and correction of the document by those of `scanner`.
+
+    Rates are the scanner's, too; jobs and E-stop stay.
 
     Args:
         memory: as it is; its positions stay.
@@ -332,6 +337,8 @@ class StateStore:
     ) -> T:
         """Write a change to the disk, then apply it; restore the disk if either fails.
 
+        One change at a time, before any other write.
+
         Args:
             take: applies the change in memory; may raise.
             after: makes the state's document with the change from the present one; None
@@ -411,6 +418,8 @@ class StateStore:
 
     def _put_job(self, name: str, job: JobMemory | None) -> None:
         """Write a job, and remove it from the unwritten ones unless it has changed again.
+
+        None deletes its file.
 
         Raises:
             JobsNotWrittenError: the disk does not take it.

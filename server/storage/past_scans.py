@@ -229,6 +229,9 @@ class _Scan:
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """Find a data set's folder.
 
+    The key is made of inode, time and size of the folder and of its document, if there is
+    one.
+
     Args:
         root: data directory.
         name: of the data set.
@@ -491,6 +494,9 @@ def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
 
 def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
     """Read and summarise a data set; a damaged one has its problem in the summary.
+
+    Paths in the problem are relative to the data directory; a document that is too large
+    is a problem.
 
     Args:
         path: of its folder.

@@ -85,6 +85,9 @@ class Incoming:
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
         """Write a chunk of an upload to a nameless file.
 
+        A chunk that overlaps what has come is cut; one that reaches beyond the total is
+        checked by the caller.
+
         A chunk that has come before is passed over, so a client may send it again; a
         chunk at 0 of another file under the same name begins a new upload. The oldest
         uploads give way to new ones.
@@ -131,6 +134,8 @@ class Incoming:
 
     def take(self, name: str) -> tuple[UploadHead, bytes]:
         """Read a complete upload and remove it from those under way.
+
+        Its file is closed, and so deleted, in any case once it is complete.
 
         Args:
             name: of the sample.

@@ -108,7 +108,10 @@ def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
 
 def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
     """Return motor -> (speed, acceleration): the scene's where it has them,
-    else the scanner's."""
+    else the scanner's.
+
+    [mm/s, mm/s2 or deg]; axes that only the scene has are left out.
+    """
     return {
         axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
         for axis, (speed, acceleration) in scanner.paces.items()

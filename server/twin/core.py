@@ -104,6 +104,9 @@ class ControlLease:
     def require(self, who: str, what: str) -> None:
         """Check that `who` may move: it has control, or takes it if it is free.
 
+        Control is free without a holder, or after its `idle_s` without a request; the
+        lease is renewed.
+
         Raises:
             RpcError: -32003, another client is the controller.
         """

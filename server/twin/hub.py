@@ -133,6 +133,9 @@ class Hub:
         """Subscribe `listener` to `topics`, and send it the kept events that it has not
         had.
 
+        Kept events are those of topics with a history, oldest first, at once and without
+        the rate.
+
         A second call changes rate and view.
 
         Args:

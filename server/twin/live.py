@@ -239,6 +239,8 @@ class LiveView:
         """Compute the image of a shot and its public geometry; the image is judged in the
         state.
 
+        Without noise and hidden truth if `predicted`, else with the truth.
+
         Args:
             shot: pose, tube and camera.
             predicted: use the public geometry for the image as well, and keep it out of

@@ -36,6 +36,8 @@ class Reader:
     async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
         """Decode the message of `raw`, or those of a batch.
 
+        An empty batch gives (). The parameters stay pickled.
+
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """

@@ -234,6 +234,8 @@ def clearance_trace(
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
     """Compute the least clearance of the scene at moments of a path.
 
+    inf and None where no pair is near enough to be a candidate.
+
     Args:
         scene: bodies and pairs.
         path: of all motors.

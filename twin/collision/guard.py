@@ -80,6 +80,8 @@ class SceneGuard:
     ) -> dict[tuple[str, str], float]:
         """Find the pairs of a pose within the safety margin, with their clearances [mm].
 
+        Of several bodies of one name the nearest counts; without `deep` an overlap is 0.
+
         Args:
             positions: motor -> position; motors left out are at home.
             deep: measure overlaps, as negative clearances; it takes some milliseconds a

@@ -102,6 +102,8 @@ def _least(
 ) -> tuple[float, tuple[str, str] | None]:
     """Find the least clearance [mm] and its pair (None if nothing is near); with
     contacts, those of the worst.
+
+    Without contacts it is refined to the scene's accuracy.
     """
     if contacts:
         worst = min(contacts, key=lambda c: c.clearance_mm)

@@ -366,6 +366,9 @@ class _Turn:
         """Compute (mm per rad, rad): within that turn the solid approaches by no
         more per radian.
 
+        The second is infinite where the crude bound (reach across the axis) is good
+        enough.
+
         The nearing along a fixed normal is a convex function of the turn, so a chord is a
         bound.
         """

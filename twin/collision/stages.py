@@ -320,6 +320,9 @@ def _chain(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute origin, slides and turns of a component's frame.
 
+    Motors that do not carry the part have zero columns; turns only of parts at the object
+    [rad].
+
     An offset belongs to the motor's reading, so it moves the same parts as the motor; a
     fixed part is at its anchor, and one with a role where the X-ray geometry has it.
 

@@ -31,6 +31,8 @@ _DEVICE: Final = re.compile(
 def plain_name(name: str, what: str = "file") -> str:
     """Return `name` if it is one plain path component.
 
+    The rules are those of `_reason`, Windows's device names included.
+
     Args:
         name: as it came.
         what: kind of the named thing, for the message.

@@ -327,6 +327,8 @@ class ScanRecord(ArrayValue):
 def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
     """Find the linear motor that takes the sample out of the beam for the flats.
 
+    Compared are the first flat and the first projection; "" without either.
+
     Args:
         machine: whose turning motors do not count.
         blocks: images with their motor positions.
@@ -349,7 +351,7 @@ def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
 
 
 def _plain(name: str) -> str:
-    """Check a file name, for pydantic; raise ValueError for one that is not plain."""
+    """Return a file name that is plain; raise ValueError with the rule that it breaks otherwise."""
     try:
         return plain_name(name)
     except DatasetNameError as error:

@@ -67,6 +67,8 @@ class LineIntegrals:
     def interpolating(self, mask: npt.NDArray[np.bool_]) -> LineIntegrals:
         """Return a copy that interpolates more pixels (rows, cols), unless none would be
         left.
+
+        Then the conversion itself is returned; pixels that are dead already stay so.
         """
         dead = self.dead | mask
         if dead.all():
@@ -158,6 +160,8 @@ def binned_mean(
     images: npt.NDArray[Any], factor: int | tuple[int, int]
 ) -> npt.NDArray[Any]:
     """Average over blocks of pixels; surplus rows and columns are cut off.
+
+    For a factor of 1 the type of `images` stays.
 
     Args:
         images: (..., rows, cols).

@@ -161,6 +161,8 @@ def rebuild(
 def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
     """Move the detector of the settings to its physical place, and note the changes.
 
+    Differences below 1e-6 mm do not count.
+
     Some FleX-ray files have `mag_det_phys` as well as `mag_det`. Where the two differ,
     the printed SDD and COR are for the wrong one, and SDD is longer by the difference (as
     public corrections of such scans have it); the axis's shadow moves in proportion.
@@ -209,6 +211,9 @@ def _profile(
     printed: Figures | None,
 ) -> tuple[Profile, str] | None:
     """Choose the given profile, or the one that reproduces the printed figures.
+
+    The first that agrees, at the first image's positions; zero offsets are tried only for
+    a machine without a default profile.
 
     Args:
         machine: whose profiles count.

@@ -97,6 +97,8 @@ def _whole(text: str) -> int:
 def parse_roi(text: str) -> Roi:
     """Read four whole numbers, left, top, right, bottom, with any separators.
 
+    Decimals that are zero are allowed; order and sensor are not checked here.
+
     Raises:
         ValueError: there are not four.
     """

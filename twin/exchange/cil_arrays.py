@@ -48,6 +48,9 @@ ORIGINS: Final = {
 def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to CIL's arguments.
 
+    Rows point up, so their direction is -v; num_pixels and pixel_size are (columns,
+    rows).
+
     Args:
         geometry: with the detector's shape.
 

@@ -137,6 +137,8 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
 def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to the arguments of `ts.cone_vec`.
 
+    The shape is (rows, columns); the vectors are source, detector, v, u, in that order.
+
     Args:
         geometry: with the detector's shape.
 
@@ -346,6 +348,8 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
 
 def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[str, Any]:
     """Parse a JSON object; it and the objects inside it are of type `kind`.
+
+    A byte order mark is removed.
 
     Args:
         text: of the file.

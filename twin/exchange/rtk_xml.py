@@ -211,6 +211,8 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
     """Compute a cone_vec row (12,) [mm] from nine numbers; the inverse of
     `parameters_of`.
 
+    u and v are orthogonal, of length `pitch_mm`.
+
     Args:
         values: in the order of `NAMES` [deg, mm].
         pitch_mm: of a pixel along u and v.

@@ -32,6 +32,8 @@ def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:
 def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
     """Check that each array is there.
 
+    Further arrays are allowed.
+
     Raises:
         ExchangeError: names those that are missing.
     """
@@ -43,6 +45,8 @@ def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
 
 def views_of(arrays: Arrays, name: str, file: str) -> int:
     """Count the views of one array, (n, ...).
+
+    A scalar has none.
 
     Raises:
         ExchangeError: there are none.
@@ -105,6 +109,8 @@ def counts_of(
 
 def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
     """Read one array of numbers above 0.
+
+    Returns float64 of `shape`.
 
     Raises:
         ExchangeError: it has other content.

@@ -703,6 +703,9 @@ class ConeVec:
     ) -> FloatArray:
         """Project points through the focal spot onto the detector.
 
+        Points behind the source are projected through it, too; pixels outside the
+        detector are returned.
+
         Args:
             points: (k, 3) [mm], object frame.
             shape: detector (rows, cols); default: the geometry's own.
@@ -747,6 +750,11 @@ class ConeVec:
         """Compute the foot of the perpendicular from the focal spot, (n, 2)
         pixels (column, row).
 
+        It may be outside the detector; pixel centres are whole numbers.
+
+        Raises:
+            GeometryError: the detector's shape is not known.
+
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
             >>> scan.piercing_points()[0].round(6).tolist()
@@ -762,6 +770,8 @@ class ConeVec:
 
     def pixel_centers(self, shape: Shape2 | None = None) -> FloatArray:
         """Compute the positions of all pixel centres, (n, rows, cols, 3) [mm].
+
+        In the object frame; the detector's shape must be known.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -800,6 +810,9 @@ class ConeVec:
 
     def binned(self, factor: int, shape: Shape2 | None = None) -> ConeVec:
         """Bin the image by `factor`; columns and rows beyond a multiple of it are cut off.
+
+        The centre moves with what is cut off. The result has a detector shape only if
+        this one has.
 
         Args:
             factor: pixels per coarse pixel along each side.

@@ -73,7 +73,10 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
     """Stretch rows (n, 12), or changes of them, to panels `times` (n,) as far
-    from the source."""
+    from the source.
+
+    The source's three stay; the input is not changed.
+    """
     out = rows.copy()
     many = times[:, None]
     out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])

@@ -282,6 +282,8 @@ class DetectorSpec(_Frozen):
     def check_mode(self, mode: str) -> str:
         """Check that a camera mode exists; case and a prefixed number do not matter.
 
+        Names of the machine's own modes must agree exactly.
+
         Raises:
             LimitError: lists the modes that exist.
 

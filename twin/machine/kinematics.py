@@ -222,6 +222,8 @@ def _too_far(
     """Convert a motor's limit error to one of the axis that was to move; returned, not
     raised.
 
+    The range is what all its motors can do from where they are.
+
     Args:
         machine: with the virtual axis.
         axis: that was to move.

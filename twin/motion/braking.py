@@ -184,6 +184,8 @@ def braked_at(
 ) -> dict[str, Drive]:
     """Return `drives` that follow `trajectories` and brake along their path from `at` on.
 
+    Drives that have nothing to do at `at` are not braked.
+
     Args:
         drives: motors; not changed.
         at: start of braking [s].
@@ -211,7 +213,10 @@ def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[s
 
 def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
     """Return the acceleration that a motor may brake with while it follows
-    `leg` [mm/s2, deg/s2]."""
+    `leg` [mm/s2, deg/s2].
+
+    The planned one, or that of `most` if greater.
+    """
     planned = leg.acceleration(time)
     if most is None:
         return planned

@@ -280,6 +280,11 @@ def move(
 ) -> Trajectory:
     """Plan the fastest trapezoidal motion to rest at `target` from any state of motion.
 
+    Positions are not limited here; no time passes if it rests at the target.
+
+    Raises:
+        ValueError: speed or acceleration is not positive.
+
     Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong
     way, brakes to rest first and then comes back; one that is faster than `speed` brakes
     to it first.

@@ -171,6 +171,8 @@ class Lookahead:
         """Find the first contact if some motors follow `trajectories`, the
         others their programme.
 
+        None also without a guard.
+
         Args:
             trajectories: motor -> trajectory.
             since: everything before is known to be free [s]; now if None.
@@ -187,6 +189,8 @@ class Lookahead:
         self, *, deep: bool = False, standing: bool = False
     ) -> Mapping[tuple[str, str], float]:
         """Find the pairs within the safety margin now, as `Guard.touching`.
+
+        Overlaps are 0 unless `deep`.
 
         Args:
             deep: measure overlaps.
@@ -211,6 +215,8 @@ class Lookahead:
 
     def joined(self, new: Trajectories) -> Joined:
         """Find the first certified programme of these three, or none; nothing moves yet.
+
+        A halt that gets no motor any farther does not count.
 
         1. The new motors follow the request, the others carry on.
         2. The new motors halt before the contact, the others carry on.
@@ -492,6 +498,8 @@ class Lookahead:
     def _within_travel(self, trajectories: Trajectories) -> bool:
         """Return whether motors that brake by themselves rest within their travel.
 
+        To `POSITION_ROUNDING`.
+
         One that stops in step with a weaker one goes farther than its own programme did.
         """
         axes = self.machine.axes
@@ -602,6 +610,8 @@ class StageChange:
     def renewed(self, before: StageChange) -> Joined:
         """Judge the change at the takeover, reusing the verdict found `before` where
         nothing has changed.
+
+        Judged anew only if at most `MAX_SWEPT_LEGS` legs are under way.
 
         Args:
             before: the same change, as it was prepared and swept.

@@ -241,6 +241,9 @@ def collision_error(
 ) -> CollisionError:
     """Make the error for a motion that a contact cut short; returned, not raised.
 
+    It has the pair, the time to the contact [s], the last free positions, and the
+    attempts so far.
+
     Args:
         contact: the two parts and the time.
         now: time of the command [s].

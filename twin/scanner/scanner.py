@@ -188,6 +188,8 @@ class ScannerTwin:
     ) -> ConeVec:
         """Compute the geometry of poses with `correction`, checked (thesis 4.8.3).
 
+        Without a correction nominal; pixels must have the camera's pitch.
+
         Raises:
             GeometryError: a geometry no scanner can have.
         """
@@ -327,6 +329,8 @@ class ScannerTwin:
         """List messages about targets beyond a limit that would arrive at the limit;
         nothing moves.
 
+        All end with "set to the limit", also where the machine refuses such targets.
+
         Args:
             targets: axis -> position [mm, deg].
             now: twin time [s].
@@ -392,6 +396,8 @@ class ScannerTwin:
 
     def estop(self, now: float, by: str = "") -> StopMotion:
         """Stop the motors by the machine's stop category; switch X-rays off.
+
+        Category 0 coasts, others brake as hard as allowed. Calling it again stops again.
 
         Motion and X-rays are rejected until a reset. Motors that coast already go on
         coasting.
@@ -529,6 +535,9 @@ class ScannerTwin:
     ) -> StageChange:
         """Prepare another sample or correction for its sweep; nothing is changed yet.
 
+        Targets that the motors are bound for already are left out; the safety state must
+        allow the others.
+
         `certified` on it may run in another thread; then `take_stage` puts it in force.
 
         Args:
@@ -574,6 +583,8 @@ class ScannerTwin:
     def take_stage(self, change: StageChange, now: float) -> CollisionError | None:
         """Put a certified change of the stage in force: sample, correction, guard,
         paces and moves.
+
+        A halt also counts as a stop.
 
         What is under way is judged anew where it has changed meanwhile. Motion that is
         not free of the new stage is halted, if halting is free. Moves of the change
@@ -775,6 +786,8 @@ class ScannerTwin:
     def _touching(self, now: float) -> tuple[str, str] | None:
         """Find the nearest pair within the safety margin now; the result is kept for a
         scanner at rest.
+
+        Closer than the margin by more than rounding, or in contact; None without a guard.
 
         Args:
             now: twin time [s].

@@ -121,7 +121,11 @@ class StagePlacement:
 
     def to_sample(self, cone_vec: ConeVec) -> ConeVec:
         """Transform a geometry of the object's frame to the sample's own frame
-        (for the projector)."""
+        (for the projector).
+
+        The placement's turn and shift [mm] are undone; without a placement the geometry
+        itself.
+        """
         if self == StagePlacement():
             return cone_vec
         back = self.rotation.T
@@ -264,6 +268,9 @@ def readout_of(
 ) -> Readout | None:
     """Compute derived quantities of the first view of a geometry.
 
+    Voxel and field are at the axis [mm], the cone angle up and down [deg], piercing point
+    and axis column in pixels.
+
     Args:
         cone: in the object's frame.
         shape: of the image, (rows, cols).
@@ -341,6 +348,8 @@ def changed_tube(
 ) -> TubeSettings:
     """Change voltage [kV] or power [W] of a tube; None keeps it.
 
+    X-rays stay as they are; the tube itself is not changed.
+
     Raises:
         LimitError: outside the tube's range; the message names the setting.
     """
@@ -402,6 +411,8 @@ def require_applicable(
 ) -> None:
     """Check that a correction leaves a geometry that a scanner can have, anywhere in the
     travel.
+
+    Anywhere is judged at the motor positions nearest to the source.
 
     Args:
         machine: with the travel of its motors.

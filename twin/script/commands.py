@@ -227,6 +227,8 @@ def _to_json(command: Command) -> dict[str, Any]:
 def _from_json(value: Any) -> Command:
     """Read a command back from the form of `_to_json`; a Command passes unchanged.
 
+    Fields that do not fit raise pydantic's ValidationError, a ValueError.
+
     Raises:
         ValueError: an unknown command.
     """

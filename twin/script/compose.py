@@ -49,6 +49,9 @@ Zero offsets are of that kind, a machine built otherwise is not (assumed).
 def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> str:
     """Compose the text of a script for a requested scan.
 
+    The last attempt's error is raised. At the usual SOD without placements a second
+    placement is added where one is possible.
+
     Distances that the request leaves out are the usual ones where the machine allows
     them, else those at home.
 
@@ -117,7 +120,10 @@ def _distances_to_try(
     request: ScanRequest, places: MotorTargets
 ) -> Iterator[tuple[float, float, float]]:
     """Yield SOD, SDD and height to try: as requested, else the usual ones, else
-    those at home [mm]."""
+    those at home [mm].
+
+    The usual are 600 and 1059 mm; every combination, SOD changing slowest.
+    """
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
         if asked is None:
@@ -213,6 +219,8 @@ class _Writer(MotorTargets):
     def step(self) -> Iterator[str]:
         """Yield the rows of a turn that stops for every image, the sample taken out of
         the beam before.
+
+        Over 360 degrees, the last angle left out; the settings file is written before.
         """
         w = self.request
         name, rotation = self.rotation
@@ -325,7 +333,11 @@ class _Writer(MotorTargets):
 
     def turn(self, total: float, frames: int, first: int) -> Iterator[str]:
         """Yield a smooth scan of `frames` images over `total` degrees from angle 0,
-        and its run-up."""
+        and its run-up.
+
+        Afterwards speed and acceleration are the axis's own again; images are numbered
+        from `first`.
+        """
         name, rotation = self.rotation
         yield from self.run_up(total, frames)
         yield from self.sweep(total, frames, first)

@@ -24,6 +24,9 @@ async def apply(
 ) -> p.CorrectionResult:
     """Make a correction, put it in force instead of the last one, and save both.
 
+    A known name with the same values is put in force again. The result has the
+    correction.
+
     The answer warns of motion that was halted because it would collide now.
 
     Raises:

@@ -73,6 +73,8 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
     """Return a paused job to its pose and continue it; queue one that ended early once
     more.
 
+    At most `PATIENCE_S`. A done job raises as `Jobs.resume`.
+
     The answer waits until the job runs or is refused.
 
     Raises:
@@ -191,6 +193,8 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
 def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
     """Return the status of a job that is to continue; raise the CollisionError of one
     that is paused by an obstacle.
+
+    Other errors of a paused job are in the status.
     """
     error = None
     if job.runner is not None:
