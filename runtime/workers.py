@@ -48,7 +48,7 @@ class Worker:
     def __init__(self, memory_bytes: int) -> None:
         """Start a worker process with a memory limit [bytes], connected by a socket pair.
 
-        It inherits the environment without the token; its standard streams are closed.
+        It inherits the environment without the token; its standard streams go nowhere.
         """
         self._memory = memory_bytes
         ours, theirs = socket.socketpair()

@@ -196,7 +196,8 @@ class ScanRunner:
     def step(self) -> None:
         """Run one frame, or one command that takes none, and pause again; clears a shown error.
 
-        Calls add up: two before the run obeys make two steps.
+        A step requested while a frame waits for room is for the next frame; others before
+        the run obeys are one.
         """
         self._pause = False
         self._single_step = True

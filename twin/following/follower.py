@@ -147,9 +147,9 @@ class Follower:
         """Update the mirror after time without a message: raise alarms for overdue and
         silent commands.
 
-        Overdue commands are reported only while it is known that their ends are not
-        heard; a late script is an error. An alarm is raised once until its condition
-        ends.
+        Overdue commands are reported unless ends are known not to be heard; then they
+        are ended by prediction. Silent ones likewise. A late script is an error. An alarm
+        is raised once until its condition ends.
 
         Commands without a sign of life for long are forgotten.
 
