@@ -270,6 +270,9 @@ def _scaled(volume: Volume, made_of: Material) -> Volume:
 def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Object:
     """Sample the materials of a phantom on one grid about the origin.
 
+    Negative amounts count as 0; a box side is at least 1e-3 of the longest. Without parts
+    there are no materials.
+
     Args:
         parts: from `channels`.
         size_mm: the phantom's extent along x, y, z [mm].

@@ -55,6 +55,8 @@ class PhantomError(TwinError):
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
     """Make the error for a value that is not what is `allowed` at key path `where`;
     returned, not raised.
+
+    The value is shown with at most 80 characters.
     """
     shown = repr(value)
     if len(shown) > 80:
@@ -136,6 +138,8 @@ def number(value: object, where: str) -> float:
 def positive(value: object, where: str) -> float:
     """Return `value` if it is a length from `MIN_LENGTH_MM` on; raise PhantomError
     otherwise.
+
+    At most `MAX_NUMBER`, and never 0.
     """
     found = number(value, where)
     if found < MIN_LENGTH_MM:

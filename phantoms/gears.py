@@ -132,6 +132,8 @@ def _teeth(
     """Compute the rings of a gear's outer surface from its bottom to its top, turned by
     the slant towards the middle.
 
+    The first and last ring are not turned; 2 `LAYERS` + 1 rings.
+
     Args:
         teeth: number of teeth.
         radii_mm: at the teeth's foot and tip.

@@ -34,6 +34,8 @@ def united(mesh: TriangleMesh) -> TriangleMesh | None:
     """Unite the overlapping bodies of a mesh; return it unchanged where the boxes around
     them are apart.
 
+    One unchanged body may meet itself: then it is not looked at.
+
     Shells turned inwards are cavities of the body around them. None where the surface of
     a body meets itself, so that it has no inside.
     """
@@ -51,6 +53,9 @@ def cut(
     parts: Sequence[tuple[analytic.Scene, Sequence[Surface], float]],
 ) -> tuple[analytic.Scene, tuple[Surface, ...]]:
     """Cut solids and surfaces so that those of a higher priority take precedence.
+
+    Pieces whose boxes do not overlap something of a higher priority stay as they are,
+    also round ones; what is cut becomes a mesh.
 
     Args:
         parts: solids, surfaces and the priority of both.

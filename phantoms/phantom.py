@@ -148,6 +148,9 @@ class Phantom(ArrayValue):
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
         """Convert to voxels for X-rays, at every call.
 
+        `voxel_mm` and `oversample` are not used for a phantom that came as voxels.
+        Nothing is cached.
+
         Args:
             voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side. A
                 phantom that came as voxels is returned as it came.

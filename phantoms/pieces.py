@@ -135,6 +135,8 @@ def size_about_origin(
     """Compute the full extent along x, y, z [mm] of the box about the origin
     that contains everything.
 
+    Voxels are not looked at.
+
     Raises:
         PhantomError: there is nothing.
     """

@@ -109,7 +109,10 @@ def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
 
 def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
     """Return whether a solid is a hole: negative, and not a bead that absorbs less
-    than its body."""
+    than its body.
+
+    A bead is a ball whose centre is exactly among `beads`.
+    """
     if solid.mu_per_mm >= 0.0:
         return False
     if isinstance(solid.shape, analytic.Sphere) and len(beads):

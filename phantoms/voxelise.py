@@ -200,6 +200,8 @@ def _quadric(
     """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded
     in an upright cylinder.
 
+    Columns that only touch miss.
+
     Args:
         to_unit: (3, 3), maps the quadric to the unit sphere or cylinder.
         center: (3,) [mm].

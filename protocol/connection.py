@@ -351,6 +351,8 @@ class Connection:
     ) -> list[bytes]:
         """Take urgent messages out of the queue before their turn.
 
+        Errors in the queue, and larger messages, keep their place.
+
         Every message up to `MAX_OVERTAKING_BYTES` is examined once: first its bytes are
         searched for `names`, which is fast, and only a message with a match is passed to
         `wanted`, which may decode it.

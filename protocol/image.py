@@ -26,6 +26,8 @@ DTYPES: tuple[str, ...] = get_args(Dtype)
 def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
     """Convert an array to an image value; `data` is a read-only view where the layout allows.
 
+    A copy is made of an array in another order or byte order.
+
     Returns:
         {"dtype": name, "shape": sizes, "data": little-endian bytes in C order}.
 

@@ -421,6 +421,8 @@ class Correlation(Generic[_W]):
     def answer(self, answer: Response | Failure) -> Response | Failure:
         """Check that an answer belongs to an open request, and close that request.
 
+        Of two requests with one id, one is closed.
+
         An error without id is about the connection and always allowed.
 
         Returns:

@@ -90,6 +90,8 @@ def parse_params(
 ) -> _P:
     """Validate the parameters of a call, given by name, by position, or not at all.
 
+    Names that the model does not have are a problem, too, if it forbids them.
+
     Args:
         method: the called method.
         given: names and values, or values in the order of the method's fields, or None.

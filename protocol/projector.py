@@ -77,6 +77,8 @@ def _rows(value: object) -> object:
 def _stack(value: object) -> object:
     """Convert an image value to projections, float32 of shape (n, rows, cols), read-only.
 
+    Values are not checked; bytes are not copied.
+
     Raises:
         ValueError: no image value, another type or shape, or an empty one.
     """
@@ -93,6 +95,8 @@ def _stack(value: object) -> object:
 
 def _buffer(value: object) -> object:
     """View the bytes of a `data` field, raw or base64, as a read-only memoryview.
+
+    Bytes are not copied, base64 is decoded.
 
     Raises:
         ValueError: neither bytes nor base64.

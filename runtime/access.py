@@ -182,6 +182,8 @@ def is_rebound(host: str) -> bool:
 def check_bind(host: str, token: str | None) -> None:
     """Check that an address that others can reach is protected by a token.
 
+    A token needs 16 characters, also on the loopback.
+
     Args:
         host: where a server is to listen.
         token: that clients must bring; None for none.

@@ -323,6 +323,8 @@ def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None
     """Print the JSON line of a ready server, with its process id; freeze garbage
     collection.
 
+    On another kind of loop only the line is printed.
+
     The measure of how long the loop is held begins here.
 
     Args:

@@ -76,6 +76,8 @@ def _in_child() -> None:
 def watch() -> None:
     """Let kernel threads sleep while they wait in this process (Linux), and have forked
     children compute in one thread.
+
+    Elsewhere kernel threads are left as they are.
     """
     if sys.platform == "linux":
         kernel_threads.waiting = load_sleeping()

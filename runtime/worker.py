@@ -65,6 +65,8 @@ def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
 def limit(what: str, most: int) -> None:
     """Limit one resource of this process to `most`, or to the system's hard limit.
 
+    The hard limit becomes that, too, so it can not be raised again.
+
     Args:
         what: name of the resource, such as RLIMIT_CPU.
         most: in the resource's unit.

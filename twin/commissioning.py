@@ -524,6 +524,8 @@ def zero_offsets(
         """Fit the first name's line and the other's value, put them into `lines`, and
         note scans that contradict.
 
+        A drift is stored only if it is determined; contradictions are above `MAX_SIGMAS`.
+
         Args:
             sides: (scans + priors, k) design matrix; rows beyond those of the scans are
                 priors, of the drift first.

@@ -147,6 +147,8 @@ LONGEST_NAME: Final = 80
 def nearest_name(asked: str, names: Sequence[str]) -> str | None:
     """Give the name that is most like the one asked for; None if none is.
 
+    None also for a name longer than `LONGEST_NAME`.
+
     Upper and lower case do not matter.
 
     Example:

@@ -79,6 +79,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run the loop until a future is done, and return its result.
 
+        Only this call jumps the clock when nothing else is left to happen.
+
         Raises:
             Deadlock: no event is left that could complete it.
         """

@@ -34,6 +34,8 @@ def machines(draw: st.DrawFn) -> Machine:
     directions of their own, with other travel, speeds and accelerations; name and zero
     offsets are the shipped one's.
 
+    Travel shrinks towards home, speed and acceleration to 0.1 to 1 of the shipped ones.
+
     Example:
         >>> @given(machines())
         ... def test_home_is_within_travel(machine: Machine) -> None:

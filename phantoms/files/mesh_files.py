@@ -261,6 +261,9 @@ def voxel_phantom(
 ) -> Phantom:
     """Make a phantom from a ready grid.
 
+    The size is that of the box about the origin; labels and several materials are not
+    made here.
+
     Args:
         data: [z, y, x], attenuation [1/mm].
         voxel_mm: voxel edge, one or along x, y, z [mm].

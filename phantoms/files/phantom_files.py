@@ -47,6 +47,8 @@ Each becomes up to 1280 triangles where shapes are drawn and checked for collisi
 def read_phantom_file(path: Path) -> Phantom:
     """Read the phantom of a TOML or JSON file; meshes that a scene names are beside it.
 
+    The format follows from the content, not from the suffix.
+
     Raises:
         PhantomError: names file, key path, value and allowed values.
     """
@@ -198,6 +200,8 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
 
 def solids_of(value: object, where: str) -> tuple[Solid, ...]:
     """Read a solid `{kind, ..., material, replaces}` of a scene file.
+
+    Whether the other material is there is not checked here.
 
     Args:
         value: entry of the document.

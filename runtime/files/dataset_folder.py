@@ -185,6 +185,8 @@ _confined: Directory | None = None
 def confined(root: Directory) -> Iterator[None]:
     """Ensure that, inside, this process reads nothing below `root` through a link.
 
+    It is for the whole process, threads included; contexts nest.
+
     A user's own folders may well have links in them; paths that strangers request of a
     server may not.
     """

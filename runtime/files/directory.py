@@ -140,6 +140,8 @@ class Directory:
     def held(self) -> Directory:
         """Hold it open: whatever its name refers to later, it stays this directory.
 
+        Returns itself; it must be below another.
+
         Raises:
             DatasetWriteError: there is no such directory, or there is a link in its
                 place.
@@ -317,6 +319,8 @@ class Directory:
     def link(self, name: str, second: str, to: Directory | None = None) -> None:
         """Give the entry `name` a second name, here or in another directory.
 
+        A link is not followed; a file of the second name raises FileExistsError.
+
         Raises:
             OSError: there is nothing, or the system has no links.
         """
@@ -346,6 +350,8 @@ class Directory:
     def discard(self, name: str) -> None:
         """Delete an entry that is no directory, safely; none there is no error.
 
+        On the disk when it returns.
+
         Raises:
             DatasetWriteError: the system refuses.
         """
@@ -356,6 +362,8 @@ class Directory:
 
     def stat(self, name: str) -> os.stat_result | None:
         """Return the status of an entry, of a link itself; None if there is none.
+
+        None also if a folder above is missing.
 
         Raises:
             OSError: it cannot be known.
@@ -486,6 +494,8 @@ class Directory:
     def _open_below(self, above: Directory) -> int | None:
         """Open the descriptor relative to the directory above, without following a link;
         None on a system without.
+
+        The caller closes it.
         """
         if not _RELATIVE:
             return None
@@ -495,6 +505,8 @@ class Directory:
     def _at(self, name: str) -> str:
         """Check that `name` is one component; return it for a call that takes
         the descriptor, too.
+
+        On a system without descriptors it is the whole path.
 
         Raises:
             OSError: another kind of name.
@@ -592,7 +604,10 @@ def _allocate(file: int, size: int) -> None:
 
 def free_bytes(path: Path) -> int | None:
     """Return the bytes free for this user on the disk of `path`; None if the system does
-    not report them."""
+    not report them.
+
+    `path` must exist.
+    """
     try:
         usage = os.statvfs(path)
     except (OSError, AttributeError):
@@ -645,6 +660,8 @@ def _fields(file: Path) -> dict[str, int]:
 def open_data(root: Path) -> Directory:
     """Open a twin's data directory, made if it is missing; check that files can be
     written into it.
+
+    The caller closes it.
 
     A full disk is no hindrance: state and jobs have room of their own (`spare_files`).
 

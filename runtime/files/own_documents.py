@@ -286,6 +286,9 @@ def set_aside(folder: Directory, name: str, error: object, without: str) -> None
     """Rename a damaged file, or another thing in its place, and log one line; raises
     nothing.
 
+    An earlier one set aside under that name is replaced; if renaming fails the line says
+    so.
+
     Args:
         folder: of the file.
         name: of the file.

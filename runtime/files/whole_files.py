@@ -22,6 +22,8 @@ OF_LIBRARIES: Final = re.compile(r"No space left|errno = (\d+)|requested and \d+
 def require_bytes(path: Path, needed: int) -> None:
     """Refuse a file that its disk cannot hold, before anything of it is written.
 
+    Room for other files is not kept.
+
     Args:
         path: of the file.
         needed: its size [bytes].

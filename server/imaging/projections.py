@@ -212,6 +212,8 @@ class Imaging:
     ) -> Float32Array:
         """Compute line integrals of `sample` at n nominal poses, in the true geometry.
 
+        Solids, meshes and voxels are added up with their factors.
+
         The sample is sent to the projector where it is new there.
 
         Args:

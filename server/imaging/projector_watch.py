@@ -101,6 +101,9 @@ class ProjectorWatch:
         """Record the problem of one projector; set `problem` and call `changed` if all
         have one, or no longer.
 
+        A projector that has not been asked yet counts as without a problem; `problem` is
+        the first one's.
+
         Args:
             client: of the projector.
             problem: None if it answers.

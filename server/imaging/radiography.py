@@ -351,6 +351,8 @@ class Radiography:
     ) -> ideal.Counts:
         """Compute the counts that the camera saves of a radiograph.
 
+        For ideal physics `before` and `trapped` are not used.
+
         Args:
             radiograph: without noise.
             camera: mode and region.

@@ -99,6 +99,8 @@ class Outbox:
         """Send an event now, or keep it while the transport is full: newest of its slot,
         or in order.
 
+        Nothing if the connection has ended. An event that cannot be encoded is logged.
+
         A connection with more than `max_events` unread is aborted.
 
         Args:

@@ -104,7 +104,10 @@ class TcpServer(ListeningServer):
 
     def look_soon(self, link: _Link) -> None:
         """Schedule a search for urgent requests of a connection, in turns that no
-        flood can fill."""
+        flood can fill.
+
+        A connection is in the list once.
+        """
         self._unexamined[link] = None
         if not self._examination_due:
             self._examination_due = True
@@ -638,6 +641,9 @@ class _Link(asyncio.BufferedProtocol):
     ) -> None:
         """Serve the remaining items of a batch, each in a turn of its own, and keep their
         answers.
+
+        Once the answers are too large, ordinary items are answered with that error
+        unserved.
 
         Args:
             batch: whose items are served.

@@ -43,6 +43,8 @@ Answer = Callable[[Context, JobClient, Id, Any], Awaitable[object]]
 async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object:
     """Check the token, admit the client and end its hello timeout.
 
+    The protocol version is not checked here.
+
     Args:
         context: of the server.
         client: that connects.
@@ -214,6 +216,9 @@ async def backproject(
     """Compute the adjoint of projections, and answer it or store it, added to a named
     volume.
 
+    A named volume that does not exist begins at zero; the sum replaces it, with parts 0
+    in the answer.
+
     Args:
         context: of the server.
         client: that calls.
@@ -275,6 +280,8 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) -> object:
     """Cancel a request of this client; the answer, a dict with the key cancelled, says
     whether there was one.
+
+    The cancelled request is answered with an error.
     """
     job = client.jobs.get(p.request)
     if job is not None:
@@ -299,6 +306,8 @@ def _accumulator(
     """Return the volume called `name`, to which a back projection is added; None if there
     is none, or no name.
 
+    Only the shape is compared, not voxel size and place.
+
     Raises:
         RpcError: it is not a volume of this grid.
     """
@@ -317,6 +326,8 @@ def _warnings(doubts: list[str]) -> dict[str, list[str]]:
 
 def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | TriangleMesh:
     """Check a volume's values, make its projection layout, and return the volume; blocks.
+
+    Meshes are returned as they are.
 
     Args:
         volume: complete.

@@ -112,6 +112,8 @@ class VolumeStore:
     def put(self, name: str, value: Body, *, evictable: bool = False) -> None:
         """Store a complete volume, mesh or scene under `name`, replacing its namesake.
 
+        It becomes the most recently used; evictable ones may be removed for it.
+
         Args:
             name, value: what.
             evictable: whether it may be forgotten where memory is needed.

@@ -169,6 +169,8 @@ class FrameLink(asyncio.BufferedProtocol):
     def eof_received(self) -> bool:
         """Close the connection when the peer has closed its side; inside a frame call
         `on_broken` first.
+
+        Returns False: the transport closes.
         """
         if self.mid_frame and not self._over:
             self._over = True

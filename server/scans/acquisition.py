@@ -239,6 +239,8 @@ class Acquisition:
         """Convert images to counts, with noise by the frame's number, and write each
         frame's file.
 
+        Without a seed there is no noise.
+
         Args:
             batch: frames with files.
             images: one for each frame.

@@ -277,6 +277,8 @@ class Checks:
 def planned(check_input: CheckInput) -> tuple[ScanPlan, list[str]]:
     """Return the plan of a scan and its warnings in words; blocks.
 
+    At most `MAX_PROBLEMS` warnings, then how many more.
+
     Raises:
         RpcError: -32005 or -32002, it may not run.
     """

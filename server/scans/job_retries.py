@@ -73,6 +73,8 @@ class Retry:
     def cancel(self) -> None:
         """Cancel the next attempt and reset the pause: a user takes over, or the job has
         ended.
+
+        Nothing to cancel is no error.
         """
         if self._task is not None:
             self._task.cancel()

@@ -317,6 +317,8 @@ class Jobs:
     def pause(self, job: Job) -> None:
         """Pause a running job; nothing to do for one that is paused.
 
+        A planned retry is cancelled, and only `resume` continues it.
+
         Raises:
             RpcError: -32003, it does not run.
         """
@@ -343,6 +345,9 @@ class Jobs:
 
     def abort(self, job: Job, reason: str | None = None, by: str | None = None) -> None:
         """End a job in any phase; its data set stays, incomplete, with the reason.
+
+        A waiting job ends at once; a running one at its next wait; the first requester
+        stays `ended_by`.
 
         X-rays go off with a job that has begun.
 
@@ -412,6 +417,8 @@ class Jobs:
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
         """Restore the jobs of an earlier server; those that had not ended are incomplete
         now.
+
+        None of them runs by itself.
 
         Changed jobs are noted for the next write, and the oldest ones beyond the limits
         forgotten.
@@ -640,6 +647,8 @@ class Jobs:
     def _store_failure(self, job: Job, error: Exception) -> JobPhase:
         """Store an error in its job, log it unless a user caused it, and return the phase
         "failed".
+
+        The error is stored in the wire's form.
         """
         if not is_user_error(error):
             log("job failed", logging.ERROR, error=True, job=job.id)

@@ -208,6 +208,8 @@ class ScanRunner:
     def abort(self, reason: str | None = None) -> None:
         """Request the end of the run: it raises `JobAborted`, with the reason, at its
         next wait.
+
+        Without a reason an earlier one stays.
         """
         if reason is not None:
             self._end = JobAborted(reason)
@@ -422,7 +424,10 @@ class ScanRunner:
 
     async def _begin(self) -> None:
         """Wait where a stop came before the run has begun: nothing is set before it may go
-        on."""
+        on.
+
+        Settings saved by such a stop are dropped.
+        """
         while self._has_request():
             await self._wait_for_request(0.0)
             self._set_progress(phase="running", error=None)
@@ -614,6 +619,8 @@ def _events(
 ) -> list[tuple[float, PlanStep | Exposure]]:
     """Sort commands and frames by time; at equal times a command is before its own
     frames.
+
+    Of commands at one time the earlier in the plan comes first.
     """
     keyed: list[tuple[tuple[float, int, int], PlanStep | Exposure]] = []
     keyed += [((s.start_s, s.index, 0), s) for s in steps]

@@ -596,6 +596,8 @@ class Submissions:
     def _require_room(self, size: int, name: str) -> None:
         """Check that the images of a scan that are not there yet fit on the disk.
 
+        Images that are there count by their size, complete or not.
+
         Args:
             size: of all images [bytes].
             name: of the data set.

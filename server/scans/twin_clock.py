@@ -86,6 +86,8 @@ class TwinClock:
     def set_speed_up(self, speed_up: SpeedUp) -> None:
         """Run faster or slower from now on.
 
+        The present time does not jump.
+
         Raises:
             LimitError: not a positive number and not "max".
         """

@@ -284,6 +284,8 @@ def _file(correction: NamedCorrection) -> str:
 def _joined(before: History, in_force: History) -> History:
     """Join the history of the file and that of the state, whose last name is in force.
 
+    One name cuts the file's history after its last place, or is appended.
+
     Args:
         before: of the file.
         in_force: of the state: a whole history, or the one name in force.
@@ -306,6 +308,8 @@ def _read_history(data: bytes) -> History:
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
     """Parse a correction and its origin (or None), and check that it is plausible.
+
+    Shifts may be of any finite length here.
 
     Raises:
         ValueError, TwinError: no correction, or an implausible one.

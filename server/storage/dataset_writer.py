@@ -135,6 +135,8 @@ class DatasetWriter:
         """Mark the data set complete: write its texts anew, after the images are safe on
         the disk.
 
+        The folder stays locked until `close`.
+
         Args:
             duration_s: of the scan as it ran [s]; None keeps the planned one.
 

@@ -83,6 +83,8 @@ def correction_of(part: p.CorrectionPart) -> NamedCorrection:
 def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
     """Check that all of a scene fits this scanner; the scanner itself is not changed.
 
+    In that order; motors left out stay, collisions are not looked for.
+
     Args:
         scene: document.
         scanner: on a copy of which the settings are tried.
@@ -121,6 +123,8 @@ def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, flo
 def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
     """Set tube, camera and rates of the axes as in the scene; X-rays and motors stay as
     they are.
+
+    In the order rates, tube, camera; those set before an error stay set.
 
     Raises:
         LimitError, UnknownNameError: a setting or an axis that this scanner does not

@@ -154,6 +154,8 @@ class SampleStore:
     def load(self, name: str, material: str | None = None) -> Phantom:
         """Load the phantom called `name`; parsed once and cached. Blocks.
 
+        Two threads may parse the same one at a time; the last stays.
+
         Args:
             name: a shipped phantom's or an upload's.
             material: instead of the one a mesh was uploaded with.
@@ -239,6 +241,8 @@ class SampleStore:
 
     def parse(self, name: str, material: str | None = None) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
+
+        It is taken from the uploads under way, so a second call fails.
 
         Args:
             name: the upload's.

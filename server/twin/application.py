@@ -88,6 +88,8 @@ class TwinSession:
     def _take_control(self, what: str) -> None:
         """Take control for the client if nobody holds it, and publish the new controller.
 
+        The lease of its own control is renewed.
+
         Raises:
             RpcError: -32003, another client is the controller.
         """

@@ -228,6 +228,8 @@ class Hub:
     ) -> None:
         """Send an event to all subscribers of `topic`.
 
+        Its number counts, and topics with a history keep it, even without subscribers.
+
         Args:
             topic: which.
             data: plain data or a model, or a function that makes it for a view.
@@ -254,6 +256,8 @@ class Hub:
         slot: str | None = "",
     ) -> None:
         """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
+
+        Nothing if it is not subscribed; the history and the rate are not touched.
 
         Args:
             listener: who has just subscribed.

@@ -178,6 +178,8 @@ def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
 def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
     """Find the line of the last motion under way at the contact that moves one of the two.
 
+    0 for a plan without steps.
+
     Args:
         plan: with its steps.
         scene: which motors move which bodies.

@@ -432,6 +432,8 @@ class RelativeMotion:
         """Shorten segments in which one body turns evenly in place: later turns
         repeat the first.
 
+        Nothing with none or two turning bodies; at least one whole turn stays.
+
         Whole turns are taken out of such segments, so they end in the pose they ended in.
         """
         if len(self._turning) != 1:
@@ -648,6 +650,8 @@ def refine_pair(
     motion: RelativeMotion, separate: Separate, limits: Limits, best: float
 ) -> tuple[float, int]:
     """Refine the least clearance of a pair that is known to be free.
+
+    An overlap ends it.
 
     Args:
         motion: of one body relative to the other.

@@ -54,6 +54,9 @@ REFINEMENT_STEPS = 40
 def leaving(scene: CollisionScene, path: Path) -> Contact | None:
     """Find the first contact of a motion that begins with bodies overlapping, or None.
 
+    Overlapping is a clearance up to `GRAZING_MM`; such pairs stop only what brings them
+    closer.
+
     Args:
         scene: bodies and pairs that must not touch.
         path: the motion.

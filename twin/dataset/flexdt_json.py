@@ -623,6 +623,9 @@ class DatasetDocument(_Model):
     ) -> Poses:
         """Compute nominal poses of the frames of one kind from their motor positions.
 
+        The camera is each frame's; frames of one mode and region in a row must name the
+        same motors.
+
         Args:
             machine: whose geometry and sensor are used.
             profile: zero offsets.

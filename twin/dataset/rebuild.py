@@ -52,6 +52,8 @@ def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
     """Compute stage angles of images 0 to count - 1 by the smooth-scan rule: i * (last -
     start) / (N - 1).
 
+    N is `count` where the texts state none; one image has the start angle.
+
     Args:
         settings: gives N ("# projections"), start and last angle; rot_obj there is the
             run-up position and does not enter.

@@ -90,6 +90,8 @@ def poses_of(
     """Compute poses with these figures and an upright detector; the inverse of
     `figures_of`.
 
+    Pixels are square; the source is at y = 0.
+
     The figures do not determine the scanner's origin and the sample's height, so those
     are arguments.
 

@@ -79,6 +79,8 @@ class ScanGeometry:
     def rows_up(self) -> ScanGeometry:
         """Return the detector with rows counted from the other side: v is negated.
 
+        Twice gives the same geometry; files, shape and notes stay.
+
         It belongs to images that are turned upside down.
         """
         down = np.repeat([1.0, -1.0], [9, 3])
@@ -163,6 +165,8 @@ def circle_of(
 
 def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     """Return the pixel pitch (u, v) [mm] of a panel with rectangular pixels of one size.
+
+    Both within `SQUARE_TOLERANCE`; the pitches are means over the views.
 
     Args:
         cone_vec: n views.

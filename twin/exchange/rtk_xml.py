@@ -192,6 +192,8 @@ def read_rtk(
 def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
     """Check the distances of source to isocentre and to detector, as the file has them.
 
+    One view with possible distances is enough; no views pass.
+
     Negative ones are those of a panel whose rows grow downwards.
 
     Raises:

@@ -821,6 +821,8 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
     """Format the log line of a command that a script can have, once; empty for others.
 
+    A tuple of one line or of none.
+
     Args:
         waiting: record of the command.
         wait: its wait.

@@ -427,6 +427,8 @@ class ConeVec:
     def concatenate(cls, parts: Sequence[ConeVec]) -> ConeVec:
         """Stack several geometries, in order; the detector's shape is kept if all share it.
 
+        Else it is unknown (None).
+
         Raises:
             GeometryError: no geometry.
 
@@ -534,6 +536,8 @@ class ConeVec:
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> ConeVec:
         """Make a geometry from the document of `to_dict`.
+
+        A document without `detector_shape` gives None.
 
         Raises:
             GeometryError: the rows do not have twelve finite numbers each, or the shape
@@ -858,6 +862,8 @@ def check_shape(shape: Shape2) -> Shape2:
 def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
     """Return stage angles (n,) [deg]: given ones, or a number of them from 0 on, even
     over full turns.
+
+    Given angles are returned as float64, not wrapped.
 
     Args:
         angles: a number of views, or angles (n,) [deg].

@@ -169,7 +169,10 @@ class Panel:
 
     def without_lag(self, image: Float32Array, before: Float32Array) -> Float32Array:
         """Subtract from line integrals (rows, cols) the light of the frame `before`, as
-        that shows it itself: of a lag of 5 % some 0.2 % remain."""
+        that shows it itself: of a lag of 5 % some 0.2 % remain.
+
+        At least `MIN_LIGHT_SHARE` of the light that is shown stays.
+        """
         share = self.lag / (1.0 - self.lag)
         shown = np.exp(-image)
         light = (shown - share * np.exp(-before)) / (1.0 - share)

@@ -101,6 +101,8 @@ class Rigid:
     ) -> Rigid:
         """Make a right-handed turn.
 
+        A direction is normalised; one of length 0 raises, too.
+
         Args:
             axis: "x", "y", "z", or a direction (3,).
             angle_deg: [deg].

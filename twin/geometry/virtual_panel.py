@@ -21,6 +21,8 @@ def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
     """Compute the factor on each panel's distance from the source that puts it
     behind an object.
 
+    A moved panel is `MOVED_BEHIND` times as far as the farthest point; 1 without points.
+
     Args:
         cone_vec: n views.
         points: (k, 3) whose convex hull holds the object [mm].

@@ -951,6 +951,8 @@ def builtin_machine_text(name: str) -> str:
 def profile_of(machine: Machine, name: str | None = None) -> Profile:
     """Load the shipped profile `name` of a machine, or its default, or one of zero offsets.
 
+    Zero offsets are called `ZERO` and are only for a machine without a default.
+
     Raises:
         UnknownNameError: lists the shipped profiles.
     """
@@ -1178,6 +1180,8 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
 
 def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
     """Merge components by name.
+
+    Values of the file replace those of the base key by key.
 
     Two components of one name are both kept, so that the check of names finds them.
 

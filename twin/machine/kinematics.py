@@ -274,6 +274,8 @@ class Place:
 def places(machine: Machine) -> list[Place]:
     """List SOD, SDD and the other quantities that motors move or the file fixes.
 
+    SOD and SDD are listed in any case.
+
     Example:
         >>> from flexdt.twin.machine.description import builtin_machine
         >>> places(builtin_machine("xyzr_cabinet"))[0]

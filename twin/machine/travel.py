@@ -53,6 +53,8 @@ class Arrival:
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
     """Apply the rule for targets beyond a limit to a move of `axis`; raises nothing.
 
+    Beyond is by more than rounding; motors of a virtual axis are shortened together.
+
     Args:
         machine: whose motors these are.
         axis: motor or virtual axis that is moved.

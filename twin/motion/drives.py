@@ -131,6 +131,9 @@ def plan_move(
 ) -> dict[str, Trajectory]:
     """Plan the motion of the motors that `targets` moves; all begin now.
 
+    Motors of a virtual axis keep in step; acceleration is at least the present one.
+    `shortest` is ignored for relative targets.
+
     Args:
         machine: whose motors these are.
         drives: every motor.

@@ -332,6 +332,11 @@ def stop(
 ) -> Trajectory:
     """Plan the fastest stop.
 
+    Limits are not looked at.
+
+    Raises:
+        ValueError: the acceleration is not positive.
+
     Example:
         >>> s = stop(0.0, velocity=2.0, acceleration=4.0, time=0.0)
         >>> s.end, s.target

@@ -133,6 +133,8 @@ async def change_settings(
     """Try a change of settings on a copy of the scanner, write the state, then change the
     scanner.
 
+    Errors of `change` and `ready` leave everything as it was.
+
     Args:
         twin: whose scanner.
         change: sets it; it is tried on a copy first, and its errors are raised.

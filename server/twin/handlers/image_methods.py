@@ -106,6 +106,8 @@ def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Sh
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
     """Check that an image fits into one answer.
 
+    Counts take 2 bytes a pixel, line integrals 4, marks one more.
+
     Args:
         shape: (rows, cols) before binning.
         params: kind, binning and marks.
