@@ -65,7 +65,7 @@ def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
 def limit(what: str, most: int) -> None:
     """Limit one resource of this process to `most`, or to the system's hard limit.
 
-    The hard limit becomes that, too, so it can not be raised again.
+    Only the soft limit is set; the hard one stays.
 
     Args:
         what: name of the resource, such as RLIMIT_CPU.

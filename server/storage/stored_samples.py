@@ -154,7 +154,7 @@ class SampleStore:
     def load(self, name: str, material: str | None = None) -> Phantom:
         """Load the phantom called `name`; parsed once and cached. Blocks.
 
-        Two threads may parse the same one at a time; the last stays.
+        Two threads may parse the same one at once; the last result is kept.
 
         Args:
             name: a shipped phantom's or an upload's.
