@@ -62,4 +62,5 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
+    """List the public names."""
     return __all__

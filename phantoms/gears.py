@@ -104,6 +104,7 @@ def _holes(plastic: Material) -> list[Solid]:
 
 
 def _polar(away: float, angle_deg: float) -> tuple[float, float]:
+    """Compute (x, y) of a place at a distance from the axis [mm] and an angle [deg]."""
     angle = math.radians(angle_deg)
     return away * math.cos(angle), away * math.sin(angle)
 

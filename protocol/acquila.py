@@ -208,6 +208,9 @@ class Exchange:
     def __init__(
         self, command: AcquilaEvent, comp_type: ComponentType, now: float
     ) -> None:
+        """Begin an exchange with the command that was sent; `now` is the moment of its last
+        message.
+        """
         self.command = command
         self._type = comp_type
         self._last = now

@@ -78,6 +78,7 @@ class Prepared:
     """A message that is encoded at most once per codec, for events to many connections."""
 
     def __init__(self, message: Message) -> None:
+        """Take a message, which is encoded at the first use with each codec."""
         self.message = message
         self._pieces: dict[Codec, list[bytes]] = {}
 

@@ -30,6 +30,9 @@ def few(most: int) -> BeforeValidator:
     """
 
     def check(value: object) -> object:
+        """Raise ValueError for a mapping of more than `most` members; return any other value
+        unchanged.
+        """
         if isinstance(value, Mapping) and len(value) > most:
             raise ValueError(f"{len(value)} members; at most {most} are allowed")
         return value

@@ -56,9 +56,11 @@ class RpcError(Exception):
     data: object = None
 
     def __post_init__(self) -> None:
+        """Convert the code, which may be a `Code`, to a plain int."""
         self.code = int(self.code)
 
     def __str__(self) -> str:
+        """Return the message alone, without code and data."""
         return self.message
 
 

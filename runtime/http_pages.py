@@ -111,6 +111,7 @@ class _Collected:
     metrics: list[Metric]
 
     def collect(self) -> list[Metric]:
+        """Return the metrics given, as prometheus_client asks for them."""
         return self.metrics
 
 

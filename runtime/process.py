@@ -68,6 +68,7 @@ class Holds:
     """Durations of the loop's turns [s]."""
 
     def __init__(self) -> None:
+        """Begin to count."""
         self.begin()
 
     def begin(self) -> None:
@@ -99,6 +100,7 @@ class _Watched(selectors.DefaultSelector):
     """Measures the time between two polls of the sockets."""
 
     def __init__(self, holds: Holds) -> None:
+        """Make a selector that reports turns of the loop to `holds`; none has begun."""
         super().__init__()
         self._holds = holds
         self._woke: float | None = None

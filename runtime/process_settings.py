@@ -39,6 +39,7 @@ class Address:
     port: int
 
     def __str__(self) -> str:
+        """Format as HOST:PORT, an IPv6 host in brackets."""
         if ":" in self.host:
             return f"[{self.host}]:{self.port}"
         return f"{self.host}:{self.port}"

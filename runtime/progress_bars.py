@@ -83,6 +83,7 @@ class Lines:
     bar = False
 
     def __init__(self, log: logging.Logger) -> None:
+        """Show work as lines of a log."""
         self._log = log
 
     def show(
@@ -146,6 +147,7 @@ class NotebookBar:
     bar = True
 
     def __init__(self) -> None:
+        """Make a bar that has not been shown yet."""
         self._handle: Any = None
 
     def show(

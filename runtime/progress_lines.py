@@ -121,6 +121,7 @@ class _ProgressThread:
     """Shows all work of this process from one thread, which starts with the first."""
 
     def __init__(self) -> None:
+        """Begin without works; the thread starts with the first one."""
         self._works: list[_Work] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -174,6 +175,7 @@ class _Told:
     """
 
     def __init__(self, function: Advance) -> None:
+        """Pass fractions to `function`; none has been passed yet."""
         self._function = function
         self._last = -1.0
 
@@ -207,6 +209,7 @@ class _Threads(threading.local):
     """The works that each thread is in, the outermost first."""
 
     def __init__(self) -> None:
+        """Begin without works, once in each thread."""
         self.works: list[_Entered] = []
 
 

@@ -72,6 +72,7 @@ class ServiceError(Exception):
     """
 
     def __init__(self, message: str, returncode: int = 1) -> None:
+        """Make the error; its exit code is that of the service, 1 for one that is not above 0."""
         super().__init__(message)
         self.exit_code = returncode if returncode > 0 else 1
 
@@ -355,6 +356,9 @@ class _Ended(Exception):
     if there is one."""
 
     def __init__(self, how: str, returncode: int | None = None) -> None:
+        """Make the exception with how a service ended; the return code is None if it did not
+        exit.
+        """
         super().__init__(how)
         self.returncode = returncode
 

@@ -43,6 +43,7 @@ class WaitingList(Generic[_G]):
     """
 
     def __init__(self, most: int) -> None:
+        """Make an empty room for `most` connections."""
         self._most = most
         self.guests: dict[_G, None] = {}
 

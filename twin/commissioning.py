@@ -451,20 +451,28 @@ def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
 
 
 def _limits(axis: Axis | MotorReply) -> tuple[float, ...]:
+    """Return lower and upper limit, largest speed and largest acceleration of an axis or a
+    reply.
+    """
     return axis.lower, axis.upper, axis.max_speed, axis.max_acceleration
 
 
 def _agree(a: Any, b: Any, slack: tuple[float, float]) -> bool:
+    """Return whether two statements agree: numbers within `slack` (relative, absolute),
+    others as texts whatever their case.
+    """
     if isinstance(a, int | float | tuple) and isinstance(b, int | float | tuple):
         return bool(np.allclose(a, b, *slack))
     return str(a).lower() == str(b).lower()
 
 
 def _plain(value: Any) -> str:
+    """Format a value as text, floats and tuples rounded to four decimals."""
     return str(np.round(value, 4).tolist() if isinstance(value, float | tuple) else value)
 
 
 def _some(names: Sequence[str]) -> str:
+    """List the first three names and the number of others."""
     return ", ".join(names[:3]) + (
         f" and {len(names) - 3} more" if len(names) > 3 else ""
     )

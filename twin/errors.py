@@ -25,6 +25,7 @@ class TwinError(ValueError):
     """
 
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
+        """Make the error with its message and a copy of `data` (None: no data)."""
         super().__init__(message)
         self.message = message
         self.data: dict[str, object] = dict(data or {})

@@ -56,6 +56,7 @@ class Passes:
     """
 
     def __init__(self, count: int) -> None:
+        """Expect `count` steps (at least one); the fraction goes nowhere until `advance` is set."""
         self._count = max(count, 1)
         self._seen = 0
         self.advance: Advance = ignore
@@ -70,6 +71,7 @@ class Passes:
         """Wrap a function that reads a part by index: each call counts one step first."""
 
         def one(index: int) -> Part:
+            """Count one step, then read the part of that index."""
             self.step()
             return read(index)
 

@@ -64,6 +64,7 @@ class Array:
     """Stands for what numpy calls ArrayLike, a union of which texts are a part."""
 
     def __class_getitem__(cls, member: object) -> type[Array]:
+        """Return the class itself, so that `Array[...]` is allowed in annotations."""
         return cls
 
 
@@ -288,6 +289,7 @@ class Known:
         return name.removesuffix(".__init__")
 
     def _names(self) -> list[str]:
+        """List the names of the function's parameters without `self` and `cls`."""
         return [name for name in self.signature.parameters if name not in ("self", "cls")]
 
     def _renamed(self, where: str, named: dict[str, Any]) -> dict[str, Any]:
@@ -379,6 +381,7 @@ class Names(dict[str, Any]):
     """
 
     def __missing__(self, name: str) -> Any:
+        """Return the builtin of that name, or Any if there is none."""
         return getattr(builtins, name, Any)
 
 
@@ -448,11 +451,15 @@ def kind_of(annotation: Any) -> Kind | None:
 
 
 def _is_number(value: Any) -> bool:
+    """Return whether a value is one real number: a scalar with a float value that is no
+    truth value.
+    """
     alone = getattr(value, "ndim", 0) == 0 and hasattr(value, "__float__")
     return alone and not isinstance(value, bool) and getattr(value, "dtype", "") != "bool"
 
 
 def _is_truth(value: Any) -> bool:
+    """Return whether a value is one truth value, Python's or numpy's."""
     alone = getattr(value, "ndim", 0) == 0
     return isinstance(value, bool) or (alone and getattr(value, "dtype", "") == "bool")
 

@@ -23,6 +23,7 @@ _ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
 
 
 def _read_array(value: object) -> FloatArray:
+    """Copy a value to a float64 array."""
     return np.array(value, dtype=np.float64)
 
 
@@ -44,6 +45,9 @@ class ArrayValue:
     __hash__ = None  # type: ignore[assignment]
 
     def __eq__(self, other: object) -> bool:
+        """Compare all fields by content, arrays element by element; NotImplemented for
+        another type.
+        """
         if type(self) is not type(other):
             return NotImplemented
         return all(

@@ -24,6 +24,7 @@ __all__ = ["Deadlock", "InProcessTwin", "twin"]
 
 
 def __getattr__(name: str) -> Any:
+    """Load a public name from `in_process` at its first use; other names raise AttributeError."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module("flexdt.testing.in_process"), name)

@@ -131,6 +131,7 @@ class _Jumps(selectors.DefaultSelector):
     """Waits for no timer: time jumps instead."""
 
     def __init__(self, loop: SimulatedLoop) -> None:
+        """Make a selector for a loop whose clock it lets jump."""
         super().__init__()
         self._loop = loop
 
@@ -158,6 +159,7 @@ class DirectProjector:
     """The projector's work without its server."""
 
     def __init__(self) -> None:
+        """Begin without bodies."""
         self.known: dict[str, Body] = {}
 
     async def put(self, name: str, body: Body) -> None:
@@ -198,6 +200,7 @@ class InProcessTransport(asyncio.Transport):
     def __init__(
         self, loop: asyncio.AbstractEventLoop, serve: Callable[[], _Receiver]
     ) -> None:
+        """Make an unconnected transport; `serve` makes the server's side of each connection."""
         super().__init__({"peername": ("in-process", 0)})
         self._loop, self._serve = loop, serve
         self._server: _Receiver | None = None
@@ -266,10 +269,12 @@ class _Client(TwinClient):
     """A blocking client that lets virtual time pass while it waits."""
 
     def __init__(self, twin: InProcessTwin, name: str) -> None:
+        """Make a client of a twin in this process; it waits by running the twin's loop."""
         self._twin = twin
         super().__init__(transport=twin.transport(), name=name)
 
     def _wait(self, work: Coroutine[Any, Any, T]) -> T:
+        """Run work on the twin's loop and return its result."""
         return self._twin.run(work)
 
 

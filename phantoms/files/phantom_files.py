@@ -351,6 +351,7 @@ def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
     """
 
     def read(one: object, at: str) -> tuple[Vector, float, str]:
+        """Read one bead: position [mm], radius [mm], material (steel if left out)."""
         needed = {"position_mm": reading.vector, "radius_mm": reading.positive}
         given = reading.fields(one, at, needed, {"material": reading.string})
         return given["position_mm"], given["radius_mm"], given.get("material", "steel")

@@ -15,6 +15,7 @@ from flexdt.protocol.state_model import State
 
 
 def _version(value: object) -> object:
+    """Convert a number below 1000 in absolute value to its text; return other values unchanged."""
     if type(value) is int or type(value) is float:
         return str(value) if abs(value) < 1000 else value
     return value

@@ -453,12 +453,15 @@ class Directory:
                 self._fd = None
 
     def __enter__(self) -> Directory:
+        """Return the directory itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the directory at the end of the context."""
         self.close()
 
     def __del__(self) -> None:
+        """Close the directory when nothing refers to it any more."""
         self.close()
 
     @contextmanager

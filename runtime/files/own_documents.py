@@ -107,6 +107,7 @@ class Changes:
     """
 
     def __init__(self) -> None:
+        """Begin without changes."""
         self._made: list[_Change] = []
 
     def put(
@@ -168,6 +169,7 @@ class Changes:
         return f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
 
     def __enter__(self) -> Changes:
+        """Return the changes themselves."""
         return self
 
     def __exit__(
@@ -372,6 +374,7 @@ def lock_folder(root: Directory) -> Callable[[], None]:
     def release(
         held: Directory = root,
     ) -> None:  # as long as it is referred to, it stays open
+        """Unlock the directory; until then the default argument keeps it open."""
         fcntl.flock(fd, fcntl.LOCK_UN)
 
     return release

@@ -32,6 +32,9 @@ class SpareFiles:
     """
 
     def __init__(self, folder: Directory) -> None:
+        """Find the usable spare files of a folder, and make the missing ones as far as there
+        is room.
+        """
         self._folder = folder
         self._there = {name for name in NAMES if self._usable(name)}
         self._refill()

@@ -71,9 +71,11 @@ class TrueGeometry:
     __slots__ = ("__parameters",)
 
     def __init__(self, parameters: Offsets = NOMINAL) -> None:
+        """Hold the hidden misalignment, from which nothing can be read outside this class."""
         self.__parameters = parameters
 
     def __repr__(self) -> str:
+        """Format without the values, which must not be logged."""
         return "TrueGeometry(hidden)"
 
     def cone_vec(self, poses: Poses, placement: StagePlacement) -> ConeVec:

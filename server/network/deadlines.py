@@ -14,6 +14,7 @@ class Deadlines:
     """
 
     def __init__(self, on_timeout: Callable[[str, float], object]) -> None:
+        """Begin without timeouts; `on_timeout` gets name and seconds of one that has passed."""
         self._on_timeout = on_timeout
         self._timers: dict[str, asyncio.TimerHandle] = {}
 

@@ -18,6 +18,7 @@ class LoopTurns:
     """
 
     def __init__(self) -> None:
+        """Begin with three empty lanes."""
         self._lanes: tuple[_Lane, ...] = (OrderedDict(), OrderedDict(), OrderedDict())
         self._due = False
 

@@ -54,6 +54,7 @@ class Lane(asyncio.Lock):
     is in the queue."""
 
     def __init__(self) -> None:
+        """Make a free lane, with `MAX_IN_HAND` places for jobs in hand."""
         super().__init__()
         self.in_hand = asyncio.Semaphore(MAX_IN_HAND)
 

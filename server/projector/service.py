@@ -62,6 +62,7 @@ class ProjectorServer(ListeningServer):
     observe: Observe
 
     def __post_init__(self) -> None:
+        """Begin with an empty waiting room and without seated clients."""
         self.waiting = WaitingList[JobClient](waiting_room.MAX_WAITING)
         self.seated: set[JobClient] = set()
 

@@ -266,6 +266,7 @@ class Checks:
         return not self._apart or (check_input.light and not self._workers.ready)
 
     async def _threaded(self, do: Callable[[], _T]) -> _T:
+        """Call `do` in a thread, after its turn among light checks, and return its value."""
         async with self._turn:
             return await asyncio.to_thread(do)
 

@@ -384,6 +384,7 @@ class Jobs:
             runner.pause(reason)
 
     def _take_over(self) -> None:
+        """Cancel a planned retry; only `resume` continues the current job from now on."""
         self.retry.cancel()
         self._manual = True
 
@@ -498,6 +499,7 @@ class Jobs:
         ]
 
     def _tell(self, job: Job) -> None:
+        """Note a job as changed, to be written, and publish it."""
         self._changed.add(job.id)
         self._notify(job)
 
@@ -626,6 +628,7 @@ class Jobs:
             self._preparing = False
 
     def _stopped(self) -> Exception | None:
+        """Return the last stop from outside since the current job's turn, or None."""
         return self._interrupted  # a call: it may change while others run
 
     def _mark_incomplete(self, job: Job, scan: JobInputs, reason: str) -> None:
@@ -656,10 +659,16 @@ class Jobs:
         return "failed"
 
     def _error(self, error: Exception) -> dict[str, object]:
+        """Convert an error to the wire's form {code, message, data}, paths relative to the
+        data directory.
+        """
         e = explain(error, self._root)
         return {"code": e.code, "message": e.message, "data": e.data}
 
     def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:
+        """Return a job's runner; raise RpcError if it has none or its phase is not among
+        `phases`.
+        """
         if job.runner is None or job.phase not in phases:
             raise self._phase_error(what, job, phases)
         return job.runner
@@ -722,6 +731,7 @@ class Jobs:
             self.retry.schedule(p.error, lambda: self._try_again(job))
 
     def _try_again(self, job: Job) -> None:
+        """Resume a job that is still paused, unless a user has taken over."""
         if job.phase == "paused" and job.runner is not None and not self._manual:
             job.runner.resume()
 

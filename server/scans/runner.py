@@ -93,6 +93,7 @@ class JobAborted(Exception):
     """A user ended the job, for the reason given."""
 
     def __init__(self, reason: str | None = None) -> None:
+        """Make the exception with the message "aborted", and the reason if there is one."""
         super().__init__(f"aborted: {reason}" if reason else "aborted")
 
 
@@ -315,6 +316,7 @@ class ScanRunner:
             self.pause(error)
 
     async def _make(self, batch: Sequence[Exposure]) -> None:
+        """Produce a batch of frames, then count its projections as done."""
         await self.produce(batch)
         made = sum(e.kind == "projection" for e in batch)
         self._set_progress(frames_done=self.progress.frames_done + made)
@@ -371,11 +373,13 @@ class ScanRunner:
         self._set_progress(tau=moment)
 
     async def _sleep(self, until: float) -> None:
+        """Wait until the twin's clock has reached `until` [s], or a request wakes the run."""
         self._waiting = self.clock.at(until)
         await self._waiting
         self._waiting = None
 
     def _wake(self) -> None:
+        """Wake the run, wherever it waits, to look at its requests."""
         self._signal.set()
         if self._waiting is not None and not self._waiting.done():
             self._waiting.set_result(None)
@@ -532,6 +536,7 @@ class ScanRunner:
             await self._sleep(rest)
 
     def _has_request(self) -> bool:
+        """Return whether a pause, a stop that is due, or an abort is requested."""
         # A call: all three may change while others run.
         return self._pause or self._stop_due or self._abort
 
@@ -598,6 +603,7 @@ class _Settings:
 
     @classmethod
     def of(cls, scanner: ScannerTwin) -> _Settings:
+        """Record tube, camera and rates of a scanner."""
         return cls(scanner.tube, scanner.camera, scanner.paces)
 
     def restore(self, scanner: ScannerTwin) -> None:

@@ -180,6 +180,7 @@ class Stage:
         return SceneGuard(scene)
 
     def _content(self, sample: Sample, upload: ReceivedSample | None) -> _Content:
+        """Return what a cache knows a sample by: the sample, and the revision of its file."""
         return sample, upload.shown if upload else self.revision(sample)
 
 
@@ -205,6 +206,7 @@ class Shapes:
     """Cache of the last requested shape."""
 
     def __init__(self, limit: int = MAX_BYTES) -> None:
+        """Begin with an empty cache; a mesh may have `limit` bytes."""
         self._limit = limit
         self._kept: Shape | None = None
 
@@ -433,4 +435,5 @@ async def wait_for_way(task: asyncio.Task[None]) -> list[str]:
 
 
 def _text(leg: Mapping[str, float]) -> str:
+    """Format targets as "axis=value, ..."."""
     return ", ".join(f"{axis}={value:g}" for axis, value in leg.items())

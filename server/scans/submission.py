@@ -256,11 +256,13 @@ class Submissions:
         drafts: list[Job] = []
 
         def after(memory: Memory) -> Memory:
+            """Draft the job, and return the state's document with its number counted."""
             drafts.append(make())
             made = max(memory.jobs_made, number_of(drafts[0].id))
             return memory.model_copy(update={"jobs_made": made})
 
         def files(changes: Changes) -> None:
+            """Add the records of scan and job to the change."""
             job_record.keep(changes, self.root, name)
             self.job_files.put(changes, drafts[0].memory())
 

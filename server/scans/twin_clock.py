@@ -173,10 +173,12 @@ class TwinClock:
         )
 
     def _rebase(self) -> None:
+        """Make the present twin time and real time the origin, before the rate changes."""
         self._base = self._time()
         self._base_wall = self._wall()
 
     def _sample(self, wall: float, now: float) -> None:
+        """Keep a sample of real and twin time [s]; drop those older than `WINDOW_S`, but two."""
         self._samples.append((wall, now))
         while len(self._samples) > 2 and wall - self._samples[1][0] > WINDOW_S:
             self._samples.popleft()

@@ -44,6 +44,7 @@ class UsedBytes:
     """
 
     def __init__(self, root: Directory) -> None:
+        """Count below `root`; nothing has been read yet."""
         self._root = root
         self._seen: dict[str, _Seen] = {}
 
@@ -134,6 +135,7 @@ class DiskRoom:
 
     @cached_property
     def _used(self) -> UsedBytes:
+        """Counter of the bytes below the data directory."""
         return UsedBytes(self.root)
 
     def require(self, what: str, size: int, there: int = 0) -> None:

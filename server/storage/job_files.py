@@ -76,6 +76,7 @@ class JobFiles:
     """
 
     def __init__(self, root: Directory) -> None:
+        """Name the folder of the jobs' files; it is made at the first write."""
         self._records = root.folder(RECORDS)
         self._folder = self._records.folder(FOLDER)
 

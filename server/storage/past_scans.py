@@ -147,10 +147,12 @@ class _LruCache:
     """Cache of the last `most` results by key."""
 
     def __init__(self, most: int) -> None:
+        """Make an empty cache of at most `most` values."""
         self._most = most
         self._made = dict[Hashable, Any]()
 
     def __contains__(self, key: Hashable) -> bool:
+        """Return whether a value is cached; that is no use of it."""
         return key in self._made
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:

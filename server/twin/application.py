@@ -33,6 +33,7 @@ class TwinSession:
     """One client connection to the twin."""
 
     def __init__(self, twin: TwinServer, peer: Peer) -> None:
+        """Begin the session of a connection with the twin."""
         self._twin = twin
         self._client = Client(peer)
 

@@ -598,6 +598,7 @@ class TwinServer:
         self.state_store.changed()
 
     def _moving(self) -> bool:
+        """Return whether any motor is under way now."""
         now = self.clock.now()
         return self.scanner.rest_time(now) > now
 
@@ -697,6 +698,7 @@ class TwinServer:
     def _publish_log(
         self, level: w.LogLevel, message: str, data: dict[str, object]
     ) -> None:
+        """Publish a log entry to all subscribers of `log`; it is not in the process's log."""
         entry = w.LogEntry(level=level, message=message, data=data)
         self.hub.publish("log", entry, slot=None)
 

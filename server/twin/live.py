@@ -288,6 +288,7 @@ class LiveView:
         return self._seen
 
     async def _show(self, shot: Shot) -> None:
+        """Compute the image of a shot, remember the shot as the last, and publish the image."""
         radiograph, cone = await self.shoot(shot)
         self._last = shot
         await self._publish(radiograph, cone, shot)
@@ -304,6 +305,7 @@ class LiveView:
         views = self.hub.views("projection")
 
         def make(view: ImageRequest) -> object:
+            """Make the image of a view, with the noise of this image's number."""
             rng = np.random.default_rng([count])
             return image_of(radiograph, cone, shot, view, self.radiography, rng)
 

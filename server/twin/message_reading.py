@@ -31,6 +31,7 @@ class Reader:
     """Reads messages in a worker; `close` must be called at the end."""
 
     def __init__(self) -> None:
+        """Set up one worker process, which starts at the first large message."""
         self._workers = Workers(1, MEMORY_BYTES, MAX_READ_S)
 
     async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:

@@ -445,6 +445,7 @@ class RelativeMotion:
         self.lengths -= 2.0 * math.pi * again / np.where(again > 0.0, rate, 1.0)
 
     def __len__(self) -> int:
+        """Return the number of segments that were kept."""
         return len(self.times)
 
     def time(self, at: Moment) -> float:

@@ -99,6 +99,7 @@ class FrameBlock(ArrayValue):
     xrays_on: bool = True
 
     def __len__(self) -> int:
+        """Return the number of images."""
         return len(self.files)
 
     def __repr__(self) -> str:

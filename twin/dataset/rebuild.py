@@ -271,6 +271,7 @@ def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machin
 
 
 def _word(text: str | None) -> str:
+    """Reduce a text to its letters and digits in lower case; "" for None."""
     return "".join(c for c in (text or "").lower() if c.isalnum())
 
 

@@ -67,6 +67,10 @@ class Entry:
 def _stated(
     kind: Kind, key: str, section: str = "", xre_key: str = "", *, separator: str = " : "
 ) -> Any:
+    """Make a field of `ScanSettings`, None by default, with its entry in the two settings texts.
+
+    Without `section` the XRE text has no such entry.
+    """
     xre = (section, xre_key) if section else None
     return field(default=None, metadata={"entry": Entry(kind, key, xre, separator)})
 
@@ -278,4 +282,5 @@ def _place(name: str) -> tuple[int, str]:
 
 
 def _exposures(blocks: Sequence[FrameBlock], kind: FrameKind) -> int:
+    """Count the exposures of the images of a kind: each image counts its averages."""
     return sum(len(b) * b.camera.averages for b in blocks if b.kind == kind)

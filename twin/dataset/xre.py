@@ -131,6 +131,7 @@ def format_sections(sections: Sections) -> str:
 
 
 def _lines(entries: Mapping[str, Value]) -> str:
+    """Format entries as lines `key = value`, without a line end after the last."""
     return EOL.join(f"{key} = {_written(value)}" for key, value in entries.items())
 
 

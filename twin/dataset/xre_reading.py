@@ -110,6 +110,7 @@ class XreSettings:
 
 
 def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatError:
+    """Make the error for an entry of the XRE text with a wrong value; returned, not raised."""
     problem = f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}"
     where = {"path": XRE_SETTINGS, "section": section, "key": key}
     return DatasetFormatError.instead(problem, text[:200], allowed, **where)

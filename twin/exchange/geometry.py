@@ -68,6 +68,7 @@ class ScanGeometry:
             )
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return len(self.cone_vec)
 
     @property

@@ -248,6 +248,7 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
 
 
 def _real(array: npt.NDArray[np.generic]) -> bool:
+    """Return whether an array has floats or integers (truth values and complex numbers are not)."""
     return np.issubdtype(array.dtype, np.floating) or np.issubdtype(
         array.dtype, np.integer
     )
@@ -299,6 +300,7 @@ def geometry_text(geometry: ScanGeometry) -> str:
 
 
 def _rows(name: str, cone_vec: ConeVec) -> str:
+    """Format the rows of a geometry as the JSON member `name`, one line a view."""
     lines = ",\n  ".join(json.dumps(row) for row in cone_vec.rows.tolist())
     return f' "{name}": [\n  {lines}\n ]'
 

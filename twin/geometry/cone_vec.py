@@ -446,12 +446,19 @@ class ConeVec:
         return cls(rows, shapes.pop() if len(shapes) == 1 else None)
 
     def __len__(self) -> int:
+        """Return the number of views."""
         return int(self.rows.shape[0])
 
     def __getitem__(self, index: int | slice | npt.NDArray[np.intp]) -> ConeVec:
+        """Select views by index, slice or array of indices; one index gives a geometry of
+        one view.
+
+        The detector's shape is kept.
+        """
         return ConeVec(self.rows[index], self.detector_shape)
 
     def __iter__(self) -> Iterator[ConeVec]:
+        """Yield each view as a geometry of one view, with the detector's shape."""
         for row in self.rows:
             yield ConeVec(row, self.detector_shape)
 
@@ -470,6 +477,7 @@ class ConeVec:
         )
 
     def __hash__(self) -> int:
+        """Hash detector shape and rows; equal geometries (but for -0 and 0) have equal hashes."""
         return hash((self.detector_shape, self.rows.shape, self.rows.tobytes()))
 
     def __repr__(self) -> str:

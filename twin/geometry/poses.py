@@ -67,9 +67,11 @@ class Poses:
             object.__setattr__(self, f.name, value)
 
     def __len__(self) -> int:
+        """Return the number of poses."""
         return len(self.angle)
 
     def __getitem__(self, index: slice | npt.NDArray[np.intp]) -> Poses:
+        """Select poses by a slice or an array of indices, in all fields."""
         return Poses(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def __eq__(self, other: object) -> bool:

@@ -159,6 +159,7 @@ class Rigid:
         )
 
     def __hash__(self) -> int:
+        """Hash the bytes of rotation and shift."""
         return hash((self.turn.tobytes(), self.shift.tobytes()))
 
     def __repr__(self) -> str:

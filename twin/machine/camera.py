@@ -35,6 +35,7 @@ class Roi:
         return self.left, self.top, self.right, self.bottom
 
     def __str__(self) -> str:
+        """Format as "left top right bottom"."""
         return f"{self.left} {self.top} {self.right} {self.bottom}"
 
 

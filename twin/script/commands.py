@@ -61,6 +61,7 @@ class Command:
     """How long the scanner's software expects the command to take."""
 
     def __init_subclass__(cls) -> None:
+        """Make each subclass a frozen dataclass with keyword arguments only."""
         dataclass(frozen=True, kw_only=True)(cls)
 
     @property

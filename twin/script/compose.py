@@ -126,6 +126,7 @@ def _distances_to_try(
     """
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
+        """Return the distance asked for alone, or (None) the usual ones, each once."""
         if asked is None:
             return dict.fromkeys(usual)
         return (asked,)

@@ -52,6 +52,9 @@ class ArgumentError(ValueError):
     or 1) the argument."""
 
     def __init__(self, message: str, code: str = "value", index: int = 0) -> None:
+        """Make the error of an argument: message, code of the problem, index of the argument
+        (0 or 1).
+        """
         super().__init__(message)
         self.code = code
         self.index = index
@@ -188,6 +191,7 @@ def _text(field: str, what: str) -> Read:
     """
 
     def read(a: str, _b: str) -> dict[str, object]:
+        """Read the first argument as the field; raise ArgumentError if it is empty."""
         if not a:
             raise ArgumentError(f"{what} is missing")
         return {field: a}

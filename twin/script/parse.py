@@ -386,6 +386,7 @@ class _Refused(Exception):
     """A line that cannot be read at all, and where."""
 
     def __init__(self, code: str, column: int, message: str) -> None:
+        """Make the error of a line with its code, its column (from 1) and message."""
         super().__init__(message)
         self.code = code
         self.column = column

@@ -35,6 +35,7 @@ class ScriptProblem:
         return f"line {self.line}, column {self.column}: {self.message}"
 
     def __str__(self) -> str:
+        """Format as "line, column: severity: message"."""
         return f"line {self.line}, column {self.column}: {self.severity}: {self.message}"
 
 
@@ -71,6 +72,7 @@ class Findings:
     """Collects problems; each is about the command at `place`, its line and column."""
 
     def __init__(self) -> None:
+        """Begin without problems, at line 0, column 1."""
         self.problems: list[ScriptProblem] = []
         self.place = (0, 1)
 

@@ -117,15 +117,18 @@ async def delete(
         ready = h.ensure_allowed(twin, client, "calibration.delete")
 
         def after(memory: Memory) -> Memory:
+            """Return the state's document with the history that lacks the correction."""
             return memory.model_copy(
                 update={"corrections": twin.corrections.in_state(history)}
             )
 
         def files(changes: Changes) -> None:
+            """Add the new history and the removal of the correction's file to the change."""
             twin.corrections.store_history(changes, history)
             twin.corrections.remove(changes, params.name)
 
         def take() -> None:
+            """Remove the correction from memory; raise first if the client has lost control."""
             ready()
             twin.corrections.forget(params.name, history)
 

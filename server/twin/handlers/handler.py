@@ -100,6 +100,7 @@ def ensure_idle(
     """
 
     def check() -> None:
+        """Raise if control has changed hands, then if a job would be disturbed."""
         twin.control.ensure_allowed(client.name, method)
         twin.jobs.require_idle(what)
 
@@ -145,11 +146,13 @@ async def change_settings(
     """
 
     def after(memory: Memory) -> Memory:
+        """Try the change on a copy of the scanner, and return the state's document with it."""
         trial = copy.copy(twin.scanner)
         change(trial)
         return with_scanner_state(memory, trial)
 
     def take() -> None:
+        """Change the scanner and notify watchers; raise first if the client has lost control."""
         ready()
         change(twin.scanner)
         twin.changed()  # here: the client may be gone when this is saved

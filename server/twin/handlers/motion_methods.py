@@ -117,6 +117,7 @@ async def _move_around_obstacles(
     task = twin.detours.go(way)
 
     def report(task: asyncio.Task[None]) -> None:
+        """Log a warning if the way has ended by an error; nothing if it was cancelled."""
         if not task.cancelled() and task.exception() is not None:
             twin.tell("warning", f"the way around ended early: {task.exception()}")
 
@@ -163,6 +164,7 @@ async def set_axis(
     """
 
     def change(scanner: ScannerTwin) -> None:
+        """Set the axis's speed and acceleration; None leaves one."""
         scanner.set_axis(
             params.axis, speed=params.speed, acceleration=params.acceleration
         )
@@ -273,6 +275,7 @@ async def set_camera(
     """
 
     def change(scanner: ScannerTwin) -> None:
+        """Set the camera; None leaves a setting."""
         scanner.set_camera(**camera_change(params))
 
     await change_settings(

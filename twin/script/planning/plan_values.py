@@ -134,6 +134,7 @@ class ExposureGroup(ArrayValue):
     exact: Mapping[str, Array] = field(default_factory=dict)
 
     def __len__(self) -> int:
+        """Return the number of images."""
         return len(self.starts)
 
     @property

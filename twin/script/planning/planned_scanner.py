@@ -151,6 +151,9 @@ class PlannedTube:
     since: float = 0.0
 
     def __post_init__(self) -> None:
+        """Begin without settings made by the script and without recorded beam; it is lit
+        from 0 s.
+        """
         self.said: set[str] = set()
         self.beam: list[BeamOn] = []
         self.lit_from = 0.0
@@ -190,6 +193,7 @@ class PlannedCamera:
     """The camera's settings, which of them the script stated, and when it is free again."""
 
     def __init__(self, settings: CameraSettings) -> None:
+        """Take the settings at the start; the script has made none yet, and the camera is free."""
         self.settings = settings
         self.said: set[str] = set()
         self.free_at = 0.0
