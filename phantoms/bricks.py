@@ -101,7 +101,7 @@ def brick_shapes(
     rotation = stage_rotation(turn)
 
     def at(x: float, y: float, z: float) -> analytic.Vector:
-        """Turn a place of the brick, [mm]."""
+        """Turn a place of the brick about the axis [mm]; z stays."""
         px, py, pz = (rotation @ np.array([x, y, 0.0]) + [0.0, 0.0, z]).tolist()
         return (px, py, pz)
 

@@ -148,7 +148,7 @@ def positive(value: object, where: str) -> float:
 
 
 def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[_T, ...]:
-    """Read a list, each item by `read`."""
+    """Read a list, each item by `read` with its key path; raise PhantomError for another value."""
     if not isinstance(value, list | tuple):
         raise wrong(value, where, "a list")
     return tuple(read(item, f"{where}[{i}]") for i, item in enumerate(value))
@@ -230,7 +230,7 @@ def packed(dtype: str) -> PlainValidator:
 
 
 def _pack(array: npt.NDArray[np.generic]) -> dict[str, object]:
-    """Encode an array as {dtype, shape, data}."""
+    """Encode an array as {dtype, shape, data}: little-endian, C order, base64."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     data = base64.b64encode(little.tobytes()).decode("ascii")
     return {"dtype": little.dtype.str, "shape": list(array.shape), "data": data}

@@ -110,7 +110,7 @@ def _polar(away: float, angle_deg: float) -> tuple[float, float]:
 
 
 def _angles() -> FloatArray:
-    """Of the corners of each ring [rad]."""
+    """Compute the angles of the corners of each ring [rad], evenly over a turn from 0."""
     count = GEAR_TEETH * STEPS_PER_TOOTH
     return np.arange(count) * 2.0 * np.pi / count
 

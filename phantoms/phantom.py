@@ -100,7 +100,7 @@ class Phantom(ArrayValue):
         freeze(self, beads=beads, bead_radius_mm=radii)
 
     def __repr__(self) -> str:
-        """One line."""
+        """Format as one line: name, size [mm] and description."""
         size = " x ".join(f"{side:g}" for side in self.size_mm)
         return f"<Phantom {self.name!r}: {size} mm, {self.description}>"
 

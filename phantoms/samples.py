@@ -406,7 +406,7 @@ def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
 
 
 def _solids(scene: Scene) -> Phantom:
-    """Make the phantom of a scene."""
+    """Make the phantom of a scene, sized about the origin, without beads."""
     return Phantom(
         "scene", f"{len(scene.solids)} solids", scene, size_about_origin(scene)
     )

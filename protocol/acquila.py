@@ -189,7 +189,9 @@ def parse_event(data: bytes | str) -> AcquilaEvent:
 
 
 def format_event(event: AcquilaEvent) -> str:
-    """Encode an event as JSON, with every field."""
+    """Encode an event as one JSON object with every field, also empty ones; characters are
+    not escaped.
+    """
     content = {name: getattr(event, _attribute(name)) for name in FIELDS}
     content["reply type"] = event.reply_type.value
     return json.dumps(content, ensure_ascii=False)

@@ -200,7 +200,7 @@ def from_plain(document: object, max_batch: int = 1000) -> Message:
 
 
 def _call(plain: dict[str, object], params: Params) -> dict[str, object]:
-    """Add `params` to a call unless it has none."""
+    """Add `params` to a call's document, in place, unless they are None; return it."""
     if params is not None:
         plain["params"] = params
     return plain
@@ -544,7 +544,9 @@ class Correlation(Generic[_W]):
         raise self._violated("an answer to a server, which asks nothing")
 
     def _violated(self, what: str) -> ProtocolError:
-        """Record a violation of the protocol and return it."""
+        """Record a violation of the protocol, which later `receive` calls raise, and return
+        its error.
+        """
         self.violation = ProtocolError(what)
         return self.violation
 

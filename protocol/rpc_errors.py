@@ -127,7 +127,7 @@ def busy(message: str, data: object = None) -> RpcError:
 
 
 def not_authorised() -> RpcError:
-    """Make the error for a missing or wrong token."""
+    """Make the error -32004 for a missing or wrong token; returned, not raised."""
     message = "a valid token is needed: session.hello {token}"
     data = {"allowed": "session.hello with the server's token"}
     return RpcError(Code.NOT_AUTHORISED, message, data)

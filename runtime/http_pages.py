@@ -143,7 +143,7 @@ class _Visitor:
     address: str
 
     def displace(self) -> None:
-        """Close the connection, which wakes its thread."""
+        """Shut the connection down, which wakes its thread; errors are ignored."""
         with contextlib.suppress(OSError):
             self.sock.shutdown(socket.SHUT_RDWR)
 
@@ -174,7 +174,7 @@ class _Server(ThreadingWSGIServer):
         super().process_request(request, client_address)
 
     def admit(self, request: Any) -> None:
-        """Move a connection to those whose request is answered."""
+        """Move a connection to those that are answered, which may displace another."""
         with self._lock:
             self._strangers.leave(self._here[request])
             self._answered.enter(self._here[request])

@@ -118,7 +118,9 @@ class Apart(QueueHandler):
             self.dropped += 1
 
     def close(self) -> None:
-        """Write the queued records; a blocked reader is abandoned."""
+        """Write the queued records and end the thread; a reader that blocks for seconds is
+        abandoned.
+        """
         self._listener.stop()
         super().close()
 

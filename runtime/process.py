@@ -172,7 +172,7 @@ class ListeningServer:
 
     @property
     def port(self) -> int:
-        """Port it listens on."""
+        """Port it listens on, the system's choice for port 0; `listen` must have been called."""
         assert self.server is not None
         return int(self.server.sockets[0].getsockname()[1])
 

@@ -78,7 +78,7 @@ def addresses(text: str | None) -> tuple[Address, ...]:
 
 
 def several(text: str) -> str:
-    """Check a text by `addresses` and return it unchanged."""
+    """Check a text by `addresses`, which may raise, and return it unchanged."""
     addresses(text)
     return text
 

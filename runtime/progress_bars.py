@@ -89,7 +89,7 @@ class Lines:
     def show(
         self, what: str, done: float | None, seconds: float, left_s: float | None
     ) -> None:
-        """Write a line."""
+        """Write a line at level warning: the work, its fraction, and seconds so far and left."""
         self._log.warning(
             "flexdt: still %s (%s)", what, time_words(done, seconds, left_s)
         )
@@ -166,7 +166,7 @@ class NotebookBar:
         )
 
     def close(self) -> None:
-        """Leave an empty place."""
+        """Leave an empty place where the bar was; nothing if it was never shown."""
         if self._handle is not None:
             self._draw("")
 

@@ -143,7 +143,7 @@ class _ProgressThread:
                 self._changed.notify()
 
     def remove(self, work: _Work) -> None:
-        """Show a work no longer."""
+        """Show a work no longer; it must have been added."""
         with self._changed:
             self._works.remove(work)
 
@@ -180,12 +180,12 @@ class _Told:
         self._last = -1.0
 
     def advance(self, done: float) -> None:
-        """Hand a fraction on."""
+        """Hand a fraction on to the caller's function, and remember it."""
         self._last = done
         self._function(done)
 
     def end(self) -> None:
-        """Say that all is done."""
+        """Hand 1.0 to the caller's function, unless 1 was the last fraction."""
         if self._last < 1.0:
             self._function(1.0)
 

@@ -116,7 +116,7 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
     found: dict[str, Any] = {}
 
     def take(**given: Any) -> None:
-        """Store the values that typer has read."""
+        """Store the values that typer has read, lists as tuples."""
         found.update(
             {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
         )

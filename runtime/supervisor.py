@@ -399,7 +399,7 @@ async def _drained(process: Process) -> int:
 
 
 async def _drain(process: Process) -> None:
-    """Read and discard standard output."""
+    """Read and discard a process's standard output until it ends."""
     assert process.stdout is not None
     while await process.stdout.read(65536):
         pass

@@ -31,7 +31,7 @@ NICENESS = 5
 
 
 def send_parts(channel: socket.socket, parts: Parts) -> None:
-    """Send a list of byte strings."""
+    """Send a list of byte strings: their number and sizes, then each; blocks."""
     channel.sendall(struct.pack(f"<I{len(parts)}Q", len(parts), *map(len, parts)))
     for part in parts:
         channel.sendall(part)

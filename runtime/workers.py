@@ -287,7 +287,7 @@ class Workers:
             self._timer = None
 
     def close(self) -> None:
-        """End all processes when the server ends."""
+        """End the idle processes, and the threads without waiting for those at work."""
         self.rest()
         self._threads.shutdown(wait=False)
 

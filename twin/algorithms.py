@@ -47,7 +47,7 @@ class Algorithm:
         return self.kind == "direct"
 
     def load(self) -> Callable[..., Any]:
-        """Import the function."""
+        """Import the algorithm's module and return its function."""
         found: Callable[..., Any] = getattr(import_module(self.home), self.function)
         return found
 

@@ -224,7 +224,7 @@ class InProcessTransport(asyncio.Transport):
         self._server.connection_made(self)
 
     async def send(self, message: Message) -> None:
-        """Hand one message to the server."""
+        """Hand one message to the server; raise ConnectionLost after the connection's end."""
         if self._server is None:
             raise ConnectionLost("the twin has ended the connection")
         self._server.data_received(self._wire.send(message))
@@ -239,7 +239,7 @@ class InProcessTransport(asyncio.Transport):
         return messages
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Hand bytes to the client."""
+        """Hand the server's bytes to the client; dropped after the connection's end."""
         if self._server is not None:
             self._inbox.put_nowait(bytes(data))
 

@@ -485,7 +485,9 @@ class Imaging:
         ]
 
     def _pinned_keys(self) -> set[_Key]:
-        """List the keys of samples that stay in memory."""
+        """List the keys of divided samples that must stay: those of `pinned`, divided either
+        way.
+        """
         names = {_name(sample) for sample in self.pinned()}
         return {key for key in self._divided if key[0] in names}
 

@@ -65,7 +65,7 @@ class ProjectorClient:
         return self._channel is not None and not self._channel.lost
 
     async def close(self) -> None:
-        """End the connection; open requests fail."""
+        """End the connection for good; open requests fail, and later ones are refused."""
         self._closed = True
         if self._channel is not None:
             self._channel.close()
@@ -88,7 +88,7 @@ class ProjectorClient:
             self._sent[name] = body
 
     async def remove(self, name: str) -> None:
-        """Have the server remove the body called `name`."""
+        """Have the server remove the body called `name`; nothing if it was not sent from here."""
         if self._sent.pop(name, None) is not None:
             await self.ask("volume.remove", {"name": name})
 

@@ -57,7 +57,7 @@ class ProjectorWatch:
     _problems: dict[Watched, str | None] = field(default_factory=dict)
 
     async def run(self) -> None:
-        """Watch until cancelled."""
+        """Watch all projectors at once, until cancelled."""
         async with asyncio.TaskGroup() as group:
             for client in self.clients:
                 group.create_task(self._watch(client))

@@ -309,14 +309,14 @@ class Radiography:
 
     @property
     def full_scale(self) -> int:
-        """Largest count."""
+        """Largest count of an image, by the ideal model or the panel."""
         if self.physics == "ideal":
             return self.model.full_scale
         return self.panel.full_scale
 
     @property
     def offset(self) -> float:
-        """Count without signal."""
+        """Mean count without signal, by the ideal model (dark counts) or the panel."""
         if self.physics == "ideal":
             return self.model.dark_counts
         return self.panel.offset_counts

@@ -173,7 +173,9 @@ class Outbox:
             await self.ready.wait()
 
     async def flushed(self) -> None:
-        """Wait until all has been handed to the transport."""
+        """Wait until queue and slots have been handed to the transport, or the connection
+        has ended.
+        """
         while (self.queue or self.slots) and not self.over:
             await self.ready.wait()
 

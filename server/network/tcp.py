@@ -403,7 +403,7 @@ class _Link(asyncio.BufferedProtocol):
         self.gone.set()
 
     def pause_writing(self) -> None:
-        """Queue messages: the client reads too slowly."""
+        """Queue messages, as the client reads too slowly; after `send_timeout_s` it is cut off."""
         self.out.pause()
         self.deadlines.start("send", self.limits.send_timeout_s)
 
@@ -424,7 +424,9 @@ class _Link(asyncio.BufferedProtocol):
         self.out.event(message, slot)
 
     def close(self, reason: str) -> None:
-        """End the connection after the queue has been sent."""
+        """End the connection after what was written has been sent, at most `send_timeout_s`;
+        log why.
+        """
         self.log("closing", reason=reason)
         self.transport.close()
         self.deadlines.start("send", self.limits.send_timeout_s)

@@ -78,7 +78,9 @@ class ComputeJob:
 
     @property
     def waits(self) -> bool:
-        """Whether a step waits and is not being computed."""
+        """Whether a step waits for its turn; False while one is being computed, and without
+        a step.
+        """
         running = self._step is not None and self._step.running()
         return self._turn is not None and not (running or self._turn.done())
 
@@ -147,7 +149,7 @@ class ComputeThread:
         self._thread.start()
 
     def put(self, step: Step) -> Future[object]:
-        """Put a step into the queue."""
+        """Put a step into the queue; return the future of its value."""
         future: Future[object] = Future()
         self._steps.put((future, step))
         return future

@@ -65,7 +65,7 @@ async def run(options: ProjectorSettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the process; return its exit code."""
+    """Run the projector's process until it is stopped; return its exit code."""
     options = parse(ProjectorSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     return run_process(options, run)

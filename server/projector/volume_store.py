@@ -253,7 +253,9 @@ def memory_of(value: Body) -> int:
 
 
 def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
-    """Compute the memory counted for an upload [bytes]."""
+    """Compute the memory that an upload will be counted with [bytes], its chunks included
+    for a mesh.
+    """
     if isinstance(what, wire.VoxelGrid):
         return LAYOUT_COPIES * what.nbytes
     return 24 * (what.vertices + what.triangles) + what.nbytes

@@ -188,7 +188,9 @@ class FrameLink(asyncio.BufferedProtocol):
         self.on_lost(self)
 
     def pause_writing(self) -> None:
-        """Pause sending: the peer reads too slowly."""
+        """Pause sending, as the peer reads too slowly; after `send_timeout_s` the connection
+        is aborted.
+        """
         self._writable.clear()
         self.deadlines.start("send", self.send_timeout_s)
 
@@ -320,7 +322,7 @@ class ProjectorLink:
         return self.link.lost
 
     def close(self) -> None:
-        """End the connection; open requests fail."""
+        """Abort the connection at once; open requests fail with `LinkLost`."""
         self._closed = True
         self.link.transport.abort()
         self._lost(self.link)

@@ -70,7 +70,7 @@ class FramePipeline(Generic[T]):
             self._changed.notify_all()
 
     async def drained(self) -> None:
-        """Wait until every frame put in has been made."""
+        """Wait until every frame put in has been made; at once if there is none."""
         async with self._changed:
             await self._changed.wait_for(lambda: self.idle)
 

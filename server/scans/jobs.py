@@ -208,12 +208,12 @@ class Jobs:
         )
 
     def shows(self, sample: Sample) -> None:
-        """Set the sample of the current job."""
+        """Set the sample of the current job; nothing without one."""
         if self.current is not None:
             self.current.sample = sample
 
     def samples(self) -> list[Sample]:
-        """List the samples of jobs that have not ended."""
+        """List the samples of jobs that have not ended, one for each job that has one."""
         unended = (j for j in self._all.values() if j.phase not in ENDED_PHASES)
         return [j.sample for j in unended if j.sample is not None]
 
@@ -338,7 +338,11 @@ class Jobs:
         runner.resume()
 
     def step(self, job: Job) -> None:
-        """Run a paused job for one step."""
+        """Run a paused job for one step; a planned retry is cancelled.
+
+        Raises:
+            RpcError: it is not paused.
+        """
         runner = self._runner(job, "step", ("paused",))
         self._take_over()
         runner.step()

@@ -552,7 +552,7 @@ class ScanRunner:
         )
 
     async def _drain(self) -> None:
-        """Wait for the last frames."""
+        """Wait for the last frames with the clock held, obeying requests meanwhile."""
         self._set_progress(what="finishing the last frames")
         while not self._pipeline.idle:
             await self._await_clock_held(self._pipeline.drained(), self.plan.duration_s)

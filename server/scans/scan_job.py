@@ -69,21 +69,21 @@ class Job:
 
     @property
     def where(self) -> Progress | None:
-        """Progress now, or at its end."""
+        """Progress of its run now, or (ended) at its end; None before it runs."""
         if self.runner is None:
             return self.last
         return self.runner.progress
 
     @property
     def frames_done(self) -> int:
-        """Number of finished frames."""
+        """Number of finished frames; 0 before it runs."""
         if self.where is None:
             return 0
         return self.where.frames_done
 
     @property
     def elapsed_s(self) -> float:
-        """Elapsed time of the plan [s]."""
+        """Time reached on the plan's clock [s]; 0 before it runs."""
         if self.where is None:
             return 0.0
         return max(0.0, self.where.tau)

@@ -56,7 +56,7 @@ class PoseList:
 
     @classmethod
     def of(cls, poses: Iterable[Mapping[str, float]]) -> PoseList:
-        """Make the list from poses."""
+        """Make the list from poses: one JSON text, and a listing with a comment line for each."""
         each = [json.dumps(dict(p)) for p in poses]
         listing = "\r\n".join([*(f"# pose {i}: {p}" for i, p in enumerate(each)), ""])
         return cls(f"[{', '.join(each)}]".encode(), listing.encode())

@@ -116,7 +116,9 @@ class Corrections:
         return self.last(self.history)
 
     def last(self, history: History) -> NamedCorrection | None:
-        """Return the correction in force after `history`."""
+        """Return the correction in force after `history`; None if that is empty or ends with
+        none.
+        """
         name = history[-1] if history else None
         return None if name is None else self._all[name]
 
@@ -276,7 +278,7 @@ class Corrections:
 
 
 def _file(correction: NamedCorrection) -> str:
-    """Return the file name of a correction."""
+    """Return the file name of a correction: its date to the second, and its encoded name."""
     stamp = correction.date.split(".")[0].replace(":", "")
     return f"{stamp} {documents.file_stem(correction.name)}.json"
 
@@ -300,7 +302,7 @@ def _joined(before: History, in_force: History) -> History:
 
 
 def _read_history(data: bytes) -> History:
-    """Parse the history."""
+    """Parse the history, strictly; its last `MAX_HISTORY` names."""
     return _HISTORY_TYPE.validate_python(documents.read_json(data), strict=True)[
         -MAX_HISTORY:
     ]

@@ -96,7 +96,7 @@ class DatasetWriter:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Names of the missing images, in the order taken."""
+        """Names of the missing images, in the order taken, each once."""
         present = self.present
         return tuple(dict.fromkeys(f for f in self.record.files if f not in present))
 

@@ -118,7 +118,7 @@ class JobFiles:
             self._folder.keep(_file(name), _text(job))
 
     def clear(self) -> None:
-        """Delete the file of every job."""
+        """Delete the file of every job; one that cannot be deleted stays."""
         for file in documents.ours(self._folder):
             with suppress(DatasetWriteError):
                 self._folder.discard(file)
@@ -141,7 +141,7 @@ def _file(job: str) -> str:
 
 
 def _text(job: JobMemory) -> bytes:
-    """Encode a job."""
+    """Encode a job as indented JSON with its schema."""
     document = JobFile(schema=1, **job.model_dump())
     return document.model_dump_json(by_alias=True, indent=1).encode("utf-8")
 

@@ -453,13 +453,13 @@ class StateStore:
                 changes.put(self._root, FILE, _text(document), self._spares.keep)
 
     def _undo(self, changes: documents.Changes) -> None:
-        """Undo the changes."""
+        """Undo changes on the disk, after a write that is under way; blocks."""
         with self._file:
             changes.undo()
 
 
 def _text(memory: Memory) -> bytes:
-    """Encode the document."""
+    """Encode the state as JSON; an empty list of jobs is left out."""
     without = set() if memory.jobs else {"jobs"}
     return memory.model_dump_json(by_alias=True, exclude=without).encode("utf-8")
 

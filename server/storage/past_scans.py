@@ -120,7 +120,7 @@ class PastScans:
         return Encoded(tuple(await workers.ask(work, self._root, params, context, codec)))
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes of listing and of fitting."""
         self._workers.close()
         self._fitters.close()
 

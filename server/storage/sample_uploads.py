@@ -198,7 +198,9 @@ class Incoming:
         self._close(oldest)
 
     def _close(self, name: str) -> None:
-        """Close the file of an upload, which deletes it."""
+        """Forget an upload and close its nameless file, which deletes it; nothing if there
+        is none.
+        """
         known = self._open.pop(name, None)
         if known is not None:
             known.file.close()
@@ -218,6 +220,6 @@ class Incoming:
         )
 
     def _writing(self) -> AbstractContextManager[None]:
-        """Convert the system's errors inside."""
+        """Convert the system's errors inside the context, as `writing`."""
         path = self._folder.path
         return writing(path, f"the upload cannot be kept in {path}")

@@ -295,7 +295,7 @@ class SampleStore:
         changes.remove(self._folder, f"{documents.file_stem(name)}.json")
 
     def forget(self, name: str) -> None:
-        """Remove an upload from memory."""
+        """Remove an upload from memory; `tidy` deletes its bytes."""
         with self._lock:
             self._replace(name, None)
 
@@ -423,7 +423,7 @@ def _bytes_of(phantom: Phantom) -> int:
 
 
 def _revision(head: UploadHead, raw: bytes) -> str:
-    """Hash a content: bytes and how they are read."""
+    """Hash a content, its bytes and how they are read, to 16 hexadecimal digits; not its name."""
     how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
     return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
 

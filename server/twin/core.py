@@ -97,7 +97,7 @@ class ControlLease:
         self._heard = clock()
 
     def heard(self, who: str) -> None:
-        """Renew the lease of `who` after a request."""
+        """Renew the lease after a request of `who`; nothing if another holds control."""
         if who == self.holder:
             self._heard = self._clock()
 
@@ -665,7 +665,9 @@ class TwinServer:
                 self._awaited.discard(end)
 
     def interrupt(self, what: str) -> None:
-        """Pause the running scan after a stop from outside."""
+        """Pause the job that runs or begins, after a stop from outside; `what` names the
+        command.
+        """
         self.jobs.interrupt(
             SafetyError(f"{what} was commanded; resume goes on", {"asked": what})
         )

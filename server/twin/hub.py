@@ -202,7 +202,7 @@ class Hub:
                 subscription.timer.cancel()
 
     def drop(self, listener: Peer) -> None:
-        """Forget a connection."""
+        """End a connection's subscriptions, and forget what it has been sent."""
         self.unsubscribe(listener, list(self._listeners))
         for topic in self._kept:
             self._last_sent.pop((listener, topic), None)

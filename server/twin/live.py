@@ -199,7 +199,7 @@ class LiveView:
         self._changed.set()
 
     def now(self) -> Shot:
-        """Return the present shot."""
+        """Return the shot of the present pose, settings and sample; nothing is computed."""
         scanner = self.scanner
         return Shot.of(scanner, self.clock.now(), self.revision(scanner.sample))
 

@@ -101,7 +101,9 @@ class Polytope(ConvexSolid):
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
     def radius_about(self, axis: FloatArray) -> float:
-        """See `ConvexSolid`."""
+        """Compute the largest distance of a vertex from the line through the origin along
+        `axis` [mm].
+        """
         along = self.vertices @ axis
         squared = np.einsum("ij,ij->i", self.vertices, self.vertices) - along * along
         return math.sqrt(max(0.0, float(squared.max())))
@@ -130,7 +132,7 @@ class UprightCylinder(ConvexSolid):
         return np.asarray(out + self.center)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """See `ConvexSolid`."""
+        """Return the lowest and highest corner of the box around the cylinder, (3,) each [mm]."""
         half = np.array([self.radius, self.radius, 0.5 * self.height])
         return np.array(self.center) - half, np.array(self.center) + half
 

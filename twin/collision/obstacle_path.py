@@ -88,7 +88,9 @@ class _Planner:
         return self.start.get(axis, self.machine.axes[axis].home)
 
     def pace(self, axis: str) -> Pace:
-        """Return the speed and acceleration of a motor."""
+        """Return the speed and acceleration of a motor: those given for the search, else the
+        machine's.
+        """
         a = self.machine.axes[axis]
         return self.paces.get(axis, (a.speed, a.acceleration))
 

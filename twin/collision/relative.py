@@ -228,7 +228,7 @@ class _Bound:
     growth: FloatArray
 
     def less(self, other: _Bound, factor: float) -> _Bound:
-        """Subtract `factor` times another bound."""
+        """Return this bound less `factor` (a number or one a segment) times another."""
         return _Bound(
             self.rate - factor * other.rate, self.growth - factor * other.growth
         )

@@ -482,7 +482,7 @@ class PredictedEntry(_Model):
 
 
 def _rounded(value: float | None) -> float | None:
-    """Round to the digits that a prediction has."""
+    """Round to four significant digits; None stays None."""
     if value is None:
         return None
     return float(f"{value:.4g}")

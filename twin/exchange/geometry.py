@@ -73,7 +73,7 @@ class ScanGeometry:
 
     @property
     def pitch_mm(self) -> tuple[float, float]:
-        """Pixel pitch (u, v) of the first view [mm]."""
+        """Pixel pitch (u, v) of the first view [mm]; others are not looked at."""
         first = self.cone_vec.rows[0]
         return float(np.linalg.norm(first[6:9])), float(np.linalg.norm(first[9:12]))
 

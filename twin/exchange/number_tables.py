@@ -35,7 +35,9 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def vectors_text(geometry: ScanGeometry) -> str:
-    """Write ASTRA's cone_vec, twelve numbers a line."""
+    """Write ASTRA's cone_vec, twelve numbers a line in full precision; shape and files are
+    not in it.
+    """
     return "".join(
         " ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist()
     )

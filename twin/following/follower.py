@@ -468,7 +468,7 @@ class Follower:
 
     @cached_property
     def _bare(self) -> tuple[c.Command, ...]:
-        """Commands of the script without place, wait and times."""
+        """Commands of the script without place, wait and times; () without a script."""
         if self.script is None:
             return ()
         return tuple(map(_bare, self.script.commands))
@@ -752,7 +752,7 @@ def _bounds(step: PlanStep, machine: Machine) -> Range:
 
 
 def _wider(found: Range) -> Range:
-    """Widen a 90 % range by `WIDENING_WIDTHS` widths."""
+    """Widen a 90 % range by `WIDENING_WIDTHS` of its width on each side, not below 0 s."""
     more = WIDENING_WIDTHS * (found[1] - found[0])
     return max(0.0, found[0] - more), found[1] + more
 

@@ -241,7 +241,9 @@ class Mirror:
         """
 
         def alike(asked: Waiting) -> tuple[bool, bool]:
-            """Rank a waiting command by agreement with the reply."""
+            """Rank a waiting command: first by agreement of the two first words, then of the
+            tick.
+            """
             return asked.heard.words[:2] == reply.words[
                 :2
             ], asked.heard.tick == reply.tick
@@ -250,7 +252,9 @@ class Mirror:
         return max(found, key=alike, default=None)
 
     def with_waiting(self, asked: Waiting, **changes: object) -> Mirror:
-        """Change a waiting command."""
+        """Return the mirror with fields of a waiting command changed; it is added if it does
+        not wait.
+        """
         changed = replace(asked, **changes)  # type: ignore[arg-type]
         return replace(self, waiting={**self.waiting, asked.heard.identity: changed})
 
@@ -272,7 +276,7 @@ class Mirror:
         return max(0.0, now - self.heard_s)
 
     def with_axis(self, name: str, **changes: object) -> Mirror:
-        """Change one axis."""
+        """Return the mirror with fields of one axis changed."""
         axes = {**self.axes, name: replace(self.axes[name], **changes)}  # type: ignore[arg-type]
         return replace(self, axes=axes)
 
@@ -310,7 +314,7 @@ class Mirror:
         """
 
         def ago(then: float | None) -> float | None:
-            """Return an age to the millisecond."""
+            """Return the age of a moment [s], to the millisecond and not below 0; None for None."""
             if then is None:
                 return None
             return round(max(0.0, now - then), 3)

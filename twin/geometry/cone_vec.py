@@ -927,7 +927,7 @@ def _formats() -> Any:
 
 
 def _span(values: FloatArray) -> str:
-    """Format the range of values."""
+    """Format the range of values, "low to high", or one number if both read alike; six digits."""
     low = f"{values.min():.6g}"
     high = f"{values.max():.6g}"
     return low if low == high else f"{low} to {high}"

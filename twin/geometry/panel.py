@@ -129,7 +129,7 @@ class Panel:
 
     @classmethod
     def flat(cls, shape: tuple[int, int]) -> Panel:
-        """Make a panel without distortion, for images (rows, cols)."""
+        """Make a panel without distortion, lag and tile borders, for images (rows, cols)."""
         model = PanelModel(0.0, shape)
         return cls(model, (0.0,) * len(model.names))
 

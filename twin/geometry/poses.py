@@ -196,7 +196,9 @@ class Poses:
         return world.moved(t_object_world, tau - self.mount)
 
     def _turned_detector(self, p: Offsets) -> tuple[FloatArray, FloatArray]:
-        """Turn the pixel steps by the detector's tilts."""
+        """Turn the pixel steps u and v by the detector's yaw, pitch and roll; unchanged if
+        all are 0.
+        """
         if p.det_yaw == 0.0 and p.det_pitch == 0.0 and p.det_roll == 0.0:
             return self.u, self.v
         return turn_detector(self.u, self.v, p.det_yaw, p.det_pitch, p.det_roll)

@@ -62,7 +62,7 @@ class PixelGrid:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height of the active area [mm]."""
+        """Width and height of the active area [mm]: unbinned columns and rows times their pitch."""
         across, up = self.edges_mm
         return self.columns * across, self.rows * up
 

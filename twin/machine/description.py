@@ -268,7 +268,9 @@ class DetectorSpec(_Frozen):
 
     @property
     def camera(self) -> CameraSettings:
-        """Camera settings at start."""
+        """Camera settings at start: mode, region and exposure of the file; one exposure an
+        image.
+        """
         modes = tuple(self.modes.items())
         return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms, modes=modes)
 
@@ -509,7 +511,9 @@ class Timing(_Frozen):
         )
 
     def seconds(self, kind: str) -> float:
-        """Return the time of a kind of command [s]."""
+        """Return the time of a kind of command [s], as `kinds` lists them (None for one
+        without).
+        """
         value: float = getattr(self, f"{kind}_s")
         return value
 
@@ -813,7 +817,9 @@ class Machine(_Frozen):
         return any(motor in self.geometry.get(q, {}) for q in ("mount_x", "mount_y"))
 
     def _motors_of(self, anchor: str) -> list[str]:
-        """List the motors that drive a quantity of `anchor`."""
+        """List the motors that drive a coordinate of `anchor`; the object has angle and
+        mount, too.
+        """
         quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
         quantities += ["angle", "mount_x", "mount_y"] if anchor == "object" else []
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
@@ -865,7 +871,7 @@ def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
 
 
 def _refuse_if(wrong: bool, at: str, value: object, allowed: str) -> None:
-    """Raise `_refused` if `wrong`."""
+    """Raise the error of `_refused` for a value at key `at`, if `wrong`."""
     if wrong:
         raise _refused(at, value, allowed)
 

@@ -147,7 +147,7 @@ def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str
 
 
 def _bounded(machine: Machine, targets: Mapping[str, float]) -> dict[str, float]:
-    """Move each target into its motor's travel."""
+    """Move each target into its motor's travel, each by itself."""
     axes = machine.axes
     return {m: min(max(t, axes[m].lower), axes[m].upper) for m, t in targets.items()}
 
@@ -159,7 +159,7 @@ def _distance_beyond(machine: Machine, motor: str, target: float) -> float:
 
 
 def _outside(machine: Machine, motor: str, target: float) -> LimitError:
-    """Make the error for a target outside the travel."""
+    """Make the error for a motor's target outside its travel; returned, not raised."""
     a = machine.axes[motor]
     message = f"{motor} target {target:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
     return LimitError.of_axis(message, motor, target, [a.lower, a.upper], a.unit)

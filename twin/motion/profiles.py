@@ -250,7 +250,7 @@ class AxisPath(ArrayValue):
         return index, np.maximum(t - self.times[index], 0.0)
 
     def positions(self, times: npt.ArrayLike) -> FloatArray:
-        """Compute positions at `times` [s], of the same shape."""
+        """Compute positions at `times` [s], of the same shape; before the path its beginning."""
         i, dt = self._at(times)
         return np.asarray(self.x[i] + dt * (self.v[i] + 0.5 * self.a[i] * dt))
 
@@ -476,7 +476,9 @@ class _Builder:
         self.time += dt
 
     def ramp(self, velocity: float, acceleration: float) -> None:
-        """Add a change to `velocity`."""
+        """Add a change to `velocity` with constant acceleration (> 0); no piece if that is
+        the velocity.
+        """
         change = velocity - self.velocity
         self._add(abs(change) / acceleration, math.copysign(acceleration, change))
         self.velocity = velocity

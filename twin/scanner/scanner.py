@@ -744,7 +744,9 @@ class ScannerTwin:
             self._drives[name] = self._drives[name].following(trajectory)
 
     def _stopped(self, stopping: StopMotion) -> StopMotion:
-        """Follow a stop and count it."""
+        """Let the motors follow a stop, count it, and return it; certificates of before are
+        void.
+        """
         self._stops += 1
         self._take(stopping.trajectories)
         return stopping

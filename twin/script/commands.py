@@ -265,6 +265,8 @@ class Script:
 
     @classmethod
     def of(cls, commands: Iterable[Command]) -> Script:
-        """Make a script from commands in memory."""
+        """Make a script from commands in memory, without warnings; its lines are the last
+        command's line.
+        """
         made = tuple(commands)
         return cls(made, (), max((c.line for c in made), default=0))

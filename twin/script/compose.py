@@ -213,7 +213,7 @@ class _Writer(MotorTargets):
         yield from self.image("io000000.tif", w.flats)
 
     def fly(self) -> Iterator[str]:
-        """Yield one smooth turn."""
+        """Yield one smooth turn of 360 degrees, the sample moved back into the beam before."""
         yield from self.go(*self.aside)
         yield from self.turn(360.0, self.request.frames, 0)
 
@@ -416,7 +416,7 @@ class _Writer(MotorTargets):
         return speed
 
     def run_up_deg(self, total: float, frames: int) -> float:
-        """Compute the length of the run-up [deg]."""
+        """Compute the length of the run-up [deg] for `frames` images over `total` degrees."""
         speed = self.turn_speed(total, frames)
         return run_up(speed, self.rotation[1].acceleration, self.image_s)
 
@@ -531,7 +531,7 @@ class _Writer(MotorTargets):
             yield _row(name, "move absolute", _decimal(value))
 
     def drive(self, name: str, speed: float, acceleration: float) -> Iterator[str]:
-        """Yield the speed and the acceleration of an axis."""
+        """Yield the rows that set speed and acceleration of an axis."""
         yield _row(name, "set speed", f"{speed:.10f}")
         yield _row(name, "set acceleration", _decimal(acceleration))
 

@@ -163,7 +163,7 @@ def rows(data: str | bytes) -> Iterator[CodeLine]:
 
 
 def line_count(data: str | bytes) -> int:
-    """Count the lines of a script."""
+    """Count the lines of a script, the last one also without a line end; 0 for an empty text."""
     text = decode(data)
     return len(_END.findall(text)) + (not text.endswith(("\n", "\r")) and bool(text))
 
@@ -413,7 +413,7 @@ class _Line:
         self.problems.append(ScriptProblem("error", code, self.row.line, column, message))
 
     def warn(self, code: str, column: int, message: str) -> None:
-        """Add a warning about this line."""
+        """Add a warning about this line, at a column (from 1)."""
         self.problems.append(
             ScriptProblem("warning", code, self.row.line, column, message)
         )
@@ -695,7 +695,7 @@ def _is_comment(word: Field) -> bool:
 
 
 def _until_comment(words: Sequence[Field]) -> list[Field]:
-    """Return the words before the first comment."""
+    """Return the words before the first one that begins a comment, or all."""
     cut = next((i for i, w in enumerate(words) if _is_comment(w)), len(words))
     return list(words[:cut])
 

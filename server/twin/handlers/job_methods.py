@@ -135,7 +135,7 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
 async def list_jobs(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.JobListResult | Encoded:
-    """List all jobs, oldest first."""
+    """List all jobs that are kept, oldest first, in several turns of the loop if there are many."""
     jobs = await h.in_turns(twin.jobs.all(), twin.jobs.status)
     return await h.encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
 

@@ -210,7 +210,7 @@ def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 
 @answers(p.SAFETY_RESET)
 def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
-    """Leave E-stop or blocked."""
+    """Leave E-stop or blocked state, if `stop` (None: any) is the latest stop; return the state."""
     twin.scanner.reset(twin.clock.now(), params.stop)
     twin.changed()
     return twin.state()
@@ -218,7 +218,7 @@ def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
 
 @answers(p.CLOCK_SET)
 def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockState:
-    """Set the speed of twin time."""
+    """Set the speed of twin time for now and later; return the clock's state."""
     twin.clock.set_speed_up(params.speed_up)
     twin.changed()
     return state_views.clock_view(twin.clock)

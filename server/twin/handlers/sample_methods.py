@@ -257,7 +257,7 @@ def _sample_info(
 
 
 def _upload_info(head: UploadHead) -> p.SampleInfo:
-    """Describe an upload without reading it."""
+    """Describe an upload without reading it: name, kind, format and bytes; no size in mm."""
     what = f"{head.format} {head.kind}, {head.total} bytes"
     return p.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 

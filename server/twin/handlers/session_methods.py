@@ -113,7 +113,7 @@ def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
 
 @answers(p.STATE_UNSUBSCRIBE)
 def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Nothing:
-    """End subscriptions."""
+    """End the client's subscriptions to these topics; others are ignored."""
     twin.hub.unsubscribe(client.peer, params.topics)
     return Nothing()
 

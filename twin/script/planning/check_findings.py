@@ -89,7 +89,7 @@ class Optics:
 
     @property
     def truncated(self) -> bool:
-        """Whether the sample is cut off anywhere."""
+        """Whether the sample is cut off at any edge; False if that was not computed."""
         return self.truncation is not None and any(
             x > 0 for x in self.truncation.values()
         )

@@ -367,6 +367,6 @@ class CheckReport(WithProblems):
 
 
 def _range(found: Range | None) -> dict[str, float | None]:
-    """Return a 90 % range as {p5_s, p95_s}."""
+    """Return a 90 % range as {p5_s, p95_s}, both None for None."""
     low, high = found or (None, None)
     return {"p5_s": low, "p95_s": high}

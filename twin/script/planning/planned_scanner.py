@@ -69,7 +69,7 @@ class Motor:
 
     @property
     def end(self) -> float:
-        """Moment at which the motor comes to rest [s]."""
+        """Moment at which the last move ends [s]; 0 without one."""
         if self.moves:
             return self.moves[-1][1].end
         return 0.0
@@ -159,7 +159,9 @@ class PlannedTube:
         self.lit_from = 0.0
 
     def _close(self, time: float) -> None:
-        """End the interval of one setting at `time`."""
+        """End the interval of one setting at `time` [s]; recorded if X-rays were on and it
+        has a length.
+        """
         if self.on and time > self.since:
             self.beam.append(BeamOn(self.since, time, self.kV, self.power_W))
         self.since = time
@@ -178,13 +180,13 @@ class PlannedTube:
         return self.on and time >= self.lit_from
 
     def set(self, time: float, name: str, value: float) -> None:
-        """Change `kV` or `power_W` at `time`."""
+        """Change `kV` or `power_W` at `time` [s], and note that the script has set it."""
         self._close(time)
         setattr(self, name, value)
         self.said.add(name)
 
     def intervals(self, end: float) -> tuple[BeamOn, ...]:
-        """List the intervals with X-rays on, up to `end`."""
+        """List the intervals with X-rays on, one for each setting, up to `end` [s]."""
         self._close(end)
         return tuple(self.beam)
 
