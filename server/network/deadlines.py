@@ -34,6 +34,6 @@ class Deadlines:
             timer.cancel()
 
     def clear(self) -> None:
-        """Cancel all timeouts; none can be started under their names again."""
+        """Cancel all timeouts; their names stay taken until `stop`."""
         for timer in self._timers.values():
             timer.cancel()
