@@ -121,8 +121,9 @@ def _usage(error: Exception) -> tuple[str, ...]:
 
 
 def _wire_error(error: RpcError) -> tuple[str, ...]:
-    """Return the lines of a server's error reply: `code`, `message` and `data` of
-    JSON-RPC."""
+    """Return the lines of a server's error reply: its message, the problems after the
+    first (which the message states), and their positions in a script.
+    """
     lines = [error.message]
     if isinstance(
         error.data, Mapping

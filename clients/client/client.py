@@ -578,7 +578,9 @@ def _end_links() -> None:
     """
 
     async def cancel() -> None:
-        """Cancel all tasks of this loop but this one, and wait for their ends."""
+        """Cancel all tasks of this loop but this one, and wait for their ends; their
+        errors are ignored.
+        """
         readers = asyncio.all_tasks() - {asyncio.current_task()}
         for reader in readers:
             reader.cancel()
@@ -592,8 +594,9 @@ if hasattr(os, "register_at_fork"):  # a forked process has no thread that runs 
 
 
 def _result(work: Coroutine[Any, Any, _R]) -> _R:
-    """Run `work` on the clients' loop and return its result; an interrupt here cancels
-    it."""
+    """Run `work` on the clients' loop, in its thread, and return its result or raise its
+    error; an interrupt here cancels it.
+    """
     doing = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
         return doing.result()

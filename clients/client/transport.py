@@ -45,8 +45,9 @@ class ConnectionLost(ConnectionError):
 
     @classmethod
     def of(cls, calls: Correlation[Any], *, sent: bool) -> ConnectionLost:
-        """Build the error of a request whose connection has ended, with the reason if
-        one is known."""
+        """Build (not raise) the error of a request whose connection has ended, with a
+        violation of the protocol or the server's reason if one is known.
+        """
         if calls.violation is not None:
             return cls(f"the server broke the protocol: {calls.violation}", sent=sent)
         if calls.reason is None:

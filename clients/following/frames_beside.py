@@ -61,6 +61,8 @@ class FramesBeside:
     def write(self, path: Path, mirror: Mirror, age_s: float) -> dict[str, object]:
         """Write one frame with its radiograph, side by side.
 
+        The frame is to the left; beside.png and beside.json are replaced each time.
+
         Args:
             path: of the frame.
             mirror: the machine when it appeared.

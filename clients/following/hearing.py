@@ -41,8 +41,9 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
 
 
 def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
-    """Read the typed command, or the name of a question; None and "" for any other
-    command."""
+    """Read the typed command, or the name of a question, as (command, ""), (None, name);
+    (None, "") for any other or invalid command.
+    """
     try:
         command = read_command(event, axes)
     except Refusal:

@@ -369,6 +369,8 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
     """Write the script of a sequence: every setting of the twin's state, the move, the
     sequence.
 
+    With a move armed it ends with the same move again, which waits for its end.
+
     Args:
         state: of the twin; its camera, tube and rates are written as settings.
         command: prefix and first number of the images.

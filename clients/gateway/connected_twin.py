@@ -143,8 +143,9 @@ class ConnectedTwin:
         await asyncio.sleep(POLL_S)
 
     def script_of(self, job: JobStatus) -> bytes | None:
-        """Read the script of a job; None where it cannot be read, or is a client's own
-        sequence."""
+        """Read the script of a job from its data set; None where it is missing or too
+        long, or is a client's own sequence.
+        """
         path = Path(job.dataset or "") / SCRIPT
         if not path.is_file() or path.stat().st_size > MAX_SCRIPT:
             return None

@@ -314,7 +314,9 @@ def _positions(state: State) -> Mapping[str, float]:
 
 
 def _correction(state: State) -> NamedCorrection | None:
-    """Return the twin's correction as offsets with name and date; None without."""
+    """Return the twin's correction as offsets with name, date and comment; None without
+    one.
+    """
     c = state.correction
     if c is None:
         return None

@@ -57,6 +57,8 @@ class Servers:
     ) -> None:
         """Prepare the servers; `start` starts them.
 
+        Ports are free ones unless `options` name them.
+
         Args:
             options: of `flexdt up`.
             log: file of their log.

@@ -136,6 +136,8 @@ def port_of(name: str, asked: int, known: Addresses) -> int:
 def port_problem(option: str, host: str, port: int) -> str | None:
     """Say why a port cannot be listened on; None if it can.
 
+    The port is bound for a moment and freed again.
+
     Args:
         option: that chooses the port.
         host: address to listen on.

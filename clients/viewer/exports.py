@@ -120,6 +120,8 @@ def replay_file(
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
     """Return the content of an exported scene.
 
+    Only html has colours, title and `beside`.
+
     Args:
         serializer: viser's, of the scene.
         form: "html" or "viser".

@@ -389,6 +389,8 @@ def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
 def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Read method and parameters of a message.
 
+    Without params these are {}.
+
     Raises:
         ValueError: it has none.
     """
@@ -400,8 +402,9 @@ def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 
 
 def without_bytes(value: Any) -> Any:
-    """Convert to plain data for JSON; bytes become null, as a page gets images another
-    way."""
+    """Convert to plain data for JSON: mappings with text keys, lists; bytes become null,
+    as a page gets images another way.
+    """
     if isinstance(value, Mapping):
         return {str(k): without_bytes(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

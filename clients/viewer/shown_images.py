@@ -142,6 +142,8 @@ def packed(
 def _jpeg(raw: npt.NDArray[np.uint16]) -> bytes:
     """Encode a grey image (rows, cols) as JPEG.
 
+    Sixteen bits are reduced to eight.
+
     Raises:
         ValueError: OpenCV cannot encode it.
     """

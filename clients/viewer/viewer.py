@@ -71,8 +71,9 @@ PageMethod = Callable[["Viewer", Page, Mapping[str, Any]], Awaitable[object]]
 
 
 def nearest(safety: SafetyState) -> dict[str, Any]:
-    """Return the nearest parts that may not touch, for pages; `close` where a warning
-    is due."""
+    """Return the nearest parts that may not touch, for pages: their distance "mm" (None:
+    unknown), "pair", and "close" if a warning is due.
+    """
     mm = safety.clearance_mm
     return {
         "mm": mm,

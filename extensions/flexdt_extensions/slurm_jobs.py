@@ -209,7 +209,7 @@ def lifetime_s(walltime: str) -> int | None:
 
 def _outcome(job: str) -> str:
     """Read from sacct how a job ended, e.g. "FAILED, exit code 1:0"; "left the queue" if
-    unknown.
+    it is unknown or sacct fails.
     """
     said = _run(
         "sacct", "--noheader", "--parsable2", "--format=State,ExitCode", f"--jobs={job}"

@@ -38,6 +38,8 @@ class Measured:
 def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
     """Measure transmission, saturated and starved pixels of a scan's radiographs.
 
+    Of `SIMULATED_VIEWS` views; saturation is None where the full scale is not known.
+
     Args:
         data: a data set or its folder.
 

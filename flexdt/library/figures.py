@@ -203,6 +203,8 @@ def image_under(
 ) -> str:
     """Draw a grey image with points over it.
 
+    Dense is dark; without points there is no legend.
+
     Args:
         values: (rows, cols); black and white are percentiles.
         points: their x and y are columns and rows.

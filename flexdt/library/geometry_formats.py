@@ -166,6 +166,8 @@ def to_cil(cone_vec: ConeVec) -> Any:
 def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
     """Make TIGRE's geometry and angles; see `ConeVec.to_tigre`.
 
+    TIGRE must be installed.
+
     Args:
         cone_vec: the geometry.
         like: grid or volume whose voxels it gets; None for no volume.

@@ -583,8 +583,9 @@ def _spot_doubt(truth: Truth) -> Iterator[str]:
 
 
 def _different(cone: ConeVec) -> npt.NDArray[np.float64]:
-    """Return the views whose distances or foot points differ, the extremes among them, (k,
-    12)."""
+    """Return some of the views whose distances or foot points differ, about 100, the
+    extremes among them, (k, 12).
+    """
     ray = cone.source - cone.detector
     feet = [np.einsum("ij,ij->i", ray, edge) for edge in (cone.u, cone.v)]
     keys = np.column_stack([cone.source_detector_distance, *feet]).round(6)

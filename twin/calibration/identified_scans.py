@@ -110,6 +110,9 @@ def _numbers(
 ) -> FrameNumbers | None:
     """Find the angle that each frame shows, if some frames do not agree with the others.
 
+    Tried are the identification, both halves and the middle of the scan, until one gives
+    numbers.
+
     Args:
         found: identification of the scan, or None.
         detections: spots of each frame.

@@ -571,6 +571,8 @@ def _report(
 ) -> Identification:
     """Make the identification of the best hypothesis: tracks, quality and rivals.
 
+    Rivals are hypotheses over 3 deg away that fit about as well.
+
     Spots that overlap their neighbours in the prediction get no track.
 
     Args:

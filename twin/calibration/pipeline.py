@@ -135,6 +135,9 @@ def _detected(
 ) -> Calibration:
     """Detect spots in all frames, and judge the frames.
 
+    If frames are found unusable, other spot sizes are looked for, with settings of their
+    own.
+
     Args:
         scans: the scans.
         model: the beads.

@@ -65,6 +65,8 @@ class EffectiveBeam:
     def transmit(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Compute the signal and its variance behind path lengths.
 
+        Exponentials are summed over the effective energies.
+
         Args:
             paths_mm: float32 (m, ...) [mm].
 

@@ -186,6 +186,9 @@ def open_beam_doubt(
 def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str:
     """Name an exposure that fills the panel, or a power where no exposure does, or a voltage.
 
+    Power is raised before time; beyond the longest exposure the text begins with "not
+    even".
+
     Args:
         machine: whose limits hold.
         exposure: the setting that `beam` was predicted for.

@@ -554,6 +554,8 @@ def way_of(rows: FloatArray) -> FloatArray:
     """Compute the path length of source and panel up to each view, relative to their
     distances, (n,) [rad].
 
+    The largest of source's, panel's and pixel vectors' relative steps counts.
+
     Args:
         rows: cone_vec of the views, (n, 12).
     """

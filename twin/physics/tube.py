@@ -156,6 +156,8 @@ def voltages() -> tuple[float, float]:
 def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     """Compute the spectrum that leaves the tube at `kV`, behind its filters.
 
+    Interpolated linearly between the tables' voltages.
+
     Args:
         kV: voltage.
         tube: with its filters; None: the default one.

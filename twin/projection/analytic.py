@@ -148,6 +148,8 @@ def _project(
 ) -> None:
     """Fill out (channels, n, rows, cols) with the solids' chords times their weights.
 
+    Zero without solids.
+
     Args:
         solids: the k solids, object frame.
         geometry: n views.
@@ -350,6 +352,8 @@ def project_mesh(
 
 def _check_closed(faces: IntArray, vertices: int) -> None:
     """Check that every edge is passed as often in one direction as in the other.
+
+    So a closed mesh may touch itself.
 
     Args:
         faces: (m, 3) numbers of vertices.

@@ -259,6 +259,8 @@ class CoarseScan:
     ) -> Float32Array:
         """Reconstruct the grid by FDK.
 
+        The images are not changed.
+
         Args:
             images: (n, rows, cols) line integrals.
             cone_vec: n views.
@@ -322,6 +324,8 @@ class CoarseScan:
         self, flaw: str, ends: tuple[float, float], turn: FloatArray | None = None
     ) -> Rung:
         """Make parallel views of a panel that sees given distances from the axis.
+
+        The source is far away; the axis falls on the grid's columns.
 
         Args:
             flaw: of the rung.

@@ -333,8 +333,8 @@ class RegionSystem(LinearSystem):
         return cls(**given, outer=Volume(zeros, (dx, dy, dz), (x, y, z)), outside=outside)
 
     def grids(self, x: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Split x into the voxels of region and surroundings, (z, y, x), z contiguous, no
-        copy.
+        """Split x into the voxels of region and surroundings, (z, y, x) each, z
+        contiguous; both are views of x.
         """
         (nz, ny, nx) = self.like.shape
         (mz, my, mx) = self.outer.shape

@@ -483,6 +483,8 @@ def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
 def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> list[str]:
     """List doubts about a correction, in sentences.
 
+    Empty without doubts.
+
     Args:
         dark: share of the pixels whose signal would be nearly all scatter.
         volume: reconstructed without the scatter.

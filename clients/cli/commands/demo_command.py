@@ -221,6 +221,8 @@ def _scan(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
     """Run the example script on the twin and read the data set back with the ordinary
     reader.
 
+    Its name has the date and time; the twin's clock runs as fast as possible.
+
     Args:
         client: connected to the twin.
         data: the twin's data directory.

@@ -275,6 +275,8 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
     """Jog for so many seconds of the twin's clock, lease after lease, at any speed of the
     clock.
 
+    Returns at the end of the travel; warnings are printed once.
+
     Args:
         client: connected to the twin.
         axis: name of the motor.

@@ -108,6 +108,8 @@ def new(
 def _kind_members(kind: Kind, **given: Any) -> dict[str, Any]:
     """Collect members of a request that belong to one kind of scan.
 
+    A position becomes a placement, `rise` the member `rise_mm`.
+
     Args:
         kind: of the scan.
         given: options by name; those left out are None or empty.

@@ -372,6 +372,8 @@ class LabScene:
         """Collect the drawn shapes for a picture that needs no browser; any thread may
         call.
 
+        An opaque sample is drawn where it is near and has no dense part.
+
         Args:
             world: of the state that was drawn last.
             shown: by the page.

@@ -113,8 +113,9 @@ def _draw_lines(
     color: tuple[int, int, int],
     px: float,
 ) -> None:
-    """Replace the lines (n, 2, 3) [mm] that clients had under this name; None removes
-    them."""
+    """Replace the lines (n, 2, 3) [mm] that clients had under this name, `px` thick; None
+    or no lines remove them.
+    """
     _remove(clients, name)
     if lines is not None and len(lines):
         for client in clients:

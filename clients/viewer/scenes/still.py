@@ -60,8 +60,9 @@ class Shape:
 
 
 def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
-    """Split meshes [mm] to shapes, large triangles divided: one may reach behind the
-    eye."""
+    """Split meshes [mm] into shapes [m], in meshes over `LARGE_MM` triangles are divided:
+    a large one may reach behind the eye.
+    """
     out = []
     for piece in pieces:
         mesh: Any = piece.mesh

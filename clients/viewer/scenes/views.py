@@ -249,6 +249,9 @@ def fitted(
 def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
     """Compute the beam's eye of a geometry, and how a page crops it to the image alone.
 
+    The eye is at the focal spot and looks at the foot of the perpendicular, unless that
+    needs too large a picture.
+
     Args:
         world: geometry.
 

@@ -312,6 +312,9 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
     """Compare a past scan's volume with the truth of its sample, with a correction and
     without.
 
+    Without a correction to compare with only the volume itself is compared; then the
+    figures of each are kept by name.
+
     Args:
         held: gets the volumes `truth` and, where there is a correction, `other`; prints
             the figures.

@@ -182,6 +182,8 @@ def _positive(value: object) -> Draw:
 def _counts(value: object) -> Draw:
     """Read a whole number above 0, or a choice of such.
 
+    Returns the draw.
+
     Raises:
         ValueError: it is none.
     """

@@ -63,6 +63,9 @@ class Augment:
     def apply(self, sample: Sample, rng: np.random.Generator) -> None:
         """Change a sample's projections, and the geometry they were truly made with.
 
+        Images are shifted by normal amounts [px], and get Poisson noise of a random
+        number of photons.
+
         Args:
             sample: arrays by name; `projections` and `cone_vec_true` are replaced.
             rng: of this item and epoch.

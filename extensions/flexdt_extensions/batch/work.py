@@ -261,6 +261,8 @@ def _spheres(
 ) -> tuple[Phantom, dict[str, Any]]:
     """Draw random spheres that do not touch, in a cylinder.
 
+    None touches another; the size is that of the cylinder.
+
     Args:
         table: numbers, radii, materials and the cylinder.
         rng: of the number of spheres.

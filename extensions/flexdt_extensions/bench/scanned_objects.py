@@ -42,6 +42,8 @@ def cylinders(
 ) -> Float32Array:
     """Compute line integrals of upright cylinders, (n, rows, cols).
 
+    Each attenuates by `ATTENUATION`; overlapping ones add up.
+
     Args:
         scan: a circle with upright panels.
         shape: (rows, cols).

@@ -331,8 +331,9 @@ class TwinFlyer(
         return f"flexdt://{self._link.address}/{method}"
 
     def taken(self) -> Iterator[tuple[float, float]]:
-        """Yield angle [deg] and planned start [s of the scan's clock] of each complete
-        image."""
+        """Yield angle [deg] and planned start [s of the scan's clock] of each image
+        completed so far; raises if no scan is prepared.
+        """
         ready = self._ready()
         if self.job is None:
             done = 0
@@ -379,8 +380,10 @@ class TwinFlyer(
         return keys
 
     async def read_configuration(self) -> dict[str, Reading[Any]]:
-        """Read the scan: frames, exposure, expected duration, angle of each image,
-        script."""
+        """Read the scan's settings, by names with the device's name before: frames,
+        exposure, expected duration, angle of each image, script; stamped with the
+        present time.
+        """
         now = time.time()
         return {
             f"{self.name}-{name}": Reading(value=setting[0], timestamp=now)
@@ -436,6 +439,8 @@ def _plan_scan(
     scan: FlyScan, text: bytes, report: CheckResult, machine: Machine, profile: Profile
 ) -> _Prepared:
     """Plan a script and check that its projections are one numbered series.
+
+    Only projections count, in the script's order.
 
     Args:
         scan: of the flyer.

@@ -422,6 +422,9 @@ class ScenarioReader:
         """Read at least so many columns of numbers, separated by commas or blanks, in a
         named file.
 
+        Lines that begin with # are comments. Raises ExchangeError without files beside
+        the scenario, and for anything but finite numbers.
+
         Args:
             name: of the file.
             where: its place in the scenario, for errors.
@@ -618,8 +621,8 @@ def place(
 
 
 def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
-    """Return the axes u, v, w as columns (3, 3); None if u and w are not at right angles, or
-    zero.
+    """Return the axes u, v = w x u, w, of unit length, as columns (3, 3); None if u and w
+    are not at right angles, or one is zero.
     """
     lengths = np.linalg.norm(u), np.linalg.norm(w)
     if min(lengths) == 0.0 or abs(u @ w) > 1e-6 * lengths[0] * lengths[1]:
@@ -631,8 +634,9 @@ def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
 
 
 def _fit_to_frames(values: FloatArray, count: int) -> FloatArray:
-    """Fit drift values to the frames: the first at the first frame, the last at the
-    last."""
+    """Fit drift values to the frames, (count,): the first at the first frame, the last at
+    the last, linearly between; a single one holds for all.
+    """
     if len(values) == 1 or count == 1:
         return np.full(count, values[0])
     if len(values) == count:

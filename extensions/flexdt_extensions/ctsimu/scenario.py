@@ -182,6 +182,8 @@ class ScenarioImages:
         """Compute the energy in each pixel of one frame, and its variance, before the
         detector blurs.
 
+        Rays per pixel are averaged and blurred by the focal spot; scatter is added.
+
         Args:
             frame: number of the frame.
             samples: with the samples; False is the open beam.

@@ -350,6 +350,8 @@ def column_lengths(cone: ConeVec, cols: int, samples: int = 80) -> FloatArray:
     """Sample the length of each ray of the middle row in each upright column of the
     object.
 
+    The rays' slope is not counted.
+
     Args:
         cone: n views.
         cols: of the detector.

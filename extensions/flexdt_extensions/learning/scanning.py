@@ -322,8 +322,9 @@ def equidistant(env: ScanEnv, frame: int) -> Action:
 
 
 def greedy(env: ScanEnv, frame: int) -> Action:
-    """Choose the angle of most expected information for its time, at the nominal
-    geometry."""
+    """Choose the action of most expected information for its time, at the nominal
+    geometry, of 36 angles (and some magnifications for "pose"); `frame` is ignored.
+    """
     candidates = [{"rot_obj": 360.0 * i / SECTORS} for i in range(SECTORS)]
     if env.kind == "pose":
         here = env.lab.position("mag_obj")
@@ -358,6 +359,8 @@ class Episode:
 
 def play(env: ScanEnv, policy: Policy, seed: int) -> Episode:
     """Run one episode.
+
+    It ends by a collision or when the frames are used up.
 
     Args:
         env: environment, which is reset.

@@ -518,6 +518,8 @@ def _polish(
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Move beads off their seats by ever smaller steps while that helps.
 
+    The step is halved when no bead moves.
+
     Args:
         beads: (k, 3) [mm].
         index: (k,) seat of each bead; -1 once it is moved.

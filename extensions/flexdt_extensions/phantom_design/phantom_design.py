@@ -554,6 +554,8 @@ def level_drawings(
 ) -> Iterator[Drawing]:
     """Draw each height at which a block holds beads, seen from above, lowest first.
 
+    Each comes with the steps to build it.
+
     Args:
         size: of the block along x, y and z [mm].
         beads: centres (k, 3) in the object's frame [mm].

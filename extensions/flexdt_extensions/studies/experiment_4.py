@@ -420,6 +420,8 @@ def moved_beads(
 ) -> tuple[Scene, BeadModel]:
     """Move beads off their model; the solids that are beads move, too.
 
+    Every sphere counts as the nearest bead.
+
     Args:
         scene: solids of the phantom.
         model: its k beads.
@@ -553,6 +555,8 @@ def image_runs(
     counts: Sequence[int] = COUNTS,
 ) -> list[Run]:
     """Calibrate one scan from N of its images, with the beads as they were found.
+
+    A run that fails has its error as a note.
 
     Args:
         name: Scan1 to Scan11.

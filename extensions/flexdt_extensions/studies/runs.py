@@ -264,8 +264,9 @@ def _mae(errors: Mapping[str, float]) -> float:
 
 
 def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
-    """Compute |value - truth| of each parameter, edge units; whole turns of alpha do
-    not count."""
+    """Compute |value - truth| of each parameter in `values`, [mm, deg]; whole turns of
+    alpha do not count.
+    """
     edge = truth.to_edge()
     return {
         name: abs(

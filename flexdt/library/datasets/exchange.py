@@ -161,6 +161,8 @@ def import_geometry(
 ) -> ScanGeometry:
     """Read a geometry in a peer's format.
 
+    Shape, views and pitch must agree with the given ones.
+
     Args:
         path: the file.
         format: one of `FORMATS` that is read (`Format.read`).

@@ -123,6 +123,8 @@ def _require_room_for(
 def unfinished(path: Path) -> str:
     """Describe a folder in which saving was interrupted.
 
+    Numbers that its note does not tell are "?".
+
     Args:
         path: of a folder with the file `UNFINISHED`.
     """

@@ -217,6 +217,9 @@ def _of_floats(
 ) -> DataSet:
     """Read float images into a data set in memory.
 
+    With flat images they are intensities, converted to line integrals; without dark ones
+    dark is 0.
+
     Args:
         folder: of the images.
         geometry: one view for each projection.

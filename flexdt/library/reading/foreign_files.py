@@ -51,6 +51,8 @@ def open_file(
 ) -> DataSet:
     """Open the data set in a file; a geometry that is given replaces the file's.
 
+    Distances are allowed only for formats that lack them.
+
     Args:
         path: of the file.
         geometry: one view for each projection.

@@ -198,6 +198,8 @@ class ScanFrames:
     def view(self, number: int, *, again: bool = True) -> Float32Array:
         """Return one frame's line integrals, binned and corrected.
 
+        Corrected are scatter, rings and beam hardening, in this order, where asked for.
+
         Args:
             number: of the frame among those that are reconstructed.
             again: keep the image, where images are kept.

@@ -232,6 +232,8 @@ class Work:
     ) -> Work:
         """Estimate the work of slabs of a grid.
 
+        Of reading, filtering and backprojecting.
+
         Args:
             images: upright.
             grid: of the entire volume.

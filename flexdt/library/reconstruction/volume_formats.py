@@ -326,8 +326,8 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 
 def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
-    """Read the fields of a header that ends with `end`, and the offset [bytes] of the
-    values.
+    """Read the fields of an ASCII header that ends with `end`, each divided by `between`,
+    and the offset [bytes] of the values; raises ValueError if no end is found.
     """
     with path.open("rb") as file:
         head, found, _ = file.read(HEADER_BYTES).partition(end)

@@ -342,8 +342,8 @@ class Candidates:
         return max((self._climbed(start) for start in starts), key=self.evidence)
 
     def _climbed(self, choice: Choice) -> Choice:
-        """Climb from a choice, one cause after the other, until no other width has more
-        evidence.
+        """Climb from a choice, one cause after the other, until no other width of any has
+        more evidence; returns that choice.
         """
         while True:
             before = choice
@@ -390,8 +390,8 @@ class Candidates:
         return spread, at.covariance(self.count)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
-        """Return the phantom's strain (10,) in a choice, and its covariance; None without
-        strain.
+        """Return the phantom's strain (10,) in a choice, in the order of STRAINS, and its
+        covariance; None if the phantom is rigid or the choice cannot be judged.
         """
         at = self.judged(choice)
         if at is None or not min(self.known.strain) > 0:
@@ -551,6 +551,9 @@ def _options(
     candidates: Candidates, choice: Choice, borders: Sequence[Border]
 ) -> dict[str, object]:
     """Make the options of the refit for a choice; falsy where nothing changes.
+
+    strain is None if it is as stated before; panel is None without bends and borders, or
+    where images differ in shape.
 
     Args:
         candidates: the table.

@@ -141,6 +141,8 @@ def judge_emptiness(
 ) -> list[Finding]:
     """Look for spots of another size in scans where no bead of the expected size was found.
 
+    Nothing where fewer than half of the frames show any round spot.
+
     Args:
         scans: the scans.
         looks: spots of each frame of each scan.
@@ -545,6 +547,8 @@ def _other_turn(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> Finding | None:
     """Check whether the stage turns by another angle than stated, from neighbouring frames.
+
+    Also None with fewer than four frames at small turns.
 
     Args:
         detections: spots of each frame.

@@ -141,6 +141,9 @@ def frame_numbers(
 ) -> FrameNumbers | None:
     """Find the angle that each frame shows.
 
+    Also None for few frames. A frame that fits no angle has the shift of the one before;
+    shifts are relative to the first frame's.
+
     Args:
         detections: spots of each of the n frames.
         beads: (k, 3) [mm].

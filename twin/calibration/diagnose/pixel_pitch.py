@@ -126,6 +126,8 @@ class _Explanations:
     ) -> Judged | None:
         """Judge the residuals.
 
+        None if its columns are not separable.
+
         Args:
             distances: columns of the panel's distance.
             width: standard deviation of their priors [mm].

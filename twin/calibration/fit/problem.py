@@ -181,6 +181,9 @@ def layout(
 ) -> ColumnLayout:
     """Assign columns.
 
+    Where source, object and detector could shift together without priors, the source is
+    held.
+
     Args:
         free: names of free parameters, any order, each once or more.
         groups: number of groups of frames.

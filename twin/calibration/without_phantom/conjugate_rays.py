@@ -202,6 +202,8 @@ class Profile:
     def _steps(self, sigma: FloatArray) -> tuple[list[Step], FloatArray]:
         """Estimate the step at each radius.
 
+        `least` of each is the step that chance would give, in view of the number tried.
+
         Args:
             sigma: (m,) standard deviations of the values; inf for one that does not count.
 
@@ -222,6 +224,9 @@ class Profile:
     def _widened(self, sigma: FloatArray, place: int) -> FloatArray:
         """Widen the standard deviations of bins until the residuals of a step at a radius
         are usual, (m,).
+
+        All by one common amount, added in quadrature; returned as they are if usual
+        already.
 
         Args:
             sigma: (m,) of the bins [px].
@@ -447,6 +452,8 @@ class ConjugateRays:
         self, group: int, values: FloatArray, columns: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Read rays to columns of a group of rows from both ends in all n views.
+
+        Interpolated between views and columns.
 
         Args:
             group: number of the group of rows.

@@ -175,6 +175,8 @@ def _require_one(
 ) -> None:
     """Check that no other gap is left when one is closed.
 
+    A gap is one between two panel tiles.
+
     Args:
         rays: both ends of rays of a turn.
         values: parameters of the plane.

@@ -123,7 +123,7 @@ def mark_of(grid, j, i):
 @inline
 def occupied(spans, grid, j, i):
     """Return the levels - 1, [first, last), of voxel column (l = i, t = j) that are not
-    empty.
+    empty; (nz, 0) for an empty column or one outside.
     """
     if i < 0 or i >= grid.nl or j < 0 or j >= grid.nt:
         return grid.nz, 0
@@ -137,7 +137,7 @@ def occupied(spans, grid, j, i):
 @inline
 def levels_between(grid, fan, t0, t1):
     """Find the levels - 1, [w0, w1), that the fan can touch from t0 to t1, with one to
-    spare.
+    spare, clipped to the box.
     """
     a, b = t0 - grid.st, t1 - grid.st
     low = grid.sz + min(fan.rise_low * a, fan.rise_low * b) - 1.0

@@ -220,8 +220,8 @@ def slab_kernel(transposed):
 
     @cuda.jit(device=True, inline=True)
     def meet(flat, inside, p, share, value):
-        """Read the contribution of a share of a slab in voxel p, or (transposed) add to
-        it.
+        """Read the contribution of a share of a slab in voxel p, or (transposed) add that
+        share of `value` to it and return 0; 0 outside or for no share.
         """
         if not inside or share <= ZERO:
             return ZERO
@@ -407,8 +407,8 @@ def column_kernel(transposed):
 
     @cuda.jit(device=True, inline=True)
     def meet(flat, inside, p, share, value):
-        """Read the contribution of a share of a slab in voxel p, or (transposed) add to
-        it.
+        """Read the contribution of a share of a slab in voxel p, or (transposed) add that
+        share of `value` to it and return 0; 0 outside or for no share.
         """
         if not inside or share <= ZERO:
             return ZERO

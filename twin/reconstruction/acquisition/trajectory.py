@@ -176,6 +176,9 @@ def mean_image(
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     """Make a circle from its sources' angles, with steps and gaps.
 
+    A gap is an arc without views, wider than usual steps; steps are widened for random
+    angles if lines would be unseen.
+
     Args:
         azimuth: (n,) from 0 to 2 pi [rad].
         centre: (2,) [mm].

@@ -259,6 +259,8 @@ def _lowest(known: dict[float, float]) -> float:
 def _turned_onto(values: Float32Array, other: Float32Array) -> Float32Array:
     """Turn a volume about its middle axis so that it is most like another.
 
+    In steps of a turn over `TURN_STEPS`; returns a copy.
+
     Args:
         values, other: (nz, ny, nx) of one grid.
     """

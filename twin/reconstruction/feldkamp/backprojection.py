@@ -186,6 +186,9 @@ class OnDevice:
     ) -> None:
         """Weigh, filter and add images in the order of their arrival.
 
+        Also into both half volumes of the noise meter, if there is one; does not wait for
+        the device.
+
         Args:
             views: their geometry, in `order`.
             order: number of the image of each.

@@ -193,8 +193,8 @@ def _add_all(
 
 
 def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """List layers (first, last) of slabs that fit the device one by one; empty without a
-    device.
+    """List layers (first, last) of the fewest slabs that fit the device one by one; empty
+    without a device, or if not even one layer fits.
     """
     count = 1
     most = like.shape[0]
