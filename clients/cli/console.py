@@ -79,6 +79,9 @@ def _end_silence() -> None:
 def waited_for(words: Sequence[str]) -> Iterator[None]:
     """Show on a terminal that a command works, until it prints something.
 
+    Without a terminal on stderr, without words, or while the shell completes words
+    nothing is shown.
+
     Args:
         words: of the command line; nothing is shown of help, completion, servers and
             quiet commands.
@@ -262,6 +265,8 @@ class ProgressBar:
     def update(self, done: float, total: float | None, text: str | None = None) -> None:
         """Show progress: in the bar, or without a terminal as a line at most every
         PLAIN_INTERVAL_S.
+
+        As a line: never in quiet mode, and not if neither `done` nor `total` has changed.
 
         Args:
             done: units.

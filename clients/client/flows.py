@@ -127,6 +127,9 @@ def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:
 async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> object:
     """Perform an effect on an event loop and return its result.
 
+    Only `Ask` has a result: that of `call`. `Sleep` waits, `Tell` calls the function and
+    awaits what it returns if that is awaitable; both return None.
+
     Args:
         effect: a request, a pause or a call of the caller's function.
         call: sends a request to the server and returns the result.

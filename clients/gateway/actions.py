@@ -422,6 +422,8 @@ async def _run(
 ) -> str:
     """Submit a script and wait for the end of its job.
 
+    A status without data set returns "".
+
     Args:
         twin: connection; its `job` is the running one meanwhile.
         script: bytes of the script.

@@ -223,6 +223,8 @@ class Recording:
     def _write_texts(self) -> None:
         """Write the transcript, and the settings texts if machine and profile are known, into
         the folder.
+
+        Needs a folder (asserts it).
         """
         assert self._folder is not None
         text = "\r\n".join([*self.transcript, ""])

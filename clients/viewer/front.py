@@ -499,6 +499,8 @@ def _response(
 ) -> Response:
     """Make a response with the headers of all content: length, type, policy, no cache.
 
+    It also says that the connection closes.
+
     Args:
         body: content.
         kind: its media type.

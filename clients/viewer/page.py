@@ -178,7 +178,10 @@ class Page:
 
     def say(self, kind: str, **content: object) -> None:
         """Send something that must arrive, in order; a page that has not taken 1000 is
-        closed."""
+        closed.
+
+        `kind` is the message's type, `content` its fields.
+        """
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:
             self._over.set()
@@ -351,7 +354,11 @@ class Page:
 
 def _words(error: RpcError | ConnectionLost) -> str:
     """Format an error's message for people: with the page's button instead of the
-    wire's method."""
+    wire's method.
+
+    Only the refusal because another is the controller is reworded; others keep their
+    text.
+    """
     if not isinstance(error, RpcError):
         return str(error)
     match error.data:

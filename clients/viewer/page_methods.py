@@ -474,7 +474,10 @@ def _readout(
     cone: Sequence[float], shape: tuple[int, ...]
 ) -> Mapping[str, object] | None:
     """Compute distances and sizes of a recorded image's nominal geometry; None: it is
-    not known."""
+    not known.
+
+    None as well where no distances can be computed from it.
+    """
     if not cone:
         return None
     view = ConeVec(np.array([cone]))

@@ -318,7 +318,10 @@ class Viewer:
 
     def show_layers(self) -> None:
         """Set the nodes that each page shows in its frames, as soon as they have
-        received all nodes."""
+        received all nodes.
+
+        Nothing without the scene of the lab.
+        """
         if (lab := self.lab) is None:
             return
         for page in self.pages.values():

@@ -132,6 +132,9 @@ def _end_with_parent() -> None:
 def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
     """Connect to the workers of a dask scheduler.
 
+    Silences the log of dask and its connections for the whole process. An error in the
+    body that is none of the cluster is raised as it is.
+
     Args:
         address: of a scheduler, or a cluster object of dask.
         tend: called at each look at the workers while the work goes on; None prints where

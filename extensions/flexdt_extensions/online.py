@@ -321,7 +321,10 @@ def next_angle(
 
 def _noise_px(fit: FitResult) -> float:
     """Estimate the typical standard deviation of a used position [px], with residuals
-    and enlargement."""
+    and enlargement.
+
+    At least 1e-4 px; where the fit's noise is not finite, it counts as 1.
+    """
     whiten = fit.problem.whiten[fit.certificate.used]
     stated = float(np.median(1.0 / np.sqrt(whiten[:, 0] * whiten[:, 2])))
     if math.isfinite(fit.certificate.noise):

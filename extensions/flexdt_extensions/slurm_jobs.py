@@ -127,6 +127,10 @@ class SlurmJobs:
     def _replace(self, gone: Sequence[Job], workers: Collection[str]) -> list[str]:
         """Replace ended jobs by new ones, unless their workers are still connected.
 
+        A job that has left the queue while its worker is connected stays listed; each
+        other one is removed and named in a line. A job whose worker had come resets the
+        count of barren ones. Then new jobs are submitted.
+
         Args:
             gone: jobs that have left the queue.
             workers: names of those that are connected.

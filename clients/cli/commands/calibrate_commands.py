@@ -207,6 +207,8 @@ def _load_inputs(
 def _load_data_sets(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
     """Load the data sets, each with its own geometry or the one of a file.
 
+    No geometries (None or an empty list): each data set keeps its own.
+
     Args:
         folders: of the data sets.
         geometries: one file for each, or None.

@@ -245,6 +245,9 @@ def _check_together(
 def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report | None]:
     """Read the chosen correction, and the report that it comes from.
 
+    None as `named` gives (None, None); "none", or a twin without a calibration in force,
+    gives zero offsets without report; a file gives its offsets and its report.
+
     Args:
         named: a report's file, "twin" or "none"; None for the scan's own.
         twin: connects, for "twin" only.

@@ -131,7 +131,11 @@ class MeshCache:
 
     def look(self, sample: SampleState) -> SampleLook:
         """Return the look of `sample`, an upload whose mesh is lacking as a box; it
-        may take a second."""
+        may take a second.
+
+        No sample has the empty look. A named phantom is loaded and kept at its first use;
+        what cannot be loaded is a box, too.
+        """
         if sample.name is None:
             return NOTHING
         if sample.revision is None and _key(sample) not in self._made:

@@ -154,6 +154,9 @@ def presets(
 ) -> dict[str, Fitted]:
     """View -> the camera that it opens with, for all but the beam's eye.
 
+    "iso", "side" and "free" show tube, ball and panel whole; "sample" shows the cylinder
+    (or the ball).
+
     Args:
         world: the machine's pose.
         radius_mm: of the ball around the sample.

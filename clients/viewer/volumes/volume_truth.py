@@ -105,7 +105,10 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
 
 def placement(folder: Path) -> StagePlacement:
     """Read the place of a data set's sample from its job's record; without one: no
-    offset."""
+    offset.
+
+    An offset is missing also where the record is damaged.
+    """
     try:
         file = folder.parent / "jobs" / f"{file_stem(folder.name)}.json"
         return StagePlacement(**json.loads(file.read_text("utf-8"))["sample"]["offset"])

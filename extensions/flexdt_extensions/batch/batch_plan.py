@@ -156,6 +156,8 @@ def _numbers(value: object) -> Draw:
 
     Raises:
         ValueError: it is none.
+
+    ValueError also for a distribution that draws texts.
     """
     draw = parse(value)
     if any(isinstance(v, str) for v in draw.values):

@@ -71,7 +71,11 @@ class Announcements(StreamResourceDataProvider):
 
     def count(self) -> int:
         """Count the events whose images the emitted documents name; dropped ones are
-        due again."""
+        due again.
+
+        The last announcement counts as dropped if the RunEngine has not filled in its
+        descriptor: the count goes back to its first event.
+        """
         if self._last is not None and not self._last["descriptor"]:
             self.last_emitted = self._last["indices"]["start"]
             self._last = None

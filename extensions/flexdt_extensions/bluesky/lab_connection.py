@@ -291,6 +291,8 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
     async def put(self, value: _T | None) -> None:
         """Ask the twin for another value.
 
+        It then reads the state afresh.
+
         Raises:
             RpcError: the twin rejects the value.
         """

@@ -867,6 +867,8 @@ class _ScanReader(ScenarioReader):
     ) -> FloatArray:
         """Read a positive number for each frame.
 
+        Only a missing value takes the default; without a default it is an error.
+
         Args:
             units: unit -> factor.
             path: keys of the value.

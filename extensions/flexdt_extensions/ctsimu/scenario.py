@@ -104,6 +104,8 @@ class ScenarioImages:
 
         Raises:
             ExchangeError: it cannot be read.
+
+        The name is relative to the scenario's folder.
         """
         try:
             return text_of(self.path.parent / name)

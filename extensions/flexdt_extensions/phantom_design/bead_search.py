@@ -91,6 +91,8 @@ def measured_spread(
     """Simulate fits to noisy points and compute the rms error of parameters and
     IN_IMAGES.
 
+    Only columns that a fit reports are compared.
+
     The check of `design.forecast`.
 
     Args:

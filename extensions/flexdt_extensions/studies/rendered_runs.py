@@ -179,6 +179,10 @@ def render(
 ) -> RenderedFrames:
     """Make the radiographs of a scan and detect the beads in them.
 
+    Returns images, their corners and the spots found in each. Noiseless images (no
+    counts) are line integrals cropped to what is not zero; noisy ones are whole, as
+    counts.
+
     Args:
         scene: the phantom's solids; model: its beads.
         poses: nominal poses.

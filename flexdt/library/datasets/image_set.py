@@ -571,6 +571,8 @@ class ImageSet:
     def _recorded_integrals(self, index: int) -> Float32Array:
         """Return line integrals of one projection as they were recorded or given, (rows,
         cols).
+
+        Given integrals are copied; otherwise the counts are normalised.
         """
         arrays = self.arrays
         if arrays is None or arrays.integrals is None:

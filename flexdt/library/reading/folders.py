@@ -457,6 +457,9 @@ def _from_texts(
 def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
     """Read the settings of the scanner's text, or of its second text if the first is unusable.
 
+    Where no text is usable but the folder has its document, it is None, and the errors
+    are warnings.
+
     Args:
         content: the folder.
         warnings: get the errors of the text that is not used.

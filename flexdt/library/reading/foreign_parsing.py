@@ -21,6 +21,8 @@ MAX_REPEATED_CHARACTERS: Final = 200
 def parsing(path: Path, form: str) -> Iterator[None]:
     """Run the body of a `with`, and turn any error of a parser into the file's error.
 
+    A TwinError passes as it is; lack of memory has its own message.
+
     Args:
         path: the file.
         form: whose format it should have.

@@ -70,6 +70,8 @@ def fits(
 ) -> FloatArray:
     """Fit balls in some windows by the kernel `fit_ball`; zeros elsewhere.
 
+    Returns one row of results for every window, in the order of the patches.
+
     Args:
         patches: the windows.
         index: of those to fit.

@@ -257,6 +257,8 @@ def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> 
     """Return the windows with uniform contrast of each bead, by the fading found in some
     frames.
 
+    Returns the same windows if no fading is found.
+
     Args:
         patches: the windows.
         behind: backgrounds.

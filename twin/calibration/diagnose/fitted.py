@@ -83,6 +83,11 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a repeated
     image.
 
+    Of one scan in one group of frames, wrong frame numbers come first (`judged` says error
+    or warning). A block of frames at an end, with no drift but the angle's, is an error
+    ("angle_step"). Otherwise "frames_inconsistent": an error for more than 30 % of the
+    frames, else a warning. At most 12 frames are listed, a block as first to last.
+
     Either most of a frame's spots are far from every prediction, or most of its positions had
     to be left out of the fit.
 
@@ -431,6 +436,8 @@ def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) 
 def _explained(better: FitResult, fit: FitResult) -> bool:
     """Check whether the residuals shrink enough from `fit` to `better`, without many more spots
     left out.
+
+    Also False if `better` is not identifiable.
     """
     rms = better.certificate.rms_px
     return (

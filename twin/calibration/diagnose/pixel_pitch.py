@@ -39,6 +39,9 @@ def with_rival_pitch(
 ) -> tuple[FitResult, Finding | None]:
     """Widen the intervals by a wrong pixel pitch that the images do not exclude.
 
+    With a rival pitch the intervals are always widened; the warning comes only if its
+    share is at least TOLD_SHARE.
+
     Args:
         fit: to be reported.
         widths: standard deviation of each offset by the scanners [mm, deg].

@@ -720,6 +720,9 @@ def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> fl
 def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     """Compute the quantities of IN_IMAGES, in the first frame of each group of frames.
 
+    Each is quantity -> estimate with value, sigma and 95 % interval; a rival pixel pitch
+    adds to the variance.
+
     Args:
         fit: whose estimates are all determined.
 
@@ -827,6 +830,9 @@ def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArr
 def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray | None]]:
     """Predict the covariance that the first frames of a fit alone would have, with the
     noise of all.
+
+    Steps with the same number of frames are listed once; the noise is at least
+    LEAST_NOISE.
 
     Args:
         fit: of n frames.

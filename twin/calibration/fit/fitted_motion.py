@@ -409,6 +409,8 @@ class _Mixed:
     def _eliminated(self, choice: _Choice) -> _Eliminated:
         """Eliminate the deviations of a choice from the normal equations (Schur complement).
 
+        If nothing moves, the equations are returned as they are.
+
         Args:
             choice: width and smoothness of each parameter; None for one that does not move.
 
