@@ -36,6 +36,9 @@ _quiet = False
 def speak(quiet: bool, verbose: bool) -> None:
     """Set the amount of output on standard error in addition to warnings and errors.
 
+    Neither changes nothing but the state of a former call; with both, `quiet` silences
+    slow steps.
+
     Args:
         quiet: no progress.
         verbose: slow steps with their duration, and messages of libraries.

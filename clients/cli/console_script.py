@@ -88,6 +88,9 @@ def _end_if_stuck(arrivals: int) -> None:
     """End the process where the main thread does not react, or where nothing works after
     it has.
 
+    Never returns. After SIGINT the main thread has STUCK_S to react; the thread that
+    watches for silence is started once.
+
     Args:
         arrivals: descriptor that gives the number of each signal, 0 for the beginning of
             an orderly end.

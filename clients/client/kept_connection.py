@@ -79,6 +79,9 @@ class KeptConnection:
     ) -> None:
         """Prepare the connection; `run` opens it.
 
+        No attempt to reconnect is made by the client itself. `problem` says why there is
+        no connection.
+
         Args:
             address: of the twin.
             name: of this client, which the twin shows.

@@ -124,6 +124,8 @@ class TcpTransport:
 
         Raises:
             ValueError: another port.
+
+        Nothing is opened yet.
         """
         if type(port) is not int or not 1 <= port <= 65535:
             raise ValueError(f"port {port!r} is not a number from 1 to 65535")

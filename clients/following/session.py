@@ -140,6 +140,8 @@ class FollowSession:
     async def run(self, address: str) -> None:
         """Listen until cancelled.
 
+        Two tasks: listen for messages, and look ahead; an error in one ends both.
+
         Raises:
             ValueError, zmq.ZMQError: no address that can be connected to.
         """

@@ -132,6 +132,9 @@ class SceneClients:
         """Put each view's camera so that it holds its points, unless a person has moved
         it.
 
+        Views whose pane has no known size yet are left out. Otherwise a camera moves only
+        if the points no longer fit its view.
+
         Args:
             anew: put all cameras to their presets, moved or not.
         """

@@ -280,7 +280,10 @@ async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
 
 async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
     """Return the first camera of a view in a pane of this page; empty where it is not
-    known."""
+    known.
+
+    The fields are those of `Standpoint`.
+    """
     fitted = viewer.clients.cameras.get(params.view)
     if fitted is None:
         return {}
@@ -488,7 +491,10 @@ def _readout(
 
 async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
     """Predict the virtual image at a recorded one's pose and exposure; returns its
-    origin as well."""
+    origin as well.
+
+    Tube and camera settings that are None are left out, so the present ones count.
+    """
     asked = {name: told[name] for name in ("kind", "positions")}
     for what in ("tube", "camera"):  # unknown settings are the present ones
         asked[what] = {k: v for k, v in told[what].items() if v is not None}
@@ -515,7 +521,10 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
 
 async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, bytes]:
     """Send a request to the volume's process; returns nothing where it has another
-    volume by now."""
+    volume by now.
+
+    Returns a head and bytes; nothing is ({}, b"").
+    """
     folder = _data(viewer) / plain_name(params.name or "", "data set")
     return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or (
         {},

@@ -78,7 +78,10 @@ def executor(
     jobs: int | None, scheduler: str | None
 ) -> AbstractContextManager[Executor | None]:
     """Choose an executor to map tasks with: a dask scheduler, own processes, or None
-    for this process."""
+    for this process.
+
+    At most one job and no scheduler: None. A scheduler comes before `jobs`.
+    """
     if scheduler is not None:
         return dask_executor(scheduler)
     if _count(jobs) <= 1:

@@ -136,6 +136,8 @@ def create(path: Path, grid: Grid) -> Any:
 def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
     """Write a slab of a volume into its store, at each resolution.
 
+    Each level halves the values of the one before.
+
     Args:
         group: of the store.
         grid: of the volume.
@@ -398,7 +400,11 @@ def as_made(running: Sequence[Future[_T]]) -> Generator[_T, None, None]:
 
 def folder_of(out: Path, identity: object) -> tuple[Path, str]:
     """Name the folder next to `out` for the unfinished volume; returns flexdt's
-    version as well."""
+    version as well.
+
+    Its name has a hash of that version and `identity`, so other requests have other
+    folders.
+    """
     made_by = version("flexdt")
     text = json.dumps([made_by, identity], sort_keys=True, default=str)
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]

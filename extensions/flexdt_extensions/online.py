@@ -234,7 +234,10 @@ def _renew(state: Online, start: Offsets) -> Online:
 
 def _prediction_sigma(state: Online, pose: Poses) -> float:
     """Compute the standard deviation of a predicted place [px], from the parameters'
-    covariance."""
+    covariance.
+
+    The largest over all rows of the prediction; the fit must exist.
+    """
     assert state.fit is not None
     rows = _rows(state, pose)
     spread = np.einsum("ij,jk,ik->i", rows, state.fit.covariance, rows)

@@ -421,6 +421,8 @@ def _with_alignment(
 ) -> PastScan:
     """Add the poses of a past scan, and its alignment without a phantom.
 
+    A scan without radiographs, or whose alignment is refused, counts as failed.
+
     Args:
         scan: its texts and profile.
         machine: that made it.

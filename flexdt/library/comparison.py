@@ -171,6 +171,8 @@ def _figures(
 def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
     """List the rows of a comparison's table: correction, rms and largest [px], rms of the
     images.
+
+    Only corrections that the document has, of before, after and in_force.
     """
     return [
         (name, *(document[name][figure] for figure in FIGURES))

@@ -103,6 +103,8 @@ def plot(
 ) -> str:
     """Draw lines and dots over two axes, as an SVG element.
 
+    Colours repeat after the last one. x and y of a series are data units.
+
     Args:
         series: the lines and dots; points that are not finite are left out.
         title, x_label, y_label: texts.

@@ -61,6 +61,8 @@ def profile(
 ) -> Profile:
     """Return a calibration profile by shipped name or by file; None is the machine's default.
 
+    A file comes before a shipped name. A profile that is given is only checked.
+
     Args:
         word: the requested name or file, or the profile itself.
         of: the machine.

@@ -22,6 +22,8 @@ def judge_first_sizes(
 ) -> list[Finding]:
     """Judge the sizes of spots in the first measurement.
 
+    At most one finding for each scan.
+
     Args:
         state: scans, identified, with their spots.
         request: whether a second measurement follows, which allows more blur now.

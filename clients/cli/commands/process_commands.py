@@ -118,7 +118,10 @@ gateway = alone(
 
 def start(name: str, more: Sequence[str]) -> None:
     """Run a process in this interpreter, with the settings file's options and then
-    those of `more`."""
+    those of `more`.
+
+    It ends by typer.Exit; if `more` requests the help, that is shown and nothing runs.
+    """
     settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}
@@ -153,8 +156,6 @@ def become(
     """Run `python -m module` in this process, with the options `given` and `more` words.
 
     A new interpreter would not react to Ctrl-C before it had loaded the module.
-
-    In this interpreter: a new one would not hear of Ctrl-C before it had loaded the module.
 
     Raises:
         typer.Exit: the process's exit code.

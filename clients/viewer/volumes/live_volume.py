@@ -125,7 +125,10 @@ def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], b
 
 def exact(data: Float32Array, place: tuple[int, int, int]) -> float | None:
     """Read the value of the voxel (x, y, z) [1/mm]; None where no data cover, or
-    outside the volume."""
+    outside the volume.
+
+    A value that is not finite counts as not covered.
+    """
     x, y, z = place
     if not all(0 <= at < n for at, n in zip((z, y, x), data.shape, strict=True)):
         return None
@@ -295,6 +298,9 @@ def _named(correction: NamedCorrection | None) -> str:
 
 def _facts(data: DataSet) -> dict[str, Any]:
     """Collect a data set's facts for people; unknown ones are empty.
+
+    `sample` and `started` are "" without the scan's document, `kV` is None without
+    settings.
 
     Returns:
         `sample`, `started` and `kV`.

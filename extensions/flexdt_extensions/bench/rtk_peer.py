@@ -103,6 +103,8 @@ def joseph(
 ) -> Work:
     """Prepare RTK's Joseph projector, its fastest on the CPU.
 
+    The call returns nothing; call it before the function of its images.
+
     Args:
         data: volume (z, y, x).
         voxel_mm: pitch (x, y, z).

@@ -88,7 +88,10 @@ def cut_off(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
 
 def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
     """Compute the images of a complete object and a rod that the panel's edge cuts in
-    some views."""
+    some views.
+
+    (views, rows, cols); the complete object is a cylinder on the axis.
+    """
     field = field_mm(scan, shape)
     return cylinders(
         scan, shape, [(0.0, COMPLETE_RADIUS * field), (field, ROD_RADIUS * field)]

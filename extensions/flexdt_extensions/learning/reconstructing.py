@@ -179,6 +179,8 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Render the middle slice of the last attempt, uint8 (rows, cols, 3); None without a
         render mode.
+
+        Values from 0 to 0.08/mm become black to white; each pixel is enlarged 8 times.
         """
         if self.render_mode is None:
             return None

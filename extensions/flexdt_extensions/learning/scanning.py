@@ -197,7 +197,10 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Render the last frame, dark where the object absorbs, eight screen pixels a
-        coarse pixel."""
+        coarse pixel.
+
+        None without a render mode.
+        """
         if self.render_mode is None:
             return None
         grey = np.uint8(255) - self._grey()

@@ -186,7 +186,10 @@ def _match_owners(
     index: npt.NDArray[np.int64], owner: npt.NDArray[np.intp]
 ) -> npt.NDArray[np.int64]:
     """Compare each bead's spot with its owner: 1 for its own, 0 for another's, -1
-    without a spot."""
+    without a spot.
+
+    `owner` names the bead of each spot; the result has one value for each bead.
+    """
     out = np.full(len(index), -1, dtype=np.int64)
     hit = index >= 0
     out[hit] = owner[index[hit]] == np.flatnonzero(hit)

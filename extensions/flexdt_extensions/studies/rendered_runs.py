@@ -315,6 +315,8 @@ def _render(task: WorkUnit, model: BeadModel, scene: Scene) -> tuple[RenderedFra
     """Make the radiographs of a task's largest number of projections, or take those of
     the last.
 
+    The radiographs of the last key are kept, and replaced by those of another.
+
     Args:
         task: its phantom, scenario, fidelity and seed.
         model: the beads.

@@ -145,6 +145,8 @@ def _real_charts(document: Mapping[str, Any]) -> list[str]:
 def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] | None:
     """Sum up weak directions; None where no row has a weak run that was solved.
 
+    A row without sigmas has "-".
+
     Args:
         rows: of the study.
 

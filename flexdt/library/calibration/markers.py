@@ -491,6 +491,9 @@ def _turning_back(
 ) -> Calibration:
     """Add an error if markers do not move, or fit twice as well with the stage reversed.
 
+    "not_turning": the largest move is below 6 median sigmas. "angle_reversed": the rms of
+    the reversed fit is below half of the found one. Unchanged also without a fit.
+
     Without perspective both directions would fit, with each marker as far behind the axis as
     before.
 
@@ -551,6 +554,9 @@ def _calibrated(
 ) -> Calibration:
     """Calibrate from spots whose beads are known.
 
+    Without images there is no second detection, bead sizes are not
+    known, and the misfit's limit is at least 3 median sigmas.
+
     Args:
         data: the scan.
         looks: spots of each frame.
@@ -594,6 +600,8 @@ def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArra
 
     Returns:
         (k,) medians [mm].
+
+    NaN for a marker that no frame shows.
     """
     scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
     return np.array(

@@ -634,6 +634,8 @@ def _normalise(
 ) -> Float32Array:
     """Compute line integrals of images that are no counts.
 
+    Several dark or flat images are averaged.
+
     Args:
         values: (n, rows, cols) intensities.
         dark: (rows, cols) or (k, rows, cols); 0 without.
@@ -652,6 +654,9 @@ def _normalise(
 def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
     """Mark images (n, rows, cols) that are zero everywhere; pixels of one row decide for
     most.
+
+    The pixels are every 41st of the middle row; only if all are zero the whole image is
+    searched.
     """
     blank: npt.NDArray[np.bool_] = counts[:, counts.shape[1] // 2, ::41].max(axis=1) == 0
     for i in np.flatnonzero(blank):

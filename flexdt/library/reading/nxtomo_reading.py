@@ -360,6 +360,9 @@ def _stated_figures(
 ) -> Iterator[Finding]:
     """Compare the angles and the pixel that the file states with the geometry.
 
+    Only the first pixel size found counts (next to the images, then at the entry and its
+    groups); one in an unknown unit is not compared.
+
     Args:
         file: open.
         name: of the group that holds the images.

@@ -91,6 +91,10 @@ def plan_whole(grid: Grid, again: int, most_pixels: int, memory: int) -> MemoryP
 def _plan(grid: Grid, kept: int, most_pixels: int, memory: int) -> MemoryPlan:
     """Plan slabs, and whether kept images are on disk.
 
+    They are on disk if they need more than KEPT_SHARE of the memory, or if the volume
+    fits whole only without them. `prepared` (kept for several passes) is set for more
+    than one slab.
+
     Args:
         grid: of the volume.
         kept: number of kept images.

@@ -531,6 +531,8 @@ def _fdk_slabs(
 ) -> Iterator[Volume]:
     """Reconstruct by FDK, slab after slab; images of a single slab enter as they are read.
 
+    A single slab is yielded as one volume of the whole grid, without prepared images.
+
     Args:
         task: the reconstruction.
         views: corrected frames.
@@ -592,6 +594,9 @@ def reconstruct_volume(
     errors: bool = False,
 ) -> Volume:
     """Reconstruct a data set in memory.
+
+    Doubts about the frames, the errors and lost voxels are warnings. The file is used
+    where three times the volume exceeds the memory; iterations never use it.
 
     A volume by FDK that exceeds the memory is in a file without a name in the folder for
     temporary files (TMPDIR); it has no `sigma`.

@@ -154,6 +154,8 @@ def _fitted(
 ) -> tuple[FloatArray, FloatArray]:
     """Fit polynomials to each window.
 
+    Windows without enough blocks have coefficients of 0.
+
     Args:
         off: (m, b) block means less the beads.
         valid: (m, b) usable blocks.

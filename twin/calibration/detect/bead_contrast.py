@@ -26,6 +26,8 @@ kinds."""
 def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
     """Make a spot finder whose limits allow for the beads' sizes and contrasts.
 
+    Contrasts that are not above 0 are left out of the faintest.
+
     Args:
         model: the phantom's beads.
         poses: rough geometry, which converts radii to pixels.

@@ -441,6 +441,8 @@ def _pack(
     """Sort measured spots into `Detections`: complete ones first, among these the strong ones
     first.
 
+    Spots at the edge come last, the strong ones first, too.
+
     Args:
         whole: results of complete spots.
         cut: results of spots at the image's edge.

@@ -161,6 +161,8 @@ def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
 def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
     """Return the part that a window shares with its image.
 
+    Both are empty where they do not overlap.
+
     Args:
         windows: of all frames.
         frame: number of the frame.

@@ -194,6 +194,8 @@ class Candidates:
     def _moving(self) -> list[str]:
         """List the free parameters whose motion can be a cause; empty for several scans or few
         frames.
+
+        Only those of MOVING that the fit estimates.
         """
         sizes = np.bincount(self.fit.problem.group)
         if len(sizes) != 1 or sizes[0] < MIN_MOVING_FRAMES:

@@ -585,6 +585,8 @@ def _one_by_one(
 ) -> Finding | None:
     """Check whether frames fit the phantom one by one, though not together.
 
+    SAMPLED_FRAMES frames are tried; at least 70 % have to fit, each with 5 spots or more.
+
     Args:
         detections: spots of each frame.
         model: the beads.

@@ -170,6 +170,9 @@ def judge_first_size(
 ) -> Finding | None:
     """Judge sizes coarsely from the first measurement.
 
+    The median ratio of complete, identified spots is judged; without any there is no
+    finding.
+
     Args:
         found: the bead of each spot.
         looks: of every frame.
