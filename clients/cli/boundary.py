@@ -145,7 +145,10 @@ def wire_code(error: RpcError) -> int:
 
 def verdict(errors: Iterable[str]) -> int:
     """Determine the exit code of a script with errors of these codes: invalid wins
-    over collision and limit."""
+    over collision and limit.
+
+    No errors give 0.
+    """
     codes = set(errors)
     if codes - set(LIMIT_CODES):
         return INVALID

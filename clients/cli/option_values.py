@@ -58,6 +58,8 @@ def span(word: str, what: str) -> tuple[float, float]:
 
     Raises:
         typer.BadParameter: neither, or the lower is above the upper.
+
+    Each end has to be a finite number, too.
     """
     ends = [number(part, what) for part in word.split(":")]
     if len(ends) > 2 or ends[0] > ends[-1]:

@@ -445,6 +445,8 @@ def _upload(
 ) -> Flow[scanner.UploadResult]:
     """Upload a sample in parts, and report the progress.
 
+    `progress` is called after each part.
+
     Args:
         head: parameters of each part: name, format and so on.
         data: content of the file.
@@ -1123,6 +1125,9 @@ def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
 
 def _script(script: str | bytes) -> dict[str, object]:
     """Make the parameters of a script from its text or bytes.
+
+    One word without spaces is taken for a file's name. A text is sent as `text`, bytes as
+    `data_base64`.
 
     Raises:
         RpcError: -32602, the name of a file in place of its text.

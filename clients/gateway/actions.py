@@ -410,6 +410,8 @@ async def abort_script(
 
     Raises:
         Refusal: none is running.
+
+    It does not wait for the job's end.
     """
     if twin.job is None:
         raise Refusal("no script or sequence of this gateway is running")

@@ -135,6 +135,8 @@ class ConnectedTwin:
     async def news(self) -> None:
         """Wait until something may have changed: an event has come, or some time has passed
         while something moves.
+
+        At the end it waits another POLL_S, so that several changes are met at once.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LIVELY_S if self.lively else None):

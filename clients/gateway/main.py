@@ -97,6 +97,8 @@ async def run(options: GatewaySettings) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the gateway with the options of `argv` (default: the command line) until it is ended;
     returns the exit code.
+
+    Where pyzmq is not installed it says so and returns the code of an invalid call.
     """
     options = parse(GatewaySettings, argv)
     set_up()

@@ -158,6 +158,9 @@ class Servers:
     def _wait_ready(self, process: subprocess.Popen[bytes]) -> dict[str, object]:
         """Wait for the supervisor's `ready` line, however long, and return its document.
 
+        Other lines are left out. The error's exit code is that of the servers if from 1
+        to 5, else 1.
+
         Raises:
             ServersError: the process ended first; with the end of its log.
         """

@@ -208,6 +208,9 @@ class Front:
     ) -> Response | None:
         """Answer a request; None to go on with a WebSocket.
 
+        A request that cannot be read has status 400; a still picture that is not there in
+        time has 204 (no content). Other content comes from `_content`.
+
         Requests of other sites and without the token are rejected; a still picture is
         waited for.
 

@@ -150,6 +150,8 @@ def viewer_pages(viewer: Viewer) -> Pages:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the viewer with the options of `argv` (default: the command line) until it is ended;
     returns the exit code.
+
+    What viser prints is suppressed.
     """
     options = parse(ViewerSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)

@@ -23,6 +23,8 @@ def page_file(name: str) -> bytes:
 
     Raises:
         FileNotFoundError: there is none of this name.
+
+    The page itself has the boxes of the layers filled in.
     """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
     if name == PAGE:

@@ -76,7 +76,10 @@ def window_of(image: ShownImage) -> tuple[float, float]:
 
 def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     """Convert to 8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter
-    bright on black."""
+    bright on black.
+
+    `window` is the values of black and white; NaN is black.
+    """
     low, high = window
     scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))
     byte = np.nan_to_num(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)

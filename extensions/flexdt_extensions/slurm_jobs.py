@@ -88,6 +88,9 @@ class SlurmJobs:
     def tend(self, workers: Collection[str]) -> list[str]:
         """Replace jobs that have left the queue.
 
+        Jobs are replaced only if the queue could be read; where no worker is connected, a
+        line says what is waited for.
+
         Args:
             workers: names of those that are connected.
 

@@ -142,6 +142,8 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     """Compute the open pixels' share of the charge at 1 m, per cm2; see `flux_map`, which
     caches it.
 
+    The view is rounded, so that nearly equal ones share a cached map.
+
     Args:
         view: cone_vec row (12,) [mm].
         shape: the panel's (rows, cols).

@@ -401,6 +401,9 @@ def _compare_with_truth(
 ) -> bool:
     """Compare the calibration with the hidden truth; a miss is called a miss.
 
+    A table is printed, then one line that says inside or miss. A parameter that the truth
+    lacks counts as 0 (angle_scale as 1).
+
     Args:
         outcome: of the calibration.
         truth: parameter -> value [mm, deg].

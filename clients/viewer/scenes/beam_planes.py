@@ -51,6 +51,9 @@ def fans(
 ) -> list[BeamPlane]:
     """Planes of the middle column before and behind the sample, and of the middle row.
 
+    Four planes: for each direction one before the sample, with all light, and one behind
+    it, with the light that passes.
+
     Args:
         world: of the image's moment.
         lines: line integrals (rows, cols).

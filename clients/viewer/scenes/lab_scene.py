@@ -508,6 +508,9 @@ class LabScene:
     ) -> Nodes:
         """Collect the nodes of all layers, for frames of a page that shows `shown`.
 
+        Returns node -> its properties: `visible` for each node, and the opacity for the
+        sample's surfaces, at most FADED_OPACITY within a drawn volume.
+
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
             faded: whether the sample fades where its volume is drawn within it.

@@ -32,6 +32,8 @@ class Stills:
     ) -> bytes:
         """Return a JPEG of at most MOST_BYTES, computed at its first use.
 
+        At most MAX_PICTURES are kept, the oldest goes first; one is computed at a time.
+
         Args:
             camera: of the view.
             asked: `w` and `h` [px], and `dark` where it is "1": the page's query.

@@ -105,6 +105,8 @@ class LiveReconstruction:
     async def ask(self, asked: Wish, *words: str) -> Answer | None:
         """Send a request to the process and wait for its answer.
 
+        None also if another volume is requested before the answer.
+
         Args:
             asked: the volume that it must have.
             words: of the request.

@@ -490,6 +490,9 @@ def _rng(plan: Plan, item: Item, frame: int) -> np.random.Generator | None:
 def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
     """Simulate an item's images by the ideal response, with noise if the plan has it.
 
+    Line integrals without noise do not pass the detector; noisy ones are taken from
+    counts.
+
     Args:
         plan: says whether counts or line integrals are made.
         item: phantom, exposure and detector.

@@ -269,6 +269,8 @@ def interleaved(
 ) -> dict[str, CallTime]:
     """Run contestants turn by turn and time them.
 
+    Returns name -> least and median time [s] and number of timed calls.
+
     Args:
         contestants: name to call; the first call of each is not counted (but for those in
             `once`, which are called one time in all). A call that returns a float (seconds) has

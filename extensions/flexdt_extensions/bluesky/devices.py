@@ -244,6 +244,8 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
         async def switch(on: bool) -> None:
             """Switch X-rays, and wait until they are ready or off.
 
+            It is over at once when they are off.
+
             Raises:
                 RuntimeError: somebody else switched them meanwhile.
             """

@@ -841,6 +841,8 @@ class _ScanReader(ScenarioReader):
     ) -> float | D:
         """Read a number that does not drift.
 
+        A drift without value is an error.
+
         Args:
             given: value or object from the document.
             units: unit -> factor.

@@ -333,6 +333,8 @@ def _part(
 ) -> dict[str, Any]:
     """Make a part's object: centre (with drifts where it moves), orientation, deviations.
 
+    Only a coordinate that changes has drifts.
+
     Args:
         places: (n, 3) of its centre in our world [mm].
         u, w: directions (3,) in the scenario's world.

@@ -62,6 +62,8 @@ def choices(action: npt.ArrayLike, sizes: Sequence[int]) -> list[int]:
 
     Raises:
         LimitError: lists the allowed values.
+
+    One number is an action for one size.
     """
     values = np.atleast_1d(action).tolist()
     if len(values) != len(sizes) or any(

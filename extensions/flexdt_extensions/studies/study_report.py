@@ -311,6 +311,8 @@ def heat_map(
 ) -> str:
     """Draw a table of numbers, green where they are good and red where not.
 
+    Returns an SVG; each cell shows its number.
+
     Args:
         values: (rows, columns); nan is white.
         rows, columns: names.

@@ -315,6 +315,8 @@ def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
 
     Raises:
         TwinError: no marker was marked.
+
+    The data set is the only one in a list.
     """
     some = np.flatnonzero(markers.seen.any(axis=1))
     if not len(some):

@@ -295,6 +295,8 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
 def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> Images:
     """Return the data set with its nominal geometry replaced and no correction in force.
 
+    The geometry may lack a shape; then it is not compared.
+
     Args:
         dataset: from `load_dataset`.
         geometry: one row for each of its projections, or its file.

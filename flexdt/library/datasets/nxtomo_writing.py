@@ -173,6 +173,8 @@ def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any
 def _exposure_of(data: ImageSet) -> tuple[float | None, float | None, float | None]:
     """Return voltage [kV], power [W] and exposure of one image [ms] as the settings or the
     simulation state them; None where unknown.
+
+    The settings come first.
     """
     if data.settings is not None:
         return data.settings.kV, data.settings.power_W, data.settings.exposure_ms

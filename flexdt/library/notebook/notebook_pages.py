@@ -326,6 +326,8 @@ def _slider(count: int, what: str, handler: str, start: int) -> str:
         what: its label.
         handler: JavaScript to call when it moves.
         start: first position.
+
+    Its values are 0 to count - 1.
     """
     hidden = " hidden" if count < 2 else ""
     return (

@@ -59,6 +59,8 @@ def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> lis
 
     Raises:
         DatasetFormatError: no scanner has such a geometry.
+
+    They are the warnings' texts; errors raise.
     """
     found = examine(Operation.OPEN, geometry, shape)
     if found:

@@ -328,6 +328,9 @@ def _angles(
 def _length(file: Any, name: str, *members: str) -> float | None:
     """Read a length from the first of some places that has it.
 
+    The entry comes before the group; a place with an unknown unit, or more than one
+    number, is passed over. A length without unit is in metres.
+
     Args:
         file: open HDF5.
         name: of the group with the images.

@@ -89,6 +89,10 @@ class _Streams:
             count: of numbers.
             default: of a missing stream; None makes that an error.
             hint: added to the message.
+
+        Raises:
+            DatasetFormatError: the stream is missing without default, too short, or longer
+                than the file.
         """
         there = self.ole.exists(name)
         if not there and default is not None:
@@ -203,6 +207,8 @@ def _reference(
     file: _Streams, code: int, shape: tuple[int, int]
 ) -> npt.NDArray[Any] | None:
     """Read the images of the open beam.
+
+    The first folder of REFERENCES that has images counts.
 
     Args:
         file: its streams.

@@ -231,6 +231,9 @@ def views_of(
 ) -> ScanFrames:
     """Select the frames that are there, and compute their geometry.
 
+    Every `every`-th of the frames that are there is taken, the first included; binning is
+    of the geometry here, and of the images as they are read.
+
     Args:
         dataset: from `load_dataset`.
         parameters: correction; None is the one in force during the scan, if any.
@@ -258,6 +261,8 @@ def views_of(
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     """Choose the grid of a requested volume; what is not requested is that of the field of
     view.
+
+    A requested shape without centre is centred at 0.
 
     Args:
         views: to reconstruct.
@@ -567,6 +572,9 @@ def _reading_once(
 ) -> Iterator[tuple[KeptImages, Work]]:
     """Read each image once from here on, and report the work done.
 
+    Yields the kept images, on disk or in memory as planned, and the progress; the images
+    are deleted at the end. Iterative methods report no progress here.
+
     Args:
         task: the reconstruction.
         plan: the split between memory and a file.
@@ -719,6 +727,9 @@ def preview(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Reconstruct a quick look at a scan: few views, coarse pixels and voxels, FDK, PNG slices.
+
+    `out` is the volume's file. About PREVIEW_VOXELS voxels along the longest side, and
+    from PREVIEW_VIEWS to twice as many views (all, if there are fewer), with a Hann window.
 
     Args:
         dataset, out, parameters, progress: as for `reconstruct_dataset`.
@@ -888,6 +899,8 @@ def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) 
 
     Raises:
         LimitError: names the needed and the free space.
+
+    Nothing is checked where the images are kept in memory.
     """
     if not plan.on_disk:
         return

@@ -45,6 +45,8 @@ def centroids(
 ) -> FloatArray:
     """Measure centroids in some windows by the kernel `measure`; zeros elsewhere.
 
+    Returns a row of results for every window. Without `least` no noise is assumed.
+
     Args:
         patches: the windows.
         index: of those to measure.

@@ -258,6 +258,8 @@ def without_beads(scene: Scene, model: BeadModel) -> Scene:
 def _is_bead(solid: Solid, model: BeadModel) -> bool:
     """Check whether a solid of the scene is one of the phantom's beads: a sphere within half a
     radius of its place.
+
+    False for any other shape.
     """
     if not isinstance(solid.shape, Sphere):
         return False
@@ -357,6 +359,8 @@ def _window_rays(
 
 def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
     """Check whether an edge of the body crosses a bead's spot or touches its rim, (n, k).
+
+    Columns and rows are looked at, with second differences 4 px wide.
 
     Args:
         body: (n, k, side, side) line integrals of everything but the bead.

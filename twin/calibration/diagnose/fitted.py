@@ -454,6 +454,9 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
 def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
     """Fit a factor on the angles, and judge whether it explains the residuals.
 
+    None also where the factor is within 5 sigma of 1. Only the steps 360 / (n - 1) and
+    360 / n are recognised as an endpoint error.
+
     Args:
         fit: without the factor.
         refit: fits again with further parameters, `extra`.

@@ -271,6 +271,8 @@ def visible_beads(
 ) -> npt.NDArray[np.bool_]:
     """Mark beads that are entirely on the detector, (n, k).
 
+    False too for beads behind the source.
+
     Args:
         model: the beads.
         poses: n frames.

@@ -733,6 +733,8 @@ def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> Floa
 
     Raises:
         TwinError: an array of another shape.
+
+    A value for all, or an array that broadcasts; NaN becomes 0.
     """
     value = centre.value if isinstance(centre, Centre) else centre
     try:

@@ -378,6 +378,9 @@ def correlation_length(
     def rho(lag: int) -> tuple[float, int]:
         """Compute the correlation of residuals `lag` frames apart in the same scan, and the
         number of values it is from.
+
+        The value is a share of the variance; 0.0 from 0 values where no two frames have
+        it.
         """
         together = use[:-lag] & use[lag:] & (group[:-lag] == group[lag:])[:, None]
         pairs = 2 * int(together.sum())

@@ -164,6 +164,10 @@ def weak_direction(
 ) -> Direction:
     """Name one direction of the column-scaled parameter space.
 
+    Columns below a tenth of the largest share are left out. The first part leads with
+    factor 1; others are its change relative to it. Size [edge unit of the lead]; inf
+    where it is not determined.
+
     Args:
         vector: (columns,) direction.
         scale: (columns,) column norms per edge unit: change = vector * sigma / scale.

@@ -58,6 +58,9 @@ def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
     def found(*args: P.args, **options: P.kwargs) -> Alignment:
         """Call `find`; where it raises NotIdentifiableError, return an alignment that refuses
         every parameter for that reason.
+
+        The refused parameters are axis_column_px, det_roll, det_yaw, source_row_px and
+        those of UNTOLD.
         """
         try:
             return find(*args, **options)

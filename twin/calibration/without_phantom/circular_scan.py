@@ -99,6 +99,8 @@ class CircularScan:
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
         """Compute the change of the axis' column with each parameter, by differences.
 
+        The differences are central, a tenth of a step to each side.
+
         Args:
             values: (k,) parameters.
             scales: (k,) their steps.

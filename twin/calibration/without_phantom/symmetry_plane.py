@@ -452,6 +452,9 @@ def _opposite_column(
 ) -> OppositeColumn | None:
     """Compare the column of the mean with that of opposite rays.
 
+    Columns apart [px], sigma of the opposite rays' column and of the mean's. With a gap,
+    the rays are those of the panel without it.
+
     Args:
         scan: the scan.
         first: start of the fit.
