@@ -156,6 +156,8 @@ def own_first(
 ) -> tuple[list[str], list[str]]:
     """Split words of the command line into options of `flexdt` itself and the others.
 
+    A flag may have its value in the same word (`--name=value`) or in the next one.
+
     Args:
         words: in order; after `--` none is an option.
         flags: the options to take, of `COMMON`.

@@ -50,6 +50,8 @@ _heard = 0
 def leave(*_: object) -> None:
     """End the process at once with a line on standard error and the exit code of an interrupt;
     printed lines stay.
+
+    Arguments (of a signal handler) are ignored.
     """
     try:
         os.write(2, LINE)

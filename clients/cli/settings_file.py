@@ -201,6 +201,8 @@ def _require_known(
 ) -> None:
     """Check the keys of a table, or those outside all tables.
 
+    The first unknown key raises.
+
     Args:
         where: beginning of the message.
         given: keys.

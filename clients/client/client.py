@@ -166,6 +166,9 @@ class Core:
 
         Raises:
             ValueError: as `subscribe`.
+
+        The parameters must be those of other listeners to the same topic. Nothing is
+        subscribed at once.
         """
         for other, theirs in self._listeners.items():
             for topic in set(listener.topics) & set(other.topics):

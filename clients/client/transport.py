@@ -192,6 +192,9 @@ class TcpTransport:
 
         Raises:
             ConnectionLost: there is no connection, or it has ended.
+
+        `.sent` of the error is True if the connection broke while the bytes were sent,
+        else it says not sent.
         """
         data = self._wire.send(message)
         if self._streams is None:

@@ -410,6 +410,8 @@ def upload_voxels(
 ) -> Flow[scanner.UploadResult]:
     """Upload voxels in chunks.
 
+    The data are sent as float32.
+
     Args:
         data: attenuation [1/mm], indexed [z, y, x].
         voxel_mm: their pitch, one number or (x, y, z).

@@ -104,6 +104,9 @@ async def wait_ready(
 ) -> str:
     """Wait until X-rays are ready: the script's polling loop as one command.
 
+    READY_S counts in the twin's time, and also in real time where the twin runs as fast
+    as it can.
+
     Returns:
         "TRUE".
 
@@ -171,6 +174,8 @@ async def move(
 ) -> str:
     """Move to a position and wait for arrival.
 
+    Where no image sequence takes the armed move within ARMED_S, it is made without.
+
     Args:
         twin: state and requests.
         command: axis, target [mm, deg] and, if any, trigger position.
@@ -236,6 +241,9 @@ async def _go(
 
 async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> float:
     """Clamp a target beyond a limit to the limit, where the machine does so.
+
+    Unchanged also where the machine does not have the axis, the target is within the
+    limits, or the machine refuses instead of clamping.
 
     Args:
         twin: connection and machine.
@@ -305,6 +313,8 @@ async def question(
     twin: ConnectedTwin, command: Question, progress: CommandProgress
 ) -> str:
     """Answer with a part of the twin's state as text.
+
+    The path must end at a bool or a number.
 
     Returns:
         "TRUE" or "FALSE", or a number with 10 decimals for positions and 6 for all else.

@@ -156,6 +156,8 @@ def port_problem(option: str, host: str, port: int) -> str | None:
 def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
     """Make the supervisor's `ready` line: the twin's address, and every process's by name.
 
+    The viewer has a URL too, and the gateway its inbound port (one above its port).
+
     Args:
         addresses: of the processes.
         secure: the viewer's URL is https.

@@ -463,6 +463,8 @@ def _kept(
     """Make a response that a browser may keep: sent again only where it has changed, and
     packed.
 
+    Packed with gzip if the browser accepts it.
+
     Args:
         request: with the tag that the browser has.
         body: content.

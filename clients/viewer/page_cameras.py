@@ -95,6 +95,8 @@ class SceneClients:
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
         """Set the nodes of a page's frames, from one thread only.
 
+        Only nodes that differ from what the frame shows are sent.
+
         Args:
             page: its frames; a frame that has not received all nodes yet is left for
                 later.

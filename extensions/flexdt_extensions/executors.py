@@ -269,6 +269,8 @@ def job_script(wanted: Slurm) -> str:
 def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
     """Submit SLURM jobs and connect to their workers; cancel the jobs at the end.
 
+    The error for a missing `sbatch` comes first.
+
     Args:
         wanted: number, size and queue of the jobs.
 

@@ -274,6 +274,8 @@ def load(
 def _json(path: Path, given: Given) -> ScanGeometry:
     """Read our own document, or a CTSimU scenario, by its content.
 
+    A document with a "file" section is a scenario.
+
     Args:
         path: file.
         given: shape and pitch, which must agree with the file's or complete it.

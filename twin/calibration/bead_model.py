@@ -55,6 +55,8 @@ class BeadModel:
     def __post_init__(self) -> None:
         """Check the beads and store them as read-only arrays, one radius a bead.
 
+        One radius counts for all beads. Contrasts are not checked here.
+
         Raises:
             TwinError: `beads` is not (k, 3), finite, k >= 1, or a radius is not positive.
         """

@@ -27,6 +27,9 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
     """Read the lines of an executed script, or of one in a recording of `flexdt follow`; print
     its problems to standard error.
 
+    Recordings are told by their first time stamp. Warnings are printed and do not stop
+    the reading.
+
     Args:
         log: file.
         machine: of the script, to read a recording.

@@ -418,6 +418,8 @@ class LabScene:
         """Show the volume's surface that a scan has reconstructed so far, on the stage;
         None removes it.
 
+        No faces remove it, too.
+
         The sample itself fades meanwhile, so that its volume is seen within it.
 
         Args:

@@ -55,6 +55,8 @@ def _way(yaw_deg: float, pitch_deg: float) -> Vector:
 
     >>> _way(0.0, 0.0)
     (-0.0, 1.0, -0.0)
+
+    The direction (x, y, z) is of length 1; angles in degrees.
     """
     yaw = math.radians(yaw_deg)
     pitch = math.radians(pitch_deg)

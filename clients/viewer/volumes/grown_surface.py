@@ -39,6 +39,8 @@ _EDGES: Final = tuple(
 def otsu(values: npt.NDArray[np.generic]) -> float:
     """Find the threshold that parts values into two classes with the least variance in each.
 
+    It is an edge of one of OTSU_BINS equal bins.
+
     Args:
         values: of any shape, finite.
 

@@ -344,6 +344,9 @@ def run_batch(
 ) -> dict[str, Any]:
     """Compute the missing items of a batch.
 
+    The summary is also written to `run.json`; `items_per_s` is None if nothing was
+    missing.
+
     Args:
         plan: of the batch.
         out: its folder; an interrupted batch of the same plan is continued.

@@ -304,6 +304,9 @@ def _draw_place(
 ) -> tuple[float, float, float] | None:
     """Draw a place for a ball in a cylinder, clear of other balls.
 
+    None as well for a ball that does not fit the cylinder. Places are uniform in the
+    cylinder.
+
     Args:
         radius: of the ball [mm].
         wide: radius of the cylinder [mm].

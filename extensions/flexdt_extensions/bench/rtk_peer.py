@@ -73,6 +73,8 @@ _PREPARED: list[Work] = []
 def _prepare(build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
     """Build the work in this process and keep it for `_PREPARED`; the process will end without
     ITK's own teardown.
+
+    Warnings of the build are suppressed.
     """
     atexit.register(os._exit, 0)  # past the wrappers' own end
     with warnings.catch_warnings():

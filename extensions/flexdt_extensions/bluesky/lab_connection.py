@@ -280,6 +280,8 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
     async def connect(self, timeout: float) -> None:
         """Connect the laboratory, if it is not yet.
 
+        The error has the connection's error as its cause.
+
         Raises:
             NotConnectedError: no answer, or the server denies access.
         """

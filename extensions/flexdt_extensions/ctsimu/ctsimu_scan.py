@@ -310,6 +310,8 @@ class _ScanReader(ScenarioReader):
 
         Raises:
             ExchangeError: it has not.
+
+        Without scattering nothing is checked.
         """
         varies = len(scan.spectra) > 1
         if scan.scattering and (varies or any(s.on_stage is None for s in scan.samples)):
@@ -765,6 +767,8 @@ class _ScanReader(ScenarioReader):
 
         Raises:
             ExchangeError: something else is there.
+
+        At most MOST.
         """
         found = self._given(*path)
         value = default if found is None else found

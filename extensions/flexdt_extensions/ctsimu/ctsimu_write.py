@@ -220,6 +220,9 @@ def _stage_motion(
 ) -> tuple[float, float, str, list[dict[str, Any]]]:
     """Determine the stage's motion from the angles.
 
+    Directions are as seen from above: growing angles are CW; falling ones are CCW with
+    start and stop negated.
+
     Deviations from equal steps become a drift of a turn about the stage's own axis.
 
     Args:

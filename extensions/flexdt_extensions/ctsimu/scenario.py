@@ -155,6 +155,8 @@ class ScenarioImages:
         """Compute path lengths through each substance, and the rest through air if there is an
         environment.
 
+        Air is the last layer, never below 0.
+
         Args:
             frame: number of the frame.
             ray: number of the ray in its pixel.

@@ -144,6 +144,10 @@ class Lab:
         """Move the motors (rotations the shorter way), wait for rest, and expose; clock and
         dose go on.
 
+        Time is in s; dose is the exposure time times the inverse square of the distance
+        to the axis, relative to REFERENCE_SOD_MM. Without a collision the time includes
+        the exposure.
+
         Args:
             targets: axis -> [mm, deg].
 

@@ -56,6 +56,9 @@ def share_identified(
     """Compute the share of simulated scans, each from its own start angle, whose beads
     are told apart.
 
+    A scan counts only if the identification does not fail, is not ambiguous, and gives no
+    spot to another bead.
+
     Args:
         model: the beads.
         planned: the scans; at most `frames` frames of them are used.
@@ -290,6 +293,9 @@ def design(
     resolution_mm: float = 0.1,
 ) -> Design:
     """Choose `count` of the seats.
+
+    Sets are tried from the best on; the first whose beads are told apart in all simulated
+    scans is returned, with the number of ambiguous ones before it.
 
     Args:
         seats: (m, 3) places a bead may take [mm, object frame].

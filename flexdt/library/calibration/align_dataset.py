@@ -158,6 +158,9 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
 def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
     """Return line integrals and poses, with small steps of the panel undone.
 
+    Unchanged if the largest step is below STANDS [px], or at least MAX_STEP_SHARE of the
+    shorter side.
+
     Args:
         data: the scan.
 

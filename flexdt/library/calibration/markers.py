@@ -331,6 +331,8 @@ def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
 def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots], Index]:
     """Convert markers to spots of each frame, all complete and of equal contrast.
 
+    Radii are NaN.
+
     Args:
         markers: k markers in n frames.
         shape: (rows, cols).

@@ -40,6 +40,8 @@ def window_of(
 ) -> tuple[float, float]:
     """Return the values of black and white.
 
+    At most about MOST_VALUES values are looked at. Equal percentiles give high = low + 1.
+
     Args:
         values: whose percentiles are taken where no window is given; NaN is left out.
         window: (black, white).

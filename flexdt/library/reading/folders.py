@@ -199,6 +199,8 @@ def _without_flat(folder: str, names: Sequence[str], pattern: str) -> str:
         folder: name of the folder.
         names: of all files in it, sorted.
         pattern: that no file matches.
+
+    The first name that looks like a flat image is named.
     """
     some = [name for name in names if FLAT_NAME.search(name)]
     guess = f"; {some[0]} looks like one" if some else ""

@@ -802,6 +802,9 @@ def _without_scatter(
     """Simulate the scatter of an object of these materials in some views, and prepare its
     subtraction from all.
 
+    Images that state no model of noise are taken as a scanner's. Returns the frames with
+    the scatter to subtract and its doubts added.
+
     A quick volume is reconstructed for the object.
 
     Args:

@@ -154,6 +154,8 @@ def fdk_slabs(
 ) -> Iterator[Volume]:
     """Reconstruct slab after slab.
 
+    Each image is corrected and kept once, at the first slab that needs it.
+
     Args:
         view: gives the corrected image of a view as recorded.
         kept: keeps prepared images.

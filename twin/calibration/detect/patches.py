@@ -150,6 +150,9 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
     """Estimate the contrast of each bead: the median over its complete spots, else the expected
     one, scaled like the others.
 
+    A median needs 3 complete spots. The others' expected contrast is multiplied by the
+    median ratio of found to expected contrast (1 without any).
+
     Args:
         results: (m, RESULTS) centroids.
         patches: m windows with expected contrasts.
@@ -178,6 +181,8 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
 
 def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
     """Mark usable pixels of some windows: inside the image and free of other beads' spots.
+
+    Other beads' spots are looked at in crowded windows only.
 
     Args:
         patches: the windows.

@@ -131,6 +131,8 @@ def solve(matrix, right, out):  # type: ignore[no-untyped-def]
     """Solve matrix @ out = right for a few unknowns into `out`: elimination with partial
     pivoting.
 
+    `matrix` and `right` are kept. There is no check for a singular matrix.
+
     LAPACK's solver, and the checks that numba adds to it, take seconds to compile.
 
     Args:

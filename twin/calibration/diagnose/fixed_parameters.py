@@ -128,6 +128,8 @@ def judge_exact(
 ) -> Finding | None:
     """Judge the dependence on values stated as exact that the images cannot check.
 
+    None also where one of the two fits is not identifiable.
+
     Args:
         fit: with those values.
         freed: the fit in which they have the usual priors instead.

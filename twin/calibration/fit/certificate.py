@@ -334,6 +334,9 @@ class Certificate:
     def mahalanobis2(self, truth: Mapping[str, float]) -> float:
         """Compute the squared distance of `truth` (edge units, some or all reported
         columns) in the covariance of those columns.
+
+        Raises:
+            ValueError: a name of `truth` that is not reported.
         """
         names = list(self.estimates)
         at = [names.index(n) for n in truth]
