@@ -61,10 +61,13 @@ def format_recorded(message: Recorded) -> bytes:
 def read_recording(data: bytes) -> Iterator[Recorded]:
     """Yield the messages of a recording; times go on after midnight.
 
+    They count from the midnight nearest to the first message, and may be below 0. A time
+    in whole seconds is taken as the end of its second, 1 s late.
+
     Example:
         >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"
         >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
-        [(86400.0, 1.0), (86401.5, 0.002)]
+        [(0.0, 1.0), (1.5, 0.002)]
     """
     stamps = list(STAMP.finditer(data))
     last = 0.0
