@@ -233,7 +233,8 @@ def main() -> None:
 
 
 def _end_without_teardown() -> None:
-    """End the process after its exit functions, without freeing its objects.
+    """End the process with `INTERRUPTED`, after its exit functions and without freeing its
+    objects.
 
     An interruption in the compiler leaves objects half made, and freeing them can crash.
     """

@@ -83,8 +83,8 @@ def ask(
 
 
 def sample_shape() -> Flow[scanner.SampleMeshResult]:
-    """Fetch the whole mesh of the sample on the stage, in parts, with its name and
-    revision.
+    """Fetch the mesh of the sample on the stage, in parts; returns the first part with the
+    bytes of all in `data`.
 
     Starts again when another sample is put on the stage meanwhile.
     """

@@ -21,7 +21,8 @@ def require_startable(
     Args:
         machine: shipped name or file; None for the FleX-ray.
         profile: of zero offsets; None for the machine's.
-        sample: on the stage at the start; None for the twin's own.
+        sample: on the stage at the start; None for the twin's own. Not checked where the data
+            folder may hold a sample of that name.
         data: the twin's folder, made by the twin if it is missing; None for one of its own.
 
     Raises:

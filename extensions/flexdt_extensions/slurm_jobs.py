@@ -191,8 +191,8 @@ def lifetime_s(walltime: str) -> int | None:
         walltime: as SLURM reads it: minutes, MM:SS, HH:MM:SS, D-HH, D-HH:MM or D-HH:MM:SS.
 
     Returns:
-        A minute, or a twentieth, before the walltime is over; None where it is that short, or
-        not of these forms.
+        A minute, or a twentieth, before the walltime is over; None for 180 s or less, or
+        another form.
 
     Example:
         >>> lifetime_s("01:00:00"), lifetime_s("2-00:00:00"), lifetime_s("UNLIMITED")

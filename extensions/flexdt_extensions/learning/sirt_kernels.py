@@ -24,7 +24,7 @@ def solve(
     iterations,
     smallest,
 ):
-    """Improve volumes by SIRT, in place, all objects at once.
+    """Improve volumes by SIRT, in place, all objects at once; values stay at least 0.
 
     Args:
         first: (views, rays + 1) index of the first voxel and length of each ray.

@@ -249,7 +249,10 @@ def _no_feature(
     Args:
         views: line integrals (rows, cols).
         mask: pixels that seem bad.
-        at_axis: pixels before the axis.
+        at_axis: pixels before the axis, left out of the range that the object gives.
+
+    Returns:
+        Those of the whole panel, also beside `mask` and away from the axis.
     """
     elsewhere = ~mask & ~at_axis
     lows = []
