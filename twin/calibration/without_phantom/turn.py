@@ -289,7 +289,7 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
         gaps: after each, (n,) [rad].
 
     Returns:
-        Places of both kinds: of missing ones at most one, of repeats none if more than a
+        Places of both kinds: of missing ones at most one; none at all if more than a
         quarter of the frames look like one.
     """
     soft = gaussian_filter(
