@@ -1,4 +1,4 @@
-"""One rule for targets beyond a motor's limit, for every kind of command.
+"""One rule for targets beyond a motor's limit, for every kind of command but jogs.
 
 A target beyond the travel by rounding alone is the limit. One beyond it by no more than
 the axis's `arrival_tolerance` (the thesis's arrivalThreshold) arrives at the limit, with
@@ -7,7 +7,8 @@ script goes to the limit, as at a limit switch, or is an error; a single request
 rejected, since its sender gets the error. Motors of a virtual axis give up the same
 share.
 
-Rates have no tolerance, and otherwise the same rule.
+Rates have no tolerance, and otherwise the same rule. A jog, which has no target, ends at
+the limit (`twin.motion.drives`).
 """
 
 from __future__ import annotations
@@ -33,12 +34,6 @@ class Arrival:
         messages: messages about what is beyond a limit by more than rounding.
         beyond: error for one that is beyond by more than the tolerance; None: there is
             none.
-
-    Attributes:
-        motors: motor -> target within its travel [mm, deg], or rate.
-        messages: what lies beyond a limit by more than rounding, in words.
-        beyond: one that lies beyond by more than the tolerance, as an error; None: there
-            is none.
     """
 
     motors: Mapping[str, float]

@@ -32,6 +32,7 @@ from flexdt_extensions.learning.rewards import (
 
 ALGORITHMS: Final = ("fdk", "sirt", "cgls")
 WINDOWS: Final = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
+"""Windows in the order of the actions, which trained agents depend on: a copy on purpose."""
 SIRT_ITERATIONS: Final = (5, 10, 20, 40, 80)
 CGLS_ITERATIONS: Final = (2, 3, 5, 8, 13)
 VIEWS: Final = (12, 60)
