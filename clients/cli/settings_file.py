@@ -43,7 +43,6 @@ from flexdt.runtime.process_settings import (
     ViewerSettings,
 )
 from flexdt.runtime.settings import Settings, option, read, words
-from flexdt.twin.errors import UnknownNameError
 
 S = TypeVar("S", bound=Settings)
 
@@ -214,14 +213,11 @@ def _require_known(
     """
     for key in given:
         if key not in known:
-            allowed = (*known, *tables)
-            raise CommandError(
-                str(
-                    UnknownNameError.among(
-                        f"{where} unknown key {key!r}; allowed", key, allowed
-                    )
-                )
-            )
+            from flexdt.twin.errors import UnknownNameError
+
+            problem = f"{where} unknown key {key!r}; allowed"
+            error = UnknownNameError.among(problem, key, (*known, *tables))
+            raise CommandError(str(error))
 
 
 def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:

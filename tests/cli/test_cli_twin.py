@@ -338,7 +338,9 @@ def test_a_parameter_that_does_not_fit_is_one_line(flexdt: Flexdt) -> None:
 def test_names_that_cannot_be_say_what_can(
     flexdt: Flexdt, script: Path, data_dir: Path
 ) -> None:
-    for words in (("sample", "../x"), ("run", str(script), "--out", "a/b")):
+    code, _, err = flexdt("sample", "../x")
+    assert (code, err) == (1, "flexdt: ../x: no such file\n")
+    for words in (("sample", "x\a"), ("run", str(script), "--out", "a/b")):
         code, _, err = flexdt(*words)
         assert code == 1
         assert "may hold anything but /, \\ and control characters" in err

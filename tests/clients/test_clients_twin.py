@@ -524,9 +524,32 @@ def test_errors_arrive_where_a_flow_may_catch_them(shell: Shell) -> None:
 # -- the page ------------------------------------------------------------------------------------
 
 
+TWO_FRAMES = (
+    "camera\tset ROI\t900 700 999 779\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\di000000.tif\t\tACK\t\t\r\n"
+    "tube\txrayon\t\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\io000000.tif\t\tACK\t\t\r\n"
+    "scanner\twrite settings file\t\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\scan_000000.tif\t\tACK\t\t\r\n"
+    "rot_obj\tmove absolute\t50\t\tACK\t\t\r\n"
+    "camera\ttake image\t\t\tACK\t\t\r\n"
+    "camera\tsave image\tE:\\x\\scan_000001.tif\t\tACK\t\t\r\n"
+    "tube\txrayoff\t\t\tACK\t\t\r\n"
+)
+"""A dark image, a flat one and two projections."""
+
+
 def test_the_pages_programmes_run(
-    servers: Servers, capsys: pytest.CaptureFixture[str]
+    servers: Servers,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.txt").write_text(TWO_FRAMES, newline="")
     page = (Path(__file__).resolve().parents[2] / "docs" / "clients.md").read_text(
         "utf-8"
     )

@@ -152,7 +152,7 @@ def test_a_broken_memory_is_set_aside_and_the_twin_starts(
     (tmp_path / "state.json").write_bytes(content)
     process = twin(rays.port, tmp_path)
     try:
-        assert Wire(process.port).call("state.get")["sample"]["name"] == "lego"
+        assert Wire(process.port).call("state.get")["sample"]["name"] == "gear"
         assert (tmp_path / "state.unreadable.json").read_bytes() == content
         assert [e["event"] for e in process.logged("error")] == [
             "the last state cannot be read; starting anew"
