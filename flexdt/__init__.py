@@ -115,10 +115,10 @@ if (
 
             return version("flexdt")
         if name not in _HOMES:
-            from difflib import get_close_matches
+            from flexdt.twin.errors import nearest_name
 
-            near = get_close_matches(name, _HOMES, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            near = nearest_name(name, list(_HOMES))
+            hint = "" if near is None else f"; did you mean {near!r}?"
             raise AttributeError(f"module 'flexdt' has no attribute {name!r}{hint}")
         from importlib import import_module
 

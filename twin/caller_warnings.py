@@ -6,8 +6,8 @@ import sys
 import warnings
 from typing import Final
 
-OWN_PREFIX: Final = "flexdt"
-"""Beginning of the names of our packages: `flexdt` and `flexdt_extensions`."""
+OWN_PACKAGES: Final = ("flexdt", "flexdt_extensions")
+"""Our packages, whose lines are no caller's."""
 
 
 def warn_caller(text: str, category: type[Warning] = UserWarning) -> None:
@@ -22,7 +22,8 @@ def warn_caller(text: str, category: type[Warning] = UserWarning) -> None:
     level = 1
     frame = sys._getframe()
     while frame.f_back is not None:
-        if not str(frame.f_globals.get("__name__", "")).startswith(OWN_PREFIX):
+        package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if package not in OWN_PACKAGES:
             break
         frame = frame.f_back
         level += 1

@@ -36,7 +36,15 @@ from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scanner_commands as scanner
 from flexdt.clients.cli.commands import script_commands as scripts
 from flexdt.clients.cli.completed_commands import completed
-from flexdt.clients.cli.console import COMPLETION_VARIABLE, hush, note, printable, speak
+from flexdt.clients.cli.console import (
+    COMPLETION_VARIABLE,
+    PROCESS_COMMANDS,
+    SERVERS,
+    hush,
+    note,
+    printable,
+    speak,
+)
 from flexdt.clients.cli.options import Json, Server, TokenFile, Verbose, argument, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
@@ -95,8 +103,6 @@ KNOWN: Final[Mapping[str, str]] = {
 installed: an entry point is looked up when its command is on the command line."""
 NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
-PROCESS_COMMANDS: Final = ("twin", "projector", "viewer", "gateway")
-"""Commands that pass their words on to a process, `--help` among them."""
 SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Scanner": (
         "state",
@@ -131,7 +137,7 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
         "bench",
         "evidence",
     ),
-    "Processes": ("up", *PROCESS_COMMANDS, "demo", "doctor"),
+    "Processes": (*SERVERS, "demo", "doctor"),
 }
 """Sections of the help page; commands in none of them are listed under Extensions."""
 
@@ -263,7 +269,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         speak(quiet=verbose is False, verbose=verbose is True)
 
     for name, command in COMMANDS.items():
-        passes = name == "up" or name in PROCESS_COMMANDS
+        passes = name in SERVERS
         context: dict[str, Any] = {
             "ignore_unknown_options": name in NUMBERS_WITH_SIGN or passes,
             "allow_extra_args": passes,

@@ -27,7 +27,9 @@ COMPLETION_VARIABLE: Final = "_FLEXDT_COMPLETE"
 """Variable of the environment by which a shell requests completions."""
 QUIET: Final = frozenset({"-q", "--quiet"})
 """Options that show no progress."""
-SERVERS: Final = ("up", "twin", "projector", "viewer", "gateway")
+PROCESS_COMMANDS: Final = ("twin", "projector", "viewer", "gateway")
+"""Commands that pass their words on to a process, `--help` among them."""
+SERVERS: Final = ("up", *PROCESS_COMMANDS)
 """Commands that run until they are stopped."""
 _quiet = False
 """Whether progress is not shown."""

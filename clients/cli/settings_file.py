@@ -20,7 +20,6 @@ variable is not set, or the one that FLEXDT_CONFIG names.
 from __future__ import annotations
 
 import os
-import re
 import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -45,12 +44,6 @@ from flexdt.runtime.process_settings import (
 from flexdt.runtime.settings import Settings, option, read, words
 
 S = TypeVar("S", bound=Settings)
-
-OPTION_PROBLEM: Final = re.compile(
-    r"Invalid value for '--(?P<flag>[a-z0-9-]+)': (?:Value error, )?(?P<why>.*)",
-    re.DOTALL,
-)
-"""Message of typer about the value of an option."""
 
 PREFIX: Final = "FLEXDT_"
 PATHS: Final = ("FILE", "DIR")
@@ -244,23 +237,17 @@ def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
     except Exception as error:
         if not hasattr(error, "format_message"):
             raise
-        raise CommandError(
-            f"{config_file(os.environ)}: [{name}] {_by_key(error.format_message())}"
-        ) from None
+        where = f"{config_file(os.environ)}: [{name}]"
+        raise CommandError(f"{where} {_problem(error)}") from None
     return read(kind, [*given, *more]) if more else found
 
 
-def _by_key(problem: str) -> str:
-    """Return a problem of an option's value as one of the file's key.
-
-    Example:
-        >>> _by_key("Invalid value for '--http-port': 7 is no port")
-        'http_port: 7 is no port'
-    """
-    found = OPTION_PROBLEM.fullmatch(problem)
-    if found is None:
-        return problem
-    return f"{found['flag'].replace('-', '_')}: {found['why']}"
+def _problem(error: Any) -> str:
+    """Return a usage error of typer's, named by the file's key instead of the option."""
+    option_of = getattr(error, "param", None)
+    if option_of is None:
+        return str(error.format_message())
+    return f"{option_of.name}: {error.message.removeprefix('Value error, ')}"
 
 
 def chosen(kind: type[S]) -> S:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from os import PathLike
 from pathlib import Path
-from typing import Final
-
-EMPTY_STAGE: Final = "empty"
-"""Name of the sample that is none."""
 
 
 def require_startable(
@@ -53,7 +51,8 @@ def _require_folder(folder: Path) -> None:
     from flexdt.runtime.files.writable import require_writable
 
     if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(20, "Not a directory", str(folder))
+        why = os.strerror(errno.ENOTDIR)
+        raise NotADirectoryError(errno.ENOTDIR, why, str(folder))
     require_writable(folder)
 
 
@@ -69,6 +68,7 @@ def _require_sample(name: str) -> None:
         UnknownNameError: it does not; lists those that do.
     """
     from flexdt.phantoms import load_phantom
+    from flexdt.twin.scanner.state import EMPTY_STAGE
 
     if name not in ("", EMPTY_STAGE):
         load_phantom(name)

@@ -28,12 +28,11 @@ from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.mesh_workers import mesh_apart, scene_apart
 from flexdt.server.storage.sample_uploads import MAX_UPLOAD_BYTES, Incoming, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.scanner.state import EMPTY_STAGE
 
 MAX_CACHED_PHANTOMS = 8
 """Number of parsed samples that are cached; meshes may be large."""
 DEFAULT_MATERIAL = "abs"
-EMPTY = "empty"
-"""Name that clears the stage."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class SampleStore:
             head = documents.read_or_set_aside(folder, file, _head_of(file), without)
             if (
                 head is not None
-                and head.name != EMPTY
+                and head.name != EMPTY_STAGE
                 and not phantoms.is_shipped(head.name)
             ):
                 self._heads[head.name] = head
@@ -221,13 +220,13 @@ class SampleStore:
         """
         if head.total > self._limit:
             raise too_large("an upload", head.total, self._limit)
-        if head.name == EMPTY or phantoms.is_shipped(head.name):
+        if head.name == EMPTY_STAGE or phantoms.is_shipped(head.name):
             what = "a shipped phantom"
-            if head.name == EMPTY:
+            if head.name == EMPTY_STAGE:
                 what = "the empty stage"
             raise LimitError(
                 f"{head.name!r} is {what}'s name; choose another",
-                {"asked": head.name, "taken": [EMPTY, *phantoms.phantom_names()]},
+                {"asked": head.name, "taken": [EMPTY_STAGE, *phantoms.phantom_names()]},
             )
         documents.file_stem(head.name)
         if head.name not in self._heads and len(self._heads) >= self._most:

@@ -70,7 +70,7 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.twin.core import TwinServer
     from flexdt.server.twin.handlers.session_methods import document
     from flexdt.server.twin.message_reading import Reader
-    from flexdt.twin.scanner.state import Sample
+    from flexdt.twin.scanner.state import EMPTY_STAGE, Sample
 
     truth = None
     if options.truth is not None:
@@ -107,7 +107,7 @@ async def run(options: TwinSettings) -> int:
     sample = None if options.fresh else twin.recall()
     if sample is None or options.sample is not None:
         name = options.sample or DEFAULT_SAMPLE
-        sample = Sample("" if name == "empty" else name)
+        sample = Sample("" if name == EMPTY_STAGE else name)
     await twin.start(sample)
     server = await serve(
         lambda peer: TwinSession(twin, peer),

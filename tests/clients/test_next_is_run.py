@@ -172,14 +172,20 @@ def test_every_command_of_the_table_has_a_case() -> None:
     assert set(NEXT) <= {case.code for case in CASES.values()} | unrun
 
 
-def test_advice_in_a_sentence_becomes_a_command() -> None:
+def test_advice_of_a_finding_becomes_a_command() -> None:
     said = error(
-        "held_parameter", "dD_z is held at 0 mm: free dD_z, det_roll too, or hold it"
+        "held_parameter",
+        "dD_z is held at 0 mm: free dD_z, det_roll too, or hold it",
+        free=("dD_z", "det_roll"),
     )
     (line,) = settling_commands(said)
     assert line.endswith(" --free {free},dD_z,det_roll")
     (line,) = settling_commands(
-        error("drift", "dO_x moves: --per-frame dO_x,dO_y follows it")
+        error(
+            "drift",
+            "dO_x moves: --per-frame dO_x,dO_y follows it",
+            per_frame=("dO_x", "dO_y"),
+        )
     )
     assert line.endswith(" --per-frame dO_x,dO_y")
     (line,) = settling_commands(error("one_bead", "a single shadow"))

@@ -13,10 +13,11 @@ from flexdt.phantoms import Phantom, load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage import stored_samples as samples
 from flexdt.server.storage.sample_uploads import UploadHead
-from flexdt.server.storage.stored_samples import EMPTY, MAX_CACHED_PHANTOMS, SampleStore
+from flexdt.server.storage.stored_samples import MAX_CACHED_PHANTOMS, SampleStore
 from flexdt.twin.errors import LimitError
+from flexdt.twin.scanner.state import EMPTY_STAGE
 
-TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]
+TAKEN = [EMPTY_STAGE, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]
 
 
 def head(name: str) -> UploadHead:
@@ -32,7 +33,7 @@ def test_an_upload_does_not_stand_for_something_else(tmp_path: Path, name: str) 
     with pytest.raises(LimitError, match="choose another") as refused:
         store.receive(head(name), 0, b"\0" * 4)
     assert refused.value.data["asked"] == name
-    assert EMPTY in refused.value.data["taken"]
+    assert EMPTY_STAGE in refused.value.data["taken"]
 
 
 @pytest.mark.parametrize("name", TAKEN)
@@ -41,7 +42,7 @@ def test_nor_one_that_lies_there_already(tmp_path: Path, name: str) -> None:
     (tmp_path / "x.bin").write_bytes(b"\0" * 4)
     store = SampleStore(open_data(tmp_path))
     assert store.uploads == ()
-    if name != EMPTY:
+    if name != EMPTY_STAGE:
         assert store.load(name) == load_phantom(name)
 
 

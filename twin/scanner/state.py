@@ -132,6 +132,10 @@ class StagePlacement:
         return cone_vec.moved(back, -back @ [self.x, self.y, self.z])
 
 
+EMPTY_STAGE: Final = "empty"
+"""Name by which users put nothing on the stage."""
+
+
 @dataclass(frozen=True)
 class Sample:
     """The sample on the stage, by name; "" is an empty stage."""

@@ -10,7 +10,6 @@ determine more.
 from __future__ import annotations
 
 import math
-import re
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -160,18 +159,16 @@ def _digits(value: object, sigma: object) -> tuple[str, str]:
 
     Where sigma is no number, 0, negative or infinite, the value has five digits.
     """
-    if not isinstance(sigma, float | int) or not 0.0 < sigma < math.inf:
-        if isinstance(value, float | int):
-            shown = f"{value:.5g}"
-        else:
-            shown = "-"
-        return shown, f"{sigma:.2g}" if isinstance(sigma, float | int) else "-"
-    places = max(0, 1 - math.floor(math.log10(sigma)))
-    if isinstance(value, float | int):
-        shown = f"{value:.{places}f}"
+    if isinstance(sigma, float | int) and 0.0 < sigma < math.inf:
+        form = f".{max(0, 1 - math.floor(math.log10(sigma)))}f"
+        forms = (form, form)
     else:
-        shown = "-"
-    return shown, f"{sigma:.{places}f}"
+        forms = (".5g", ".2g")
+    shown, spread = (
+        format(number, form) if isinstance(number, float | int) else "-"
+        for number, form in zip((value, sigma), forms, strict=True)
+    )
+    return shown, spread
 
 
 def calibrate_with(
@@ -531,28 +528,20 @@ NEXT: Final[Mapping[str, Sequence[str]]] = {
     "bead_size": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
 }
 """Code of a finding that forbids a result -> commands that would settle it; other findings
-name the options in their text, or have a report that shows the shadows."""
-ADVISED: Final[Sequence[tuple[re.Pattern[str], str]]] = (
-    (re.compile(r"--per-frame ([\w,]+)"), _CALIBRATE + " --per-frame {advised}"),
-    (
-        re.compile(r"\bfree ((?:\w+, )*\w+)(?: too|$)"),
-        _CALIBRATE + " --free {free},{advised}",
-    ),
-)
-"""Advice in the text of a finding -> the command that follows it."""
+advise options, or have a report that shows the shadows."""
 
 
 def settling_commands(finding: Finding) -> Sequence[str]:
     """Return the commands that would settle a finding, with places for the data set's
-    words: those of its code, else those that its text advises, else one for a report.
+    words: those of its code, else those that it advises, else one for a report.
     """
     if finding.code in NEXT:
         return NEXT[finding.code]
-    found = [
-        line.replace("{advised}", names[1].replace(", ", ","))
-        for advice, line in ADVISED
-        if (names := advice.search(finding.text)) is not None
-    ]
+    found = []
+    if finding.per_frame:
+        found.append(f"{_CALIBRATE} --per-frame {','.join(finding.per_frame)}")
+    if finding.free:
+        found.append(f"{_CALIBRATE} --free {{free}},{','.join(finding.free)}")
     return found or [_REPORT]
 
 

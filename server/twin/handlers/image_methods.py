@@ -17,7 +17,6 @@ from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.rpc_errors import invalid_params, problem, too_large
 from flexdt.server.imaging.radiography import marks_of
 from flexdt.server.imaging.radiography import predict as forecast
-from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.server.twin.handlers.motion_methods import camera_change
@@ -26,7 +25,12 @@ from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.scanner.state import changed_camera, changed_tube, switched
+from flexdt.twin.scanner.state import (
+    EMPTY_STAGE,
+    changed_camera,
+    changed_tube,
+    switched,
+)
 
 
 @answers(p.PROJECTION_GET)
@@ -177,7 +181,7 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
     sample = twin.scanner.sample
     scanner = twin.scanner
     name = params.sample or sample.name
-    if not name or name == EMPTY:
+    if not name or name == EMPTY_STAGE:
         raise LimitError("nothing stands on the stage", {"asked": "exposure.predict"})
     material = None
     if name == sample.name:

@@ -11,11 +11,10 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import scanner_messages as p
 from flexdt.protocol.rpc_errors import busy
 from flexdt.server.storage.sample_uploads import UploadHead
-from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.scanner.state import Sample, StagePlacement
+from flexdt.twin.scanner.state import EMPTY_STAGE, Sample, StagePlacement
 
 MAX_NAMED_UPLOADS = 50
 """Number of the newest uploads that an error lists."""
@@ -43,7 +42,7 @@ async def set_sample(
         offset = StagePlacement()
     else:
         offset = StagePlacement(**params.offset.model_dump())
-    if name == EMPTY:
+    if name == EMPTY_STAGE:
         sample = Sample()
     else:
         async with twin.samples.turn:
@@ -66,7 +65,7 @@ async def list_samples(
     In that order; a long list is made in several turns of the loop.
     """
     empty = p.SampleInfo(
-        name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
+        name=EMPTY_STAGE, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
     )
     shipped = await h.in_turns(
         phantom_names(), lambda name: _sample_info(name, load_phantom(name))

@@ -75,6 +75,8 @@ ALIKE_MOTION: Final = {
 """Parameter -> other motions that look like this motion of the object."""
 OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
 """Codes of findings on motion that may be followed from frame to frame."""
+UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")
+"""Parameters that are advised to differ between frames where no cause explains a misfit."""
 MOST_FRAMES: Final = 720
 """Scans of more frames are not looked at: four motions at once take seconds there."""
 
@@ -323,9 +325,9 @@ def explain_residuals(
     explained = moving(plain, lambda motion: refit(motion=motion)) or error(
         "misfit",
         f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
-        "looked for "
-        "explains them: check that nothing is loose, or let frames differ, --per-frame "
-        "dO_x,dO_y,alpha",
+        "looked for explains them: check that nothing is loose, or let frames differ, "
+        f"--per-frame {','.join(UNEXPLAINED_MOTION)}",
+        per_frame=UNEXPLAINED_MOTION,
     )
     return fit, [*_lost_beads(fit), explained]
 
@@ -359,6 +361,7 @@ def _drifts(fit: FitResult) -> list[Finding]:
                 f"{drift.column} changes by {drift.size:+.3g} {unit} {how} ({drift.score:.0f} "
                 f"sigma){_looks_alike(drift.column)}; its interval contains the change, and "
                 f"--per-frame {','.join(MOVING)} would follow it",
+                per_frame=MOVING,
             )
         )
     for there, code, what in (
@@ -481,8 +484,8 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
     return error(
         "angle_endpoint" if known else "angle_scale",
         f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct "
-        "them, or free "
-        "angle_scale",
+        "them, or free angle_scale",
+        free=("angle_scale",),
     )
 
 
@@ -548,6 +551,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         code,
         f"{', '.join(said)} moves during the scan, {how}{_looks_alike(name)}: --per-frame "
         f"{','.join(names)} follows it",
+        per_frame=names,
     )
 
 

@@ -94,9 +94,8 @@ def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
         for n in named
         for e in (free.certificate.estimates[n],)
     )
-    return error(
-        "held_parameter", f"{listed}: free {', '.join(named)} too, or hold it where it is"
-    )
+    text = f"{listed}: free {', '.join(named)} too, or hold it where it is"
+    return error("held_parameter", text, free=named)
 
 
 @dataclass(frozen=True)
@@ -268,7 +267,11 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     text = (
         f"{'; or '.join(texts)}: free {', '.join(causes)} too, or give the prior it has"
     )
-    return PriorsJudged(error("held_parameter", text), 1.0, causes)
+    offered = [
+        name for name in causes if "@" not in name
+    ]  # those of one scan are no option
+    finding = error("held_parameter", text, free=offered)
+    return PriorsJudged(finding, 1.0, causes)
 
 
 def _other_pixels(fit: FitResult, dD_z: float) -> str:

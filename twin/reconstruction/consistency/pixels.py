@@ -85,7 +85,7 @@ class BadPixels:
     @property
     def columns(self) -> int:
         """Number of columns that are bad over more than half of their rows."""
-        return int((self.mask.mean(axis=0) > 0.5).sum())
+        return int(_bad_columns(self.mask).sum())
 
     def __str__(self) -> str:
         """Describe as one sentence how many pixels are interpolated, with the whole
@@ -108,8 +108,8 @@ def bad_pixels(
 
     Args:
         views: gives line integrals of some views of a scan, (rows, cols) each; called
-            twice where there are bad ones: the worst make their neighbours look bad as
-            well.
+            once, and where there may be bad ones for each further pass: the worst make
+            their neighbours look bad as well.
         axis_column: where the axis falls.
 
     Returns:
@@ -214,18 +214,17 @@ def _lasting_and_flickering(
 
     area = binary_dilation(mask, np.ones((1, 2 * COMPARED_COLUMNS + 1), np.bool_))
     along = []
-    down = []
-    slopes_along = []
-    slopes_down = []
+    clear_along = []
+    clear_down = []
     for view in views:
-        along.append(_beyond_neighbours(view)[area])
-        down.append(_beyond_neighbours(view.T).T[area])
-        slopes_along.append(_neighbours_range(view)[area])
-        slopes_down.append(_neighbours_range(view.T).T[area])
+        beyond = _beyond_neighbours(view)
+        along.append(beyond[area])
+        clear_along.append((beyond - _slopes(view))[area])
+        clear_down.append((_beyond_neighbours(view.T) - _slopes(view.T)).T[area])
     in_row = np.array(along)
-    clear_in_row = in_row - MIN_SLOPE_RATIO * np.array(slopes_along)
-    clear_in_column = np.array(down) - MIN_SLOPE_RATIO * np.array(slopes_down)
-    in_bad_column = np.broadcast_to(mask.mean(axis=0) > 0.5, mask.shape)
+    clear_in_row = np.array(clear_along)
+    clear_in_column = np.array(clear_down)
+    in_bad_column = np.broadcast_to(_bad_columns(mask), mask.shape)
     share = np.where(at_axis, MIN_AXIS_CHANGES_SHARE, MIN_CHANGES_SHARE)
     flickers = _flickers(np.minimum(clear_in_row, clear_in_column), area, share)
     flickers |= in_bad_column & _flickers(in_row, area, share)
@@ -266,8 +265,7 @@ def _no_feature(
     mean = total / len(lows)
     beyond = mean > max(highs) + EXPLAINED_ABOVE * span
     beyond |= mean < min(lows) - EXPLAINED_BELOW * span
-    whole = np.broadcast_to(mask.mean(axis=0) > 0.5, mask.shape)
-    return np.asarray(whole | beyond)
+    return np.asarray(_bad_columns(mask) | beyond)
 
 
 def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
@@ -299,6 +297,11 @@ def _flickers(
     usual = median_filter(changes, footprint=about, mode="reflect")
     least = np.maximum(least_share * len(distances), MIN_CHANGES_RATIO * usual)
     return np.asarray(changes >= least)
+
+
+def _bad_columns(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Find columns that are bad over more than half of their rows, (cols,)."""
+    return np.asarray(mask.mean(axis=0) > 0.5)
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
@@ -381,12 +384,19 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
     return np.asarray(response > np.maximum(BAD_RESPONSE_RATIO * usual, least))
 
 
-def _neighbours_range(view: Float32Array) -> Float32Array:
-    """Compute the range of a pixel's neighbours in its row, without it, (rows, cols)."""
+def _neighbours(view: Float32Array) -> list[Float32Array]:
+    """List a pixel's neighbours in its row from left to right, without it, each (rows, cols)."""
     cols = view.shape[1]
     wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")
-    others = [wide[:, k : k + cols] for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
-    return np.asarray(np.max(others, axis=0) - np.min(others, axis=0))
+    return [wide[:, k : k + cols] for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
+
+
+def _slopes(view: Float32Array) -> Float32Array:
+    """Compute what a pixel may be beyond its neighbours in the row for their own range,
+    (rows, cols).
+    """
+    others = _neighbours(view)
+    return np.float32(MIN_SLOPE_RATIO) * np.asarray(np.ptp(others, axis=0), np.float32)
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
@@ -396,9 +406,7 @@ def _beyond_neighbours(view: Float32Array) -> Float32Array:
 
     One neighbour may be bad as well. Returns (rows, cols).
     """
-    cols = view.shape[1]
-    wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")
-    first, second, third, fourth = (wide[:, k : k + cols] for k in (0, 1, 3, 4))
+    first, second, third, fourth = _neighbours(view)
     one = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
     other = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
     low = np.minimum(one, other)

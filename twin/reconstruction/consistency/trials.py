@@ -95,6 +95,7 @@ class Trial:
         own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation)
         assert own is not None  # as a scan has a volume
         self.own = own
+        self._seconds: dict[Tried, FloatArray] = {}
         self.expected = self._expected(own, scan.cone_vec)
         self.telling = self.expected < MAX_RELIABLE_RESIDUAL
         self.excess = self._excess(own, self.expected)
@@ -129,7 +130,7 @@ class Trial:
         """
         if one.shown is None:
             return np.inf
-        return self._excess(one.shown, self._expected(one.shown, one.suspect.cone_vec))
+        return self._excess(one.shown, self._expected_of(one, one.shown))
 
     def fits_as_well(self, one: Tried, ratio: float) -> bool:
         """Return whether an explanation leaves at most `ratio` times the residual, each
@@ -137,9 +138,15 @@ class Trial:
         """
         if one.shown is None:
             return False
-        expected = self._expected(one.shown, one.suspect.cone_vec) / self.expected
+        expected = self._expected_of(one, one.shown) / self.expected
         usual = float(np.exp(np.log(expected[self.telling]).mean()))
         return one.residual <= ratio * usual
+
+    def _expected_of(self, one: Tried, shown: Reprojection) -> FloatArray:
+        """Compute an explanation's `_expected`, once: it is a reconstruction."""
+        if one not in self._seconds:
+            self._seconds[one] = self._expected(shown, one.suspect.cone_vec)
+        return self._seconds[one]
 
     def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
         """Compute the misfit of a volume's second reconstruction, infinite without one,
