@@ -101,7 +101,7 @@ def test_the_readmes_lines_run(there: Path, capsys: pytest.CaptureFixture[str]) 
         )  # of biased values, too: it is a newcomer's first volume
         exec(compile(block.replace("lego-scan", "readme-scan"), "README.md", "exec"), {})
     assert (there / "lego.nrrd").stat().st_size > 0
-    assert "6 parameters from 120 frames" in capsys.readouterr().out
+    assert "6 parameters from 240 frames" in capsys.readouterr().out
 
 
 def test_every_name_of_the_face_is_on_the_page() -> None:
