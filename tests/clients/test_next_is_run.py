@@ -66,21 +66,32 @@ class Case:
         true: where everything really is.
         phantom: that is named; the one that was scanned is "lego".
         moving: parameters with another value in each frame.
+        advises: option that is in one of the proposed commands.
     """
 
     code: str
     true: Callable[[], Poses]
     phantom: str = "lego"
     moving: tuple[str, ...] = ()
+    advises: str = ""
 
 
 CASES = {
     "right": Case("", turned),
     "wrong_phantom": Case("wrong_phantom", turned, "normal"),
-    "moves": Case("vibration", lambda: swaying(turned()), moving=("dO_x", "dO_y")),
-    "angle_scale": Case("angle_scale", lambda: turned(factor=1.004)),
+    "moves": Case(
+        "vibration",
+        lambda: swaying(turned()),
+        moving=("dO_x", "dO_y"),
+        advises="--per-frame dO_x,",
+    ),
+    "angle_scale": Case(
+        "angle_scale", lambda: turned(factor=1.004), advises=",angle_scale"
+    ),
     "reversed": Case("angle_reversed", lambda: turned(factor=-1.0)),
-    "held_parameter": Case("held_parameter", lambda: elsewhere(turned())),
+    "held_parameter": Case(
+        "held_parameter", lambda: elsewhere(turned()), advises=",dD_z"
+    ),
 }
 
 
@@ -132,6 +143,7 @@ def filled_in(line: str, scan: Path, folder: Path) -> list[str]:
 def run_what_is_proposed(case: Case, folder: Path) -> None:
     """Calibrate a scan and run every command that is proposed on it."""
     scan, lines, _ = proposed(case, folder)
+    assert any(case.advises in line for line in lines), lines
     for line in lines:
         words = filled_in(line, scan, folder)
         if str(folder / "nearer") in words:

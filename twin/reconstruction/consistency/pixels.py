@@ -392,8 +392,8 @@ def _neighbours(view: Float32Array) -> list[Float32Array]:
 
 
 def _slopes(view: Float32Array) -> Float32Array:
-    """Compute what a pixel may be beyond its neighbours in the row for their own range,
-    (rows, cols).
+    """Compute how far a pixel may be beyond its neighbours in the row, as these differ among
+    themselves, (rows, cols).
     """
     others = _neighbours(view)
     return np.float32(MIN_SLOPE_RATIO) * np.asarray(np.ptp(others, axis=0), np.float32)
