@@ -251,7 +251,7 @@ def test_help_lists_every_key(page: Any) -> None:
     assert "source up" in text
     assert "emergency stop" in text
     assert page.locator("#help-dialog kbd").count() == 23
-    page.click("#help-dialog button")
+    page.locator("#help-dialog").get_by_role("button", name="Close", exact=True).click()
     assert not page.locator("#help-dialog").is_visible()
 
 
