@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
+from flexdt.protocol.state_model import State
 from tests.viewer.looking import KNOWN_HERE, USUAL, seen, until
 
 CHROMIUM = "/usr/bin/chromium"
@@ -78,6 +79,8 @@ class Lab:
             sample: on the stage at the first start; "" for the twin's own.
         """
         self.folder, self.log, self.module = folder, folder / "log", ""
+        self.first: State | None = None
+        """The twin's state before any test has touched it."""
         self.data = folder / "data"
         self.projector = Process(
             "flexdt.server.projector.main", "--port", "0", "--threads", "1", log=self.log
@@ -144,6 +147,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     running = Lab(tmp_path_factory.mktemp("lab"), str(SPEED_UP))
+    with running.client() as client:
+        running.first = client.state()
     yield running
     running.stop()
 
@@ -261,7 +266,7 @@ def wait() -> Callable[..., Any]:
 def at_peace(request: pytest.FixtureRequest) -> None:
     """Whatever the test before left behind, the servers run, no scan does, nothing moves, no
     key is held, no note is left and no correction in force when a test begins; and the page
-    knows it. A module begins with the usual camera."""
+    knows it. A module begins with the machine as it was before the first one."""
     if "lab" not in request.fixturenames:
         return
     lab: Lab = request.getfixturevalue("lab")
@@ -293,7 +298,7 @@ def at_peace(request: pytest.FixtureRequest) -> None:
             until(lambda: at_rest(client), "the motors rest")
             client.reset()
             if lab.module != request.module.__name__:
-                client.set_camera(**USUAL)
+                as_at_first(lab, client)
                 lab.module = request.module.__name__
             while client.state().correction is not None:
                 client.revert_calibration()
@@ -302,6 +307,22 @@ def at_peace(request: pytest.FixtureRequest) -> None:
         for page in pages:
             seen(page, client)
             page.locator("#notes").evaluate("e => e.replaceChildren()")
+
+
+def as_at_first(lab: Lab, client: TwinClient) -> None:
+    """Give the twin the camera, tube, sample, places and speeds of before the first test.
+
+    A module's tests pass or fail whichever module ran before them on the same servers.
+    """
+    assert lab.first is not None
+    client.set_camera(**USUAL)
+    tube = lab.first.tube
+    client.set_tube(kV=tube.kV, power_W=tube.power_W, on=False)
+    client.set_sample(lab.first.sample.name)
+    motors = {n: a for n, a in lab.first.axes.items() if not a.virtual}
+    client.move({n: a.position for n, a in motors.items()}, plan=True, wait=True)
+    for name, axis in motors.items():
+        client.set_axis(name, speed=axis.speed, acceleration=axis.acceleration)
 
 
 def at_rest(twin: TwinClient) -> bool:
