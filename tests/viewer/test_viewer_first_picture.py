@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -184,6 +185,15 @@ def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> 
         ).any()
 
 
+def still_of(page: Any, url: str) -> Image.Image:
+    """Fetch the viewer's own picture of the scene; a JPEG of at most 60 kB."""
+    raw = page.request.get(url).body()
+    assert len(raw) <= 60_000
+    painted = Image.open(io.BytesIO(raw))
+    assert painted.format == "JPEG"
+    return painted
+
+
 @pytest.mark.browser
 def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
     open_page: Callable[..., Any], lab: Any
@@ -192,17 +202,17 @@ def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
     box = page.locator(".view[data-view=iso]")
     page.wait_for_function("document.querySelector('#still').naturalWidth > 0")
     url = page.evaluate("document.querySelector('#still').src")
-    raw = page.request.get(url).body()
-    assert len(raw) <= 60_000
-    painted = Image.open(io.BytesIO(raw))
-    assert painted.format == "JPEG"
-    frame = box.bounding_box()
-    assert painted.size == (round(frame["width"]), round(frame["height"]))
+    asked = {name: int(re.search(rf"[?&]{name}=(\d+)", url)[1]) for name in "wh"}
+    painted = still_of(page, url)
+    assert painted.size == (asked["w"], asked["h"])
     page.locator(".view.live").wait_for()
     page.locator("#still").wait_for(state="hidden")
     # Both pictures are of one scene, from one place: edges of the one are edges of the other.
     page.wait_for_timeout(1500)
     live = picture(box).mean(axis=2)
+    # The bar above may have wrapped to a second row since: one picture of the pane as it is now.
+    size = f"w={live.shape[1]}&h={live.shape[0]}"
+    painted = still_of(page, re.sub(r"w=\d+&h=\d+", size, url))
     own = np.asarray(painted.convert("L"), dtype=np.float32)
     part = np.s_[60:-130, 130:-20]  # without buttons, tag and the sample's picture
     assert np.corrcoef(live[part].ravel(), own[part].ravel())[0, 1] > 0.8

@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.drag_handles import SIZE_M
+from flexdt.clients.viewer.scenes.layers import LAYERS
 from flexdt.clients.viewer.scenes.sample_looks import MeshCache
 from flexdt.clients.viewer.scenes.views import Standpoint, presets
 from flexdt.clients.viewer.scenes.world import world_of
@@ -49,6 +50,9 @@ def show(page: Any, view: str) -> Any:
     return box
 
 
+AT_FIRST = {**{layer.name: layer.shown for layer in LAYERS}, "opacity": 0.6}
+"""What a page shows before anybody has switched a layer."""
+
 PATH_PX = 100
 """A planned trajectory takes more pixels than that, and what remains without it fewer."""
 
@@ -76,7 +80,7 @@ def outline_error(scene: Any, lab: Any, wait: Wait) -> float:
         layers(scene, sample=False)
         empty = still(crop)
     finally:
-        layers(scene, **dict.fromkeys(hidden, True), sample=True, opacity=0.6)
+        layers(scene, **AT_FIRST)
     drawn = np.abs(with_sample - empty).max(axis=2) > 24.0
     rows, cols = drawn.shape
     # Pixel centres of the screen to pixels of the image: the crop is exactly the image.
@@ -414,7 +418,7 @@ def block(scene: Any, twin: TwinClient, wait: Wait) -> Iterator[Any]:
     scene.set_viewport_size({"width": 1340, "height": 800})
     yield scene
     scene.set_viewport_size({"width": SIZE[0], "height": SIZE[1]})
-    layers(scene, **dict.fromkeys(HIDDEN, True), sample=True, opacity=0.6)
+    layers(scene, **AT_FIRST)
     scene.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     go(scene, twin, wait, stood)
 
@@ -438,28 +442,37 @@ def off_outline(
 
     The points are projected here, with the pinhole of the view's camera alone.
     """
-    frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
-    camera = preset(box.page, view, frame)
-    corners = np.array([_on_screen(frame, camera, p) for p in points])
-    wanted = inside_hull(corners, int(frame["height"]), int(frame["width"]))
-    assert 200 < wanted.sum() < 0.2 * wanted.size
-    depth = np.where(
-        wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted)
-    )
     found = math.inf
-    for _ in range(
-        12
-    ):  # the image on the panel, a shape or the view's own width may come late
+    # The image on the panel, a shape or the view's own size may come late.
+    for _ in range(12):
         box.locator(".home").click()
         layers(box.page, **{layer: True})
         shown = still(box)
         layers(box.page, **{layer: False})
-        differs = np.abs(still(box) - shown).max(axis=2) > 24.0
-        assert differs.shape == wanted.shape
+        bare = still(box)
+        if bare.shape != shown.shape:
+            continue
+        differs = np.abs(bare - shown).max(axis=2) > 24.0
+        wanted = _convex_outline(box, view, points, differs.shape)
+        assert 200 < wanted.sum() < 0.2 * wanted.size
+        depth = np.where(
+            wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted)
+        )
         found = min(found, float((depth * (differs ^ wanted)).max()))
         if found <= 2.0:
             break
     return found
+
+
+def _convex_outline(
+    box: Any, view: str, points: npt.NDArray[np.float64], shape: tuple[int, ...]
+) -> npt.NDArray[np.bool_]:
+    """Draw the convex hull of points [m] as a view of now shows it, in a picture of `shape`
+    (rows, cols)."""
+    frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
+    camera = preset(box.page, view, frame)
+    corners = np.array([_on_screen(frame, camera, p) for p in points])
+    return inside_hull(corners, *shape)
 
 
 def inside_hull(
