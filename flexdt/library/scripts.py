@@ -8,6 +8,8 @@ from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
+
 from flexdt.library.machines import machine as find_machine
 from flexdt.library.machines import profile as find_profile
 from flexdt.phantoms import Phantom
@@ -105,7 +107,10 @@ def size_of(phantom: Phantom | None) -> SampleSize | None:
     """Return the size of a phantom on the stage; None leaves it to the script."""
     if phantom is None:
         return None
-    return SampleSize.around(phantom.size_mm, phantom.name)
+    corners = phantom.mesh(around=True).vertices
+    if not len(corners):  # a phantom without matter
+        return SampleSize.around(phantom.size_mm, phantom.name)
+    return SampleSize.of_points(np.asarray(corners, np.float64), phantom.name)
 
 
 def collisions(phantom: Phantom | None) -> CollisionCheck:

@@ -19,6 +19,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
 from flexdt.phantoms import Phantom
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.scans.twin_clock import TwinClock
@@ -119,15 +121,17 @@ class Stage:
         return pieces
 
     def size(self, sample: Sample) -> SampleSize | None:
-        """Compute the cylinder about the axis that contains the sample; None for an empty
-        stage.
-
-        Diameter and height [mm]; the offset enlarges it.
+        """Compute what contains the sample at every angle, from its shape where it stands;
+        None for an empty stage. May take a second, as `pieces`.
         """
         phantom = self.phantom(sample)
         if phantom is None:
             return None
-        return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
+        source = f"sample {sample.name}"
+        corners = [piece.vertices for piece in self.pieces(sample)]
+        if not corners:  # a sample without matter
+            return SampleSize.around(phantom.size_mm, source, sample.offset)
+        return SampleSize.of_points(np.concatenate(corners), source)
 
     def scene(
         self,

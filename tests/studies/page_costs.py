@@ -42,24 +42,47 @@ LIVE = "document.querySelector('.view.live') !== null"
 COMPARED = "document.querySelector('#volume-compared').childElementCount > 0"
 WRONG = {"dO_x": 0.6, "det_roll": 1.5}
 """What the sliders of Misalign say [mm, deg]."""
+SERVER_PARTS = {
+    "live volume": "live_volume",
+    "viewer": "viewer.main",
+    "projector": "projector.main",
+    "twin": "twin.main",
+    "workers": "runtime.worker",
+    "supervisor": "launch.up",
+}
+"""Part of the servers -> what its command line holds."""
 STEPS = ("bend", "scan", "fit", "apply", "again")
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Wall seconds, and processor seconds of servers and of browser."""
+    """Wall seconds, and processor seconds of each part of servers and browser."""
 
     wall_s: float
-    servers_s: float
-    browser_s: float
+    parts_s: dict[str, float]
+
+    @property
+    def servers_s(self) -> float:
+        """Add up the servers' parts."""
+        return sum(self.parts_s.get(name, 0.0) for name in SERVER_PARTS)
+
+    @property
+    def browser_s(self) -> float:
+        """Add up the browser's parts."""
+        return sum(self.parts_s.values()) - self.servers_s
 
     def since(self, other: Moment) -> str:
-        """Say what has passed between two moments."""
+        """Say what has passed between two moments, the parts in parentheses."""
+        parts = {
+            name: used - other.parts_s.get(name, 0.0)
+            for name, used in sorted(self.parts_s.items())
+        }
+        named = ", ".join(f"{n} {used:.1f}" for n, used in parts.items() if used >= 0.05)
         return (
             f"{self.wall_s - other.wall_s:.1f} s wall, "
             f"{self.servers_s - other.servers_s:.1f} CPU s of the servers, "
             f"{self.browser_s - other.browser_s:.1f} of the browser "
-            f"(load average {os.getloadavg()[0]:.1f})"
+            f"({named}; load average {os.getloadavg()[0]:.1f})"
         )
 
 
@@ -70,6 +93,26 @@ def processor_s(pid: int) -> float | None:
     except OSError:
         return None
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def part_of(pid: int, lab: set[int]) -> str:
+    """Name the part of servers or browser that a process is; "" where it has ended.
+
+    Args:
+        pid: the process.
+        lab: process ids of the servers.
+    """
+    try:
+        command = Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return ""
+    if not command:  # ended, and not yet waited for
+        return ""
+    if pid in lab:
+        names = (name for name, module in SERVER_PARTS.items() if module in command)
+        return next(names, "supervisor")
+    _, _, kind = command.replace("\0", " ").partition("--type=")
+    return kind.split(" ", 1)[0] or "browser"
 
 
 def family(pid: int) -> set[int]:
@@ -94,19 +137,18 @@ class Meter:
 
     def __init__(self, servers: int) -> None:
         self._servers = servers
-        self._ended = {"servers": 0.0, "browser": 0.0}
         self._seen: dict[tuple[str, int], float] = {}
 
     def now(self) -> Moment:
         """Read the clocks of all processes."""
         lab = family(self._servers)
         for pid in family(os.getpid()) - {os.getpid()}:
-            if (used := processor_s(pid)) is not None:
-                self._seen["servers" if pid in lab else "browser", pid] = used
-        total = dict.fromkeys(self._ended, 0.0)
-        for (kind, _), seconds in self._seen.items():
-            total[kind] += seconds
-        return Moment(time.monotonic(), total["servers"], total["browser"])
+            if (used := processor_s(pid)) is not None and (name := part_of(pid, lab)):
+                self._seen[name, pid] = used
+        total: dict[str, float] = {}
+        for (name, _), seconds in self._seen.items():
+            total[name] = total.get(name, 0.0) + seconds
+        return Moment(time.monotonic(), total)
 
     def until(self, page: Any, condition: str) -> Moment:
         """Wait for a condition of the page, reading the clocks meanwhile."""

@@ -287,7 +287,21 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
 
 
 def _share(held: Held, name: str) -> Callable[[float, float], None]:
-    return lambda done, whole: held.say(**{name: done / whole})
+    """Report a share of work under a name, at most every `TELL_S` seconds.
+
+    The end is left to what follows, which is told anyway.
+    """
+    told = -TELL_S
+
+    def report(done: float, whole: float) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now < told + TELL_S:
+            return
+        told = now
+        held.say(**{name: done / whole})
+
+    return report
 
 
 def _named(correction: NamedCorrection | None) -> str:

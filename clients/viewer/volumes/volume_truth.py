@@ -71,10 +71,10 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         half = 0.0
     else:  # means over two voxels a side, centred half a voxel before the later one
         whole = phantom.volume(voxel / 2)
-        data = np.pad(whole.data, (0, 1))
+        data = np.pad(whole.data, (1, 1))
         half = 0.5
         for axis in range(3):
-            data = (data + np.roll(data, 1, axis)) / np.float32(2)
+            data = _means_of_pairs(data, axis)
     if dataset.folder is None:
         stands = StagePlacement()
     else:
@@ -101,6 +101,14 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         )
         out[k] = ndimage.map_coordinates(data, at[::-1], order=1, mode="constant")
     return np.maximum(out, 0.0, out=out)  # a hole leaves a rounding error
+
+
+def _means_of_pairs(data: Float32Array, axis: int) -> Float32Array:
+    """Compute the means of neighbours along an axis, one fewer than there are."""
+    along = np.moveaxis(data, axis, 0)
+    means = along[:-1] + along[1:]
+    means *= np.float32(0.5)
+    return np.moveaxis(means, 0, axis)
 
 
 def placement(folder: Path) -> StagePlacement:

@@ -119,6 +119,44 @@ def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -
     assert cut["top"] == pytest.approx(cut["bottom"])  # at home the beam meets the middle
 
 
+def corners_of(kind: int, rng: np.random.Generator) -> np.ndarray:
+    """Corners of a drawn sample (k, 3) [mm]: a ball, a disc on edge, a gear, a cloud."""
+    cloud = rng.normal(size=(400, 3))
+    ball = cloud / np.linalg.norm(cloud, axis=1, keepdims=True)
+    around = 2.0 * np.pi * np.arange(40) / 40
+    teeth = np.where(np.arange(40) % 4 < 2, 1.0, 0.8)[:, None]
+    ring = teeth * np.stack([np.cos(around), np.sin(around)], axis=1)
+    gear = np.concatenate([np.column_stack([ring, np.full(40, z)]) for z in (-0.7, 0.7)])
+    drawn = [ball, ball * [1.0, 0.1, 1.0], gear, 0.3 * cloud]
+    shift = rng.uniform(-3.0, 3.0, 3)
+    return np.asarray(rng.uniform(30.0, 48.0) * drawn[kind] + shift)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_what_a_sample_loses_over_a_turn_follows_from_its_corners(
+    flexray: Machine, profile: Profile, seed: int
+) -> None:
+    """Each corner is projected at every quarter of a degree, by similar triangles."""
+    corners = corners_of(seed % 4, np.random.default_rng(seed))
+    made = report(flexray, profile, sample=SampleSize.of_points(corners, "drawn"))
+    turn = np.radians(np.arange(0.0, 360.0, 0.25))[:, None]
+    x, y, z = corners.T
+    depth = 500.0 + x * np.cos(turn) + y * np.sin(turn)
+    columns = 1000.0 * (y * np.cos(turn) - x * np.sin(turn)) / depth / 0.1496
+    rows = 1000.0 * z / depth / 0.1496
+    beyond = {
+        "left": -columns.min() - 478,
+        "right": columns.max() - 478,
+        "top": rows.max() - 380,
+        "bottom": -rows.min() - 380,
+    }
+    cut = made.optics[0].truncation
+    assert cut is not None
+    for edge, px in beyond.items():
+        assert cut[edge] == pytest.approx(max(px, 0.0), abs=1.0), edge
+    assert bool(made.problems) == (max(beyond.values()) > 0.5)
+
+
 PLACES = st.fixed_dictionaries({
     "mag_obj": st.floats(100, 700), "mag_det": st.floats(800, 1050), "tra_obj": st.floats(-4, 4),
     "tra_det": st.floats(-200, 200), "ver_tube": st.floats(0, 100), "ver_det": st.floats(4, 100),

@@ -1,13 +1,13 @@
 """The beam's view of the sample in the images of a plan, and warnings about it.
 
-Poses come from the nominal geometry. The sample is a cylinder about the rotation axis, or
-only the axis where its size is unknown, so a report about truncation is about the
-cylinder that holds the sample at every angle of a full rotation.
+Poses come from the nominal geometry. The sample is a body of revolution about the rotation
+axis that holds it at every angle of a full rotation: that of its corners, else a cylinder, or
+only the axis where its size is unknown. A report about truncation is about that body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -193,12 +193,11 @@ def _view(
     size = plan.sample
     if size is not None:
         radius = size.diameter_mm / 2
-        half = size.height_mm / 2
         edges = [_project(p, q, shape)[:, 0] for q in _tangents(p, radius)]
         left = np.minimum(*edges)
         right = np.maximum(*edges)
-        if half > 0.0:
-            rows = [_project(p, q, shape)[:, 1] for q in _rims(p, radius, half)]
+        if size.height_mm > 0.0:
+            rows = [_project(p, q, shape)[:, 1] for q in _rims(p, size.outline_mm)]
             top = np.min(rows, axis=0)
             bottom = np.max(rows, axis=0)
     return View(kind, camera, lines, p, left, right, top, bottom, axis)
@@ -225,15 +224,15 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
     return [np.column_stack([p.axis[:, :2] + xy, p.source[:, 2]]) for xy in aside]
 
 
-def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
-    """Compute the nearest and farthest points of the cylinder's two rims, four of
-    (n, 3) [mm]."""
+def _rims(p: Poses, rims_mm: Sequence[tuple[float, float]]) -> list[FloatArray]:
+    """Compute the nearest and farthest points of circles about the axis, two of (n, 3)
+    for each [mm]."""
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     return [
         p.axis + np.column_stack([depth * along, np.full(len(along), height)])
+        for radius, height in rims_mm
         for depth in (radius, -radius)
-        for height in (half_height, -half_height)
     ]
 
 

@@ -5,12 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
+import numpy as np
+
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.state import StagePlacement
 from flexdt.twin.script.commands import AnyCommand, ImageKind
 from flexdt.twin.values import Array, ArrayValue
+
+ROUNDING_MM: Final = 1e-9
+"""A circle so little beyond others lies within them."""
 
 
 @dataclass(frozen=True)
@@ -167,11 +174,19 @@ class SampleSize:
     """A cylinder about the rotation axis that contains the sample [mm]; height 0 is unknown.
 
     It is centred at the sample's reference height.
+
+    Attributes:
+        diameter_mm, height_mm: of the cylinder.
+        source: of the size, for people.
+        rims_mm: circles about the axis, (radius, height) each: the body of revolution of
+            their convex hull contains the sample at every angle. Empty where only the
+            cylinder is known.
     """
 
     diameter_mm: float
     height_mm: float = 0.0
     source: str = "given"
+    rims_mm: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def around(
@@ -192,3 +207,57 @@ class SampleSize:
             radius = 0.5 * math.hypot(x, y, z)
             z = 2.0 * radius
         return cls(2.0 * (radius + math.hypot(at.x, at.y)), z + 2.0 * abs(at.z), source)
+
+    @classmethod
+    def of_points(cls, points_mm: FloatArray, source: str = "given") -> SampleSize:
+        """Make the cylinder, and the rims, that contain points at every angle.
+
+        Args:
+            points_mm: (k, 3) in the object frame, k > 0: corners of the sample's shape, as
+                it stands on the stage.
+            source: of the size, for people.
+        """
+        radius = np.hypot(points_mm[:, 0], points_mm[:, 1])
+        height = points_mm[:, 2]
+        diameter_mm = 2.0 * float(radius.max())
+        height_mm = 2.0 * float(np.abs(height).max())
+        return cls(diameter_mm, height_mm, source, _outer_rims(radius, height))
+
+    @property
+    def outline_mm(self) -> tuple[tuple[float, float], ...]:
+        """The rims, else those of the cylinder: circles (radius, height) about the axis."""
+        if self.rims_mm:
+            return self.rims_mm
+        radius = self.diameter_mm / 2
+        half = self.height_mm / 2
+        return (radius, -half), (radius, half)
+
+
+def _outer_rims(
+    radius: FloatArray, height: FloatArray
+) -> tuple[tuple[float, float], ...]:
+    """Find the circles on the convex hull of a body of revolution, from the lowest up.
+
+    Args:
+        radius, height: of its circles, (k,) each [mm].
+
+    Returns:
+        (radius, height) of those that no others contain.
+    """
+    order = np.lexsort((-radius, height))
+    _, first = np.unique(height[order], return_index=True)
+    widest = order[first]
+    chain: list[tuple[float, float]] = []
+    for r, z in zip(radius[widest].tolist(), height[widest].tolist(), strict=True):
+        while len(chain) > 1 and _lies_within(chain[-2], chain[-1], (r, z)):
+            chain.pop()
+        chain.append((r, z))
+    return tuple(chain)
+
+
+def _lies_within(
+    below: tuple[float, float], middle: tuple[float, float], above: tuple[float, float]
+) -> bool:
+    """Check whether a circle lies within the cone through one below and one above it."""
+    share = (middle[1] - below[1]) / (above[1] - below[1])
+    return middle[0] <= below[0] + share * (above[0] - below[0]) + ROUNDING_MM
