@@ -10,9 +10,13 @@ decides which connection gives way.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConcurrencyError
+from websockets.protocol import CONNECTING, OPEN, State
 
 from flexdt.runtime import waiting_room
 from flexdt.runtime.process import tune
@@ -86,6 +90,24 @@ class BrowserConnection(ServerConnection):
             self.transport.abort()
         else:
             super().data_received(data)
+
+    @asynccontextmanager
+    async def send_context(self, *, expected_state: State = OPEN) -> AsyncIterator[None]:
+        """Write to the connection as the library does, but for an answer to a browser that
+        has left meanwhile: that is no error of the library's.
+
+        Raises:
+            ConcurrencyError: the browser has left before it was answered.
+        """
+        async with super().send_context(expected_state=expected_state):
+            try:
+                yield
+            except Exception as error:
+                protocol = self.protocol
+                left = protocol.eof_sent or protocol.state is not CONNECTING
+                if expected_state is CONNECTING and left:
+                    raise ConcurrencyError("the browser left unanswered") from error
+                raise
 
     async def recv(self, decode: bool | None = None) -> Any:
         """Receive the next message."""

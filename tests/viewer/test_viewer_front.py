@@ -115,6 +115,52 @@ def test_a_picture_that_takes_too_long_is_answered_with_none(
     asyncio.run(work())
 
 
+@pytest.mark.parametrize("ask", ["still", "page"])
+@pytest.mark.parametrize("half", [True, False])
+def test_browsers_that_leave_unanswered_leave_no_error_in_the_log(
+    ask: str, half: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Requests whose answer is waited for; the browser ends its side, or the connection."""
+    asked, left = asyncio.Event(), asyncio.Event()
+    pages: list[str] = []
+
+    async def late(*_: object) -> None:
+        asked.set()
+        await left.wait()
+
+    async def run() -> None:
+        front = Front(echo, nowhere, HTML, {}, still=late)
+        monkeypatch.setattr(front, "_stranger", late if ask == "page" else nobody)
+        await front.start("127.0.0.1", 0)
+        _, writer = await asyncio.open_connection("127.0.0.1", front.port)
+        path = "/still.jpg?view=iso" if ask == "still" else f"/ws/{'a' * 24}"
+        upgrade = (
+            "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+        )
+        head = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{front.port}\r\n"
+        writer.write((head + upgrade * (ask == "page") + "\r\n").encode())
+        await asked.wait()
+        if half:
+            writer.write_eof()
+        else:
+            writer.transport.abort()
+        await asyncio.sleep(0.1)
+        left.set()
+        await asyncio.sleep(0.1)
+        status, _, _ = await fetch(front.port, "/main.js")
+        pages.append(str(status))
+        await front.close()
+
+    asyncio.run(run())
+    assert pages == ["200"]
+    assert [r.getMessage() for r in caplog.records if r.levelname == "ERROR"] == []
+
+
+async def nobody(*_: object) -> None:
+    """Admit every request."""
+
+
 def test_what_has_not_changed_is_not_sent_again() -> None:
     """viser's program, nearly all of each view, is one file under a name made of its
     content."""
