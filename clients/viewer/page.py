@@ -96,6 +96,8 @@ class Page:
         self.id = id
         self.kind = "line_integral"
         self.dark = self.live = False
+        self.fine = True
+        """Whether a graphics processor draws, as far as the page has said."""
         self.shown = Shown()
         self.plan: Any = None
         self.orbit: Any = None

@@ -261,6 +261,7 @@ async def layers(viewer: Viewer, page: Page, params: Params) -> object:
 async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
     """Set light or dark, plain or fine, for this page's scenes."""
     page.dark = params.dark
+    page.fine = params.fine
     viewer.clients.theme(page.id, page.dark, params.fine)
     return {}
 

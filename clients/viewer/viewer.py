@@ -1,8 +1,9 @@
 """The viewer as one asyncio program: the twin's states in, scenes and pages out.
 
 Owns the link to the twin, the viser server, the pages and their shared data. Drawing
-happens at most 30 times a second, always of the newest state. Commands do not pass
-through here: each goes out over its page's own connection.
+happens at most 30 times a second (10 times where no page has a graphics processor), always of
+the newest state. Commands do not pass through here: each goes out over its page's own
+connection.
 """
 
 from __future__ import annotations
@@ -50,6 +51,9 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 
 DRAW_HZ: Final = 30.0
+PLAIN_DRAW_HZ: Final = 10.0
+"""Rate where no page has a graphics processor: pictures follow each other more slowly there,
+and each state costs its browser and this process ten milliseconds of the processor."""
 ASKED_HZ: Final = 36.0
 """Rate of states requested of the twin [1/s]: slightly more, since late ones are
 dropped."""
@@ -355,8 +359,8 @@ class Viewer:
     # -- drawing -----------------------------------------------------------------------------
 
     async def _draw(self) -> None:
-        """Draw the newest state at most `DRAW_HZ` times a second, for ever; older ones
-        are skipped.
+        """Draw the newest state at most `DRAW_HZ` times a second (`PLAIN_DRAW_HZ` where no
+        page has a graphics processor), for ever; older ones are skipped.
 
         A failure is logged once, until a state is drawn again.
         """
@@ -376,7 +380,9 @@ class Viewer:
                     if sound:  # once, not for each of thirty a second
                         log("a state could not be drawn", logging.ERROR, error=True)
                     sound = False
-            await asyncio.sleep(max(0.0, begun + 0.8 / DRAW_HZ - loop.time()))
+            plain = self.pages and not any(page.fine for page in self.pages.values())
+            most_hz = PLAIN_DRAW_HZ if plain else DRAW_HZ
+            await asyncio.sleep(max(0.0, begun + 0.8 / most_hz - loop.time()))
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
         """Draw a state: sample, cameras, scene and pages.

@@ -28,6 +28,9 @@ from flexdt.clients.launch.processes import Servers
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from docs.tools.page_pictures import CHROMIUM, FLAGS
 
+SOFTWARE_FLAGS = [*FLAGS, "--disable-gpu-compositing"]
+"""As chromium works by itself where no graphics processor is: SwiftShader draws WebGL alone,
+and the page around it is put together without it."""
 SIZE = {"width": 1440, "height": 900}
 PATIENCE_MS = 900_000
 REST_S = 60.0
@@ -35,9 +38,9 @@ REST_S = 60.0
 SETTLING_MS = 20_000
 """From the first picture to rest: scenes fade in, and pictures are compressed ahead."""
 PICTURE = (
-    "document.querySelector('#still')?.naturalWidth > 0 || window.flexdt?.store.image"
+    "document.querySelector('#still')?.naturalWidth > 0 || !!window.flexdt?.store.image"
 )
-IMAGE = "window.flexdt?.store.image && flexdt.store.session"
+IMAGE = "!!(window.flexdt?.store.image && flexdt.store.session)"
 LIVE = "document.querySelector('.view.live') !== null"
 COMPARED = "document.querySelector('#volume-compared').childElementCount > 0"
 WRONG = {"dO_x": 0.6, "det_roll": 1.5}
@@ -161,7 +164,7 @@ class Meter:
 @contextmanager
 def browsing(play: Any) -> Iterator[Any]:
     """A context of a browser that has never been here."""
-    browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    browser = play.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_FLAGS)
     context = browser.new_context(viewport=SIZE)
     context.set_default_timeout(PATIENCE_MS)
     yield context
@@ -264,7 +267,7 @@ def scan(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
                 page.screenshot(path=shots / f"scan-{percent}.png")
         scanned = meter.until(page, "flexdt.store.job?.state === 'done'")
         whole = meter.until(
-            page, "flexdt.volume().told?.past && flexdt.volume().three.block"
+            page, "!!(flexdt.volume().told?.past && flexdt.volume().three.block)"
         )
         compared = meter.until(page, COMPARED)
         for what, moment in (

@@ -132,6 +132,59 @@ function glassThatDraws() {
     }
     return NO_PROGRAM;
 }
+// Means over cubes of f codes a side, as bytes: 1 to 255 from `low` to `high`, 0 without data.
+function means(codes, size, n, f, low, high) {
+    const data = new Uint8Array(n[0] * n[1] * n[2]);
+    const scale = 254 / (high - low);
+    for (let z = 0, o = 0; z < n[2]; z++)
+        for (let y = 0; y < n[1]; y++)
+            for (let x = 0; x < n[0]; x++, o++) {
+                let sum = 0;
+                let known = 0;
+                for (let c = 0; c < f; c++)
+                    for (let r = 0; r < f; r++) {
+                        const from = ((z * f + c) * size[1] + y * f + r) * size[0] + x * f;
+                        for (let at = from; at < from + f; at++) {
+                            sum += codes[at];
+                            if (codes[at])
+                                known++;
+                        }
+                    }
+                if (known)
+                    data[o] = 1 + Math.min(254, Math.max(0, scale * (sum / known - low)));
+            }
+    return data;
+}
+// The greatest byte of each brick; what lies at its edge is seen from the next one, too.
+function greatest(data, n, grid) {
+    const bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
+    const [x, y, z] = n.map((count, axis) => bricksOf(count, grid[axis]));
+    for (let k = 0, o = 0; k < n[2]; k++)
+        for (let j = 0; j < n[1]; j++)
+            for (let i = 0; i < n[0]; i++, o++) {
+                const v = data[o];
+                if (!v)
+                    continue;
+                for (let c = z.first[k]; c <= z.last[k]; c++)
+                    for (let b = y.first[j]; b <= y.last[j]; b++)
+                        for (let a = x.first[i]; a <= x.last[i]; a++) {
+                            const at = (c * grid[1] + b) * grid[0] + a;
+                            if (v > bricks[at])
+                                bricks[at] = v;
+                        }
+            }
+    return bricks;
+}
+// The bricks from which each voxel of an axis is seen.
+function bricksOf(voxels, bricks) {
+    const first = new Uint8Array(voxels);
+    const last = new Uint8Array(voxels);
+    for (let at = 0; at < voxels; at++) {
+        first[at] = Math.max(0, Math.floor((at - 1) / BRICK));
+        last[at] = Math.min(bricks - 1, Math.floor((at + 1) / BRICK));
+    }
+    return { first, last };
+}
 export function raycast(canvas, side = 0) {
     const found = glassThatDraws();
     if (typeof found === "string")
@@ -179,8 +232,6 @@ export function raycast(canvas, side = 0) {
             if (!b)
                 return;
             fill(b, ends(b), 0);
-            if (!twin)
-                fill(b, ends(b), 2);
             me.draw();
         },
         beside(b) {
@@ -214,46 +265,9 @@ export function raycast(canvas, side = 0) {
         const size = extent(b);
         const f = Math.max(1, Math.ceil(Math.max(...size) / largest));
         const n = size.map((v) => Math.max(1, Math.floor(v / f)));
-        const [lo, hi] = range.map((v) => codeOf(b, v));
-        const data = new Uint8Array(n[0] * n[1] * n[2]);
         const grid = n.map((v) => Math.ceil(v / BRICK));
-        const bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
-        const put = (x, y, z, v) => {
-            const k = (z * grid[1] + y) * grid[0] + x;
-            if (v > bricks[k])
-                bricks[k] = v;
-        };
-        for (let z = 0, o = 0; z < n[2]; z++)
-            for (let y = 0; y < n[1]; y++)
-                for (let x = 0; x < n[0]; x++, o++) {
-                    let sum = 0;
-                    let known = 0;
-                    for (let c = 0; c < f; c++)
-                        for (let r = 0; r < f; r++)
-                            for (let k = 0, at = ((z * f + c) * size[1] + y * f + r) * size[0] + x * f; k < f; k++, at++)
-                                if (b.codes[at]) {
-                                    sum += b.codes[at];
-                                    known++;
-                                }
-                    const v = known
-                        ? 1 + Math.min(254, Math.max(0, (254 * (sum / known - lo)) / (hi - lo)))
-                        : 0;
-                    data[o] = v;
-                    // What lies at the edge of a brick is seen from the next one, too.
-                    const [i, j, l] = [x, y, z].map((q) => Math.floor(q / BRICK));
-                    put(i, j, l, v);
-                    for (const [at, step] of [
-                        [x, 0],
-                        [y, 1],
-                        [z, 2],
-                    ]) {
-                        const edge = at % BRICK === 0 ? -1 : at % BRICK === BRICK - 1 ? 1 : 0;
-                        const to = [i, j, l];
-                        to[step] += edge;
-                        if (edge && to[step] >= 0 && to[step] < grid[step])
-                            put(to[0], to[1], to[2], v);
-                    }
-                }
+        const data = means(b.codes, size, n, f, codeOf(b, range[0]), codeOf(b, range[1]));
+        const bricks = greatest(data, n, grid);
         texture(unit, n, data, gl.LINEAR);
         texture(unit + 1, grid, bricks, gl.NEAREST);
         gl.uniform3fv(place("count"), n);
@@ -338,6 +352,8 @@ export function raycast(canvas, side = 0) {
         gl.uniform2fv(place("room"), room);
         gl.uniform2f(place("grey"), tone(seen[0]), 1 / Math.max(1e-6, tone(seen[1]) - tone(seen[0])));
         gl.uniform1f(place("split"), twin ? 2 * me.split - 1 : 2);
+        gl.uniform1i(place("other"), twin ? 2 : 0);
+        gl.uniform1i(place("otherBricks"), twin ? 3 : 1);
         gl.uniform1f(place("level"), Math.max(tone(me.level), 2 / 255));
         gl.uniform1i(place("cut"), me.cut);
         gl.uniform1i(place("most"), me.most ? 1 : 0);

@@ -3,12 +3,18 @@
 // empty scene takes fewer calls than ENOUGH a picture, or all is hidden. Without a graphics
 // processor (`gap` > 0, the page's choice) a picture is drawn at most every `gap` ms and
 // without smoothed edges, so that the rest stays quick; where nothing has changed it is drawn
-// anew every REST_MS and not, as viser does, every HEARTBEAT_MS: that took half a core.
+// anew every REST_MS and not, as viser does, every HEARTBEAT_MS: that took half a core. While
+// nobody touches the scene, each picture is followed by a pause of PAUSES times what it took, so
+// that a scan which moves the machine leaves the processor to images and volume.
 (() => {
     const ENOUGH = 3;
     const LATE_MS = 5000;
     const HEARTBEAT_MS = 1000;
     const REST_MS = 8000;
+    const PAUSES = 6;
+    const LONGEST_PAUSE_MS = 1500;
+    const TOUCHED_MS = 2000;
+    const LOOK_MS = 25;
     const ask = window.requestAnimationFrame.bind(window);
     const gl = WebGL2RenderingContext.prototype;
     // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
@@ -36,7 +42,38 @@
     // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its canvas
     const context = HTMLCanvasElement.prototype.getContext;
     HTMLCanvasElement.prototype.getContext = function (kind, options) {
-        return context.call(this, kind, /^webgl/.test(kind) ? { ...options, antialias: false } : options);
+        if (!/^webgl/.test(kind))
+            return context.call(this, kind, options);
+        const made = context.call(this, kind, { ...options, antialias: false });
+        if (made instanceof WebGL2RenderingContext)
+            glass = made;
+        return made;
+    };
+    let glass = null;
+    let drawn = false;
+    // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
+    const clear = gl.clear;
+    gl.clear = function (mask) {
+        drawn = true;
+        clear.call(this, mask);
+    };
+    let touched = -Infinity;
+    for (const kind of ["pointerdown", "pointermove", "wheel", "keydown"])
+        window.addEventListener(kind, () => {
+            touched = performance.now();
+        }, { capture: true, passive: true });
+    // The end of the pause after a picture, as soon as the graphics have finished it.
+    let free = -Infinity;
+    const paused = (begun, done) => {
+        if (!glass || !done || glass.isContextLost())
+            return;
+        if (glass.clientWaitSync(done, 0, 0) === glass.TIMEOUT_EXPIRED) {
+            setTimeout(() => paused(begun, done), LOOK_MS);
+            return;
+        }
+        glass.deleteSync(done);
+        const now = performance.now();
+        free = now + Math.min(LONGEST_PAUSE_MS, PAUSES * (now - begun));
     };
     const every = window.setInterval.bind(window);
     const beats = (f, ms) => ms === HEARTBEAT_MS && !String(f).includes("retry");
@@ -52,14 +89,32 @@
         queue = new Map();
         due = false;
         last = performance.now();
+        drawn = false;
         for (const callback of now.values())
             callback(time);
+        if (!drawn || !glass)
+            return;
+        const done = glass.fenceSync(glass.SYNC_GPU_COMMANDS_COMPLETE, 0);
+        glass.flush();
+        paused(last, done);
+    };
+    const soonest = () => {
+        const watched = performance.now() < touched + TOUCHED_MS;
+        return Math.max(last + gap, watched ? -Infinity : free) - performance.now();
+    };
+    // A touch ends a pause that is under way.
+    const wait = () => {
+        const left = soonest();
+        if (left > 0)
+            setTimeout(wait, Math.min(left, gap));
+        else
+            ask(run);
     };
     window.requestAnimationFrame = (callback) => {
         queue.set(next, callback);
         if (!due) {
             due = true;
-            setTimeout(() => ask(run), Math.max(0, last + gap - performance.now()));
+            wait();
         }
         return next++;
     };
