@@ -407,7 +407,7 @@ class Viewer:
         self.world = world
         if sample_changed:
             await self._dress(lab, state)
-        rim_mm = views.rim(world, [skin.vertices for skin in self.look.skins])
+        rim_mm = views.rim(world, self.look.hulls_m)
         self.clients.cameras = views.presets(world, self.look.radius_mm, rim_mm)
         if first:  # the picture of the scene shows an image, too
             self.feeds["line_integral"].start()

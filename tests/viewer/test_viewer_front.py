@@ -118,7 +118,10 @@ def test_a_picture_that_takes_too_long_is_answered_with_none(
 @pytest.mark.parametrize("ask", ["still", "page"])
 @pytest.mark.parametrize("half", [True, False])
 def test_browsers_that_leave_unanswered_leave_no_error_in_the_log(
-    ask: str, half: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ask: str,
+    half: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Requests whose answer is waited for; the browser ends its side, or the connection."""
     asked, left = asyncio.Event(), asyncio.Event()

@@ -28,7 +28,7 @@ from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import glb
 from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.sample_looks import MeshCache, SampleLook, Skin, fetch
-from flexdt.clients.viewer.scenes.views import beam_view
+from flexdt.clients.viewer.scenes.views import beam_view, rim
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
 from flexdt.clients.viewer.scrubbed_plan import (
     document,
@@ -174,6 +174,22 @@ def test_samples_look_as_large_as_they_are(name: str) -> None:
     points = np.concatenate([skin.vertices for skin in look.skins]) * 1000.0
     size = points.max(axis=0) - points.min(axis=0)
     np.testing.assert_allclose(size, phantom.size_mm, rtol=0.02, atol=0.05)
+
+
+@pytest.mark.parametrize("name", phantom_names())
+def test_the_close_up_holds_what_turns_and_no_more(name: str) -> None:
+    """The cylinder of the close-up against all vertices of the mesh, turned by degrees."""
+    look = MeshCache().look(SampleState(name=name))
+    vertices = 1000.0 * np.concatenate([s.vertices for s in look.skins]).astype(float)
+    reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
+    world = placed(MACHINE, PROFILE, CAMERA, {**AT, "rot_obj": 31.0}, Offsets())
+    around = rim(world, look.hulls_m)
+    assert around is not None
+    across = np.hypot(*(around - world.axis)[:, :2].T)
+    assert across.min() * np.cos(np.pi / 12) == pytest.approx(reach, abs=1e-3)
+    heights = vertices[:, 2] + world.sample.shift[2]
+    assert around[:, 2].min() == pytest.approx(heights.min(), abs=1e-3)
+    assert around[:, 2].max() == pytest.approx(heights.max(), abs=1e-3)
 
 
 def test_an_unknown_upload_is_a_box_of_its_size() -> None:

@@ -92,6 +92,11 @@ class SampleLook:
         far = self._reach(2)
         return None if far is None else 2.0 * far
 
+    @cached_property
+    def hulls_m(self) -> tuple[npt.NDArray[np.float32], ...]:
+        """Corners of each skin's convex hull, (k, 3) [m]; of a flat skin all its vertices."""
+        return tuple(_hull(skin.vertices) for skin in self.skins)
+
     def _reach(self, axes: int) -> float | None:
         """Compute the greatest distance of the skins from the origin along the first
         `axes` axes [mm]; None without skins.
@@ -100,6 +105,19 @@ class SampleLook:
             np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins
         ]
         return float(max(far)) / MM if far else None
+
+
+def _hull(vertices_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Find the corners of the convex hull of vertices (k, 3); all of them where they lie in a
+    plane.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        corners = vertices_m[ConvexHull(vertices_m).vertices]
+        return np.asarray(corners, np.float32)
+    except (QhullError, ValueError):  # flat, or nothing at all
+        return vertices_m
 
 
 NOTHING = SampleLook((), np.zeros((0, 3)))

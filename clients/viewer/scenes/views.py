@@ -189,20 +189,11 @@ def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArr
 
     Args:
         world: pose of the sample.
-        vertices_m: of its meshes, in its own frame.
+        vertices_m: of its meshes, or of their convex hulls, in its own frame.
     """
     if not any(len(some) for some in vertices_m):
         return None
-    ends = (
-        np.array(
-            [[some.min(axis=0), some.max(axis=0)] for some in vertices_m if len(some)]
-        )
-        / MM
-    )
-    low = ends[:, 0].min(axis=0)
-    high = ends[:, 1].max(axis=0)
-    pick = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)])
-    corners = world.sample @ np.where(pick, high, low)
+    corners = world.sample @ (np.concatenate(vertices_m).astype(np.float64) / MM)
     middle = world.axis
     radius = float(np.linalg.norm((corners - middle)[:, :2], axis=1).max())
     angles = np.arange(RIM_CORNERS) * 2.0 * np.pi / RIM_CORNERS
