@@ -179,3 +179,43 @@ def test_one_click_ends_with_a_volume_beside_its_truth(
              for share, one in seen.items()}  # fmt: skip
     assert noise[0] < 0.2 < noise[1000], "the truth has no noise in air, the scan has"
     page.close()
+
+
+REFUSED = """
+(all) => {
+  const send = WebSocket.prototype.send;
+  WebSocket.prototype.send = function (text) {
+    const asked = JSON.parse(text);
+    const compose = asked.method === 'viewer.compose';
+    if (compose && (all || 'voxel_um' in asked.params)) asked.params.voxel_um = 0.02;
+    send.call(this, JSON.stringify(asked));
+  };
+}
+"""
+"""Asks for a voxel that no place of the stage has: where one is asked for, or always."""
+
+
+@pytest.mark.parametrize("all", [False, True])
+def test_a_scan_that_is_not_as_it_should_be_says_why(
+    open_page: Callable[..., Any], twin: TwinClient, all: bool
+) -> None:
+    jobs = len(twin.jobs().jobs)
+    twin.control("force")
+    twin.set_sample("small-3")
+    twin.move({"mag_obj": 650.0}, wait=True)
+    twin.control("release")
+    page = open_page(fresh=True)
+    page.wait_for_function("flexdt.store.state?.sample.name === 'small-3'")
+    page.evaluate(REFUSED, all)
+    page.click("#scan-it")
+    title = "No scan" if all else "Scanned where it stands"
+    note = page.locator(".note", has_text=title)
+    note.wait_for()
+    assert "outside [70, 996] mm" in note.inner_text()
+    if not all:
+        page.locator(".note", has_text="has begun").wait_for()
+        twin.control("force")
+        twin.abort_job()
+        twin.control("release")
+    assert len(twin.jobs().jobs) == jobs + (not all)
+    page.close()

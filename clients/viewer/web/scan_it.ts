@@ -1,7 +1,7 @@
 // "Scan it": one turn of what stands on the stage. The sample fills the image, the views
 // follow from its size, the volume grows in the scene meanwhile and then stands beside its
 // truth.
-import { $, $button, $select, clicks, el, setText } from "./dom.js";
+import { $, $button, $select, clicks, el, setText, words } from "./dom.js";
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
 import { isUnfinished } from "./job_words.js";
@@ -43,9 +43,16 @@ function turning({ sample: some }: State): [across: number, upright: number] | n
 }
 // The state of the twin, once the page's own is of the same sample or has had time for it.
 async function current(): Promise<State | null> {
-  const state = await call("state.get").catch(() => null);
+  const state = await command("state.get", {}, "No scan");
   for (let wait = 0; state && !isShown(state.sample) && wait < SHOWN_TRIES; wait++)
     await new Promise((again) => setTimeout(again, SHOWN_AGAIN_MS));
+  if (state && !isShown(state.sample))
+    emit(
+      "note",
+      "warning-note",
+      "Scan it",
+      "the sample’s shape is not here yet: its box counts",
+    );
   return state;
 }
 // The voxel size [um] at which the sample fills the image.
@@ -62,8 +69,25 @@ export function viewsFor(state: State, voxel_um: number): number {
   const wanted = size ? Math.ceil((Math.PI / 2) * (size[0] / shown_mm)) : MOST_VIEWS;
   return Math.min(MOST_VIEWS, Math.max(LEAST_VIEWS, wanted)) | 1;
 }
-// A script for it: nearer or farther where that is possible, else where the stage stands; with
-// as many views as follow from the sample, unless they are given.
+// A script of one turn that may run, at a voxel size or where the stage stands; else why not.
+async function composed(
+  frames: number,
+  voxel_um: number | null,
+): Promise<Answers["viewer.compose"] | string> {
+  const asked = { kind: "fly" as const, frames, exposure_ms: EXPOSURE_MS };
+  const more = voxel_um === null ? {} : { voxel_um };
+  try {
+    const made = await call("viewer.compose", { ...asked, ...more });
+    const { ok, problems } = await call("script.check", { text: made.text });
+    if (ok) return made;
+    const error = problems.find(({ severity }) => severity === "error");
+    return error?.message ?? "its script is not ready to run";
+  } catch (error) {
+    return words(error);
+  }
+}
+// A script for it: nearer or farther where that is possible, else where the stage stands, which
+// is said; with as many views as follow from the sample, unless they are given.
 async function script(
   state: State,
   views: number | null,
@@ -71,17 +95,18 @@ async function script(
   const now_um = 1000 * (state.geometry.voxel_size_mm ?? 0.1);
   const wanted_um = filling(state);
   const near = wanted_um !== null && Math.abs(wanted_um / now_um - 1) > SAME ? wanted_um : null;
+  let refused = "";
   for (const voxel_um of near === null ? [null] : [near, null]) {
     const frames = views ?? viewsFor(state, voxel_um ?? now_um);
-    const asked = { kind: "fly" as const, frames, exposure_ms: EXPOSURE_MS };
-    const more = voxel_um === null ? {} : { voxel_um };
-    const made = await call("viewer.compose", { ...asked, ...more }).catch(() => null);
-    const found = made && (await call("script.check", { text: made.text }).catch(() => null));
-    if (found?.ok) return made;
+    const made = await composed(frames, voxel_um);
+    if (typeof made !== "string") {
+      if (refused) emit("note", "warning-note", "Scanned where it stands", refused);
+      return made;
+    }
+    refused = made;
   }
-  const frames = views ?? LEAST_VIEWS;
-  const least = { kind: "fly" as const, frames, exposure_ms: EXPOSURE_MS };
-  return command("viewer.compose", least, "No scan");
+  emit("note", "error", "No scan", refused);
+  return null;
 }
 // Puts a sample on the stage, unless it stands there, and begins one turn of it that fills the
 // image; its job, or null.
