@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -36,6 +38,24 @@ window.setTimeout = (f, ms, ...more) => later(f, ms > 5000 ? 2 ** 31 - 1 : ms, .
 """
 """Notes stay until the test ends: a slow machine may look for one later than people do."""
 HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
+
+
+LEAST_PORT, MOST_PORT = 15_000, 30_000
+"""Ports that Linux gives nobody by itself (net.ipv4.ip_local_port_range)."""
+
+
+def kept_port() -> int:
+    """Find a free port on which a server that was ended can start again: while it is away no
+    other process gets that port as any free one.
+    """
+    while True:
+        port = random.SystemRandom().randint(LEAST_PORT, MOST_PORT)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
 
 
 class Process:
@@ -83,7 +103,12 @@ class Lab:
         """The twin's state before any test has touched it."""
         self.data = folder / "data"
         self.projector = Process(
-            "flexdt.server.projector.main", "--port", "0", "--threads", "1", log=self.log
+            "flexdt.server.projector.main",
+            "--port",
+            str(kept_port()),
+            "--threads",
+            "1",
+            log=self.log,
         )
         self.twin_words = (
             "--data", str(self.data), "--speed-up", speed_up,
@@ -93,7 +118,7 @@ class Lab:
         self.twin = Process(
             "flexdt.server.twin.main",
             "--port",
-            "0",
+            str(kept_port()),
             *self.twin_words,
             *first,
             log=self.log,
@@ -105,7 +130,11 @@ class Lab:
             str(self.data),
         )
         self.viewer = Process(
-            "flexdt.clients.viewer.main", "--port", "0", *self.viewer_words, log=self.log
+            "flexdt.clients.viewer.main",
+            "--port",
+            str(kept_port()),
+            *self.viewer_words,
+            log=self.log,
         )
 
     @property
