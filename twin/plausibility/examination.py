@@ -50,15 +50,23 @@ def examine(
 ) -> tuple[Finding, ...]:
     """Find contradictions in the input of an operation.
 
+    Warns and raises nothing itself; see `settled`. Without a geometry only values are
+    checked. Checks whose argument is None are skipped; `boxes` and `grid` also need
+    `shape`, except FDK's check of an inclined beam.
+
     Args:
-        operation: operation to be done.
-        geometry: of the views, or None of data without any.
-        shape: detector (rows, cols), or None where it is not known.
-        images: line integrals (n, rows, cols).
-        volume: values of voxels [1/mm].
+        operation: operation to be done; it decides which checks are made.
+        geometry: of the views, or None for data without any.
+        shape: detector (rows, cols), or None if unknown.
+        images: line integrals (n, rows, cols); about `SOME_PIXELS` pixels of
+            `SOME_IMAGES` images are read.
+        volume: values of voxels (nz, ny, nx) [1/mm].
         boxes: low and high corner of the box around each part of a sample, (k, 2, 3)
             [mm].
-        grid: low and high corner of the volume that is to be found, (2, 3) [mm].
+        grid: low and high corner of the volume to be computed, (2, 3) [mm].
+
+    Returns:
+        All findings, those of the geometry first; empty if there are none.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=np.linspace(0, 6.28, 90), pixel=0.1)
@@ -81,8 +89,9 @@ def _found(
     """Yield the findings of all checks of a geometry; arguments as for `examine`.
 
     Spans are checked unless projecting, arcs only for an iterative method whose spans are
-    fine; placement needs `boxes`, grid checks need `grid`, both need `shape`. Inclination
-    is checked for FDK only.
+    fine. Placement needs `boxes` and `shape`, the grid check needs `grid` and `shape`;
+    the panel counts as real only when simulating, layers above and below it count unless
+    FDK. Inclination is checked for FDK with a `grid`, about the grid's centre.
     """
     yield from geometry_findings(geometry, shape)
     if operation is not Operation.PROJECT:
@@ -101,8 +110,10 @@ def _found(
 
 
 def _values(images: Any, volume: npt.NDArray[Any] | None) -> Iterator[Finding]:
-    """Yield the findings of all checks of values: of a sample of the images' line
-    integrals, and of the volume; None is not checked.
+    """Yield the findings of all checks of values: of a sample (`some_of`) of the images'
+    line integrals, then of the whole volume.
+
+    None, and images without any view, are not checked.
     """
     if images is not None and len(images):
         yield from integral_findings(some_of(images))
@@ -111,7 +122,15 @@ def _values(images: Any, volume: npt.NDArray[Any] | None) -> Iterator[Finding]:
 
 
 def some_of(images: Any) -> npt.NDArray[Any]:
-    """Sample every so many rows and columns of a few images, (k, r, c)."""
+    """Sample evenly spaced rows and columns of a few evenly spaced images.
+
+    Args:
+        images: (n, rows, cols), anything that is indexed by view.
+
+    Returns:
+        Array (k, r, c): at most `SOME_IMAGES` images, first and last among them, of
+        roughly `SOME_PIXELS` pixels each (all pixels of small images).
+    """
     count, rows, cols = images.shape
     some = np.unique(np.linspace(0, count - 1, SOME_IMAGES).astype(int))
     each = max(1, int((rows * cols / SOME_PIXELS) ** 0.5))

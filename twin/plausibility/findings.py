@@ -87,7 +87,8 @@ def warn_of(
     findings: Iterable[Finding],
     error: type[TwinError] = TwinError,
 ) -> None:
-    """Raise an error for refusals as `settled` does, and warn about the other findings.
+    """Raise an error for a refusal as `settled` does; otherwise give a Python warning
+    (`PlausibilityWarning`, at the caller's line) for each finding that is a warning.
 
     Args:
         findings: of one entry point.
@@ -100,15 +101,21 @@ def warn_of(
 def settled(
     findings: Iterable[Finding], error: type[TwinError] = TwinError, where: str = ""
 ) -> list[str]:
-    """Raise an error for a refusal, or return the texts of warnings.
+    """Raise an error for the first refusal, or return the texts of all warnings.
+
+    Findings of severity NOTE are ignored. Nothing is printed or warned; see `warn_of`.
 
     Args:
         findings: of one entry point.
         error: type of error to raise.
-        where: prefix of each sentence, such as a path.
+        where: prefix of each sentence, such as a path; none if empty.
+
+    Returns:
+        Texts "cause; remedy" of the warnings, in order.
 
     Raises:
-        TwinError: of the type `error`, for the first finding that is a refusal.
+        TwinError: of the type `error`, with the facts `check` (kind), `asked` (figure)
+            and `allowed` (remedy).
 
     Example:
         >>> doubt = Finding("gap", "no image 17", "give 359 views", Severity.WARNING)

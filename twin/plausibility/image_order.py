@@ -46,7 +46,15 @@ class Ordered:
 
 
 def ordered(names: Sequence[str]) -> Ordered:
-    """Put the names of images in order.
+    """Put the names of image files in the order of their numbers, and find errors in it.
+
+    Repeated names count once. Names that differ by one evenly spaced number of fixed
+    width are returned sorted, without findings (`_numbered`). Else a first duplicate and
+    a gap are reported; names of another form than most are listed in `others` and ignored
+    for gaps, without a finding (`other_name` makes one).
+
+    Args:
+        names: file names, with or without an ending.
 
     Example:
         >>> ordered(["p_0.5.tif", "p_0.25.tif", "p_-1.tif"]).names
@@ -66,16 +74,16 @@ def ordered(names: Sequence[str]) -> Ordered:
 
 
 def _numbered(names: list[str]) -> Ordered | None:
-    """Check whether sorted names differ by a whole number of fixed width alone, without a gap.
-
-    A number next to a sign, point or exponent does not count; fewer than two names give
-    None.
+    """Sort names quickly if they differ only by a whole number of fixed width whose steps
+    are even.
 
     Args:
-        names: sorted.
+        names: sorted, without repetition.
 
     Returns:
-        The names in their order; None if they differ otherwise.
+        The names in that order, without findings. None for fewer than two names, names of
+        unequal length, several differing parts, uneven steps, or a number next to a sign,
+        decimal point or another number.
     """
     if len(names) < 2 or len({*map(len, names)}) != 1:
         return None
@@ -107,7 +115,12 @@ def _numbered(names: list[str]) -> Ordered | None:
 
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
     """Make the warning on names that are written otherwise than those of the other
-    images.
+    images; its figure is their number.
+
+    Args:
+        others: the names in question; the first `MAX_NAMES_SHOWN` are named.
+        names: all names, at least one of them not in `others`; the first such is the
+            example.
     """
     like = next(name for name in names if name not in others)
     told = ", ".join(others[:MAX_NAMES_SHOWN])
@@ -117,7 +130,9 @@ def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
 
 
 def duplicate(one: str, other: str) -> Finding:
-    """Make the refusal (a finding, not raised) of two files with one number."""
+    """Make the refusal (a finding, not raised) that two files have one number, so that
+    the meant one is unknown; its figure is 2.
+    """
     cause = f"{one} and {other} have one number: which of them is meant is not known"
     return Finding(
         "duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0
@@ -133,7 +148,8 @@ def _is(names: Sequence[str]) -> str:
 def _keys(names: Sequence[str]) -> dict[str, Key]:
     """Compute sort keys of names: their text without the numbers, and the numbers.
 
-    Hyphens count as signs where only some names have them, points as decimal points where
+    An ending that begins with a letter (`.tif`) is removed first. Hyphens count as signs
+    where that makes the texts of more names equal, points as decimal points where
     `_decimal` decides so.
 
     Returns:
@@ -172,12 +188,14 @@ def _numbers(key: Key) -> tuple[float, ...]:
 def _key(stem: str, *, signed: bool, decimals: bool) -> Key:
     """Split a file's stem into texts and numbers, in turns.
 
-    The first and the last part are texts, perhaps "".
+    The first and the last part are texts, perhaps "". A hyphen at the beginning or after
+    one of `SIGNED_AFTER` is always a sign; a plus sign likewise, and dropped.
 
     Args:
         stem: name without its ending.
-        signed: a hyphen before a number is its sign.
-        decimals: a point between digits is a decimal point; otherwise it separates two numbers.
+        signed: a hyphen before any number is its sign; otherwise it stays in the text.
+        decimals: a point between digits is a decimal point; otherwise it separates two
+            numbers, and is a text of its own.
     """
     parts: list[str | float] = []
     at = 0
@@ -207,6 +225,10 @@ def _decimal(
 ) -> bool:
     """Decide whether points in names are decimal points and not separators of numbers.
 
+    If decimal points make more names equal (1.1 and 1.10), they are only believed when
+    they make more texts equal. Otherwise True if all fractions have one width or none of
+    several digits ends in 0; False for names without points.
+
     Args:
         decimal: keys with decimal points, by name.
         whole: keys without.
@@ -225,7 +247,15 @@ def _decimal(
 
 def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str, ...]:
     """Return the few names whose text (without numbers) differs from that which most
-    share; empty unless at least four share one and the others are rare.
+    share.
+
+    Args:
+        names: in order.
+        keys: their sort keys.
+
+    Returns:
+        The names, in order; empty unless at least four share one text and the others are
+        at most two or `MAX_OTHERS_SHARE` of all.
     """
     texts = Counter(_text(keys[name]) for name in names)
     usual, most = texts.most_common(1)[0] if texts else ("", 0)
@@ -236,8 +266,12 @@ def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str,
 
 
 def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
-    """Yield at most one finding: on the first two names with equal numbers, e.g. `7.tif`
-    and `007.tif`; nothing for names without numbers.
+    """Yield at most one finding: a refusal on the first two names with equal keys, e.g.
+    `7.tif` and `007.tif`; nothing for names without numbers.
+
+    Args:
+        names: in order.
+        keys: their sort keys.
     """
     seen: dict[Key, str] = {}
     for name in names:
@@ -249,11 +283,12 @@ def _duplicates(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]
 
 
 def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
-    """Yield a warning if numbers are missing between others of one step.
+    """Yield at most one warning if numbers are missing between others of one step.
 
-    Nothing for fewer than 4 names, several texts, several numbers that vary, or steps
-    that are not mostly even. "Gap" is the finding's kind; its figure is the number of
-    missing images.
+    Nothing for fewer than 4 names, several texts, none or several numbers that vary,
+    steps that are not multiples of the median step, or less than `MIN_EVEN_SHARE` of
+    steps equal to it. "Gap" is the finding's kind; its figure is the number of missing
+    images, and only the first gap is named.
 
     Args:
         names: in order.

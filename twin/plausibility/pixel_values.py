@@ -33,8 +33,11 @@ so low."""
 def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
     """Find images given as line integrals that are none.
 
-    Yields at most one finding: counts (refusal), whole numbers (warning) or transmission
-    (warning), from type and values.
+    Yields at most one finding, from type and values. Integers: counts above
+    `MAX_LINE_INTEGRAL` (refusal), smaller but not all zero "whole numbers" (warning).
+    Floats: an open beam at the images' edges above `MAX_LINE_INTEGRAL` (counts, refusal)
+    or near 1 with a darker object (transmission, warning). Nothing without pixels, or if
+    the left and right edges differ (`_beam`).
 
     Args:
         images: some of the scan's, (k, rows, cols).
@@ -82,8 +85,12 @@ _FROM_COUNTS: Final = (
 
 
 def _beam(images: npt.NDArray[Any]) -> float | None:
-    """Return the mean of the median values at the images' left and right edges if both
-    differ by at most 10 %, else None.
+    """Return the mean of the median values at the images' left and right edges
+    (`EDGE_PART` of the columns each) if both differ by at most 10 %, else None, also for
+    NaN.
+
+    Args:
+        images: (k, rows, cols).
     """
     wide = max(1, int(EDGE_PART * images.shape[2]))
     edges = images[:, :, :wide], images[:, :, -wide:]
@@ -96,11 +103,13 @@ def _beam(images: npt.NDArray[Any]) -> float | None:
 def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
     """Find volumes given as attenuation that are none.
 
-    Warns of values that are not finite; then refuses values as low as Hounsfield units,
-    or warns of values above any element's. Nothing for other types or without voxels.
+    Yields a warning if values are NaN or infinite; then, of the finite ones, a refusal
+    below `MIN_ATTENUATION` (Hounsfield units), else a warning above `MAX_PER_MM`, more
+    than any element has. Nothing for types other than float or integer, or without
+    voxels.
 
     Args:
-        values: of the voxels (nz, ny, nx).
+        values: of the voxels (nz, ny, nx) [1/mm].
     """
     data = np.asarray(values)
     if not data.size or data.dtype.kind not in "fiu":

@@ -31,8 +31,10 @@ MIN_OPEN_VIEWS_SHARE: Final = 0.8
 def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[Finding]:
     """Find flat images of different beams.
 
-    Yields at most one warning, its figure the difference of levels as a share; nothing
-    for one flat image or without signal.
+    Compares each image's median ratio to the mean flat, over pixels with more than one
+    count of signal. Yields at most one warning, its figure the difference of levels as a
+    share, if that exceeds `MAX_FLAT_DIFFERENCE` and `NOISE_SIGMAS` of noise; nothing for
+    one flat image or without signal.
 
     Args:
         flats: (k, rows, cols) [counts].
@@ -62,11 +64,14 @@ def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[F
 def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
     """Find an open beam at the object's side that differs from the flat image.
 
-    Yields at most one warning, its figure the highest level; nothing if few views show
-    the beam, or for a beam that is only darker and does not drift.
+    Yields at most one warning, its figure the highest level: if that exceeds 1 by more
+    than `MAX_BEAM_DIFFERENCE`, or the levels differ by as much and drift steadily.
+    Nothing if fewer than two views, or than `MIN_OPEN_VIEWS_SHARE` of them, show the
+    beam; nor for a beam that is only darker and does not drift.
 
     Args:
-        levels_seen: of the open beam in some views (`open_beam`), relative to the flat image.
+        levels_seen: open beam in some views (`open_beam`), relative to the flat image;
+            None where a view does not show it.
     """
     found = [level for level in levels_seen if level is not None]
     if len(found) < max(2.0, MIN_OPEN_VIEWS_SHARE * len(levels_seen)):
@@ -85,8 +90,11 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
 
 
 def _drifts(levels: FloatArray) -> bool:
-    """Return whether levels rise or fall steadily, near a straight line, throughout the
-    scan.
+    """Return whether levels rise or fall steadily: none is off the fitted straight line
+    by 30 % of their range or more.
+
+    Args:
+        levels: (k,) in the order of the views.
     """
     line = np.polyval(
         np.polyfit(np.arange(len(levels)), levels, 1), np.arange(len(levels))
@@ -100,7 +108,9 @@ def open_beam(
     """Compute the open beam's level at an image's left and right edges, relative to the
     flat.
 
-    Also None for small images or unequal edges.
+    Each edge is two strips of `STRIP_PART` of the columns. Both strips and their
+    `STRIP_BLOCKS` blocks must have one level within `MAX_STRIP_DIFFERENCE` or noise, and
+    both edges must agree.
 
     Args:
         counts: the image (rows, cols).
@@ -108,7 +118,8 @@ def open_beam(
         opened: flat less dark image (rows, cols) [counts]; NaN where there is no beam.
 
     Returns:
-        None where the object or its scatter reaches an edge.
+        Mean level of both edges; None where the object or its scatter reaches an edge,
+        the edges differ, a block has no finite pixel, or the image is too small.
     """
     rows, cols = counts.shape
     wide = max(1, int(STRIP_PART * cols))
@@ -140,6 +151,8 @@ def open_beam(
 
 
 def _blocks(strip: npt.NDArray[Any]) -> FloatArray:
-    """Average the parts of a strip, from top to bottom."""
+    """Average `STRIP_BLOCKS` parts of a strip, from top to bottom, over finite pixels;
+    NaN for a part without any.
+    """
     parts = [part[np.isfinite(part)] for part in np.array_split(strip, STRIP_BLOCKS)]
     return np.array([float(part.mean()) if part.size else np.nan for part in parts])

@@ -30,12 +30,19 @@ def placement_findings(
     *,
     exposed: bool = False,
 ) -> Iterator[Finding]:
-    """Find doubts about the views of a sample.
+    """Warn if sample, source and panel do not fit each other.
+
+    Stops at the first of: the source in a part's box, no view sees the sample, the panel
+    in the sample's box (only if `exposed`). Otherwise may yield several "units" warnings:
+    magnification above `MOST_MAGNIFIED`, a shadow smaller than a pixel, or one over
+    `MOST_OVERSIZE` times a panel of at least `FEWEST_PIXELS` rows and columns. Nothing
+    without boxes or views.
 
     Args:
         cone_vec: the views.
         shape: detector (rows, cols).
-        boxes: low and high corner of the box around each part of the sample, (k, 2, 3) [mm].
+        boxes: low and high corner of the box around each part of the sample, (k, 2, 3)
+            [mm].
         exposed: images are exposed, so that the panel is no virtual one.
 
     Example:
@@ -103,10 +110,18 @@ def placement_findings(
 def _seen(
     places: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
 ) -> npt.NDArray[np.bool_]:
-    """Mark the views on whose panel a box may cast a shadow, (n,), from its corners' images (n,
-    8, 2).
+    """Mark the views on whose panel a box may cast a shadow.
 
-    A box that the source's plane crosses may be anywhere.
+    A box that the source's plane crosses may be anywhere and counts as seen; one behind
+    the source does not.
+
+    Args:
+        places: images of the box's 8 corners, (n, 8, 2) [px].
+        ahead: whether each corner is before the source, (n, 8).
+        shape: detector (rows, cols).
+
+    Returns:
+        (n,) bool.
     """
     far = np.array(shape[::-1]) - 0.5
     overlap = (places.max(axis=1) > -0.5) & (places.min(axis=1) < far)

@@ -46,14 +46,15 @@ FDK_TOO: Final = "an iterative method (sirt, cgls, tv) takes any trajectory"
 def distance_findings(
     sod: float, sdd: float, pixel: npt.ArrayLike, names: tuple[str, str] = ("SOD", "SDD")
 ) -> Iterator[Finding]:
-    """Refuse distances and pixels that no scanner has.
+    """Find distances and pixels that no scanner has.
 
-    Yields (does not raise) at most one refusal: wrong distances, wrong pixels, or pixels
-    too large for the distance.
+    Yields (does not raise) at most one refusal: distances that are not finite with 0 <
+    SOD <= SDD, pitches that are not finite and positive, or pitches above `MOST_PITCH`
+    times SDD.
 
     Args:
         sod, sdd: source to axis and to panel [mm].
-        pixel: pitches [mm].
+        pixel: one pitch or several [mm].
         names: of the distances in the file or dictionary.
     """
     pitches = np.atleast_1d(np.asarray(pixel, dtype=np.float64))
@@ -83,13 +84,14 @@ def geometry_findings(
 ) -> Iterator[Finding]:
     """Find rows of a geometry that no scanner has.
 
-    Yields at most one finding: pixels too large for their distance or a source that
-    stands still (refusals), or a panel seen under too wide an angle (a warning, needs
-    `shape`).
+    Yields at most one finding: pixels above `MOST_PITCH` times their distance or a source
+    that stands still (refusals), or a panel seen under more than `WIDEST_DEG` along its
+    diagonal (a warning, from up to `SOME_VIEWS` views, needs `shape`). Nothing without
+    views.
 
     Args:
         cone_vec: n views.
-        shape: detector (rows, cols), or None.
+        shape: detector (rows, cols), or None to skip the check of the angle.
     """
     if not len(cone_vec):
         return
@@ -135,8 +137,12 @@ def geometry_findings(
 
 
 def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
-    """Return whether all views (3 at least) have one source, with beams on opposite sides
-    of it.
+    """Return whether all views (3 at least) have one source, with beams more than 120 deg
+    apart.
+
+    Args:
+        cone_vec: n views.
+        distance: of source and panel, (n,) [mm]; 1e-9 of the largest counts as no motion.
     """
     if (
         len(cone_vec) < 3
@@ -149,7 +155,15 @@ def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
 
 
 def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
-    """Find degrees in angles of a circular scan that are to be radians, (n,).
+    """Find degrees in angles of a circular scan that are to be radians.
+
+    Yields at most one warning, its figure the span [rad]: more than `MOST_TURNS` turns,
+    or fewer than `FEW_A_TURN` views a turn with a span that is round in degrees. Nothing
+    for fewer than `RADIANS_VIEWS` or not finite angles, less than 2.5 turns, or steps of
+    the golden ratio (`GOLDEN`).
+
+    Args:
+        angles: (n,) in any order.
 
     Example:
         >>> [one.kind for one in radian_findings(np.arange(0, 360, 2))]
@@ -176,7 +190,9 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
 
 
 def _round_degrees(span: float, step: float) -> bool:
-    """Return whether a span [deg], alone or with one step more, is a multiple of 5 deg."""
+    """Return whether a span, alone or with one step more, is a positive multiple of 5
+    (within 0.01); both in the same unit, degrees if the angles are [deg].
+    """
     return any(
         abs(whole / 5.0 - round(whole / 5.0)) < 2e-3 and whole > 0
         for whole in (span, span + step)
@@ -185,7 +201,7 @@ def _round_degrees(span: float, step: float) -> bool:
 
 def arc_deg(cone_vec: ConeVec) -> float:
     """Compute the arc that the views of a circular scan cover [deg]: the full turn
-    without its widest gap between views.
+    without its widest gap between neighbouring directions of beams (0 for one view).
     """
     azimuth = azimuths(cone_vec)
     at = np.sort(azimuth % math.tau)
@@ -200,8 +216,9 @@ def azimuths(cone_vec: ConeVec) -> FloatArray:
 
 
 def about_z(cone_vec: ConeVec) -> bool:
-    """Return whether the views' central beams have nearly one inclination to the
-    horizontal and none is nearly vertical, as on a circle or helix about z.
+    """Return whether the views turn about z, as on a circle or helix: inclinations of the
+    central beams to the horizontal differ by less than 0.2 rad, and none is nearly
+    vertical (within 3 deg).
     """
     beam = cone_vec.detector - cone_vec.source
     level = np.hypot(beam[:, 0], beam[:, 1])
@@ -211,8 +228,10 @@ def about_z(cone_vec: ConeVec) -> bool:
 
 
 def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
-    """Warn of radians given as degrees: many views about z within a few degrees; yields
-    at most one finding, its figure the span [deg].
+    """Warn of radians given as degrees: `RADIANS_VIEWS` views or more about z within less
+    than `RADIANS_SPAN` degrees.
+
+    Yields at most one finding, its figure the span [deg]; nothing for a span of 0.
     """
     if len(cone_vec) < RADIANS_VIEWS or not about_z(cone_vec):
         return
@@ -227,10 +246,12 @@ def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
 
 def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     """Warn if the views leave out an arc of directions, for a method that takes any
-    trajectory; at most one finding, its figure the arc [deg].
+    trajectory.
 
-    Nothing for fewer than 3 views or directions, or a rotation that is not about z.
-    Opposite directions count as one.
+    The widest gap, less the mean of the others, must exceed one of `MISSING_DEG`, and the
+    gap as many `TIMES_USUAL` that mean. Yields at most one finding, its figure the gap
+    [deg]. Nothing for fewer than 3 views or directions, or a rotation that is not about
+    z. Opposite directions count as one.
     """
     if len(cone_vec) < 3 or not about_z(cone_vec):
         return
@@ -256,14 +277,17 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
 
 
 def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[Finding]:
-    """Find laminography: a beam inclined to the plane of rotation, of which FDK knows nothing.
+    """Find laminography: a beam inclined to the plane of rotation, where FDK is wrong.
 
-    Yields at most one finding, a warning or, from a larger inclination, a refusal;
-    nothing if grid and panel are on different sides of the plane.
+    Yields at most one finding, a warning above 10 deg or a refusal above 20 deg
+    (`INCLINED_DEG`); its figure is the smallest inclination of any view's beam to the
+    panel's centre or to the grid's. Nothing for fewer than 3 views, a scan that is not
+    about z or whose source rises, or if grid and panel are on different sides of the
+    plane.
 
     Args:
         cone_vec: views of a circle about z.
-        centre: of the grid [mm].
+        centre: of the grid, (3,) [mm].
     """
     if (
         len(cone_vec) < 3

@@ -26,8 +26,11 @@ PIXEL_TOLERANCE: Final = 0.02
 def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Finding]:
     """Compare a file's angles with the geometry's, whatever their zero and sense are.
 
-    Yields at most one warning: a wrong unit, another order, or that they differ. Nothing
-    if they agree, numbers differ, or the geometry does not turn about z.
+    Yields at most one warning: degrees and radians are confused, the order is another, or
+    the angles differ; its figure is the largest difference [deg]. Nothing if they agree
+    within `ANGLE_TOLERANCE_DEG` or `ANGLE_TOLERANCE_STEPS` steps, if their number is not
+    the views' or below 3, if they are not finite or all equal, or if the geometry does
+    not turn about z.
 
     Args:
         geometry: n views.
@@ -71,9 +74,12 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
 
 
 def pixel_findings(geometry: ConeVec, stated_mm: float) -> Iterator[Finding]:
-    """Compare a file's pixel with the geometry's, on the panel or at the axis.
+    """Compare a file's pixel with the geometry's, on the panel or scaled to the rotation
+    axis, both from the first view's columns.
 
-    Yields at most one warning; nothing for a stated pitch that is not a positive number.
+    Yields at most one warning, its figure the ratio to the panel's pitch, if both differ
+    by more than `PIXEL_TOLERANCE`; nothing without views or for a stated pitch that is
+    not a positive number.
 
     Args:
         geometry: the views.
@@ -97,8 +103,15 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 
 
 def _worst(own: FloatArray, stated: FloatArray) -> float:
-    """Compute the largest difference of angles, for the best zero and sense of rotation
-    [rad].
+    """Compute the largest difference of angles modulo a turn, for the better sense of
+    rotation and the mean difference as zero.
+
+    Args:
+        own: (n,) angles of the geometry [rad].
+        stated: (n,) stated angles [rad], in the same order.
+
+    Returns:
+        Difference [rad], at most pi.
     """
     found = []
     for sense in (1.0, -1.0):
@@ -109,13 +122,14 @@ def _worst(own: FloatArray, stated: FloatArray) -> float:
 
 
 def _same_set(own: FloatArray, stated: FloatArray, allowed: float) -> bool:
-    """Check whether angles are equal in another order, each counted from its first, last or
-    least one, and in either sense.
+    """Check whether two sets of angles are equal modulo a turn in another order: the
+    geometry's counted from its first or last one, the stated ones from their first, last
+    or least, in either sense.
 
     Args:
         own: (n,) angles of the geometry [rad].
         stated: (n,) stated angles [rad].
-        allowed: largest difference [rad].
+        allowed: sorted angles may differ by twice this [rad].
     """
     for sense in (1.0, -1.0):
         turned = sense * stated

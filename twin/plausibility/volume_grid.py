@@ -36,16 +36,20 @@ def grid_findings(
     *,
     layers: bool = True,
 ) -> Iterator[Finding]:
-    """Find grids outside the field of view.
+    """Find grids outside the field of view, from `POINTS`^3 points of the grid and
+    `SOME_VIEWS` views.
 
     Yields at most one finding: a refusal if no view sees any of it, or a warning if more
-    than `MOST_UNSEEN` of it is seldom seen. Nothing for panels of one pixel.
+    than `MOST_UNSEEN` of its points are seen in fewer than `SELDOM` of the views (on a
+    helix, of the views of the best seen point); the warning's figure is the unseen share.
+    Nothing without views or for panels of one pixel.
 
     Args:
         cone_vec: n views.
         shape: detector (rows, cols).
         low, high: corners of the grid, (3,) [mm].
-        layers: count those above and below the panel; FDK makes them NaN and warns.
+        layers: points above and below the panel count as unseen; False for FDK, which
+            makes them NaN and warns.
     """
     if not len(cone_vec) or max(shape) < 2 or (not layers and shape[1] < 2):
         return
@@ -100,11 +104,12 @@ def grid_findings(
 
 
 def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
-    """Return whether the shadow of the grid's points may meet the panel in some view.
+    """Return whether the bounding box of the images of the grid's points meets the panel
+    in some view, so that a grid coarser than the panel counts as seen.
 
     Args:
         at: images of the points, (n, k, 2) [px].
-        ahead: whether each point is between source and panel, (n, k).
+        ahead: whether each point is between source and panel, (n, k); others are ignored.
         shape: detector (rows, cols).
     """
     far = np.array(shape[::-1]) - 0.5
@@ -114,8 +119,13 @@ def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
 
 
 def voxel_findings(voxel_mm: float, view_mm: float) -> Iterator[Finding]:
-    """Refuse voxels so large that fewer than `FEWEST_VOXELS` fit into a field of view of
-    `view_mm`; yields at most one finding.
+    """Find voxels so large that fewer than `FEWEST_VOXELS` fit into a field of view.
+
+    Yields (does not raise) at most one refusal, its figure the voxel size.
+
+    Args:
+        voxel_mm: edge of a voxel [mm].
+        view_mm: width of the field of view [mm].
     """
     if voxel_mm * FEWEST_VOXELS > view_mm:
         cause = f"voxels of {voxel_mm:g} mm in a field of view of {view_mm:.4g} mm across"
