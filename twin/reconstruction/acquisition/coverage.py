@@ -49,10 +49,13 @@ def normalise_coverage(
     *,
     cut_off: bool,
 ) -> None:
-    """Scale voxels that are above or below the panel in some views; those seen too little
-    are NaN.
+    """Scale voxels that are above or below the panel in some views, in place; voxels seen
+    too little become NaN.
 
-    See `fdk_kernels.normalise_coverage`. Of many views, one stands for some neighbours.
+    A voxel needs `MIN_SEEN_SHARE` of the views' weight. With `cut_off` it also needs
+    lines of `MIN_LINES_SHARE` of half a turn, less the widest arc of a view. Does nothing
+    if all rows of the grid are on the panel and not `cut_off`. Of more than `MAX_VIEWS`
+    views, one stands for some neighbours. See `fdk_kernels.normalise_coverage`.
 
     Args:
         data: the volume's, (ny, nx, nz), changed in place.
@@ -117,7 +120,11 @@ class LostVoxels:
 
     @classmethod
     def of(cls, data: Float32Array) -> LostVoxels:
-        """Count those of a volume (nz, ny, nx)."""
+        """Count the voxels without a value (NaN) of a volume (nz, ny, nx), by every
+        fourth one along y and x.
+
+        Layers without any value count as lost layers; their voxels are not counted again.
+        """
         lost = np.isnan(data[:, ::4, ::4]).reshape(len(data), -1)
         held = lost[~lost.all(axis=1)]
         return cls(len(data), len(data) - len(held), held.size, int(held.sum()))
@@ -133,7 +140,8 @@ class LostVoxels:
 
     def warnings(self) -> list[str]:
         """List warnings: of lost layers, if any, and of voxels not seen from all sides,
-        if more than `LOST_SHARE`; both are NaN in the volume.
+        if more than `LOST_SHARE` of those examined; both are NaN in the volume. Empty if
+        all is well.
         """
         said = []
         if self.lost_layers:
@@ -181,10 +189,12 @@ class Sharing:
     def of(
         cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume
     ) -> Sharing:
-        """Compute the shares of upright panels for a grid, and check that every voxel is seen
-        from every side.
+        """Compute the shares of upright panels for a grid, and check that the helix rises
+        slowly enough for every voxel to be seen from every side.
 
-        Also raised if the helix rises too steeply for panel and grid.
+        The width that must be seen is the grid's, or the field of view's where that is
+        narrower. The checked rise is independent of the grid's height; `whole` says which
+        layers are complete.
 
         Args:
             circle: the sources' helix.
@@ -193,7 +203,8 @@ class Sharing:
             like: place and size of the grid.
 
         Raises:
-            GeometryError: a voxel is not seen from every side.
+            GeometryError: the helix rises by more a turn than panel and grid allow; names
+                the largest rise.
         """
         rows, cols = shape
         away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
@@ -225,21 +236,28 @@ class Sharing:
         )
 
     def columns(self) -> FloatArray:
-        """Compute the kernel's depth lookup, (n, 2): first depth, and depths a mm."""
+        """Compute the columns that a helix adds to the kernel's table of views, (n, 2):
+        the first tabulated depth [mm], and tabulated depths a mm.
+        """
         first, last = self.depth.T
         return np.column_stack([first, (DEPTHS - 1) / (last - first)])
 
     def table(self, views: slice, rows: tuple[int, int]) -> Float32Array:
-        """Compute the shares of rows at each depth.
+        """Compute the weights of a view's rows at each depth, as a voxel is seen from
+        several turns.
 
-        Shares of a voxel's rays from several turns of a helix add up to 1.
+        A ray's share falls from the panel's middle row to its edges, and within
+        `HELIX_TAPER_RAD` of the helix's ends; shares of a voxel's rays from all turns add
+        up to 1.
 
         Args:
             views: a slice of the views, n of them.
-            rows: first row, and the one after the last; rows off the panel repeat its edge.
+            rows: first row, and the one after the last; rows off the panel repeat its
+                edge.
 
         Returns:
-            (n, DEPTHS, rows), between 0 and 1.
+            (n, DEPTHS, rows), between 0 and 1, at even depths from the least to the
+            largest of the grid.
         """
         first, last = self.depth[views].T[..., None]
         depth = first + (last - first) * np.linspace(0.0, 1.0, DEPTHS)

@@ -32,7 +32,9 @@ FLAT = 1e-3
 
 
 def leans(cone_vec: ConeVec) -> bool:
-    """Return whether rows are not horizontal, or columns not vertical."""
+    """Return whether some view's rows are not horizontal or columns not vertical, by a
+    slope of more than `UPRIGHT`; columns may point up or down.
+    """
     slope_u = np.abs(cone_vec.u[:, 2]) / np.linalg.norm(cone_vec.u, axis=1)
     slope_v = np.linalg.norm(cone_vec.v[:, :2], axis=1) / np.linalg.norm(
         cone_vec.v, axis=1
@@ -46,8 +48,8 @@ def is_upright(cone_vec: ConeVec) -> bool:
 
 
 def on_its_side(cone_vec: ConeVec) -> bool:
-    """Return whether detector columns are clearly nearer to the horizontal than rows, on
-    average over the views.
+    """Return whether detector columns are nearer to the horizontal than rows, by the mean
+    absolute slope over the views and a margin of `UPRIGHT`.
     """
     steep = np.abs(np.stack([cone_vec.u[:, 2], cone_vec.v[:, 2]]))
     steep /= np.linalg.norm([cone_vec.u, cone_vec.v], axis=2)
@@ -63,15 +65,16 @@ def swapped(cone_vec: ConeVec) -> ConeVec:
 
 
 def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
-    """Compute upright panels with the same centres, pitches and orientation of their
-    backs.
+    """Compute upright panels (rows horizontal, columns down) with the same sources,
+    centres and pitches; u points to the right as seen from the source.
 
     Args:
-        cone_vec: (n).
+        cone_vec: n views.
         finer: columns per column of the original panel, with a narrower pitch.
 
     Raises:
-        GeometryError: a panel is horizontal.
+        GeometryError: a panel is horizontal (the level part of its normal is at most
+            `FLAT`).
     """
     away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
     level = np.hypot(away[:, 0], away[:, 1])
@@ -94,10 +97,15 @@ def rectified(
 ) -> Float32Array:
     """Resample images (Lanczos) onto the panels of `target`, which has the same sources.
 
+    Pixels beyond an image's edge repeat its last pixel.
+
     Args:
         images: (n, rows, cols).
         cone_vec, target: n rows each.
         cols: of the target's panels; default: as many as in images.
+
+    Returns:
+        New images (n, rows, cols).
     """
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -128,8 +136,12 @@ def homography(
     """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
-        """Return the matrix that takes a pixel (column, row, 1) to its ray: columns u, v, first
-        pixel minus source.
+        """Compute the matrix (3, 3) that takes a pixel (column, row, 1) to its ray:
+        columns u, v, first pixel minus source.
+
+        Args:
+            row: cone_vec row (12,).
+            rows, cols: of its panel.
         """
         first = (
             row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
@@ -142,17 +154,25 @@ def homography(
 def field_of_view(
     cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None
 ) -> Grid:
-    """Compute the largest box about the object frame's z axis that all views together can
-    fill.
+    """Compute the largest box about the object frame's z axis that some view sees: as
+    wide as the far edge of a shifted panel reaches, as high as the highest and lowest
+    rows.
+
+    Views on their side are swapped and tilted panels made upright first. Widths are those
+    at the rotation axis, in the view of the largest magnification.
 
     Args:
         cone_vec: the scan.
         shape: detector (rows, cols).
         voxel_mm: default: the pixel's size at the rotation axis, to 1 um, or to three
-            digits where it is below 10 um.
+            digits where it is below 10 um (`SMALL_MM`).
+
+    Returns:
+        Grid with whole voxels, at least one each way, centred on z = (up - down) / 2.
 
     Raises:
-        GeometryError: the axis is not in front of the source, or no voxel is so large.
+        GeometryError: the axis is not in front of the source in every view, a panel lies
+            flat, or `voxel_mm` is not positive and finite.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 10), pixel=1)
@@ -195,9 +215,19 @@ def field_of_view(
 def rows_needed(
     cone_vec: ConeVec, shape: tuple[int, int], like: Volume
 ) -> tuple[int, int]:
-    """Find rows first <= r < last with the volume's shadow in some view (a few to spare).
+    """Find rows first <= r < last with the volume's shadow in some view, with 2 rows to
+    spare at least.
 
-    There is one more above the panel and one below it: pixels see beyond their centres.
+    Both are limited to one row beyond the panel on either side, as pixels see beyond
+    their centres: -1 to rows + 1. All rows if a corner of the volume has no finite image.
+
+    Args:
+        cone_vec: n views.
+        shape: detector (rows, cols).
+        like: the volume.
+
+    Returns:
+        (first, last), at least two rows.
     """
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     corners = np.array(like.center_mm) + signs * np.array(like.size_mm) / 2

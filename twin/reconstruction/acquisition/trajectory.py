@@ -78,8 +78,14 @@ class Circle:
         return not len(self.gaps)
 
     def from_gap(self, angle: FloatArray) -> FloatArray:
-        """Compute angles [rad] to the nearest edge of an arc without views ("gap"): zero
-        within it, infinite on a full circle.
+        """Compute the distance of angles to the nearest edge of an arc without views
+        ("gap").
+
+        Args:
+            angle: of any shape [rad], taken modulo a turn.
+
+        Returns:
+            [rad], of the same shape: 0 within a gap, infinite on a full circle.
         """
         if self.full:
             return np.full_like(angle, np.inf)
@@ -93,26 +99,34 @@ class Circle:
 
 
 def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
-    """Make the error that FDK cannot use a trajectory, with those it can use."""
+    """Make (do not raise) the error that FDK cannot use a trajectory; it advises the
+    iterative methods.
+
+    Args:
+        why: reason, the message's beginning.
+        asked, allowed: figures of the error's details.
+    """
     what_can = "the iterative methods (sirt, sart, cgls, em) take any trajectory"
     return GeometryError(f"{why}; {what_can}", {"asked": asked, "allowed": allowed})
 
 
 def circle_of(cone_vec: ConeVec) -> Circle:
-    """Fit the circle or helix of a scan's sources.
+    """Fit a circle, or else a helix about z, to a scan's sources.
 
-    "Gaps" are arcs without views. Also raised if the sources lie on a line or leave the
-    circle, or the helix rises unsteadily.
+    The centre is fitted by least squares in x and y. A helix is recognised by a steady
+    rise over a turn or more; else the sources must keep to a horizontal circle within
+    `MAX_CIRCLE_DEVIATION` of its radius. "Gaps" are arcs without views.
 
     Args:
         cone_vec: n views.
 
     Returns:
-        Centre, radius, and each view's angle and step of angle; for a circle its gaps, for a
-        helix its rise.
+        Centre, radius, and each view's angle and step of angle; for a circle its gaps,
+        for a helix its rise.
 
     Raises:
-        GeometryError: fewer than three views, or neither about an axis along z.
+        GeometryError: fewer than three views, sources on a line, or neither a circle nor
+            a helix.
     """
     s = cone_vec.source
     if len(s) < 3:
@@ -145,10 +159,17 @@ def circle_of(cone_vec: ConeVec) -> Circle:
 
 
 def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Find the first views of different angles, in their order, and the one each view
-    repeats.
+    """Find the first views of different angles, and which of them each view repeats.
 
-    Neither depends on the order of views, except in which of equal ones is the first.
+    Angles are equal to 1e-9 rad; on a circle modulo a turn, on a helix not. Neither
+    result depends on the order of views, except in which of equal ones is the first.
+
+    Args:
+        circle: n views.
+
+    Returns:
+        Views of different angles in order of angle, (k,), and the position in that list
+        for each view, (n,).
     """
     if circle.rise:
         angle = circle.angle.round(9)
@@ -166,7 +187,12 @@ def _on_circle(angle: FloatArray) -> FloatArray:
 def mean_image(
     image: Callable[[int], npt.NDArray[np.generic]], views: npt.NDArray[np.intp]
 ) -> Float32Array:
-    """Average some views' images, summed in the given order, (rows, cols)."""
+    """Average some views' images, summed as float32 in the given order, (rows, cols).
+
+    Args:
+        image: gives a view's image by its number.
+        views: numbers, at least one.
+    """
     total = np.asarray(image(int(views[0])), np.float32)
     for view in views[1:].tolist():
         total = total + np.asarray(image(view), np.float32)
@@ -176,8 +202,9 @@ def mean_image(
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     """Make a circle from its sources' angles, with steps and gaps.
 
-    A gap is an arc without views, wider than usual steps; steps are widened for random
-    angles if lines would be unseen.
+    A gap is an arc without views, wider than `GAP_STEPS` usual steps or a third of a
+    turn; if the gaps leave lines unseen, as for random angles, it must be wider than
+    `RANDOM_GAP_STEPS`.
 
     Args:
         azimuth: (n,) from 0 to 2 pi [rad].
@@ -185,7 +212,8 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
         radius: [mm].
 
     Returns:
-        The circle; views at one angle share its step, and gaps belong to no view.
+        The circle; a view's step is half the way to its neighbour on either side, views
+        at one angle share it equally, and gaps belong to no view.
     """
     at, same = np.unique(_on_circle(azimuth), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
@@ -205,8 +233,14 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
 
 
 def _usual(steps: FloatArray) -> float:
-    """Find the usual step: a third of the total is in narrower ones, even with repeated
-    turns.
+    """Find the usual step: narrower ones make up a third of the total, so that repeated
+    turns do not matter.
+
+    Args:
+        steps: (k,) [rad].
+
+    Returns:
+        [rad]; a full turn if there are no steps.
     """
     ordered = np.sort(steps)
     covered = np.cumsum(ordered)
@@ -220,8 +254,6 @@ def _helix(
 ) -> Circle | None:
     """Fit a helix that rises steadily for a turn or more without a gap.
 
-    None too if it hardly rises or has an arc without views.
-
     Args:
         azimuth: (n,) of the sources [rad].
         height: (n,) [mm].
@@ -229,7 +261,10 @@ def _helix(
         radius: [mm].
 
     Returns:
-        The helix; None if the sources are on none.
+        The helix, its angles counted from its lowest view and growing with height. None
+        if the rise is at most `MAX_CIRCLE_RISE` of the radius, spans less than a turn,
+        deviates by more than `MAX_HELIX_DEVIATION` of a turn's rise, or has an arc
+        without views.
     """
     order = np.argsort(height, kind="stable")
     run = np.empty(len(order))
@@ -264,10 +299,11 @@ def redundancy(
 ) -> FloatArray:
     """Compute weights of rays so that a line and its opposite together count once.
 
-    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol. 47
-    (2002) 2525), which falls smoothly to nothing towards a gap of the angles, and towards the
-    near edge of a panel moved to one side; with gaps that is where an object reaches `beyond`
-    the near edge. In a full turn of a centred panel each counts 1/2.
+    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol.
+    47 (2002) 2525), which falls smoothly to nothing towards a gap of the angles, and
+    towards the near edge of a panel moved to one side by more than a column; with gaps
+    the latter only if an object reaches `beyond` the near edge. In a full turn of a
+    centred panel each counts 1/2.
 
     Args:
         circle: of the sources.
@@ -279,7 +315,8 @@ def redundancy(
         (n, cols) between 0 and 1.
 
     Raises:
-        GeometryError: some lines are not seen from either side.
+        GeometryError: the axis is off the panel, or some lines are not seen from either
+            side.
     """
     fan = fan_angles(circle, cone_vec, cols)
     low, high = reach(fan)
@@ -310,18 +347,34 @@ def redundancy(
 
 
 def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
-    """Return whether a panel moved aside sees few columns beyond the axis."""
+    """Return whether a panel moved aside sees few columns beyond the axis: fewer than
+    twice `MIN_TAPER_COLS` on its near side. False for a panel centred within a column.
+
+    Args:
+        circle: of the sources.
+        cone_vec: n upright views.
+        cols: columns of the panel.
+    """
     low, high = reach(fan_angles(circle, cone_vec, cols))
     column = (low + high) / cols
     return abs(high - low) > column and min(low, high) < 2 * MIN_TAPER_COLS * column
 
 
 def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
-    """Move panels by up to a quarter of a column: the axis is on a column or between two.
+    """Move panels along their rows, by up to a quarter of a column, so that the axis is
+    on a column or halfway between two.
 
     Where the weights of a ray and its opposite change within few columns, the weights'
     contribution to the filtered rows is large, odd about the axis, and cancels only if
     both are sampled alike.
+
+    Args:
+        circle: of the sources.
+        cone_vec: n views.
+        shape: detector (rows, cols).
+
+    Returns:
+        New geometry; each view is moved by its own amount.
     """
     at = cone_vec.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = np.round(2.0 * at) / 2.0 - at
@@ -334,8 +387,15 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
-    """Compute the confidence, 0 to 1, of views: it falls smoothly towards an arc without
-    views ("gap").
+    """Compute the confidence in views at some angles: it falls smoothly, as a squared
+    sine over `GAP_RAMP_RAD`, towards an arc without views ("gap").
+
+    Args:
+        circle: with its gaps.
+        angle: of any shape [rad].
+
+    Returns:
+        Of the same shape, 1e-12 in a gap to 1; 1 everywhere on a full circle.
     """
     from_gap = circle.from_gap(angle)
     return np.asarray(
@@ -347,7 +407,13 @@ def _check_covered(circle: Circle, widest: float) -> None:
     """Check that the lines which arcs without views ("gaps") leave out, up to an angle of
     the fan, are seen from the opposite side.
 
-    Raises: GeometryError: some are not; names the arcs and the span that is needed.
+    Args:
+        circle: with its gaps.
+        widest: largest fan angle [rad].
+
+    Raises:
+        GeometryError: some are not; names the first three arcs and the span that is
+            needed.
     """
     if _unseen(circle.gaps, widest) > 1e-6:
         covered = TURN - float(np.diff(circle.gaps).sum())
@@ -364,8 +430,16 @@ def _check_covered(circle: Circle, widest: float) -> None:
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
-    """Compute how far arcs without views overlap with the opposites of others, in view of
-    the fan angle `widest` [rad]; negative if they do not.
+    """Compute the largest overlap of an arc without views with the opposite of any such
+    arc, widened by the fan.
+
+    Args:
+        gaps: (k, 2) first and last angle [rad].
+        widest: fan angle to either side [rad].
+
+    Returns:
+        Overlap [rad]; at most 0 if every line of a gap is seen from its other side, minus
+        a turn without gaps.
     """
     width = np.diff(gaps)[:, 0]
     middle = gaps.mean(axis=1)
@@ -376,8 +450,8 @@ def _unseen(gaps: FloatArray, widest: float) -> float:
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
-    """Compute fan angles that all views have on the clockwise side and on the other
-    [rad].
+    """Compute the fan angles that all views have on the clockwise side and on the other,
+    both positive for an axis on the panel [rad].
 
     Args:
         fan: (n, cols) [rad].
@@ -387,10 +461,11 @@ def reach(fan: FloatArray) -> tuple[float, float]:
 
 def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
     """Count the columns before the first and after the last by which a shifted panel is
-    continued.
+    continued, so that its sides reach equally far from the axis.
 
-    The filter's response to the panel's signal continues beyond its near edge. Voxels whose
-    shadow falls there need it, as far out as the panel ends on the other side.
+    The filter's response to the panel's signal continues beyond its near edge. Voxels
+    whose shadow falls there need it, as far out as the panel ends on the other side. At
+    most `MAX_PANEL_WIDTHS` panels.
 
     Args:
         circle: of the sources.
@@ -423,7 +498,8 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
-    """Compute the horizontal angle of each column's ray from the line source to axis.
+    """Compute the horizontal angle of each column's ray from the line from the source to
+    the axis.
 
     Args:
         circle: of the sources.

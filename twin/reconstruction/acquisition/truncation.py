@@ -90,8 +90,15 @@ class Prism:
         return cls(x[:2] * field, to_disc, float(np.exp(x[5])))
 
     def integrals(self, source: FloatArray, rays: FloatArray) -> FloatArray:
-        """Compute line integrals (...) of the prism in the plane of rotation, of `rays`
-        (..., 2) from `source` (..., 2) [mm]; 0 for rays that miss it.
+        """Compute line integrals of the prism in the plane of rotation along whole lines;
+        0 for rays that miss it.
+
+        Args:
+            source: (..., 2) [mm].
+            rays: (..., 2) directions from the source [mm]; their length does not matter.
+
+        Returns:
+            (...), attenuation times the chord, without a unit.
         """
         start = (source - self.centre) @ self.to_disc.T
         along = rays @ self.to_disc.T
@@ -115,7 +122,9 @@ class Prism:
         return np.array([*self.centre, first, low, second, self.attenuation])
 
     def rim(self) -> FloatArray:
-        """Compute 72 points on the prism's outline at z = 0, (72, 3) [mm]."""
+        """Compute 72 points, evenly spaced in angle of the unit disc, on the prism's
+        outline at z = 0, (72, 3) [mm].
+        """
         turn = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         disc = np.stack([np.cos(turn), np.sin(turn)])
         return np.pad(
@@ -151,15 +160,18 @@ class Truncation:
 
     @property
     def explained(self) -> bool:
-        """True if each band whose rows are continued has a prism."""
+        """True if each band whose rows are continued has a prism; also if none is
+        continued.
+        """
         return all(
             p is not None for p, cut in zip(self.prisms, self.cut_off, strict=True) if cut
         )
 
     @property
     def otherwise(self) -> Truncation:
-        """The same with rows continued in another way: they fade out, or follow the best
-        of the prisms that do not explain the images, or fade out later.
+        """The same with rows continued in another way, to see how much depends on it:
+        they fade out if prisms explained them; else they follow the best of the prisms
+        that do not explain the images (`others`), and fade out later where there is none.
         """
         if self.explained:
             return replace(self, prisms=(None,) * len(self.prisms))
@@ -175,12 +187,15 @@ class Truncation:
         """Count the columns before the first and after the last that the object's shadow
         reaches.
 
+        Half a panel at least, for rows that fade out; 2 more than the prisms' widest
+        shadow in any view.
+
         Args:
             cone_vec: upright views.
             cols: columns of the panel.
 
         Returns:
-            (before, after), at most twice the panel's columns.
+            (before, after), at most twice the panel's columns each.
         """
         most = 2.0 * cols
         before = 0.5 * cols
@@ -196,9 +211,11 @@ class Truncation:
     def continuation(
         self, cone_vec: ConeVec, first_row: int, shape: tuple[int, int], panel: slice
     ) -> Continuation:
-        """Say how the rows of some views go on beyond the panel's edges.
+        """Compute how the rows of some views go on beyond the panel's edges.
 
-        Bands between two estimated ones are mixed; a band without a prism has zeros.
+        Rows between two bands mix both, rows beyond the outermost use that one; a band
+        without a prism has zeros. The rest fades out as a cosine over `fade` times the
+        panel's columns.
 
         Args:
             cone_vec: of widened images, (n).
@@ -260,7 +277,7 @@ class Continuation:
 
     @classmethod
     def empty(cls, views: int, rows: int, wide: int) -> Continuation:
-        """Make a continuation with nothing beyond the edges.
+        """Make a continuation with nothing beyond the edges: all parts zero, and edge 0.
 
         Args:
             views: number of views.
@@ -284,10 +301,12 @@ def truncation_of(
     cone_vec: ConeVec,
     shape: tuple[int, int],
 ) -> Truncation | None:
-    """Estimate the object beyond the panel's edges from some views of a scan.
+    """Estimate the object beyond the panel's edges from up to `SAMPLES` views of a scan.
 
-    Repeated angles are averaged, and tilted panels rectified. A panel moved to one side
-    may hide an object beyond its far edge: then `beyond` is set.
+    Repeated angles are averaged, images on their side swapped and tilted panels
+    rectified. Only the far edge of a panel moved to one side counts in a full turn. In a
+    short scan, a shifted panel may hide an object beyond its near edge: if no prism
+    explains it, `beyond` is set and no rows are continued.
 
     Args:
         image: gives the line integrals of a view, (rows, cols), by its number.
@@ -295,7 +314,10 @@ def truncation_of(
         shape: (rows, cols).
 
     Returns:
-        For `fdk_parts`; None if the panel saw the complete object.
+        For `fdk_parts`; None if the panel saw the complete object or has one column.
+
+    Raises:
+        GeometryError: FDK cannot use the trajectory.
     """
     circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
     places, same = distinct_angles(circle)
@@ -337,13 +359,15 @@ def truncation_of(
 
 
 def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
-    """Check whether some columns of the views show more than noise.
+    """Check whether some view shows more than noise in its marked columns.
 
-    Smoothed by blocks; noise is estimated from the same images.
+    Images are smoothed by blocks of an eighth of the rows and an edge's columns; the
+    limit is twice `SIGNIFICANT_SIGMAS` of noise estimated from the same image, and half
+    of `ACCURACY` of the largest value.
 
     Args:
         images: n views (rows, cols).
-        there: (n, cols) the columns to check.
+        there: (n, cols) the columns to check; a view without any is skipped.
     """
     from scipy.ndimage import uniform_filter
 
@@ -369,15 +393,20 @@ def _fit_truncation(
 ) -> Truncation | None:
     """Fit the object beyond the edges of upright panels; see `truncation_of`.
 
-    Returns None if both edges show an open beam, or no band of rows is cut off at an
-    edge that counts. Bands of a helix, and even ones, get no prism.
+    Bands of rows are fitted from the strongest to the weakest, each starting from the
+    last prism found. Bands of a helix, and those whose means vary by less than
+    `ACCURACY`, get no prism.
 
     Args:
         images: line integrals of some views.
         cone_vec: of these views.
         shape: (rows, cols).
-        edges_that_count: edges at which an object may be cut off.
+        edges_that_count: (2,) left and right, at which an object may be cut off.
         helix: the scan is a helix.
+
+    Returns:
+        None if both edges show an open beam, or no band of rows is cut off at an edge
+        that counts.
     """
     rows, cols = shape
     limits = np.linspace(0, rows, min(BANDS, rows) + 1).round().astype(int)
@@ -424,8 +453,9 @@ def _fit_truncation(
 def _open_beam(seen: FloatArray) -> bool:
     """Return whether both edges show an open beam that differs from the flat field.
 
-    It has one value in each view, in all rows and without a slope; an object's outline
-    slopes.
+    It has one value in each view, in all rows (`MAX_SPREAD` of the contrast) and without
+    a slope (`MAX_SLOPE`); an object's outline slopes. False for fewer than 8 bins, or if
+    the object does not attenuate more than the edges.
 
     Args:
         seen: (views, bands, bins) line integrals.
@@ -446,8 +476,14 @@ def _open_beam(seen: FloatArray) -> bool:
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:
-    """Estimate the standard deviation of noise in lines (..., k) that are otherwise
-    smooth.
+    """Estimate the standard deviation of noise in lines that are otherwise smooth, from
+    the median second difference along the last axis.
+
+    Args:
+        lines: (..., k).
+
+    Returns:
+        0 for fewer than 3 values.
     """
     bend = lines[..., 2:] - 2.0 * lines[..., 1:-1] + lines[..., :-2]
     # Of normal noise, a second difference's median is 1.65 standard deviations.
@@ -457,14 +493,17 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
 
 
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
-    """Find the edges beyond which the object continues, in some neighbouring views or all.
+    """Find the edges beyond which the object continues, in some neighbouring views or
+    all.
 
-    The middle one of three views counts, and the mean of all, in which less noise hides it.
-    Noise is that of every other bin near the edge: detectors blur it over some columns.
+    The middle one of three views counts, and the mean of all, in which less noise hides
+    it. Noise is that of every other bin near the edge: detectors blur it over some
+    columns; an edge must exceed `SIGNIFICANT_SIGMAS` of it. The mean must also exceed pi
+    / 2 times `ACCURACY` of `usual`.
 
     Args:
         band: (n, bins) line integrals of a band of rows.
-        least: line integral below which an edge never counts.
+        least: line integral below which an edge never counts in single views.
         usual: line integral that is typical of the object.
 
     Returns:
@@ -496,16 +535,21 @@ def _fit(
 ) -> tuple[Prism | None, Prism | None]:
     """Fit the prism that explains the values, or else the best one.
 
+    Starts from the neighbour, or from circles of 1.1, 1.5 and 2.2 radii of the field of
+    view; narrows the loss until the best quarter of rays decides. A prism explains the
+    values if that quarter deviates by at most half of `ACCURACY`, besides noise. If the
+    neighbour's start fails, the circles are tried.
+
     Args:
         source: (n, 1, 2) [mm].
         rays: (n, k, 2) from the source to columns of the panel, in the plane [mm].
         seen: (n, k) line integrals in the plane.
         usual: usual line integral of the object.
-        near: prism of a neighbouring band.
+        near: prism of a neighbouring band, or None.
 
     Returns:
-        the prism that explains the values or None, and the best one that does not or
-            None.
+        (prism, None) if it explains the values; (None, best one) if not; (None, None) if
+        no ray meets the object.
     """
     from flexdt.twin.reconstruction.kernels.truncation_kernels import fit_prism
 
@@ -585,12 +629,14 @@ def _edge(cols: int) -> int:
 def _rays(
     cone_vec: ConeVec, rows: FloatArray, columns: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute sources (n, 1, 2), rays in the plane (n, k, 2) and heights of rows (n, r)
-    [mm].
+    """Compute sources, horizontal rays and heights of rows [mm].
 
     Args:
-        cone_vec: (n) upright panels.
+        cone_vec: n upright panels.
         rows, columns: (r,), (k,) counted from the panel's middle.
+
+    Returns:
+        Sources (n, 1, 2), rays in the plane (n, k, 2), heights above the source (n, r).
     """
     panel = cone_vec.detector - cone_vec.source
     across = panel[:, None, :2] + columns[:, None] * cone_vec.u[:, None, :2]
