@@ -93,8 +93,8 @@ class Contradiction:
 
     @property
     def _explanations(self) -> str:
-        """Possible explanations, joined by ", or ", each with its figure unless that is
-        empty.
+        """Possible explanations, joined by ", or ", each followed by its figure unless
+        that is empty.
         """
         words = [
             KINDS[kind] + (f" {figure}" if figure else "")
@@ -106,12 +106,16 @@ class Contradiction:
 def compared(scan: CoarseScan) -> Comparison | None:
     """Compare a scan's images with the projections of its volume.
 
+    Some views and rows are tried first; all views if the expected residual of some is too
+    large. Where the misfit is below `MIN_DOUBTFUL_MISFIT`, the comparison is not
+    `doubtful` and repeated with at least `RIVALS_ROWS` rows.
+
     Args:
-        scan: coarse; some of its views and rows are compared.
+        scan: coarse.
 
     Returns:
-        None for helices, for scans of too few views or columns, and where images fit of
-        which the panel cuts a part off.
+        None for helices, for scans of fewer than `MIN_VIEWS` views or columns, and where
+        images fit of which the panel cuts a part off.
     """
     if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < MIN_VIEWS:
         return None
@@ -136,12 +140,16 @@ class Comparison:
     """
 
     def __init__(self, trial: Trial, *, doubtful: bool) -> None:
-        """Try the opposite rotation and the other suspected geometries, unless no view
-        pair is reliable ("telling").
+        """Try the opposite rotation and the other suspected geometries, unless no measure
+        is reliable ("telling").
 
-        Without `doubtful`, the scan counts as fitting; unfit is only a whole scan of even
-        steps whose misfit exceeds `MAX_MISFIT`. Far geometries are tried only on an unfit
-        scan.
+        Not doubtful means that the scan fits. Unfit is only a whole scan of even steps
+        whose misfit exceeds `MAX_MISFIT`. Panels far aside are tried only on an unfit
+        scan, mirrored images only if doubtful.
+
+        Args:
+            trial: of the scan's stated geometry.
+            doubtful: the residual is larger than of most scans.
         """
         self._trial = trial
         self._doubtful = doubtful
@@ -154,18 +162,24 @@ class Comparison:
 
     @property
     def widening(self) -> float:
-        """Factor of a bound where the images fit less well than those of most scans."""
+        """Factor of a bound where the images fit less well than those of most scans: the
+        misfit over `MIN_DOUBTFUL_MISFIT`; 1 unless doubtful, whole and tried.
+        """
         if not self._tried or not self._doubtful or not self._trial.whole:
             return 1.0
         return self._trial.excess / MIN_DOUBTFUL_MISFIT
 
     def contradiction(self) -> Contradiction | None:
-        """Find the error of the scan's geometry; None if there is none, nothing was
-        tried, or no doubt exists.
+        """Find the error of the scan's geometry.
 
-        A tried geometry is named if it changes the volume, fits clearly better than the
-        scan's own and fits well. Else, if the scan does not fit its own geometry, the
-        result names no explanation.
+        An explanation is named if it changes the volume by more than `MIN_CHANGE`, fits
+        clearly better than the stated geometry (score below `MAX_BETTER_MISFIT`, or
+        `MAX_MUCH_BETTER_MISFIT` for truncated, uneven or partly unreliable scans) and
+        fits well (`MAX_MISFIT`); others as good are named with it. Else, if the scan does
+        not fit its own geometry, the result names no explanation.
+
+        Returns:
+            None if there is no error, nothing was tried, or the scan is not doubtful.
         """
         trial = self._trial
         if not self._tried or not self._doubtful:
@@ -187,13 +201,18 @@ class Comparison:
         return None
 
     def undecided(self, claimed: float) -> Contradiction | None:
-        """Find an explanation that fits as well and would change the volume.
-
-        None if the scan is truncated or no rival has too little evidence against it. The
-        result's `change` is None where the rival is clearly better.
+        """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`) and would
+        change the volume by more than is claimed.
 
         Args:
-            claimed: largest relative error that is claimed of nine of ten uniform regions.
+            claimed: largest relative error that is claimed of nine of ten uniform
+                regions.
+
+        Returns:
+            None if the scan is truncated or each such explanation is contradicted by
+            `MIN_EVIDENCE_SIGMAS`. Else all that are as good as the best; `change` is the
+            largest of theirs, or None where the best is clearly better than the stated
+            geometry of a doubtful scan.
         """
         trial = self._trial
         rivals = [
@@ -225,8 +244,13 @@ class Comparison:
     def _named(
         self, as_good: list[Tried], score: float, change: float | None = None
     ) -> Contradiction:
-        """Make the contradiction that names the explanations `as_good`, each kind once,
-        with their figures.
+        """Make the contradiction that names explanations, each kind once, with its last
+        figure.
+
+        Args:
+            as_good: the explanations.
+            score: the best one's misfit over that of the stated geometry.
+            change: see `Contradiction`.
         """
         figures = {one.suspect.kind: one.suspect.figure for one in as_good}
         kinds = tuple(figures)

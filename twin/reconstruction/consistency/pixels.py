@@ -104,16 +104,19 @@ class BadPixels:
 def bad_pixels(
     views: Callable[[], Iterable[Float32Array]], axis_column: float
 ) -> BadPixels | None:
-    """Find pixels that do not respond as their neighbours do.
+    """Find pixels that do not respond as their neighbours do: dead, hot or flickering.
+
+    Pixels at the axis that a feature of the object may explain are left out.
 
     Args:
         views: gives line integrals of some views of a scan, (rows, cols) each; called
-            once, and where there may be bad ones for each further pass: the worst make
-            their neighbours look bad as well.
+            once, and where there may be bad ones for each of two or three further passes:
+            the worst make their neighbours look bad as well.
         axis_column: where the axis falls.
 
     Returns:
-        None if no pixel is bad.
+        None if no pixel is bad, or more than `MAX_BAD_SHARE` are: such images are of
+        another kind.
     """
     first, response = _outliers(views(), axis_column)
     if not first.any():
@@ -138,17 +141,21 @@ def bad_pixels(
 def _outliers(
     views: Iterable[Float32Array], axis_column: float
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-    """Find pixels far beyond their neighbours in the mean over the views.
+    """Find pixels far beyond their neighbours in the root mean square over the views.
 
-    Near the axis the neighbours above and below count, too, as rings of the object end there.
+    Neighbours are those in the row; a pixel within a group of two to five in its row is
+    found by its column. Near the axis (`AXIS_PART` of the columns) a pixel must stand out
+    from both, or be in a column that is bad in `MIN_COLUMN_SHARE` of its rows, as rings
+    of the object end there.
 
     Args:
-        views: line integrals (rows, cols).
+        views: line integrals (rows, cols); those of at most 4 rows or columns are not
+            judged.
         axis_column: column of the rotation axis.
 
     Returns:
-        The outliers, and the excess of all pixels over their neighbours, (rows, cols) each; one
-        pixel without views or of too small ones.
+        The outliers, and the excess of all pixels over their neighbours, (rows, cols)
+        each; (1, 1) of False and 0 without views or of too small ones.
     """
     along = _Usual()
     down = _Usual()
@@ -176,9 +183,16 @@ def _outliers(
 
 
 def _short_groups(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Keep pixels with another one among their neighbours in the row, (rows, cols).
+    """Keep marked pixels of short groups in a row: with another one within `NEIGHBOURS`
+    columns, but not part of a run longer than 5.
 
-    A thin layer of the object gives longer runs than a pixel and its neighbours.
+    A thin layer of the object gives longer runs.
+
+    Args:
+        mask: (rows, cols) bool.
+
+    Returns:
+        (rows, cols) bool.
     """
     from scipy.ndimage import binary_opening, convolve1d
 
@@ -195,20 +209,22 @@ def _lasting_and_flickering(
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Find pixels that deviate in nearly all views, and those that do now and then.
 
-    A flickering pixel deviates from its row and from its column at once; one of a bad column
-    from the row alone, and one beside other bad ones in its row from the column alone. Edges
-    and thin walls of the object deviate from one of the two. Its beads deviate from both, and
-    visit the pixels about as often: a pixel flickers if it does so more often than they do.
-    The top of a round body at the axis is always there, but less beyond its neighbours than
-    they are apart.
+    A flickering pixel deviates from its row and from its column at once; one of a bad
+    column from the row alone, and one beside other bad ones in its row from the column
+    alone. Edges and thin walls of the object deviate from one of the two. Its beads
+    deviate from both, and visit the pixels about as often: a pixel flickers if it does so
+    more often than they do (`_flickers`). The top of a round body at the axis is always
+    there, but less beyond its neighbours than they are apart.
 
     Args:
         views: line integrals (rows, cols).
-        mask: pixels that are beyond their neighbours.
-        at_axis: pixels before the axis, where a feature of the object comes and goes slowly.
+        mask: pixels that are beyond their neighbours; only these are returned.
+        at_axis: pixels before the axis, where a feature of the object comes and goes
+            slowly.
 
     Returns:
-        Both kinds, each (rows, cols).
+        Lasting ones (deviating in `MIN_LASTING_SHARE` of the views) and flickering ones,
+        each (rows, cols).
     """
     from scipy.ndimage import binary_dilation
 
@@ -240,18 +256,20 @@ def _no_feature(
     mask: npt.NDArray[np.bool_],
     at_axis: npt.NDArray[np.bool_],
 ) -> npt.NDArray[np.bool_]:
-    """Find pixels at the axis that no feature of the object explains, (rows, cols).
+    """Find pixels that no feature of the object explains.
 
-    A bead on the axis stands before one pixel in all views, as a defect does. Columns that are
-    bad over most rows, and means beyond what the object gives elsewhere, are defects.
+    A bead on the axis stands before one pixel in all views, as a defect does. Columns
+    that are bad over more than half of their rows are defects, and so are means over the
+    views that exceed the range of values elsewhere by `EXPLAINED_ABOVE`, or fall below it
+    by `EXPLAINED_BELOW`, of that range.
 
     Args:
-        views: line integrals (rows, cols).
-        mask: pixels that seem bad.
+        views: line integrals (rows, cols), at least one.
+        mask: pixels that seem bad, left out of the range.
         at_axis: pixels before the axis, left out of the range that the object gives.
 
     Returns:
-        Those of the whole panel, also beside `mask` and away from the axis.
+        (rows, cols) bool of the whole panel, also beside `mask` and away from the axis.
     """
     elsewhere = ~mask & ~at_axis
     lows = []
@@ -269,7 +287,15 @@ def _no_feature(
 
 
 def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
-    """Find where distances (views, pixels) are like a pixel's root mean square, or larger."""
+    """Find where distances are like a pixel's root mean square or larger: above
+    `MIN_DEVIATION_RATIO` of it and twice `MIN_BAD_RESPONSE`.
+
+    Args:
+        distances: (views, pixels).
+
+    Returns:
+        (views, pixels) bool.
+    """
     usual = np.sqrt(np.mean(np.square(distances), axis=0))
     least = np.maximum(MIN_DEVIATION_RATIO * usual, 2.0 * MIN_BAD_RESPONSE)
     return np.asarray(distances > least)
@@ -280,11 +306,12 @@ def _flickers(
     area: npt.NDArray[np.bool_],
     least_share: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.bool_]:
-    """Find pixels that deviate and cease often, and more often than those about, (rows, cols).
+    """Find pixels that deviate and cease often, and `MIN_CHANGES_RATIO` times as often as
+    the median of `COMPARED_COLUMNS` columns on either side, (rows, cols).
 
     Args:
         distances: beyond the neighbours, (views, pixels of the area).
-        area: the pixels, (rows, cols).
+        area: the pixels, (rows, cols); others have no changes.
         least_share: changes of a flickering pixel over the views, (rows, cols).
     """
     from scipy.ndimage import median_filter
@@ -336,7 +363,7 @@ class _Usual:
 
     def add(self, square: Float32Array) -> None:
         """Add one image of squares (rows, cols) to the sum, and keep the largest values
-        of each pixel apart: one more for every `VIEWS_AN_OUTLIER` images.
+        of each pixel apart: one more image of them for every `VIEWS_AN_OUTLIER` added.
         """
         self.count += 1
         if self._total is None:
@@ -353,7 +380,7 @@ class _Usual:
 
     def root(self) -> Float32Array:
         """Compute the root mean square of the images without each pixel's largest values,
-        (rows, cols).
+        one of `VIEWS_AN_OUTLIER`, (rows, cols). Needs an image.
         """
         assert self._total is not None  # as there was an image
         rest = self._total - sum(self._largest, np.float32(0.0))
@@ -362,10 +389,14 @@ class _Usual:
 
 
 def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
-    """Find pixels whose response is far above the usual one (largest block median around
-    them), (rows, cols) of bool.
+    """Find pixels whose response is far above the usual one, (rows, cols) of bool.
 
-    Columns at the edges have a minimum of their own.
+    Usual is the largest median of the blocks (`BLOCK`) of and around the pixel; the limit
+    is `BAD_RESPONSE_RATIO` times that, and at least `MIN_BAD_RESPONSE`, in the outermost
+    `NEIGHBOURS` columns `MIN_EDGE_RESPONSE`.
+
+    Args:
+        response: (rows, cols).
     """
     from scipy.ndimage import maximum_filter
 
@@ -400,11 +431,17 @@ def _slopes(view: Float32Array) -> Float32Array:
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
-    """Compute the distance of pixels above or below all but one neighbour in the row.
+    """Compute the distance of pixels above or below all but one of their four neighbours
+    in the row, one of which may be bad as well.
 
-    0 for pixels within them; towards the ends of a row slopes are continued.
+    0 for pixels within them. In the outermost columns the range is widened on both sides
+    by `EDGE_SLOPE_FACTOR` times itself, as a slope goes on.
 
-    One neighbour may be bad as well. Returns (rows, cols).
+    Args:
+        view: (rows, cols).
+
+    Returns:
+        (rows, cols), not negative.
     """
     first, second, third, fourth = _neighbours(view)
     one = np.maximum(np.minimum(first, second), np.minimum(third, fourth))

@@ -48,13 +48,14 @@ class Reprojection:
         cone_vec: ConeVec,
         truncation: Truncation | None,
     ) -> Reprojection | None:
-        """Reconstruct images as of a geometry, and project the volume.
+        """Reconstruct images as of a geometry, and project the volume again coarsely; NaN
+        voxels count as 0.
 
         Args:
             scan: gives the grid.
             images: (n, rows, cols).
             cone_vec: n views.
-            truncation: object beyond their edges.
+            truncation: object beyond their edges, or None.
 
         Returns:
             None where FDK cannot use the geometry.
@@ -68,14 +69,15 @@ class Reprojection:
         return cls(images, values, again)
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
-        """Compute the root mean square of the residual over that of the images, without
-        noise.
-
-        It is computed of the values, and of their changes along rows, which scatter and
-        beam hardening hardly alter, (2,).
+        """Compute the root mean square of the residual, less noise, over that of the
+        images.
 
         Args:
-            least: share of the residual that is kept whatever the noise.
+            least: share of the residual's mean square that is kept whatever the noise.
+
+        Returns:
+            (2,): of the values, and of their changes along rows, which scatter and beam
+            hardening hardly alter.
         """
         residual, signal, noise = self._powers
         beside = np.maximum(residual - noise, least * residual)
@@ -83,8 +85,9 @@ class Reprojection:
 
     @cached_property
     def arcs(self) -> FloatArray:
-        """Mean squares of the residual in arcs of views: of its values, and of their
-        changes along rows, (2, arcs)."""
+        """Mean squares of the residual in `ARCS` arcs of neighbouring views: of its
+        values, and of their changes along rows, (2, ARCS); above 0.
+        """
         rest = self.again - self.images
         least = np.finfo(np.float32).tiny
         parts = [
@@ -96,7 +99,8 @@ class Reprojection:
     @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean squares (2,) of residual, images and noise: first of the values, then of
-        their changes from view to view; noise is estimated from neighbours.
+        their changes along rows. Noise is the images' less the reprojection's, at least
+        0, times `NOISE_VARIANCE_RATIO`.
         """
         rest = self.again - self.images
         # Differences between neighbours in both are the object's.
@@ -121,10 +125,14 @@ def _changes(images: Float32Array) -> Float32Array:
 
 
 def _noise_of(images: Float32Array) -> float:
-    """Estimate the variance of white noise in images, (n, rows, cols).
+    """Estimate the variance of white noise in images.
 
-    It is computed from differences of neighbouring pixels and of neighbouring views,
-    whichever show less of the object.
+    The smaller of two estimates: from mixed second differences of neighbouring rows and
+    columns (of columns alone with one row), and from second differences of neighbouring
+    views, whichever show less of the object.
+
+    Args:
+        images: (n, rows, cols).
     """
     if images.shape[1] > 1:
         mixed = np.diff(np.diff(images, axis=2), axis=1)

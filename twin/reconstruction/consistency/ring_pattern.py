@@ -54,15 +54,20 @@ def ring_errors(
 ) -> Float32Array:
     """Find each pixel's constant error, to be subtracted from all views.
 
+    Pixels and complete columns (means over `COLUMN_ROWS` rows) are judged separately; a
+    pattern shared by the rows above and below, or by the other side of the axis, is the
+    object's.
+
     Args:
         views: (rows, cols) line integrals of all views, in order.
         axis_column: where the axis falls, of a full turn; None where columns on both
             sides of it do not see the same rays: then complete columns are left
             unchanged.
-        width: columns of the neighbourhood.
+        width: columns of the neighbourhood; made odd, 3 at least.
 
     Returns:
-        (rows, cols); 0 where nothing stands out from object and noise.
+        (rows, cols); 0 where nothing stands out from object and noise, and everywhere
+        with fewer than `MIN_GROUPS` groups of `GROUP_VIEWS` views.
 
     Raises:
         LimitError: no views.
@@ -81,9 +86,11 @@ def ring_errors(
 
 
 def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Array]:
-    """Compute medians of pixels' excess over neighbours in groups of views.
+    """Compute medians of pixels' excess over neighbours in groups of `GROUP_VIEWS` views.
 
-    Groups are joined in pairs when there are `MAX_GROUPS`, so that memory is bounded.
+    Groups are joined in pairs when there are `MAX_GROUPS`, so that memory is bounded;
+    later groups then have twice as many views. A last incomplete group is dropped unless
+    it is the only one.
 
     Args:
         views: line integrals (rows, cols).
@@ -155,8 +162,11 @@ class _Pattern:
 
     @classmethod
     def of(cls, groups: Float32Array) -> _Pattern:
-        """Compute the pattern common to groups of views, (k, rows, cols): their median,
-        with its variance from their spread, averaged over blocks.
+        """Compute the pattern common to groups of views: their median, with its variance
+        from their spread, averaged over blocks of `BLOCK_PX`.
+
+        Args:
+            groups: (k, rows, cols).
         """
         middle = np.median(groups, axis=0)
         apart = SIGMA_OF_MEDIAN * np.median(np.abs(groups - middle), axis=0)
@@ -168,8 +178,9 @@ class _Pattern:
     ) -> Float32Array:
         """Compute the pixels' share of the pattern, (rows, cols).
 
-        What other pixels share with them is the object's; only what exceeds the noise is
-        left.
+        The part that correlates with other pixels, in blocks of `BLOCK_PX`, is the
+        object's and removed, one function after the other. The rest is shrunk by the
+        variance of noise, to 0 where it does not exceed that by `MIN_EXCESS_SIGMAS`.
 
         Args:
             ways: functions from values (rows, cols) to those of other pixels, to which an
@@ -207,6 +218,13 @@ def _columns_seen_twice(cols: int, axis_column: float) -> npt.NDArray[np.bool_]:
 def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
     """Return values of the columns as far from the axis on the other side, 0 off the
     panel.
+
+    The centre of symmetry is the one within `AXIS_REACH_PX` of the stated axis, in half
+    columns, at which both sides correlate best.
+
+    Args:
+        values: (rows, cols).
+        axis_column: the stated axis [px].
     """
     stated = round(2.0 * axis_column)
     reach = range(stated - 2 * AXIS_REACH_PX, stated + 2 * AXIS_REACH_PX + 1)
@@ -216,8 +234,8 @@ def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
 
 
 def _mirrored(values: Float32Array, total: int) -> Float32Array:
-    """Return values with column c in the place of column `total` - c, 0 where there is
-    none.
+    """Return a copy of values with column c in the place of column `total` - c, 0 where
+    there is none.
     """
     out = np.zeros_like(values)
     columns = np.arange(values.shape[1])

@@ -64,8 +64,14 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
 
     Args:
         scan: coarse.
-        whole: the panel sees the complete object; if not, only panels on the wrong side
-            and mirrored images are suspected, which make an object seem cut off.
+        whole: the panel sees the complete object; if not, only mirrored columns, a panel
+            offset to the other side and one without offset are suspected, which make an
+            object seem cut off.
+
+    Yields:
+        Mirrored columns (of a truncated scan only with an offset), offsets along rows if
+        above `CENTRE_TOLERANCE`; for a whole scan also mirrored rows, both mirrored,
+        other orders and spans, and the opposite offset along columns if above it.
     """
     images = scan.images
     cone_vec = scan.cone_vec
@@ -86,11 +92,12 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
 
 
 def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
-    """Rotate the views about the axis, each by its own angle.
+    """Rotate source and panel of each view about the scan's axis, each by its own angle;
+    the images stay.
 
     Args:
         scan: n views.
-        turn: (n,) [rad].
+        turn: (n,) [rad], counter-clockwise.
     """
     cos = np.cos(turn)
     sin = np.sin(turn)
@@ -108,14 +115,24 @@ def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
 
 
 def moved(cone_vec: ConeVec, along: float, down: float = 0.0) -> ConeVec:
-    """Move panels along their rows and down their columns [pixels]."""
+    """Move panels along their rows and down their columns; the source stays.
+
+    Args:
+        cone_vec: n views.
+        along: by so many pixels along u.
+        down: by so many pixels along v.
+    """
     panel = cone_vec.detector + along * cone_vec.u + down * cone_vec.v
     return ConeVec.from_vectors(cone_vec.source, panel, cone_vec.u, cone_vec.v)
 
 
 def _orders(scan: CoarseScan) -> Iterator[Suspect]:
-    """Yield suspected scans whose images belong to other angles: in another order, or
-    over half or twice the span; each with its views turned.
+    """Yield suspected scans whose images belong to other angles: in another order
+    (`_permutations`), then over half and twice the span; each with the same images and
+    its views turned.
+
+    Args:
+        scan: coarse; orders are those of all its original views.
     """
     angle = scan.circle.angle
     count = len(angle)
@@ -131,9 +148,15 @@ def _orders(scan: CoarseScan) -> Iterator[Suspect]:
 
 
 def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp], str]]:
-    """Yield kinds of orders, the view whose angle each image has, (n,), and a
-    description: interlaced passes and names for steadily growing angles, else sorted
-    angles ("listed").
+    """Yield orders in which images may have been taken.
+
+    Args:
+        angle: (n,) of the views [rad].
+
+    Yields:
+        Kind, the view whose angle each image has (n,), and a description. For angles that
+        steadily grow or fall: interlaced in each of `INTERLACED_PASSES`, and the
+        alphabetical order of numbers; else only sorted by angle ("listed").
     """
     count = len(angle)
     listed = np.arange(len(angle))
@@ -149,12 +172,14 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
 
 
 def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
-    """Compute where the source's foot on the axis falls, from the middle of the panel.
+    """Compute where the source's foot on the axis falls, from the middle of the panel,
+    averaged over about eight views.
 
-    Averaged over about eight views.
+    Args:
+        scan: coarse.
 
     Returns:
-        offset along rows and down columns, over all views [coarse pixels].
+        offset along rows and down columns [coarse pixels].
     """
     shape = (scan.images.shape[1], scan.images.shape[2])
     x, y = scan.circle.centre

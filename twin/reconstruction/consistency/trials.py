@@ -86,9 +86,14 @@ class Trial:
     def __init__(self, scan: CoarseScan) -> None:
         """Reproject the scan in its own geometry and find what can be compared.
 
-        `whole`: no view is truncated. `telling`: where the expected residual is below
-        `MAX_RELIABLE_RESIDUAL`. `even`: enough views for the columns, and no step far
-        above the median.
+        Sets `whole` (no row is cut off), `expected` (misfit (2,) of a second
+        reconstruction), `telling` ((2,): for values and their changes, whether that is
+        below `MAX_RELIABLE_RESIDUAL`), `excess` (misfit over the expected one) and `even`
+        (`MIN_VIEWS_A_COLUMN` views a column, and no step above `MAX_ARC_RATIO` times the
+        median).
+
+        Args:
+            scan: coarse; all of its views and rows are compared.
         """
         self.scan = scan
         self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
@@ -113,7 +118,8 @@ class Trial:
         return self._tried(reversed_turn(self.scan))
 
     def others(self, *, far: bool, mirrored: bool = True) -> list[Tried]:
-        """Try all explanations but the opposite rotation.
+        """Try all explanations but the opposite rotation: panels moved along rows, then
+        `suspects`.
 
         Args:
             far: panels far aside, too, as for images that do not fit.
@@ -125,16 +131,17 @@ class Trial:
         return [*self._beside(far), *map(self._tried, chosen)]
 
     def excess_of(self, one: Tried) -> float:
-        """Compute an explanation's misfit over that of its volume's second
-        reconstruction.
+        """Compute an explanation's misfit over that of its volume's second reconstruction
+        (cached); infinite if FDK cannot use its geometry.
         """
         if one.shown is None:
             return np.inf
         return self._excess(one.shown, self._expected_of(one, one.shown))
 
     def fits_as_well(self, one: Tried, ratio: float) -> bool:
-        """Return whether an explanation leaves at most `ratio` times the residual, each
-        geometry measured by its volume's second reconstruction.
+        """Return whether an explanation leaves at most `ratio` times the residual of the
+        stated geometry, each measured by its volume's second reconstruction; False if FDK
+        cannot use its geometry.
         """
         if one.shown is None:
             return False
@@ -143,14 +150,20 @@ class Trial:
         return one.residual <= ratio * usual
 
     def _expected_of(self, one: Tried, shown: Reprojection) -> FloatArray:
-        """Compute an explanation's `_expected`, once: it is a reconstruction."""
+        """Compute `_expected` of an explanation once and cache it: it is a
+        reconstruction.
+        """
         if one not in self._seconds:
             self._seconds[one] = self._expected(shown, one.suspect.cone_vec)
         return self._seconds[one]
 
     def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
-        """Compute the misfit of a volume's second reconstruction, infinite without one,
-        (2,).
+        """Compute the misfit (2,) of a volume's second reconstruction: its projections,
+        reconstructed and projected again; infinite where FDK cannot use the geometry.
+
+        Args:
+            shown: projections of the volume.
+            cone_vec: n views.
         """
         again = Reprojection.of(self.scan, shown.again, cone_vec, None)
         if again is None:
@@ -158,19 +171,27 @@ class Trial:
         return again.misfit()
 
     def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
-        """Compute the misfit relative to the expected one: by edges, if the coarse volume
-        has some.
+        """Compute the misfit relative to the expected one: of changes along rows if those
+        are reliable, else of values.
         """
         ratios = shown.misfit(MIN_SIGNAL_SHARE) / expected
         return float(ratios[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> Tried:
-        """Compare a suspected geometry with the scan's own, over the reliable ("telling")
-        places.
+        """Compare a suspected geometry with the scan's own, by the reliable ("telling")
+        measures.
 
-        Scores and residuals are geometric means of ratios, suspect to own: below 1 the
-        suspect fits better. Without a reprojection or a reliable place only the suspect
-        is filled in.
+        Score and residual are geometric means of ratios, suspect to own: below 1 the
+        suspect fits better. Evidence is the mean log ratio over arcs, in standard errors:
+        negative if the suspect fits better.
+
+        Args:
+            suspect: reconstructed as complete: the explanation of a scan also explains
+                why it seemed cut off.
+
+        Returns:
+            With the suspect alone (scores infinite) if FDK cannot use it or no measure is
+            reliable.
         """
         # The explanation of a scan also explains why it seemed cut off.
         shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
@@ -189,8 +210,13 @@ class Trial:
     def _change(self, suspect: Suspect, shown: Reprojection) -> float:
         """Compute the largest relative change of nine of ten uniform nodes.
 
-        An object that is turned about the axis is none: the zero of an opposite rotation
-        is unknown, and so is which end of an object is up.
+        A mirrored volume is turned upside down first (`UPSIDE_DOWN`), and one of `TURNED`
+        is compared as it is and turned onto the scan's, whichever is less: the zero of an
+        opposite rotation is unknown, and so is which end of an object is up.
+
+        Args:
+            suspect: the explanation.
+            shown: its volume; voxels of the rim count as 0.
         """
         nodes = self._nodes
         values = np.where(self.scan.rim, np.float32(0.0), np.nan_to_num(shown.values))
@@ -210,17 +236,25 @@ class Trial:
 
     def _beside(self, far: bool) -> list[Tried]:
         """Try panels moved along their rows (offset axis): towards the side where images
-        fit better, in doubled steps until they fit worse; then between the best.
+        fit better, in doubled steps until they fit worse (`MAX_PROBE_STEPS` at most);
+        then twice at the parabola's vertex between the best.
 
-        With `far` larger steps are tried if small ones do not help. For a whole scan both
-        sides are tried until one is evident. Returns all that were tried.
+        With `far`, larger first steps (`FAR_PROBE_COLUMNS`) are tried if small ones do
+        not help. For a whole scan both sides are tried until the evidence against reaches
+        `MIN_EVIDENCE_SIGMAS`.
+
+        Args:
+            far: see above.
+
+        Returns:
+            All that were tried, in order.
         """
         known = {0.0: 1.0}
         tried: dict[float, Tried] = {}
 
         def score(columns: float) -> float:
-            """Score the axis shifted by so many columns; each shift is tried once and
-            kept.
+            """Score the panel moved by so many columns (0: 1.0); each movement is tried
+            once and cached.
             """
             if columns not in known:
                 tried[columns] = self._offset(columns)
@@ -251,7 +285,12 @@ def _lowest(known: dict[float, float]) -> float:
     """Find the place of the lowest score: vertex of a parabola through the squares of the
     three lowest, within their range.
 
-    The lowest of them if a score is not finite or the parabola opens downwards.
+    Args:
+        known: place -> score, three at least.
+
+    Returns:
+        The place; that of the lowest score if one of the three is not finite or the
+        parabola opens downwards.
     """
     places = sorted(known, key=known.__getitem__)[:3]
     squares = np.square([known[place] for place in places])
@@ -264,12 +303,15 @@ def _lowest(known: dict[float, float]) -> float:
 
 
 def _turned_onto(values: Float32Array, other: Float32Array) -> Float32Array:
-    """Turn a volume about its middle axis so that it is most like another.
-
-    In steps of a turn over `TURN_STEPS`; returns a copy.
+    """Turn a volume about its middle axis, in steps of a turn over `TURN_STEPS`, so that
+    its mean layer is most like that of another.
 
     Args:
-        values, other: (nz, ny, nx) of one grid.
+        values: (nz, ny, nx), turned (linear interpolation).
+        other: (nz, ny, nx) of the same grid.
+
+    Returns:
+        A turned copy; 0 where the corners are empty.
     """
     from scipy.ndimage import rotate
 
@@ -281,8 +323,14 @@ def _turned_onto(values: Float32Array, other: Float32Array) -> Float32Array:
 
 
 def _around(values: Float32Array) -> FloatArray:
-    """Sample the mean layer on circles about its middle, (radii, TURN_STEPS), weighted by
-    the roots of their lengths.
+    """Sample the mean layer on circles about its middle, weighted by the roots of their
+    radii.
+
+    Args:
+        values: (nz, n, n).
+
+    Returns:
+        (radii, TURN_STEPS), radii 1, 2 ... below half the side [voxels].
     """
     from scipy.ndimage import map_coordinates
 
