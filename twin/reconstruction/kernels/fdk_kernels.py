@@ -36,8 +36,10 @@ from flexdt.twin.projection.volume import aligned_zeros
 
 
 def lanes() -> int:
-    """Return the voxels in a register of the processor that numba compiles for: 16, 8 or
-    1.
+    """Return the float32 voxels in a register of the processor that numba compiles for:
+    16 (AVX-512), 8 (AVX2), or 1 where fused multiply-add or AVX2 is missing.
+
+    The features of numba's setting CPU_FEATURES count, else those of this processor.
     """
     asked = config.CPU_FEATURES
     features = (get_host_cpu_features() if asked is None else asked).split(",")
@@ -78,7 +80,9 @@ def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
     """
 
     def permute(name: str, *args: Any) -> Any:
-        """Emit a call of an intrinsic that permutes registers; returns its result."""
+        """Emit a call of the intrinsic `name`, which permutes registers, declared in the
+        module if needed; returns the permuted register.
+        """
         kind = ir.FunctionType(_FLOATS, [arg.type for arg in args])
         return builder.call(
             cgutils.get_or_insert_function(builder.module, kind, name), args
@@ -95,7 +99,16 @@ def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
 def _at(
     context: Any, builder: Any, signature: Any, args: Any, array: int, index: Any
 ) -> Any:
-    """Compute the address of LANES values in the argument number `array`."""
+    """Emit the address of LANES float32 values in a numba array.
+
+    Args:
+        context, builder, signature, args: of numba's code generator.
+        array: number of the array among the arguments.
+        index: of the first value, an LLVM integer.
+
+    Returns:
+        Pointer to a register.
+    """
     data = context.make_array(signature.args[array])(context, builder, args[array]).data
     return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
 
@@ -118,11 +131,13 @@ def mix_lanes(
 ) -> Any:
     """Compute out[r + i] = one * left[at + i] + other * right[at + i], 0 <= i < LANES.
 
-    Not for 1 lane.
+    Not for 1 lane. Neither bounds nor alignment are checked; `out` is changed in place.
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        """Emit the weighted sum of LANES elements of two arrays, stored in a third."""
+        """Emit the weighted sum of LANES elements of two arrays, stored in the first;
+        returns numba's void.
+        """
         left = _load(b, _at(context, b, signature, args, 2, args[4]))
         right = _load(b, _at(context, b, signature, args, 3, args[4]))
         mixed = _fma(b, left, _spread(b, args[5]), b.fmul(right, _spread(b, args[6])))
@@ -138,13 +153,13 @@ def resample_lanes(
 ) -> Any:
     """Add line at (at + v / 2^POINT + i step), linear, to acc[k + i], 0 <= i < LANES.
 
-    Not for 1 lane. Needs 0 <= v / 2^POINT + i step < 2 LANES - 1; reads line[at : at + 2
-    LANES].
+    Not for 1 lane. Needs 0 <= v / 2^POINT + i step < 2 LANES - 1, which is not checked;
+    reads line[at : at + 2 LANES].
     """
 
     def codegen(context: Any, b: Any, signature: Any, args: Any) -> Any:
         """Emit LLVM code of the linear look-up of LANES places in a line, added to LANES
-        elements of the target.
+        elements of the target; returns numba's void.
         """
         target = _at(context, b, signature, args, 0, args[1])
         # line[at : at + 2 LANES] in two registers, between whose samples the permutation picks.
@@ -171,7 +186,9 @@ def resample_lanes(
 
 @fused
 def mix_one_by_one(out, left, right, first, count, one, other):
-    """Compute out[r] = one * left[first + r] + other * right[first + r], 0 <= r < count."""
+    """Compute out[r] = one * left[first + r] + other * right[first + r], 0 <= r < count,
+    one value after the other; `out` is changed in place.
+    """
     for r in range(count):
         out[r] = one * left[first + r] + other * right[first + r]
 
@@ -187,8 +204,10 @@ def mix_wide(out, left, right, first, count, one, other):
 
 @kernel
 def add_line(acc, line, first, count, start, step):
-    """Add line at (start + k step), linear, to acc[first + k], 0 <= k < count, all
-    inside.
+    """Add line at (start + k step), linear, to acc[first + k], 0 <= k < count, in place.
+
+    All places must be inside the line, which needs one sample after the last place;
+    nothing is checked.
     """
     for k in range(count):
         at = start + k * step
@@ -199,8 +218,11 @@ def add_line(acc, line, first, count, start, step):
 
 @kernel
 def add_line_wide(acc, line, first, count, start, step):
-    """Apply `add_line`, with its arguments, to LANES voxels at a time while that fits and
-    steps are not too steep; `line` needs MARGIN samples after its end. Adds to `acc`.
+    """Apply `add_line`, with its arguments, to LANES voxels at a time while that fits;
+    one by one for the first up to an aligned voxel, for the rest, and for all if the step
+    is `STEEPEST` or more.
+
+    Adds to `acc`, aligned to registers; `line` needs MARGIN samples after its end.
     """
     k = np.int64(0)
     if abs(step) < STEEPEST:
@@ -251,7 +273,8 @@ def _column(g, cols, x, y):
         y: [mm].
 
     Returns:
-        depth along the panel's normal [mm], 0 if the view does not see them, and the column.
+        depth along the panel's normal [mm], and the column, a fraction from 0 to cols -
+        1. (0, 0) if the voxels are behind the source or beside the image.
     """
     x -= g[0]
     y -= g[1]
@@ -266,22 +289,24 @@ def _column(g, cols, x, y):
 
 @kernel
 def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
-    """Add one view to the voxels above one another at (x, y); see `backproject`.
+    """Add one view to the voxels above one another at (x, y), weighted by 1 / depth^2;
+    see `backproject`.
 
-    Nothing is added where the column is beyond the image or behind the source; only
-    voxels whose rows are on the panel.
+    Nothing is added where the column is beyond the image or behind the source, and only
+    to voxels whose rows are on the panel. Values are interpolated linearly between
+    columns and rows.
 
     Args:
         acc: (nz,) voxels, changed in place.
         image: (cols, rows) filtered.
         rows: of the image.
         shares: (depths, rows) of a helix; unused otherwise.
-        g: (11,) or (13,) row of the views' table.
+        g: (11,) row of the views' table, or (13,) of a helix.
         x: [mm].
         y: [mm].
         z0: lowest voxel's centre [mm].
         dz: step along z [mm].
-        line: room for a column of the image.
+        line: room for a column of the image, overwritten.
     """
     depth, c = _column(g, len(image), x, y)
     if depth == 0.0:
@@ -324,12 +349,19 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
 def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, row, rise):
     """Compute where a view sees neighbouring voxels.
 
-    Fills the sample before (at), the fractions across and down, and the weight, 0 for
-    voxels that it does not see. Numbers that differ little are float32.
+    Numbers that differ little are float32. Places are limited to the image, so that those
+    without weight can be read.
 
-    size, base: columns and rows of the image; the column to which `c` is relative.
-    zero: the voxel of which `depth`, `c` and `row` are.
-    slope, turn, rise: change a voxel of the depth, and of column and row times the depth.
+    Args:
+        at: (n,) int32, filled: index of the sample before each place, column * rows +
+            row.
+        across, down: (n,) filled: fractions of a column and a row behind it.
+        weight: (n,) filled: 1 / depth^2; 0 for voxels behind the source or off the image.
+        size: columns and rows of the image.
+        base: the column to which `c` is relative.
+        zero: the voxel of which `depth`, `c` and `row` are.
+        slope: change a voxel of the depth.
+        turn, rise: change a voxel of column and row times the depth.
     """
     none = np.float32(0.0)
     first, last, lowest = (
@@ -358,7 +390,8 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
 
 @fused
 def _add_places(acc, image, rows, at, across, down, weight):
-    """Add a view's values at places, interpolated and weighed, to voxels.
+    """Add a view's values at places, interpolated bilinearly and weighed, to voxels; no
+    bounds are checked.
 
     Args:
         acc: (n,) voxels, changed in place.
@@ -380,11 +413,14 @@ def _add_places(acc, image, rows, at, across, down, weight):
 
 @kernel
 def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
-    """Add one view to neighbouring voxels: for few rows, for which full registers would not
-    pay.
+    """Add one view to neighbouring voxels along x, layer by layer: for few rows, for
+    which full registers would not pay.
+
+    Nothing is added if the farthest voxel is behind the source; single voxels behind it
+    or off the image get weight 0.
 
     Args:
-        acc: (nx, nz) voxels from (x, y) on, changed in place.
+        acc: (nx, nz) voxels from (x, y) on, changed in place; nx at most WIDE.
         image: (cols, rows) filtered.
         rows: of the image.
         g: (11,) row of the views' table, see `backproject`.
@@ -393,7 +429,7 @@ def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
         z0: of the lowest [mm].
         dx: step along x [mm].
         dz: step along z [mm].
-        at: room for indices.
+        at: room for WIDE indices.
         parts: (3, WIDE) room.
     """
     n, cols = len(acc), len(image)
@@ -448,12 +484,17 @@ def _add_tile(
     parts,
     volume,
 ):
-    """Add all views to one tile of voxel columns.
+    """Add all views to one tile of voxel columns, TILE along y and TILE along x; WIDE
+    along x for panels of few rows, which have a way of their own (`_add_few`). Tiles end
+    at the grid's edges.
 
-    The sum is added to `volume` in place; panels of few rows have a way of their own.
+    The sum is added to `volume` in place.
 
-    Args as for `backproject`; besides first_x, first_y: the tile's first voxel column; line,
-    at, parts: room.
+    Args:
+        images, rows, shares, views, x0, y0, z0, dx, dy, dz, volume: as for `backproject`;
+            images without additional rows mean few rows.
+        first_x, first_y: the tile's first voxel column.
+        line, at, parts: room.
     """
     ny, nx = volume.shape[:2]
     few = images.shape[2] == rows
@@ -492,18 +533,21 @@ def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
 
     @parallel
     def backproject(images, rows, shares, views, x0, y0, z0, dx, dy, dz, volume, workers):
-        """Add views to a volume.
+        """Add views to a volume: tiles of voxel columns are taken by the threads one
+        after the other.
 
-        images: float32 (n, cols, rows and as many more as `room` says), contiguous.
-        rows: of the images.
-        shares: float32 (n, depths, rows), weights of rows in a helix; else (n, 0, 0).
-        views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in
-            pitches of columns; column of the foot point; distance in pitches of rows; row
-            of the foot point; of a helix (n, 13): first depth of the shares, and how many
-            a mm.
-        x0..dz: centre of the first voxel and steps [mm].
-        volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
-        workers: threads.
+        Args:
+            images: float32 (n, cols, rows and as many more as `room` says), contiguous.
+            rows: of the images.
+            shares: float32 (n, depths, rows), weights of rows in a helix; else (n, 0, 0).
+            views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y;
+                distance in pitches of columns; column of the foot point; distance in
+                pitches of rows; row of the foot point; of a helix (n, 13): first depth of
+                the shares, and how many a mm.
+            x0, y0, z0: centre of the first voxel [mm].
+            dx, dy, dz: steps [mm].
+            volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
+            workers: threads.
         """
         _ = lanes  # part of the disk cache's key
         ny, nx = volume.shape[:2]
@@ -545,9 +589,24 @@ backproject = _entry_point(LANES)
 
 @kernel
 def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
-    """Add a view's weight to the voxels above one another at (x, y) that its rows see; `seen`
-    holds the differences from one to the next. Returns that weight, and the angle of the lines
-    through the voxels that the panel's columns see in this view; see `normalise_coverage`.
+    """Add a view's weight to the voxels above one another at (x, y) that its rows see;
+    see `normalise_coverage`.
+
+    Args:
+        g: (11,) row of the views' table.
+        weights: (cols,) of the view's rays; the column is rounded down.
+        rows: of the image.
+        on_panel: first and last column of the panel.
+        radius: from the axis to the source [mm].
+        x, y: [mm].
+        z0, dz: centre of the lowest voxel and step along z [mm].
+        seen: (nz + 1,) differences of the weight from one voxel to the next, changed in
+            place.
+
+    Returns:
+        The weight (times depth^-1.5), and the angle [rad] of the lines through the voxels
+        that the panel's columns see in this view, 0 off the panel; both 0 if the view
+        does not see them.
     """
     depth, c = _column(g, weights.size, x, y)
     if depth == 0.0:
@@ -589,17 +648,23 @@ def normalise_coverage(
     half_turn,
     volume,
 ):
-    """Divide each voxel by the share of the views' weight that saw it.
+    """Divide each voxel by the share of the views' weight that saw it, in place.
 
     In the other views it is above or below the panel. Voxels whose share is less than
     `least` become NaN, as do those that are not seen along lines of all directions
-    (`half_turn`).
+    (`half_turn`); voxels seen by all views stay.
 
-    views: float64 (n, 11) and weights: float64 (n, cols), of `backproject`.
-    on_panel: first and last column of the panel.
-    radius: from the axis to the source [mm].
-    half_turn: pi, or nearly so [rad]; 0 where nothing is beside the panel.
-    volume: float32 (ny, nx, nz).
+    Args:
+        views: float64 (n, 11), of `backproject`.
+        weights: float64 (n, cols) of rays.
+        rows: of the images.
+        on_panel: first and last column of the panel.
+        radius: from the axis to the source [mm].
+        x0, y0, z0: centre of the first voxel [mm].
+        dx, dy, dz: steps [mm].
+        least: share of the weight.
+        half_turn: pi, or nearly so [rad]; 0 where nothing is beside the panel.
+        volume: float32 (ny, nx, nz).
     """
     ny, nx, nz = volume.shape
     for iy in prange(ny):
@@ -633,10 +698,12 @@ def normalise_coverage(
 
 
 def room(n: int, cols: int, rows: int, few: bool) -> Float32Array:
-    """Allocate memory for images, (n, cols, rows and more), in aligned columns of full
-    registers.
+    """Allocate zeros for images, (n, cols, rows and more), in aligned columns of full
+    registers: one register more than needed if rows fill the last.
 
-    Panels of few rows get no more rows, by which the kernel recognises them.
+    Args:
+        n, cols, rows: size of the images.
+        few: of a panel of few rows: no more rows, by which the kernel recognises it.
     """
     shape = (n, cols, rows if few else (rows // LANES + 1) * LANES)
     return aligned_zeros(math.prod(shape)).reshape(shape)
@@ -645,14 +712,16 @@ def room(n: int, cols: int, rows: int, few: bool) -> Float32Array:
 @parallel
 def weigh(images, first, factors, across, up, out):
     """Compute out[n, r, c] = images[n, first + r, c] * factors[n, c] / length of the ray
-    to (r, c).
+    to (r, c), for all rows of `out`.
 
-    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its
-    outermost ones.
-    out: float32 (n, rows, cols or more); 0 in columns after these.
-    factors: float64 (n, cols).
-    across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n,
-    rows) [mm^2].
+    Args:
+        images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its
+            outermost ones.
+        first: row of the panel that is the first of `out`; may be off the panel.
+        factors: float64 (n, cols).
+        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n,
+            rows) [mm^2].
+        out: float32 (n, rows, cols or more), filled; 0 in columns after these.
     """
     n, rows, padded = out.shape
     cols = factors.shape[1]
@@ -670,13 +739,14 @@ def weigh(images, first, factors, across, up, out):
 
 @parallel
 def add_views(images, first, signs, sums):
-    """Add images to their sum, and each with its sign to their alternating sum.
+    """Add images to their sum, and each with its sign to their alternating sum, in place.
 
-    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its outermost
-        ones.
-    first: row of the panel that is the first of `sums`.
-    signs: float32 (n,).
-    sums: float32 (2, rows, cols), added to.
+    Args:
+        images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its
+            outermost ones.
+        first: row of the panel that is the first of `sums`; may be off the panel.
+        signs: float32 (n,): 1, -1 or 0.
+        sums: float32 (2, rows, cols): plain, alternating; added to.
     """
     _, rows, cols = sums.shape
     for r in prange(rows):
@@ -693,7 +763,15 @@ def add_views(images, first, signs, sums):
 
 @parallel
 def copy_rows(images, order, first, out):
-    """Copy out[n, r, c] = images[order[n], first + r, c], float32, on all cores."""
+    """Copy out[n, r, c] = images[order[n], first + r, c], float32, on all cores; the rows
+    must exist.
+
+    Args:
+        images: (any number, rows, cols).
+        order: (n,) numbers of images.
+        first: first row that is copied.
+        out: (n, rows, cols), filled.
+    """
     n, rows, _ = out.shape
     for job in prange(n * rows):
         out[job // rows, job % rows] = images[order[job // rows], first + job % rows]
@@ -701,8 +779,11 @@ def copy_rows(images, order, first, out):
 
 @parallel
 def respond(spectra, response):
-    """Multiply spectra, float32 (n, frequencies, 2), real and imaginary, by response
-    (frequencies,).
+    """Multiply spectra by a filter's response, in place.
+
+    Args:
+        spectra: float32 (n, frequencies, 2), real and imaginary.
+        response: (frequencies,).
     """
     for k in prange(len(spectra)):
         for f in range(response.size):
@@ -741,8 +822,11 @@ PARTS = 1024
 
 
 def lanczos() -> Float32Array:
-    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1: three
-    lobes, sum 1.
+    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1 between
+    samples 0 and 1: Lanczos' kernel of three lobes.
+
+    Returns:
+        float32 (PARTS + 1, TAPS), each row's sum 1.
     """
     x = np.arange(PARTS + 1)[:, None] / PARTS - np.arange(-2, 4)
     weights = np.sinc(x) * np.sinc(x / 3.0)
@@ -751,16 +835,18 @@ def lanczos() -> Float32Array:
 
 @parallel
 def warp(images, maps, weights, out):
-    """Sample out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges repeat their last pixel.
+    """Sample out[n, r, c] = images[n] at maps[n] @ (c, r, 1); points off the image take
+    its edge's value.
 
-    `weights` are those of `lanczos`: with three lobes sharp details in a tilted image stay
-    sharper than by cubic interpolation, which took contrast from the finest ones.
+    `weights` are those of `lanczos`, for the nearest of PARTS tabulated fractions: with
+    three lobes sharp details in a tilted image stay sharper than by cubic interpolation,
+    which took contrast from the finest ones.
 
     Args:
-        images: float32 (n, rows of the panel, cols).
+        images: float32 (n, rows, cols).
         maps: float64 (n, 3, 3) homographies.
         weights: float32 (PARTS + 1, TAPS).
-        out: float32 (n, rows, wide), filled.
+        out: float32 (n, rows, wide), filled; as many rows as the images.
     """
     n, rows, wide = out.shape
     cols = images.shape[2]

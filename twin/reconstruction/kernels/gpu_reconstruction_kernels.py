@@ -48,10 +48,17 @@ else:
 @cuda.jit
 def weigh(images, top, factors, across, up, out):
     """Compute out[n, c, r] = images[n, top + r, c] * factors[n, c] / sqrt(across[n, c] +
-    up[n, r]).
+    up[n, r]), one pixel a thread.
 
-    All are float32; images (n, rows of the panel, cols), out (n, cols, rows); see
+    Rows and columns are swapped; rows off the panel repeat its outermost ones. See
     `fdk_kernels.weigh`.
+
+    Args:
+        images: float32 (n, rows of the panel, cols).
+        top: row of the panel that is the first of `out`.
+        factors, across: float32 (n, cols).
+        up: float32 (n, rows).
+        out: float32 (n, cols, rows), filled.
     """
     r = cuda.blockIdx.x * PLANE[0] + cuda.threadIdx.x
     c = cuda.blockIdx.y * PLANE[1] + cuda.threadIdx.y
@@ -65,14 +72,17 @@ def weigh(images, top, factors, across, up, out):
 
 @cuda.jit
 def convolve(weighted, taps, start, out):
-    """Convolve rows with taps.
+    """Convolve rows with symmetric taps: out[n, c, r] = sum over j of weighted[n, j, r] *
+    taps[|start + c - j|].
 
-    out[n, c, r] = sum over j of weighted[n, j, r] * taps[|start + c - j|]. A thread
-    computes RUN neighbouring columns: from one j to the next the taps move on by one
-    place, so that two numbers are read for RUN products.
+    A thread computes RUN neighbouring columns: from one j to the next the taps move on by
+    one place, so that two numbers are read for RUN products.
 
-    weighted: float32 (n, wide, rows), rows contiguous; out: (n, cols, rows).
-    taps: float32 (wide + RUN,) at least.
+    Args:
+        weighted: float32 (n, wide, rows), rows contiguous.
+        taps: float32 (wide + RUN,) at least.
+        start: column of `weighted` that is the first of `out`.
+        out: float32 (n, cols, rows), filled.
     """
     r = cuda.blockIdx.x * PLANE[0] + cuda.threadIdx.x
     c = (cuda.blockIdx.y * PLANE[1] + cuda.threadIdx.y) * RUN
@@ -108,7 +118,17 @@ SIDES = 128
 
 @cuda.jit(device=True, inline=True)
 def prism_path(lengths, view, low, share, slant, c):
-    """Compute path length times attenuation, of a ray `slant` times its horizontal part."""
+    """Compute path length times attenuation of a ray through the prisms of its row's two
+    bands, interpolated.
+
+    Args:
+        lengths: (n, bands, wide), over the ray's horizontal length [1/mm]; the last band
+            stands for the one after it.
+        view: number of the image.
+        low, share: lower band of the row, and how much the next one counts.
+        slant: length of the ray from source to pixel [mm].
+        c: column.
+    """
     high = min(low + 1, lengths.shape[1] - 1)
     lower = lengths[view, low, c]
     return (lower + share * (lengths[view, high, c] - lower)) * slant
@@ -119,10 +139,15 @@ def edge_sum(
     images, top, lengths, band, share, across, up, before, edge, view, r, side, part
 ):
     """Compute a 32nd of the sum, over an edge's columns, of a row less the prisms' path
-    lengths.
+    lengths: every 32nd column from `part` on; 0 if there is none.
 
-    The first arguments are those of `filter_rows`; view, r: image and row; side: 0 left, 1
-    right; part: which 32nd.
+    The first arguments are those of `filter_rows`.
+
+    Args:
+        view: number of the image.
+        r: row; off the panel its outermost row is read.
+        side: 0 left, 1 right.
+        part: which 32nd.
     """
     row = min(max(top + r, 0), images.shape[1] - 1)
     first = images.shape[2] - edge if side else 0
@@ -152,10 +177,19 @@ def weighted_pixel(
     c,
     which,
 ):
-    """Compute a pixel of a widened row with FDK's weight; see `fdk_kernels.weigh`.
+    """Compute a pixel of a widened row with FDK's weight: on the panel the image's (rows
+    off it repeat its outermost one), beside it the prisms' path and the fading rest; see
+    `fdk_kernels.weigh`.
 
-    rests: residual of the prisms at the low (2 `which`) and the high edge (2 `which` + 1)
-    of the row.
+    The first arguments are those of `filter_rows`.
+
+    Args:
+        rests: (4,) residual of the prisms at the low (2 `which`) and the high edge (2
+            `which` + 1) of the row.
+        view: number of the image.
+        r: row.
+        c: column among the widened ones.
+        which: 0 or 1, of the block's two rows.
     """
     slant = math.sqrt(across[view, c] + up[view, r])
     if c < before or c >= before + images.shape[2]:
@@ -188,19 +222,25 @@ def filter_rows(
 ):
     """Continue rows beyond the panel's edges, weigh and filter them.
 
-    A block takes two rows as the real and the imaginary part of one signal, through a Fourier
-    transform in its shared memory, forward to the order of reversed bits and back from it.
+    A block of THREADS takes two rows as the real and the imaginary part of one signal,
+    through a Fourier transform in its shared memory, forward to the order of reversed
+    bits and back from it. The last row of an odd number is paired with itself.
 
-    images: float32 (n, rows of the panel, cols); row `top` is the first that is needed.
-    before: columns that go into the filter before the panel's first.
-    edge: columns at an edge whose mean is continued; 0 where no column is beyond.
-    factors, across, up: float32 (n, wide), (n, wide), (n, rows) of `fdk_kernels.weigh`.
-    lengths, band, share, cut, fade: of `truncation_kernels.continue_rows`, float32 and
-        int32.
-    response: float32 (length,) over the length, a power of 2, in the order of reversed
-        bits.
-    cosines, sines: float32 (length / 2,) of 2 pi k / length.
-    out: float32 (n, cols, rows), from column `start` of the filtered rows on.
+    Args:
+        images: float32 (n, rows of the panel, cols); row `top` is the first that is
+            needed.
+        top: see images; rows off the panel repeat its outermost ones.
+        before: columns that go into the filter before the panel's first.
+        edge: columns at an edge whose mean is continued; 0 where no column is beyond.
+        factors, across, up: float32 (n, wide), (n, wide), (n, rows) of
+            `fdk_kernels.weigh`.
+        lengths, band, share, cut, fade: of `truncation_kernels.continue_rows`, float32
+            and int32.
+        response: float32 (length,) over the length, a power of 2 up to LENGTH, in the
+            order of reversed bits.
+        cosines, sines: float32 (length / 2,) of 2 pi k / length.
+        start: first column of the filtered rows that is kept.
+        out: float32 (n, cols, rows), filled.
     """
     real = cuda.shared.array(4096, np.float32)
     imaginary = cuda.shared.array(4096, np.float32)
@@ -310,16 +350,21 @@ def filter_rows(
 
 @cuda.jit
 def backproject(images, cols, rows, views, first, size, volume):
-    """Add views to a volume.
+    """Add views to a volume, interpolated linearly between columns and rows.
 
-    The line of rows that a voxel column meets is the same for all its voxels. The threads of a
-    warp, which have one voxel column in common, find it in double precision for as many views
-    at a time, one each; then every thread goes through these views with rows in fixed point.
+    The line of rows that a voxel column meets is the same for all its voxels. The threads
+    of a warp, which have one voxel column in common, find it in double precision for as
+    many views at a time, one each; then every thread goes through these views for RUN
+    voxels with rows in fixed point. Voxels behind the source or off the panel get nothing
+    of a view.
 
-    images: float32 (n * cols * rows,), rows of a column beside each other; fewer than 2^32.
-    views: float64 (n, 11), as `fdk.view_table` makes them.
-    first, size: centre of the first voxel and steps, (3,) x, y, z [mm].
-    volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
+    Args:
+        images: float32 (n * cols * rows,), rows of a column beside each other; fewer than
+            2^32.
+        cols, rows: of an image.
+        views: float64 (n, 11), as `fdk_views.view_table` makes them.
+        first, size: centre of the first voxel and steps, (3,) x, y, z [mm].
+        volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
     """
     lane, warp = cuda.threadIdx.x, cuda.threadIdx.y
     ix = cuda.blockIdx.y * BLOCK[1] + warp
@@ -429,8 +474,12 @@ def differences(x, i, k, column, counts, stride, scale):
 
 @cuda.jit
 def lengths(x, counts, stride, scale, out):
-    """Fill `out` with the length of each voxel's differences, whose sum is the total variation;
-    arguments as those of `differences`.
+    """Fill `out` with the length of each voxel's differences, whose sum is the total
+    variation; 0 for places between voxel columns (beyond nz); one voxel a thread.
+
+    Args:
+        x, counts, stride, scale: as those of `differences`.
+        out: flat, as many as `x`, filled.
     """
     i = cuda.grid(1)
     if i < x.size:
@@ -443,8 +492,8 @@ def lengths(x, counts, stride, scale, out):
 
 @cuda.jit
 def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
-    """Compute x, the allowed values next to z - theta D' dual, D' the transposed differences; a
-    thread a voxel.
+    """Compute x = max(z - theta D' dual, lowest), D' the transposed differences, one
+    voxel a thread; 0 where not allowed and at places between voxel columns.
 
     Args:
         z: flat voxels.
@@ -479,8 +528,10 @@ def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
 
 @cuda.jit
 def dual_step(x, ahead, dual, rate, momentum, counts, stride, scale):
-    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate: ahead =
-    dual + momentum times the change of dual.
+    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate:
+    ahead = dual + momentum times the change of dual; one voxel a thread.
+
+    Places between voxel columns stay. D x are the `differences`.
 
     Args:
         x: flat voxels.

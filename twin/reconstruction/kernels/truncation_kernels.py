@@ -33,14 +33,15 @@ itself it is infinite."""
 
 @kernel
 def _chord(prism, source_x, source_y, x, y):
-    """Compute path length times attenuation through a prism, over the ray's horizontal length.
+    """Compute path length times attenuation through a prism, over the ray's horizontal
+    length; 0 for a ray that misses it.
 
     Args:
         prism: (6,) centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc;
             attenuation.
         source_x: [mm].
         source_y: [mm].
-        x: horizontal direction of the ray.
+        x: horizontal direction of the ray, of any length.
         y: likewise.
     """
     start_x = source_x - prism[0]
@@ -57,7 +58,8 @@ def _chord(prism, source_x, source_y, x, y):
 
 @kernel
 def _edge_mean(line, before, first, last, lower, upper, share, across, high):
-    """Average a row less the prisms' path lengths over columns first <= c < last of the panel.
+    """Average a row less the prisms' path lengths over columns first <= c < last of the
+    panel; 0 without columns.
 
     Args:
         line: the panel's row.
@@ -82,10 +84,18 @@ def _edge_mean(line, before, first, last, lower, upper, share, across, high):
 def _continue_side(
     out, first, last, near, lower, upper, share, across, high, rest, fade, factors
 ):
-    """Fill columns first <= c < last of a row: the prisms, and the rest at the edge fading
-    out, times the columns' factors over the rays' lengths, if there are factors.
+    """Fill columns first <= c < last of a row: the prisms' path, and the rest at the edge
+    fading out; with factors, times these over the rays' lengths.
 
-    near: first and last of these columns in which some of the rest is left.
+    Args:
+        out: (wide,) row, changed in place.
+        first, last: columns.
+        near: first and last of these columns in which some of the rest is left; only read
+            with factors.
+        lower, upper, share, across, high: as for `_edge_mean`.
+        rest: residual at the edge.
+        fade: (wide,) share of it that is left.
+        factors: (wide,), or (0,) for none.
     """
     if factors.size == 0:
         for c in range(first, last):
@@ -103,15 +113,17 @@ def _continue_side(
 
 @parallel
 def prism_lengths(before, cols, edge, plane, prisms, out):
-    """Compute the horizontal path lengths times attenuation of prisms beyond a panel's edges.
+    """Compute the horizontal path lengths times attenuation of prisms beyond a panel's
+    edges.
 
-    before, cols: columns before the panel's first, and of the panel.
-    edge: columns at an edge whose mean is continued.
-    plane: (n, 6) source, ray to the first column of `out`, and step from column to
-        column, x and y [mm].
-    prisms: (k, 6) of `_chord`.
-    out: float32 (n, k, wide), over the horizontal length of the ray [1/mm]; 0 in columns
-        of the panel that are not at an edge.
+    Args:
+        before, cols: columns before the panel's first, and of the panel.
+        edge: columns at an edge whose mean is continued.
+        plane: (n, 6) source, ray to the first column of `out`, and step from column to
+            column, x and y [mm].
+        prisms: (k, 6) of `_chord`; those without attenuation give 0.
+        out: float32 (n, k, wide), filled, over the horizontal length of the ray [1/mm]; 0
+            in columns of the panel that are not at an edge.
     """
     n, bands, wide = out.shape
     after = before + cols
@@ -132,20 +144,24 @@ def continue_rows(
 ):
     """Continue rows beyond the panel's edges; with factors, weigh them in the same pass.
 
-    images: float32 (n, rows of the panel, cols).
-    first: row of the panel that is the first of `out`; rows beyond it repeat its
-    outermost ones.
-    before: columns of `out` before the panel's first.
-    edge: columns at an edge whose mean is continued.
-    lengths: (n, bands, wide) of `prism_lengths`.
-    band, share: (rows,) lower band of each row, and how much the next one counts.
-    cut: (rows,) share of the prisms' residual at the edges that is continued.
-    fade: (wide,) part of it that is left in each column.
-    across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n,
-    rows) [mm^2].
-    factors: (n, wide) that rows are multiplied by, over the rays' lengths, as
-    `fdk_kernels.weigh` does; (n, 0) for rows as they are.
-    out: float32 (n, rows, wide or more); 0 in columns after these.
+    Beside the panel a row is the prisms' path length and the mean residual at its edge,
+    which fades out.
+
+    Args:
+        images: float32 (n, rows of the panel, cols).
+        first: row of the panel that is the first of `out`; rows beyond it repeat its
+            outermost ones.
+        before: columns of `out` before the panel's first.
+        edge: columns at an edge whose mean is continued; 0 for no residual.
+        lengths: (n, bands, wide) of `prism_lengths`.
+        band, share: (rows,) lower band of each row, and how much the next one counts.
+        cut: (rows,) share of the prisms' residual at the edges that is continued.
+        fade: (wide,) part of it that is left in each column.
+        across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n,
+            rows) [mm^2].
+        factors: (n, wide) that rows are multiplied by, over the rays' lengths, as
+            `fdk_kernels.weigh` does; (n, 0) for rows as they are.
+        out: float32 (n, rows, wide or more), filled; 0 in columns after these.
     """
     n, rows, padded = out.shape
     wide = across.shape[1]
@@ -195,8 +211,8 @@ def continue_rows(
 
 @kernel
 def _cost(x, source, rays, length, seen, scale):
-    """Compute half the sum of Cauchy's losses of a prism's deviations, over their squared
-    scale.
+    """Compute half the sum of Cauchy's losses log(1 + r^2) of a prism's deviations r, in
+    units of the scale; rays that miss the prism have path 0.
 
     Args:
         x: (6,) of `Prism.of`.
@@ -228,9 +244,10 @@ def _cost(x, source, rays, length, seen, scale):
 
 @kernel
 def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient):
-    """Compute curvature and gradient of `_cost`, whose arguments come first.
+    """Compute curvature (Gauss-Newton) and gradient of `_cost`.
 
-    Rays that miss the prism add nothing; large residuals count less.
+    Rays that miss the prism add nothing; large residuals count less, and slopes near the
+    rim are limited (`MIN_CHORD_SHARE`).
 
     Args:
         x: (6,) of `Prism.of`.
@@ -240,7 +257,7 @@ def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradi
         seen: see `_cost`.
         scale: see `_cost`.
         slope: room for six numbers.
-        matrix: (6, 6) lower triangle filled.
+        matrix: (6, 6) lower triangle filled, the rest 0.
         gradient: (6,) filled.
     """
     e = math.exp(x[2])
@@ -288,7 +305,7 @@ def _solved(matrix, gradient, free, damping, factor, step):
     """Compute the damped step of the free parameters by Cholesky.
 
     Args:
-        matrix: (6, 6) curvature, lower triangle.
+        matrix: (6, 6) curvature, lower triangle; unchanged.
         gradient: (6,).
         free: (6,) bool.
         damping: share of the diagonal that is added to it.
@@ -296,7 +313,8 @@ def _solved(matrix, gradient, free, damping, factor, step):
         step: (6,) filled; 0 for parameters that are not free.
 
     Returns:
-        Whether there is a step; False if the matrix is not positive definite.
+        True if there is a step; False if the matrix is not positive definite, then `step`
+        is meaningless.
     """
     for a in range(PARAMETERS):
         step[a] = -gradient[a] if free[a] else 0.0
@@ -325,14 +343,24 @@ def _solved(matrix, gradient, free, damping, factor, step):
 
 @serial
 def fit_prism(source, rays, length, seen, least, most, scale, x):
-    """Fit a prism within bounds, in place; returns the cost (`_cost` times scale^2).
+    """Fit a prism within bounds, in place, by damped Gauss-Newton steps
+    (Levenberg-Marquardt).
 
-    source: (n, 2); rays: (n, k, 2) in the plane, over the radius of the field of view.
-    length: (n, k) of these rays [mm].
-    seen: (n, k) line integrals in the plane.
-    least, most: (6,) bounds.
-    scale: deviation from which on rays count less.
-    x: (6,) of `Prism.of`; the first guess, then the result.
+    Parameters at a bound that the gradient pushes outwards are fixed for a step. Ends
+    when the relative fall of the cost is at most `MIN_GAIN`, after MAX_STEPS, or if the
+    damping exceeds `MOST_DAMPING`.
+
+    Args:
+        source: (n, 2) in the plane, over the radius of the field of view.
+        rays: (n, k, 2) likewise.
+        length: (n, k) of these rays [mm].
+        seen: (n, k) line integrals in the plane.
+        least, most: (6,) bounds.
+        scale: deviation from which on rays count less.
+        x: (6,) of `Prism.of`; the first guess, clipped to the bounds, then the result.
+
+    Returns:
+        The cost (`_cost` times scale^2).
     """
     slope = np.empty(PARAMETERS)
     gradient = np.empty(PARAMETERS)

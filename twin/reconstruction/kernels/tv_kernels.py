@@ -35,12 +35,13 @@ def differences(x, k, j, i, scale):
 
 @parallel
 def variation(x, scale, layers, first, last):
-    """Compute the total variation of layers first <= k < last, which the caller adds up.
+    """Compute the total variation of layers first <= k < last, each in double precision,
+    which the caller adds up.
 
     Args:
         x: (nz, ny, nx).
         scale: (3,) factors on the differences.
-        layers: (nz,) float64, filled.
+        layers: (nz,) float64; elements first to last - 1 are filled.
         first: first layer.
         last: layer after the last.
     """
@@ -56,8 +57,8 @@ def variation(x, scale, layers, first, last):
 
 @parallel
 def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
-    """Compute x, the allowed values next to z - theta D' dual, D' the transposed differences,
-    in layers first <= k < last.
+    """Compute x = max(z - theta D' dual, lowest), D' the transposed differences, in
+    layers first <= k < last; 0 where not allowed.
 
     Args:
         z: (nz, ny, nx).
