@@ -44,7 +44,13 @@ steps."""
 
 
 def device_takes(like: Volume, shape: tuple[int, int]) -> bool:
-    """Return whether a device has room for the grid of `like` and images of (rows, cols)."""
+    """Return whether a device is present and has room for the grid of `like` (at most
+    `MOST_COLUMNS` voxels along y) and `STACKS` stacks of `CHUNK` images.
+
+    Args:
+        like: place and size of the grid; its values are not read.
+        shape: (rows, cols) of the images.
+    """
     nz, ny, nx = like.shape
     need = 4 * (nz * ny * nx + STACKS * CHUNK * shape[0] * shape[1])
     return gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(need)
@@ -69,10 +75,14 @@ class OnProcessor:
         self.meter: NoiseMeter | None = None
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume, in place, and to the noise
-        meter, if there is one.
+        """Weigh and filter views in small groups that stay in the caches, and add them to
+        the volume, in place; then also to the noise meter, if there is one.
 
-        Memory for filtered columns is kept for the next views of the same size.
+        Memory for filtered columns is kept for the next views of the same size; the meter
+        overwrites it.
+
+        Args:
+            views: the next ones.
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -106,8 +116,15 @@ class OnProcessor:
 
 
 def _weighed(views: Views) -> Float32Array:
-    """Compute the images weighted for the filter, padded with zeros to its length, (n,
-    rows, padded columns); widened first where they are truncated.
+    """Compute the images weighted for the filter, padded with zeros to its length.
+
+    Rows are widened first where columns off the panel go into the filter.
+
+    Args:
+        views: n views.
+
+    Returns:
+        (n, rows that are needed, padded columns).
     """
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -140,7 +157,8 @@ class OnDevice:
     """
 
     def __init__(self, like: Volume) -> None:
-        """Allocate a volume of zeros on the device, with the place and size of `like`.
+        """Allocate a volume of zeros on the device, with the place and size of `like`;
+        other memory is allocated when views are added.
 
         Raises:
             gpu.DeviceError: the device fails.
@@ -153,8 +171,8 @@ class OnDevice:
         self.meter: NoiseMeter | None = None
 
         def prepare() -> None:
-            """Allocate on the device the grid, a volume of zeros, the stream and the
-            image upload.
+            """Allocate on the device the grid, a volume of zeros, the stream of the
+            kernels and the image upload; stores all four in the object.
             """
             from numba import cuda
 
@@ -168,11 +186,17 @@ class OnDevice:
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume on the device; see
-        `OnProcessor`.
+        """Weigh and filter views, and add them to the volume on the device; does not wait
+        for the last of its work.
 
-        Views are sorted by the noise meter's sign, if there is a meter. Raises if the
-        device fails.
+        Views are sorted by the noise meter's sign (plus, 0, minus), if there is a meter,
+        and then added to its half volumes as well.
+
+        Args:
+            views: the next ones.
+
+        Raises:
+            gpu.DeviceError: the device fails.
         """
         signs = np.zeros(len(views.images), np.float32)
         if self.meter is not None:
@@ -184,14 +208,15 @@ class OnDevice:
     def _add(
         self, views: Views, order: npt.NDArray[np.intp], plus: int, minus: int
     ) -> None:
-        """Weigh, filter and add images in the order of their arrival.
+        """Weigh, filter and add images, in sorted order; also into both half volumes of
+        the noise meter, if there is one.
 
-        Also into both half volumes of the noise meter, if there is one; does not wait for
-        the device.
+        Filters by a Fourier transform where a padded row fits (`padded_power`), else by
+        convolution. Does not wait for the device.
 
         Args:
-            views: their geometry, in `order`.
-            order: number of the image of each.
+            views: with sorted tables but images in the order of arrival.
+            order: number of the image for each row of the tables.
             plus: number of first views that count with a plus in the noise.
             minus: first view of those that count with a minus.
         """
@@ -261,14 +286,16 @@ class OnDevice:
         return ready
 
     def _filter_tables(self, views: Views, length: int) -> tuple[Any, ...]:
-        """Upload the tables that all chunks share: continuation, response, transform's factors.
+        """Upload the tables that all chunks share: continuation, response in the order of
+        reversed bits, the transform's factors.
 
         Args:
             views: with their response.
             length: of the transform, a power of 2.
 
         Returns:
-            `band` to `sines` of `kernels.filter_rows`, on the device.
+            `band` to `sines` of `kernels.filter_rows`, on the device, as the kernel takes
+            them.
         """
         from numba import cuda
 
@@ -284,7 +311,13 @@ class OnDevice:
 
     def _convolved(self, views: Views) -> Any:
         """Weigh the images and filter them by a sum over taps, for rows of any length;
-        result as that of `_transformed`, on the device.
+        the processor continues the rows.
+
+        Args:
+            views: n views, images and tables in the same order.
+
+        Returns:
+            As that of `_transformed`, (n, cols, rows) on the device.
         """
         from numba import cuda
 
@@ -321,8 +354,13 @@ class OnDevice:
         return ready
 
     def _ready(self, n: int, cols: int, rows: int) -> Any:
-        """Reserve device memory for filtered columns, (n, cols, rows); reused by the next
-        call, enlarged where too small.
+        """Reserve device memory for filtered columns, with undefined content.
+
+        One piece of memory is shared by all calls, and replaced by a larger one where too
+        small.
+
+        Returns:
+            (n, cols, rows) on the device.
         """
         from numba import cuda
 
@@ -339,7 +377,8 @@ class OnDevice:
         flat: Any,
         shape: tuple[int, ...],
     ) -> None:
-        """Add filtered images to a volume on the device.
+        """Upload the views' table and add filtered images to a volume on the device; does
+        not wait.
 
         Args:
             ready: filtered images (n, cols, rows) on the device.
@@ -382,8 +421,11 @@ class OnDevice:
         """Return a copy of the sum so far, (ny, nx, nz), after the device has ended its
         work.
 
-        With a noise meter, its data gets the difference of both half volumes. Raises if
-        the device fails.
+        With a noise meter, its data is overwritten by the difference of both half
+        volumes, plus less minus.
+
+        Raises:
+            gpu.DeviceError: the device fails.
         """
         from flexdt.twin.projection.kernels import layout_kernels
 
@@ -405,8 +447,9 @@ class OnDevice:
 
 
 def padded_power(views: Views) -> int:
-    """Count the columns of a row padded to a power of 2; 0 where the device has no room for
-    it."""
+    """Compute the columns of a row padded to a power of 2, enough for the filter's reach;
+    0 where it exceeds `kernels.LENGTH`, which a block's memory has no room for.
+    """
     from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
     least = max(2 * views.reach - 1, views.factors.shape[1], 2)
@@ -415,7 +458,9 @@ def padded_power(views: Views) -> int:
 
 
 def bits_reversed(length: int) -> npt.NDArray[np.intp]:
-    """List numbers below a power of 2 with their bits in reversed order, (length,)."""
+    """List the numbers below a power of 2 with their bits in reversed order, (length,);
+    [0] for 1.
+    """
     order = np.zeros(1, np.intp)
     while len(order) < length:
         order = np.concatenate([2 * order, 2 * order + 1])

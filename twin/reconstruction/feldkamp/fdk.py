@@ -66,15 +66,18 @@ class Task:
     def onto(
         self, target: Backprojector, like: Volume, progress: Progress | None
     ) -> tuple[Float32Array, Noise | None]:
-        """Reconstruct into one grid.
+        """Reconstruct into one grid: plan, add all views, scale voxels that some views do
+        not see.
 
         Args:
-            target: adds the views to a volume.
+            target: adds the views to a volume; gets a new noise meter if noise is
+                measured.
             like: place and size of the grid.
             progress: called with the share of the views that is done.
 
         Returns:
-            Values (nz, ny, nx), and their noise; None without `errors` or in a helix.
+            Values (nz, ny, nx), and their noise; None without `errors`, in a helix, or
+            where it cannot be measured.
 
         Raises:
             GeometryError: see `plan_fdk`; or images that do not fit.
@@ -108,6 +111,9 @@ def fdk_parts(
 ) -> Volume:
     """Reconstruct as `fdk` from views that come in parts, in order, without warnings.
 
+    Works on a device, slab by slab, if there is one with room, no target is given and the
+    scan is a circle; if the device fails, from the beginning on the processor.
+
     Args:
         parts: gives float32 (k, rows, cols) arrays of line integrals, together one image
             a view; called again if a device fails on the way, and for each slab of a
@@ -122,6 +128,13 @@ def fdk_parts(
         outside: keep the values that continued rows give to voxels of a wide object that
             are not seen from all sides, instead of NaN.
         errors: give the volume its `sigma` (of circles).
+
+    Returns:
+        The volume (nz, ny, nx) [1/mm], NaN where too few views see a voxel.
+
+    Raises:
+        GeometryError: see `plan_fdk`; or images that do not fit.
+        UnknownNameError: no such window.
     """
     like = as_volume(like)
     task = Task(parts, cone_vec, shape, window, truncation, outside, errors)
@@ -136,7 +149,7 @@ def fdk_parts(
 def _on_device(
     task: Task, like: Volume, slabs: list[tuple[int, int]], progress: Progress | None
 ) -> Volume:
-    """Reconstruct on a device, slab by slab.
+    """Reconstruct on a device, slab by slab; the images are read once a slab.
 
     Args:
         task: images, geometry and settings.
@@ -145,7 +158,10 @@ def _on_device(
         progress: called with the share that is done.
 
     Returns:
-        The volume, with noise where it was measured in every slab.
+        The volume, with noise where it was measured in every slab, else without any.
+
+    Raises:
+        gpu.DeviceError: the device fails.
     """
     if len(slabs) == 1:
         data, noise = task.onto(OnDevice(like), like, progress)
@@ -193,8 +209,15 @@ def _add_all(
 
 
 def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """List layers (first, last) of the fewest slabs that fit the device one by one; empty
-    without a device, or if not even one layer fits.
+    """List layers (first, last) of the slabs that fit the device one by one: the number
+    of slabs is doubled until one fits.
+
+    Args:
+        like: the complete grid.
+        shape: (rows, cols) of the images.
+
+    Returns:
+        Empty without a device, or if not even one layer fits.
     """
     count = 1
     most = like.shape[0]
@@ -206,7 +229,9 @@ def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def _share(progress: Progress | None, k: int, count: int) -> Progress | None:
-    """Map progress of the k-th of several equal parts to progress of all."""
+    """Map progress of the k-th (from 0) of several equal parts to progress of all; None
+    without progress.
+    """
     if progress is None:
         return None
     return lambda part: progress((k + part) / count)

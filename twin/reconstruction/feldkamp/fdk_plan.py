@@ -150,12 +150,13 @@ class FdkPlan:
     def views_of(self, part: Float32Array, done: int) -> Views:
         """Take the images of some views up to the filter.
 
-        They are turned and rectified to an upright panel, continued beyond a truncated
-        one, and get their weights.
+        They are turned and rectified to an upright panel where needed, and get their
+        weights and the data by which rows are continued beyond a truncated panel;
+        filtering is the back-projector's.
 
         Args:
             part: (k, rows, cols) line integrals as recorded.
-            done: views before these.
+            done: number of views before these.
 
         Raises:
             GeometryError: images of another shape, or more than there are views.
@@ -205,12 +206,17 @@ class FdkPlan:
         )
 
     def cover(self, data: Float32Array, grid: Volume, *, outside: bool) -> None:
-        """Scale voxels that some views do not see, and make NaN those that too few see.
+        """Scale voxels that some views do not see, and make NaN those that too few see;
+        in place.
+
+        In a helix, layers outside those that are seen from every side become NaN, and
+        nothing is scaled.
 
         Args:
             data: of a volume of all views, (ny, nx, nz), changed in place.
             grid: its grid.
-            outside: keep voxels that the panel's continued rows alone show from all sides.
+            outside: keep voxels that the panel's continued rows alone show from all
+                sides.
         """
         if self.sharing is not None:
             z = grid.centers()[2]
@@ -238,18 +244,19 @@ def plan_fdk(
     window: str = PLAIN,
     truncation: Truncation | None = None,
 ) -> FdkPlan:
-    """Plan FDK of a scan into a grid.
+    """Plan FDK of a scan into a grid; reads no images.
 
     Args:
         cone_vec: of all views.
         shape: detector (rows, cols).
-        like: the grid.
+        like: the grid; its values are not read.
         window: of the ramp filter.
         truncation: object beyond the panel's edges (`truncation_of`); None for nothing.
 
     Raises:
-        GeometryError: no circle and no helix, too short a scan, too steep a helix, or rows of
-            one pixel.
+        GeometryError: no circle and no helix, too short a scan, too steep a helix, a
+            panel that moves sideways or lies flat, the axis off the panel, or rows of one
+            pixel.
         UnknownNameError: no such window.
     """
     circle = circle_of(cone_vec)
@@ -281,7 +288,10 @@ def plan_fdk(
 
 
 def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels:
-    """Make the panels upright, with the axis on a column or between two if needed.
+    """Make the panels upright, with the axis on a column or between two if few columns
+    are beyond it.
+
+    A tilted panel gets `FINER` times as many columns; one on its side is swapped.
 
     Args:
         circle: of the sources.
@@ -289,8 +299,8 @@ def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels
         shape: (rows, cols).
 
     Returns:
-        The views as stated and upright with their shapes, and whether rows and columns were
-        exchanged.
+        The views as stated and upright with their shapes, and whether rows and columns
+        were exchanged.
 
     Raises:
         GeometryError: rows of one pixel, a horizontal panel, or one that moves sideways.
@@ -316,7 +326,13 @@ def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels
 
 
 def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> None:
-    """Check that all views see the axis at about one column: redundancy is weighed by columns.
+    """Check that all views see the axis at about one column (within `MAX_SIDEWAYS_SHARE`
+    of the columns): redundancy is weighed by columns.
+
+    Args:
+        circle: of the sources.
+        level: upright views.
+        shape: (rows, cols).
 
     Raises:
         GeometryError: the panel moves sideways during the scan, as in a tiled one.
@@ -332,7 +348,8 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
 def _widths(
     circle: Circle, panels: Panels, like: Volume, truncation: Truncation | None
 ) -> Widths:
-    """Find the rows and columns that a grid and the object beyond the panel's edges need.
+    """Find the rows in the grid's shadow, and the columns off the panel that a shifted
+    panel and the object beyond its edges need.
 
     Args:
         circle: of the sources.
@@ -360,10 +377,12 @@ def weighing(
     views: slice,
     weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute the weights that FDK applies before the filter.
+    """Compute the weights that FDK applies before the filter: cosine, distances,
+    redundancy and the view's arc.
 
-    The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion
-    for a panel at any angle to that line then needs the distance along the panel's normal only.
+    The cosine is that of the ray with the line from source to axis. Exact fan-beam
+    inversion for a panel at any angle to that line then needs the distance along the
+    panel's normal only.
 
     Args:
         shape: (rows, cols).
@@ -373,7 +392,8 @@ def weighing(
         weights: (n, cols) of `redundancy`.
 
     Returns:
-        Factors (n, cols), across (n, cols) and up (n, rows) of `Views`.
+        Factors (n, cols), across (n, cols) and up (n, rows) of `Views`; across and up are
+        squares [mm^2].
     """
     rows, cols = shape
     source = cone_vec.source

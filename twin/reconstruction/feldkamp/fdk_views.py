@@ -59,7 +59,9 @@ class Views:
 
     @property
     def shown(self) -> slice:
-        """Rows of the panel that are needed, or that rows off the panel repeat."""
+        """Rows of the panel that are needed, or that rows off the panel repeat; at least
+        one.
+        """
         count = self.images.shape[1]
         first = min(max(self.top, 0), count - 1)
         return slice(first, min(max(self.top + self.up.shape[1], first + 1), count))
@@ -69,7 +71,9 @@ class Views:
         return replace(self.without_images(which), images=self.images[which])
 
     def without_images(self, which: slice | npt.NDArray[np.intp]) -> Views:
-        """Select the tables of some of these views; images still hold all views."""
+        """Select the tables of some of these views; `images` is unchanged and still holds
+        all views.
+        """
         return replace(
             self,
             beyond=self.beyond.of(which),
@@ -86,12 +90,12 @@ class Views:
         return int(max(self.factors.shape[1] - self.kept.start, self.kept.stop))
 
     def prism_lengths(self) -> Float32Array:
-        """Compute the prisms' share of rows beyond the panel's edges, (n, bands, columns)
-        [1/mm].
+        """Compute the prisms' path lengths times attenuation in the columns beyond the
+        panel's edges and at them; 0 elsewhere.
 
-        Empty (0 bands) without prisms.
-
-        See `truncation_kernels.prism_lengths`.
+        Returns:
+            (n, bands, columns), over the ray's horizontal length [1/mm]; see
+            `truncation_kernels.prism_lengths`.
         """
         from flexdt.twin.reconstruction.kernels import truncation_kernels
 
@@ -109,7 +113,8 @@ class Views:
 
         Args:
             out: (n, rows, columns or more), filled; 0 in columns after these.
-            weighed: multiply by factors / length of the ray to the pixel.
+            weighed: multiply by factors / length of the ray to the pixel; else values as
+                they are.
         """
         from flexdt.twin.reconstruction.kernels import truncation_kernels
 
@@ -132,8 +137,16 @@ class Views:
 
 
 def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Compute the kernel's table of upright views, (n, 11): source, horizontal normal and
-    row direction, scales and foot in columns and rows; see `fdk_kernels.backproject`.
+    """Compute the kernel's table of upright views.
+
+    Args:
+        cone_vec: n upright views; only the horizontal part of u is used.
+        shape: detector (rows, cols).
+
+    Returns:
+        (n, 11): source x, y, z; horizontal unit normal, away from the source; unit row
+        direction; distance over the pitch, and foot, of columns; the same of rows. See
+        `fdk_kernels.backproject`.
     """
     rows, cols = shape
     pitch_u = np.linalg.norm(cone_vec.u, axis=1)

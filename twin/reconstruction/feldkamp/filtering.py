@@ -13,13 +13,19 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 
 def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
-    """Compute the frequency response of the filter, times the pitch, (length / 2 + 1,) [1/mm].
+    """Compute the frequency response of the windowed ramp filter, times the pitch.
+
+    It is the transform of the filter sampled in space, which keeps the mean right (Kak
+    and Slaney), padded to a fast even length of at least twice the reach.
 
     Args:
         reach: least distance between columns that do not act on each other; the number of
             columns of a row, or less where not all filtered values are needed.
         pitch_mm: between columns.
         window: of `WINDOWS`.
+
+    Returns:
+        (length / 2 + 1,) [1/mm].
 
     Raises:
         UnknownNameError: lists the windows.
@@ -55,9 +61,16 @@ def padded_length(response: Float32Array) -> int:
 
 
 def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
-    """Convolve rows (..., cols), zero beyond their ends, with the filter of `response`.
+    """Convolve rows, zero beyond their ends, with the filter of `response`, on all cores.
 
-    Columns are right within the reach that `ramp` was given.
+    Columns are right within the reach that `ramp` was given; further ones wrap around.
+
+    Args:
+        rows: (..., cols), not changed.
+        response: of `ramp`.
+
+    Returns:
+        (..., cols), at most the padded length.
     """
     from scipy import fft
 
@@ -72,7 +85,16 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
 
 
 def taps(response: Float32Array, wide: int, more: int) -> FloatArray:
-    """Compute the filter in space, by the distance in columns: (wide + more,)."""
+    """Compute the filter in space, by the distance in columns.
+
+    Args:
+        response: of `ramp`.
+        wide: number of distances from 0 on.
+        more: zeros after them.
+
+    Returns:
+        (wide + more,); 0 at distances beyond the padded length.
+    """
     values = np.fft.irfft(response.astype(np.float64), padded_length(response))[:wide]
     return np.pad(values, (0, wide - len(values) + more))
 

@@ -25,8 +25,8 @@ class ImageUpload:
     """
 
     def __init__(self, stream: Any) -> None:
-        """Begin uploads for kernels that run in `stream`: a stream of its own and two
-        buffers in turn, allocated at their first use.
+        """Prepare uploads for kernels that run in `stream`: a stream of its own and two
+        host buffers in turn, allocated at their first use. Uploads nothing.
         """
         from numba import cuda
 
@@ -48,14 +48,18 @@ class ImageUpload:
     def images(
         self, images: Float32Array, order: npt.NDArray[np.intp], rows: slice
     ) -> Any:
-        """Upload some rows of images, (n, rows.stop - rows.start, cols).
+        """Upload some rows of images in portions, without waiting for the last.
 
-        Uploads in portions, without waiting for the last; the result is on the device.
+        The caller's images may be changed after the return. The result is valid in the
+        reader's stream after `hand_over`, until the chunk after the next begins.
 
         Args:
             images: (n, rows, cols).
-            order: number of the image for each place, (n,).
+            order: number of the image for each place, (k,).
             rows: rows to upload.
+
+        Returns:
+            (k, rows.stop - rows.start, cols) on the device.
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -75,8 +79,17 @@ class ImageUpload:
         return there
 
     def table(self, name: str, values: FloatArray | Float32Array) -> Any:
-        """Upload a table as single precision, without waiting; tables of one name share
-        their memory, chunk by chunk.
+        """Upload a table as single precision, without waiting.
+
+        Tables of one name share their memory, which is overwritten by the chunk after the
+        next.
+
+        Args:
+            name: of the table.
+            values: of any shape.
+
+        Returns:
+            Of the same shape, on the device.
         """
         there = self._room(name, values.size).reshape(values.shape)
         portion = self._portion(values.size).reshape(values.shape)
@@ -105,8 +118,9 @@ class ImageUpload:
         self._read[self._chunk] = done
 
     def _room(self, name: str, count: int) -> Any:
-        """Return device memory (count,) for the array `name` of this chunk, kept for
-        later chunks and enlarged where too small.
+        """Return device memory (count,) float32 for the array `name` of this chunk, kept
+        for later chunks; replaced by new memory where too small. Its content is
+        undefined.
         """
         from numba import cuda
 
@@ -116,11 +130,11 @@ class ImageUpload:
         return pair[self._chunk][:count]
 
     def _portion(self, count: int) -> Any:
-        """Return page-locked memory once the device has fetched its content; two portions take
-        turns.
+        """Return page-locked memory, after waiting until the device has fetched its
+        earlier content; two portions take turns.
 
         Args:
-            count: float32 numbers needed.
+            count: float32 numbers needed; a portion has at least `PORTION_BYTES`.
 
         Returns:
             (count,) float32.

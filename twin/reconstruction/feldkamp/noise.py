@@ -59,9 +59,10 @@ class Noise:
 
     def sigma(self, grid: Volume) -> Float32Array:
         """Compute the standard deviation of noise at each voxel of a grid, (nz, ny, nx)
-        [1/mm]; nan where the grid is.
+        [1/mm]; NaN where the grid's values are.
 
-        Adds the variance common to all views, by the distance from the rotation axis.
+        It is the root of the interpolated variance of the views' own noise plus that
+        common to all views, by the distance from the rotation axis.
         """
         x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
@@ -104,9 +105,11 @@ class NoiseMeter:
     """
 
     def __init__(self, like: Volume, circle: Circle, table: FloatArray) -> None:
-        """Make a coarse grid in which views are added with alternating signs.
+        """Make a coarse grid of at most `NODES` nodes along a side, in which views are
+        added with alternating signs.
 
-        By angle the signs alternate; the last of an odd number has sign 0.
+        Nodes along z are at least `MIN_ROW_DISTANCE` rows apart. By angle the signs
+        alternate; the last of an odd number has sign 0.
 
         Args:
             like: the volume's grid.
@@ -137,8 +140,14 @@ class NoiseMeter:
         self._response: FloatArray = np.zeros(0)
 
     def note(self, views: Views) -> Float32Array:
-        """Record values and positions of the next views in their order; returns each
-        one's sign in the alternating sum, (n,).
+        """Record the next views, in the order of the scan: adds their images to plain and
+        alternating sums, and stores where they see the points of `_points`.
+
+        Args:
+            views: n views, before the filter.
+
+        Returns:
+            (n,) sign of each in the alternating sum: 1, -1 or 0.
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -155,8 +164,12 @@ class NoiseMeter:
         return signs
 
     def add(self, views: Views, columns: Float32Array) -> None:
-        """Add the next views by their filtered columns (n, cols, rows) to the alternating
-        volume; `columns` are overwritten.
+        """Record the next views (`note`) and add their filtered columns to the
+        alternating volume `data`.
+
+        Args:
+            views: n views.
+            columns: (n or more, cols, rows) filtered; overwritten, times the signs.
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -188,14 +201,15 @@ class NoiseMeter:
         return radii, radii[:, None] * around + self._circle.centre
 
     def _seen_at(self, views: Views) -> tuple[FloatArray, FloatArray]:
-        """Compute the column, before the filter, at which views see the points, and the weight
-        there.
+        """Compute the column, before the filter, at which views see the points, and the
+        weight there.
 
         Args:
             views: n views.
 
         Returns:
-            (n, POINTS) each; both 0 for a point beside the panel.
+            (n, POINTS) each: column, a fraction; weight at the nearest column over
+            depth^2. Both 0 for a point beside the panel or behind the source.
         """
         points = self._points()[1]
         g = views.table[:, :, None]
@@ -215,11 +229,14 @@ class NoiseMeter:
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
     def found(self) -> Noise | None:
-        """Compute the noise after all views; None if too few rows see the grid, or no
-        voxel is seen.
+        """Compute the noise after all views.
 
-        The result has the local variance of each voxel and the variance common to all
-        views over the radius from the rotation axis.
+        The variance of the views' own noise is local, from differences of neighbouring
+        layers of the alternating sum if there are more than two; that common to all views
+        is given over the radius from the rotation axis.
+
+        Returns:
+            None if at most `MIN_ROW_DISTANCE` + 1 rows see the grid, or no voxel is seen.
         """
         assert self._means is not None
         if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():
@@ -239,7 +256,11 @@ class NoiseMeter:
 
     def _shared_variance(self) -> FloatArray:
         """Compute the variance at each point of the noise that all views share (as of a
-        pixel's fixed error), (points,) [1/mm^2].
+        pixel's fixed error), (POINTS,) [1/mm^2].
+
+        Its share is the excess of the mean image's power over that of the alternating
+        sum, in the finer half of the spectrum, where the object is blurred; 0 if there is
+        none.
         """
         assert self._means is not None
         length = 2 * (len(self._response) - 1)
@@ -268,9 +289,16 @@ class NoiseMeter:
 
 
 def _local_variance(values: Float32Array) -> Float32Array:
-    """Compute the variance of zero-mean values about each of them, (nz, ny, nx).
+    """Compute the variance of zero-mean values about each of them, from the median of
+    their sizes in a window of `WINDOW_NODES`, which few strong edges do not change,
+    smoothed.
 
-    It is computed from the median of their sizes, which few strong edges do not change.
+    Args:
+        values: (nz, ny, nx); NaN is replaced by the nearest value, one at least must be
+            finite.
+
+    Returns:
+        (nz, ny, nx) without NaN.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
 
@@ -286,11 +314,18 @@ def _local_variance(values: Float32Array) -> Float32Array:
 
 
 def _spectrum(image: Float32Array, length: int) -> FloatArray:
-    """Compute the power of an image's noise along its rows, (length / 2 + 1,).
+    """Compute the power of an image's noise along its rows.
 
-    The volume's voxels may be anywhere between two rows. Rows a few apart are compared,
-    so that only the object's edges remain, which the median over all pairs of rows
-    ignores.
+    The volume's voxels may be anywhere between two rows, so that rows and their means are
+    mixed. Rows `MIN_ROW_DISTANCE` apart are compared, so that only the object's edges
+    remain, which the median over all pairs of rows ignores. Averaged over `BANDS` bands.
+
+    Args:
+        image: (rows, cols), more than `MIN_ROW_DISTANCE` + 1 rows.
+        length: of a padded row.
+
+    Returns:
+        (length / 2 + 1,), a column's share.
     """
     between = 0.5 * (image[1:] + image[:-1])
     power = [
