@@ -79,7 +79,9 @@ class BeadModel:
 
     @property
     def contrasts(self) -> FloatArray:
-        """Contrast of each bead to a common factor, (k,)."""
+        """Contrast of each bead to a common factor, (k,): `contrast`, or the diameters
+        without it.
+        """
         if self.contrast is None:
             return 2.0 * self.bead_radius_mm
         return self.contrast
@@ -96,12 +98,15 @@ class BeadModel:
 
 
 def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
-    """Make the bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm).
+    """Make the bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm,
+    exact).
 
-    A bead model is returned as it is; the contrast comes from the phantom's scene.
+    A bead model is returned as it is. Of a phantom, tolerance, name and scene are
+    optional (0, "phantom", none); the scene gives the contrast (`with_contrast`).
 
     Raises:
-        TwinError: it has no beads.
+        TwinError: no beads, a shape other than (k, 3), a coordinate that is not finite,
+            or a radius that is not positive.
     """
     match phantom:
         case BeadModel():
@@ -119,15 +124,16 @@ def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
 
 
 def with_contrast(model: BeadModel, scene: Scene | None) -> BeadModel:
-    """Add the contrast that the phantom's solids give each bead.
+    """Add the contrast that the phantom's solids give each bead: diameter times
+    attenuation of the nearest ball.
 
     Args:
         model: the beads.
         scene: the phantom's solids; None if it has none.
 
     Returns:
-        The model with contrasts; itself if it has some already, or if a bead is no ball of the
-        scene.
+        A copy with contrasts; the model itself if it has some already, if the scene has
+        no balls, or if a bead is half its radius or more from the nearest one.
     """
     balls = [
         solid for solid in (scene or Scene(())).solids if isinstance(solid.shape, Sphere)
@@ -155,9 +161,15 @@ def _centre(ball: Solid) -> FloatArray:
 
 
 def spot_radii(model: BeadModel, cone: ConeVec) -> FloatArray:
-    """Compute the radius of each bead's spot, (n, k) [px], to first order (minor semi-axis).
+    """Compute the radius of each bead's spot (minor semi-axis) to first order: radius
+    times magnification over the column pitch.
 
-    It is below 0 for a bead behind the source.
+    Args:
+        model: k beads.
+        cone: n views.
+
+    Returns:
+        (n, k) [px]; below 0 for a bead behind the source.
     """
     depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
     scale = cone.source_detector_distance / np.linalg.norm(cone.u, axis=1)

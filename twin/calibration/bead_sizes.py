@@ -20,14 +20,17 @@ BLURRED_FIRST = 0.4
 def judge_first_sizes(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> list[Finding]:
-    """Judge the sizes of spots in the first measurement.
-
-    At most one finding for each scan.
+    """Judge the sizes of spots in the first measurement against those predicted by the
+    fit.
 
     Args:
         state: scans, identified, with their spots.
-        request: whether a second measurement follows, which allows more blur now.
+        request: whether a second measurement follows; then a deviation of `BLURRED_FIRST`
+            is allowed now, as blur makes spots wider, else `OTHER_BEADS`.
         fit: gives the geometry of each scan.
+
+    Returns:
+        At most one finding for each scan; empty if all fit.
     """
     out = []
     if request.second_look:
@@ -42,8 +45,8 @@ def judge_first_sizes(
 
 
 def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
-    """Judge in each scan the bead sizes of the second measurement, or of the first where the
-    second has none.
+    """Judge in each scan the bead sizes of the second measurement, or of the first (with
+    `OTHER_BEADS`) where the second measured no size.
 
     Args:
         state: scans, spots, identifications and the second measurements.

@@ -54,15 +54,20 @@ def lag_of(
 ) -> Lag:
     """Estimate the lag of a scan, from places far from all beads of the frame itself.
 
+    The shadow of the frame before, less that of the frame after, is searched there in
+    about `LAG_SAMPLE` frames; a smooth body is subtracted.
+
     Args:
         images: (n, k, side, side) windows of the plan, line integrals.
-        frames: of the scan, in the order in which they were taken; windows of neighbouring
-            frames are read.
+        frames: of the scan, in the order in which they were taken; windows of
+            neighbouring frames are read.
         plan: windows round the beads of each frame.
         usable: (n,) frames that show the beads where the plan has them; None: all.
 
     Returns:
-        The share of the frame before, and its sigma; an unseen lag if too few places are clear.
+        The share of the frame before, 0 or more, and its sigma from the scatter of the
+        beads; `Lag()`, which is unseen, if fewer than `FEWEST_BEADS` beads have clear
+        places.
     """
     light = np.exp(-images)
     if usable is not None:  # One that shows what the frame before shows is no lag.
@@ -92,15 +97,18 @@ def lag_of(
 
 
 def without_lag(frames: Frames, plan: Windows, lag: Lag) -> Float32Array:
-    """Remove the lag of the frame before from the windows of every frame, (n, k, side, side).
+    """Remove the lag of the frame before from the windows of every frame.
 
-    The lag in the frame before is removed first. Frames without a frame before stay as
-    they are.
+    The lag in the two frames before is removed first. Pixels for which no frame before
+    has a value stay as they are; at least `LEAST_LIGHT` of the open beam is left.
 
     Args:
         frames: of the scan, in the order in which they were taken.
         plan: windows round the beads of each frame.
         lag: of the camera.
+
+    Returns:
+        Line integrals (n, k, side, side), nan where a frame has no image.
     """
     light = np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan)
     for back in (2, 1, 0):
@@ -120,8 +128,16 @@ def _rolled(plan: Windows, step: int) -> Windows:
 def _near(
     corner: npt.NDArray[np.int64], plan: Windows, some: slice
 ) -> npt.NDArray[np.bool_]:
-    """Mark pixels of windows (n, k, side, side) within reach of any bead predicted in
-    that frame; n are the frames of `some`.
+    """Mark pixels of windows within reach of any bead that is predicted in that frame:
+    1.12 times its longer semi-axis and 3 px.
+
+    Args:
+        corner: (n, k, 2) corners of the windows.
+        plan: gives predictions and the size of windows.
+        some: frames of the plan, n of them.
+
+    Returns:
+        (n, k, side, side) bool.
     """
     reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
     out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
@@ -132,8 +148,15 @@ def _near(
 
 
 def _products(light: Float32Array, shadow: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sum products over each bead's windows: of its shadow in another frame with the
-    image at that place, and with itself, (k,) each.
+    """Sum products over each bead's windows, less a paraboloid each: of its shadow in
+    another frame with the image at that place, and of the shadow with itself.
+
+    Args:
+        light: (n, k, side, side) the image, nan where unusable.
+        shadow: likewise, of the other frame; only pixels finite in both count.
+
+    Returns:
+        (k,) each; 0 for a bead without pixels.
     """
     use = np.isfinite(light) & np.isfinite(shadow)
     one, other = (_bent(values, use) for values in (shadow, light))

@@ -37,10 +37,10 @@ FOUND = Solver(spread_px=POSITION_SPREAD_PX)
 def fit_with_loose_priors(
     state: Calibration, request: CalibrationRequest, wide: FitResult
 ) -> FitResult:
-    """Fit with loosened priors, to compare them with.
+    """Fit with loosened priors and no bound, to compare priors with images.
 
-    Beads that were freed because of the residuals stay free only if loose priors do not explain
-    the residuals as well.
+    Beads that were freed because of the residuals (not by the request) stay free only if
+    loose priors do not explain the residuals as well.
 
     Args:
         state: the scans and their measurements.
@@ -75,7 +75,8 @@ def _beads_explain_more(freed: FitResult, loose: FitResult) -> bool:
 
 def _start(state: Calibration, request: CalibrationRequest) -> list[Offsets]:
     """List the offsets from which each scan's fit starts: the request's, with the free
-    parameters at their identified values.
+    parameters at their identified values; those that all scans share are the first
+    scan's.
     """
     out = []
     for found in state.identifications:
@@ -96,11 +97,15 @@ def fit_scans(
 ) -> FitResult:
     """Fit to the best positions: of the second measurement, else of the first.
 
+    Positions of a first measurement count alike (`FOUND`), unless all spots were given
+    with their beads.
+
     Args:
         state: the scans and their measurements.
         request: the free parameters.
         start: offsets of each scan; None: from the identification.
-        bead_tolerance_mm: prior of the beads' places; None: the request's.
+        bead_tolerance_mm: prior of the beads' places, which are free if it is above 0;
+            None: the request's.
         panel: distortion to estimate; None: no distortion.
         strain: prior of the phantom's strains; None: the usual one.
         arc: whether an exposure lasts a part of the step.
@@ -157,15 +162,18 @@ def refit_scans(
     strain: Strain | None = None,
     arc: bool | None = None,
 ) -> FitResult:
-    """Fit again with more parameters free, or with causes of the residuals.
+    """Fit again with more parameters free, or with causes of the residuals; see
+    `fit_scans`.
 
     Args:
-        state: the scans and their measurements.
+        state: the scans and their measurements; not changed.
         request: the parameters free otherwise.
         fit: the last one, whose distortion, strain and arc are kept.
         extra: parameters that are free too.
-        motion: of the scans; None: as in `state`.
-        bead_tolerance_mm: prior of the beads' places; None: the request's.
+        motion: of the scans, applied to their poses first; None: none besides that in
+            `state`.
+        bead_tolerance_mm: prior of the beads' places; None: the request's, not the last
+            fit's.
         start: offsets of each scan; None: those of the last fit.
         panel: distortion to estimate; None: the last fit's.
         strain: prior of the phantom's strains; None: the last fit's.

@@ -58,6 +58,9 @@ def explain(
     """Explain the residuals of a fit, and fit with beads or panel free where they are the
     cause.
 
+    See `explain_residuals`; this gives it the scans' strains, tolerance, floor of sigmas
+    and arc.
+
     Args:
         state: the scans and their measurements.
         request: the free parameters.
@@ -83,8 +86,10 @@ def explain(
 
 
 def _stated_arc(state: Calibration) -> float | None:
-    """Return the part of a step that an exposure lasts in all scans; None: they differ,
-    or it is not stated.
+    """Return the part of a step that an exposure lasts, if it is equal in all scans.
+
+    Returns:
+        None if the scans differ, or do not state it.
     """
     arcs = {scan.arc for scan in state.scans}
     return arcs.pop() if len(arcs) == 1 else None
@@ -99,19 +104,23 @@ def check_fixed(
 ) -> tuple[FitResult, list[Finding]]:
     """Fit the requested parameters, if the fixed ones agree with the data.
 
-    All six main parameters are free first; where the data do not separate six, each is
-    freed by itself. Then the priors of other offsets are compared with the images, and
-    widened where they are a little too narrow.
+    Where the data contradict a fixed parameter, the findings say so and nothing more is
+    checked. Then the priors of other offsets are compared with the images: where they
+    contradict, findings say so; where they are a little too narrow, they are widened and
+    the fit repeated. Intervals are widened where fixed values are doubtful; parameters
+    stated as exact are judged, and so is a rival pixel pitch.
 
     Args:
         state: the scans and their measurements.
         asked: the user's request.
-        free: the same with all six main parameters free, where the data separate them.
+        free: the same with all six main parameters free, where the data separate them;
+            else fixed ones are freed one by one.
         free_fit: its fit.
         explained: findings on its residuals.
 
     Returns:
-        The fit with those parameters fixed that are to be, and the findings that go with it.
+        The fit with those parameters fixed that are to be, and the findings that replace
+        `explained`.
     """
     fixed = _fixed_values(state, asked)
     fit = free_fit
@@ -141,6 +150,9 @@ def check_fixed(
         found += listed(judge_exact(fit, refit_scans(state, usual, fit), exact))
 
     def without(name: str) -> FitResult:
+        """Fit with one parameter's prior so wide that the images alone determine it,
+        without a bound.
+        """
         alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
         return refit_scans(state, alone, fit)
 
@@ -169,14 +181,19 @@ def _contradicted(
     fixed: Mapping[str, float],
     free: tuple[FitResult, list[Finding]],
 ) -> list[Finding] | None:
-    """Return the findings if the data contradict fixed parameters, else None.
+    """Judge whether the data contradict fixed parameters.
+
+    The free fit is judged if it has all of them; else a fit for each, with that one free.
 
     Args:
         state: the scans and their measurements.
         asked: the user's request.
         fit: its fit.
-        fixed: main parameters that it fixes, edge units.
+        fixed: main parameters that it fixes, edge units; may be empty.
         free: the fit with more parameters free, and the findings on its residuals.
+
+    Returns:
+        Findings on the residuals and on the first contradiction; None if there is none.
     """
     trials = [free]
     if not set(fixed) <= set(free[0].values):
@@ -194,14 +211,16 @@ def _contradicted(
 def _with_usual_priors(
     state: Calibration, asked: CalibrationRequest
 ) -> tuple[CalibrationRequest, dict[str, float]]:
-    """Give the parameters stated as exact their usual priors.
+    """Give the parameters stated as exact (prior 0) their usual priors; not those that
+    only choose the object's frame when beads are anywhere.
 
     Args:
         state: the scans, which may state priors, too.
         asked: the caller's request.
 
     Returns:
-        The request with those priors, and the values that were exact, edge units.
+        The request with those priors, and the values that were exact, edge units; empty
+        if there are none.
     """
     stated = stated_priors(state.scans, asked)
     defined = OF_FRAME if (asked.bead_tolerance_mm or 0.0) >= ANYWHERE else ()
@@ -218,13 +237,18 @@ def _left_by_priors(
     loose_fit: FitResult,
     explained: Sequence[Finding],
 ) -> list[Finding]:
-    """Return the findings that remain with wider priors, where priors are off.
+    """Return the findings on residuals that remain with wider priors, where priors are
+    off.
 
     Args:
         state: the scans and their measurements.
         usual: request with its priors.
         loose_fit: the fit with wider ones.
-        explained: findings with the priors; one on the beads' tolerance stays.
+        explained: findings with the priors; one on the beads' tolerance stays if that fit
+            frees beads.
+
+    Returns:
+        Findings without "misfit".
     """
     priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
@@ -237,8 +261,13 @@ def _left_by_priors(
 def _doubted(
     fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]
 ) -> FitResult:
-    """Widen the intervals by the change that fixed parameters would make, where the data
-    doubt them.
+    """Widen the intervals by the change of each value between both fits, where the data
+    doubt fixed parameters by more than `DOUBT_SIGMAS`; else return `fit` as it is.
+
+    Args:
+        fit: with the fixed parameters.
+        free_fit: with more parameters free.
+        fixed: name -> fixed value, edge units.
     """
     if max(held_distance(free_fit, fixed).values(), default=0.0) <= DOUBT_SIGMAS:
         return fit
@@ -249,13 +278,13 @@ def _doubted(
 def _fit_with_fixed(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> FitResult:
-    """Fit from the geometry of another fit, with the fixed parameters of `request` at their
-    values.
+    """Fit from the geometry of another fit, with the parameters that are neither free nor
+    have a prior in `request` at its start's values.
 
     Args:
         state: the scans and their measurements.
         request: free and fixed parameters.
-        fit: gives the start of the others.
+        fit: gives the start of the others, and distortion, strain and arc.
     """
     fixed = from_printed_reading(request.start, request.reading)
     known = {*request.free, *priors_of(state.scans, request)}

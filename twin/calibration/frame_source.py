@@ -43,13 +43,17 @@ class FrameSpots:
 
 
 def without_repeats(looks: Sequence[FrameSpots]) -> tuple[FrameSpots, ...]:
-    """Mark frames that repeat the frame before as unused.
+    """Mark usable frames that repeat the frame before as REPEATED.
 
-    Noise never repeats: such a frame is a copy, of a camera that stuttered. Where most
-    frames repeat (images without noise of an object at rest) nothing is changed.
+    Noise never repeats: a frame whose two or more spots are all within 1e-7 px of the
+    last frame's is a copy, of a camera that stuttered. Where more than half of the frames
+    repeat (images without noise of an object at rest) nothing is changed.
 
     Args:
         looks: spots of each frame.
+
+    Returns:
+        As many frames; marked ones keep their spots.
     """
     out = list(looks)
     for i in range(1, len(out)):
@@ -86,8 +90,17 @@ def nothing(shape: tuple[int, int]) -> Detections:
 
 
 def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
-    """Detect the beads of one line-integral image; without any, marked DARK, if its
-    median exceeds `DARK` and intensities are not asked for.
+    """Detect the beads of one line-integral image.
+
+    A frame whose median (of every 16th row and column) exceeds `DARK` is marked DARK and
+    not searched, unless the detector is for intensities.
+
+    Args:
+        image: (rows, cols).
+        detector: settings.
+
+    Returns:
+        USABLE, perhaps without spots; or DARK without spots.
     """
     shape = (image.shape[0], image.shape[1])
     if not detector.intensities and float(np.median(image[::16, ::16])) > DARK:

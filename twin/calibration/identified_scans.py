@@ -37,15 +37,16 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
     """Identify the bead of each spot, scan by scan until one fails.
 
     A scan whose spots are identified already is taken as it is. Frames with wrong numbers
-    are left out, and the scan identified again. Where frames may move, a failed one is
-    tried with a wide gate.
+    are marked as repeated, so that they are left out, and the scan identified again; if
+    their number forbids using the scan, the search ends. Where frames may move, a failed
+    one is tried with a wide gate.
 
     Args:
         state: scans with their spots.
-        request: gives the start.
+        request: gives the start, and whether frames may move.
 
     Returns:
-        The state with identifications and findings.
+        The state with findings and the identifications up to the first scan that failed.
     """
     out: list[Identification] = []
     findings: list[Finding] = []
@@ -94,7 +95,9 @@ def _spots(scan: Scan, looks: Sequence[FrameSpots]) -> list[Detections]:
 def _without(
     looks: Sequence[FrameSpots], frames: Sequence[int]
 ) -> tuple[FrameSpots, ...]:
-    """Mark some frames (by number) as repeated, so that their spots are not used."""
+    """Mark some frames (by number, from 0) as REPEATED, so that their spots are not used;
+    other numbers are ignored.
+    """
     again = frozenset(frames)
     return tuple(
         replace(look, state=FrameState.REPEATED) if i in again else look
@@ -110,8 +113,10 @@ def _numbers(
 ) -> FrameNumbers | None:
     """Find the angle that each frame shows, if some frames do not agree with the others.
 
-    Tried are the identification, both halves and the middle of the scan, until one gives
-    numbers.
+    Nothing is searched where the identification explains more than `MAX_BEAD_SHARE` of
+    the spots of every frame of two or more. Tried are a clear identification
+    (`CLEAR_PX`), both halves and the middle of the scan, then any identification, until
+    one below `NEAR_PX` gives numbers.
 
     Args:
         found: identification of the scan, or None.

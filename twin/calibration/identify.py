@@ -157,20 +157,25 @@ def identify(
 ) -> Identification:
     """Assign spots to beads.
 
-    Start angles are tried all around, first roughly. If the best leaves large residuals,
-    or with `loose`, roll, tilts and others are fitted too.
+    `search.starts` start angles are tried all around on `search.frames` frames, first
+    roughly; up to `MAX_FINALISTS` different ones on all frames. If the best leaves more
+    than `LOOSE_PX`, or with `loose`, roll, tilts and others are fitted too.
 
     Args:
         detections: of each of the n frames.
         phantom: the beads.
-        geometry: rough geometry of each frame; positions may be off by centimetres and the
-            start angle may be anything, but the angles between frames must be right.
+        geometry: rough geometry of each frame; positions may be off by centimetres and
+            the start angle may be anything, but the angles between frames must be right.
         start: offsets to begin with.
         search: settings; None is the default.
         loose: standard deviations [mm, deg, 1] of other offsets that may be off.
 
+    Returns:
+        The best assignment, its quality, and rivals that fit as well.
+
     Raises:
-        TwinError: frames and geometry differ in number, or there is no spot.
+        TwinError: frames and geometry differ in number, there is no spot, or no
+            orientation fits.
     """
     how = Search() if search is None else search
     model = bead_model(phantom)
@@ -226,7 +231,7 @@ def identify(
 def attempt(
     detections: Sequence[Detections], model: BeadModel, poses: Poses, **how: Any
 ) -> Identification | None:
-    """Call `identify` with the options `how`; None where it raises a TwinError."""
+    """Call `identify` with the options `how`; return None where it raises a TwinError."""
     try:
         return identify(detections, model, poses, **how)
     except TwinError:
@@ -236,12 +241,15 @@ def attempt(
 def identified(
     index: npt.NDArray[np.int64], detections: Sequence[Detections], start: Offsets
 ) -> Identification:
-    """Make the identification from known spots.
+    """Make the identification from known spots; nothing is fitted or checked.
 
     Args:
         index: (n, beads) spot of each bead, -1 unseen.
         detections: spots of each frame.
         start: offsets that it keeps.
+
+    Returns:
+        With residual NaN, all spots explained, no rivals.
     """
     shadows = _Shadows.of(detections)
     origin = (np.array([d.shape[::-1] for d in detections], dtype=np.float64) - 1) / 2
@@ -334,13 +342,14 @@ def _spread(frames: npt.NDArray[np.intp], count: int) -> npt.NDArray[np.intp]:
 def assign(
     predicted: FloatArray, points: FloatArray, counts: npt.NDArray[np.int64], gate: float
 ) -> npt.NDArray[np.int64]:
-    """Assign spots to predictions one-to-one within each frame, at the least sum of squares.
+    """Assign spots to predictions one-to-one within each frame, at the least sum of
+    squared distances, capped at the gate.
 
     Args:
-        predicted: (n, k, 2).
+        predicted: (n, k, 2); one that is not finite gets no spot.
         points: (n, m, 2), inf beyond each frame's count.
         counts: (n,) spots in each frame.
-        gate: pairs further apart are not assigned [px].
+        gate: pairs this far apart or further are not assigned [px].
 
     Returns:
         (n, k) index of the spot, -1 without one.
@@ -363,14 +372,15 @@ def assign(
 
 
 def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
-    """Shift dO_x and dO_y in `x` so that prediction and spots overlap most.
+    """Shift dO_x and dO_y in `x` so that prediction and spots overlap most: by the mean
+    shift in the 3 x 3 cells of 24 px with most votes.
 
-    They are shifts on the panel, converted by the median magnification.
+    Shifts on the panel are converted by the median magnification.
 
     Args:
         problem: gives the prediction.
         shadows: the spots.
-        x: (c,) column values.
+        x: (c,) column values; not changed.
 
     Returns:
         The shifted values; `x` itself if it predicts nothing.
@@ -416,7 +426,8 @@ def _followed(
     cap: float,
     give_up: bool,
 ) -> _Hypothesis:
-    """Assign and fit with each gate in turn, until the last one changes nothing.
+    """Assign and fit with each gate in turn, until a gate equal to the last one changes
+    no assignment.
 
     Args:
         problem: of the fit.
@@ -425,10 +436,10 @@ def _followed(
         gates: in turn [px].
         solver: of each fit.
         cap: distance at which the loss is capped [px].
-        give_up: whether fewer than four matches give an infinite loss.
+        give_up: fewer than four matches give an infinite loss; else they end the rounds.
 
     Returns:
-        The hypothesis, with its loss per possible match.
+        The hypothesis, with its loss per possible match; infinite if a fit fails.
     """
     used = math.nan
     before = np.zeros(0, np.int64)
@@ -455,10 +466,11 @@ def _followed(
 def _rounds(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
-    """Refine one hypothesis: assign spots to beads and fit, with ever smaller gates.
+    """Refine one hypothesis: assign spots to beads and fit in a few steps, with ever
+    smaller gates.
 
-    A hypothesis without a finite loss takes its start from a vote. All rounds have the same
-    loss, so that hypotheses can be compared.
+    A hypothesis without a finite loss takes its start from a vote. All rounds have the
+    same loss, capped at 40 px, so that hypotheses can be compared.
 
     Args:
         problem: of the fit.
@@ -467,7 +479,8 @@ def _rounds(
         gates: largest distances of a spot from its bead, one a round [px].
 
     Returns:
-        The refined hypothesis; with the parameters of `h` if its loss is not finite.
+        The refined hypothesis; with the parameters of `h` and an infinite loss if it
+        failed.
     """
     if math.isfinite(h.loss):
         x = h.x
@@ -482,7 +495,8 @@ def _rounds(
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
-    """Compute the loss of an assignment: mean squared distance of spots to their beads, capped.
+    """Compute the loss of an assignment: mean squared distance of spots to their beads; a
+    missing pair counts as the cap.
 
     Args:
         predicted: (n, k, 2) places of the beads [px].
@@ -490,7 +504,8 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
         cap: distance from which a spot counts as unexplained [px].
 
     Returns:
-        The loss [px^2] and the number of explained spots.
+        The loss [px^2], per possible pair (the lesser of spots and beads in each frame),
+        and the number of explained spots.
     """
     index = assign(predicted, shadows.points, shadows.counts, cap)
     frames, beads = np.nonzero(index >= 0)
@@ -506,8 +521,12 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
 def _with_tracks(
     problem: FitProblem, shadows: _Shadows, index: npt.NDArray[np.int64]
 ) -> FitProblem:
-    """Set the spots assigned by `index` (n, k; negative: none) as the problem's
-    measurements, of unit weight.
+    """Return the problem with assigned spots as its measurements, each of unit weight.
+
+    Args:
+        problem: of the fit.
+        shadows: the spots.
+        index: (n, k) spot of each bead; negative: unseen.
     """
     tracks, _, bias = shadows.picked(index, np.zeros((len(index), 2)))
     whiten = np.broadcast_to([1.0, 0.0, 1.0], (*index.shape, 3)).copy()
@@ -517,8 +536,11 @@ def _with_tracks(
 
 
 def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
-    """Keep hypotheses of finite loss that ended over 3 deg from every better one;
-    `hypotheses` are best first.
+    """Keep hypotheses of finite loss whose start angle is over 3 deg from that of every
+    better one kept.
+
+    Args:
+        hypotheses: best first.
     """
     out: list[_Hypothesis] = []
     for h in hypotheses:
@@ -541,7 +563,8 @@ def _finish(
     how: Search,
     wide_px: float = 20.0,
 ) -> _Hypothesis:
-    """Assign and fit on all frames; the gate narrows from `wide_px`.
+    """Assign and fit on all frames with up to 12 gates: from `wide_px`, halved until 20
+    px, then the search's final one.
 
     Columns that the hypothesis lacks start at the problem's values.
 
@@ -571,9 +594,10 @@ def _report(
 ) -> Identification:
     """Make the identification of the best hypothesis: tracks, quality and rivals.
 
-    Rivals are hypotheses over 3 deg away that fit about as well.
-
-    Spots that overlap their neighbours in the prediction get no track.
+    Rivals are hypotheses over 3 deg away whose excess of squared residuals is below
+    `MAX_RIVAL_EXCESS` variances of the best. Spots that overlap their neighbours in the
+    prediction get no track. The start angle is reduced to half a turn about that of
+    `start`.
 
     Args:
         problem: of the fit.
@@ -642,7 +666,16 @@ def _at(problem: FitProblem, x: FloatArray, start: Offsets) -> Offsets:
 
 
 def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:
-    """Mark beads whose predicted spot nearly touches another bead's, (n, k)."""
+    """Mark beads whose predicted spot nearly touches another bead's: closer than 1.12
+    times both radii and 2 px.
+
+    Args:
+        predicted: (n, k, 2) [px].
+        radii: (n, k) of the spots [px].
+
+    Returns:
+        (n, k) bool; both of a pair are marked.
+    """
     distance = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=3)
     reach = 1.12 * (radii[:, :, None] + radii[:, None]) + 2.0
     k = predicted.shape[1]

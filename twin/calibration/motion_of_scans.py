@@ -21,7 +21,7 @@ from flexdt.twin.calibration.request import CalibrationRequest
 def fit_with_motion(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> tuple[Calibration, FitResult]:
-    """Put the motion of the scans into their poses, and fit to them.
+    """Put the motion of the scans into their poses, and fit to them; see `follow_motion`.
 
     An earlier motion is taken out of the poses first.
 
@@ -31,7 +31,7 @@ def fit_with_motion(
         fit: the last one.
 
     Returns:
-        The state with the motion, and the fit.
+        The state with the motion in its poses, and the fit.
     """
     still = [s.poses for s in state.scans]
     if state.motions:
@@ -61,16 +61,15 @@ def settle_motion(
 ) -> tuple[Calibration, list[Finding]]:
     """Widen the sigmas of the motion by the change that the last fit would make to it.
 
-    Findings are a warning if it changes by more than a sigma, and an error if an asked
-    parameter is determined worse than `request.bound`.
-
     Args:
-        state: with a motion.
+        state: with a motion, which is required.
         request: the parameters that may move.
         fit: the last one.
 
     Returns:
-        The state, and a finding if the motion still changes.
+        The state with wider sigmas but the same motion, and up to two findings: a warning
+        if it changes by more than a sigma, and an error if the fit is identifiable but an
+        asked parameter with a unit is determined worse than `request.bound`.
     """
     held = state.motion
     assert held is not None

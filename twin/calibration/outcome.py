@@ -59,8 +59,9 @@ class Calibration:
 
     @property
     def panel(self) -> Panel | None:
-        """Distortion and lag of the panel, None if neither was found; lag is the mean
-        over the scans that show it.
+        """Distortion and lag of the panel; lag is the mean over the scans that show it,
+        on a flat panel of the first scan's shape without distortion. None if neither was
+        found.
         """
         if self.fit is None:
             panel = None

@@ -85,15 +85,21 @@ def calibrate(
     scene: Scene | None = None,
     detector: SpotFinder | None = None,
 ) -> Calibration:
-    """Calibrate from images: detect, identify, fit, measure again, fit again and diagnose.
+    """Calibrate from images: detect, identify, fit, measure again, fit again and
+    diagnose.
+
+    Stops at the first stage with an error, at a fit that determines nothing (singular),
+    and at offsets that are implausible; the outcome then holds the fit so far and its
+    findings.
 
     Args:
         scans: one or more scans of the same phantom.
         phantom: its beads.
         request: the parameters to estimate; None is the thesis's six parameters.
-        scene: the phantom's solids, so that its body can be subtracted; None is the phantom's
-            own if it has one.
-        detector: settings of the detection; None: from the phantom's beads and the geometry.
+        scene: the phantom's solids, so that its body can be subtracted; None is the
+            phantom's own if it has one.
+        detector: settings of the detection; None: from the phantom's beads and the
+            geometry.
 
     Returns:
         Fit and findings; without a fit if an error ended it earlier.
@@ -133,10 +139,10 @@ def calibrate(
 def _detected(
     scans: Sequence[Scan], model: BeadModel, detector: SpotFinder | None
 ) -> Calibration:
-    """Detect spots in all frames, and judge the frames.
+    """Detect spots in all frames, mark repeated frames, and judge the frames.
 
-    If frames are found unusable, other spot sizes are looked for, with settings of their
-    own.
+    If a finding forbids using them and no settings were given, other spot sizes are
+    looked for, which may add findings.
 
     Args:
         scans: the scans.
@@ -167,10 +173,11 @@ def _detected(
 
 
 def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
-    """Fit to the detected spots: with all six main parameters free if they are identifiable,
-    else with the requested ones.
+    """Fit to the detected spots: with all six main parameters free if they are
+    identifiable, else with the requested ones.
 
-    Adds the motion of single frames if requested, and findings on bead sizes.
+    Adds the motion of single frames if requested, and findings on bead sizes if these are
+    known and the fit is not singular.
 
     Args:
         state: scans with identified spots.
@@ -192,15 +199,17 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
 
 
 def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
-    """Measure the spots a second time, fit to them, and judge sizes, body and lag.
+    """Measure the spots a second time, fit to them, and judge sizes (if known), body and
+    lag; with motion if it is requested.
 
     Args:
         fitted: the first fit.
         solids: bodies of the phantom besides its beads; None if unknown.
 
     Returns:
-        As `fitted`, with the new fit and findings. If nothing could be measured, only the fit
-        that `measure_again` returned.
+        As `fitted`, with the new fit, findings and the sum of iterations. If nothing
+        could be measured, nothing is judged: the state and fit that `measure_again`
+        returned.
     """
     request = fitted.request
     state, fit, iterations = measure_again(fitted.state, request, fitted.fit, solids)
@@ -216,15 +225,18 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
 
 
 def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
-    """Explain the residuals, check the parameters that were not estimated, and add both as
-    findings.
+    """Explain the residuals, check the parameters that were not estimated, settle the
+    motion if there is one, and add findings.
+
+    With motion, vibration is not reported.
 
     Args:
         fitted: the last fit.
         asked: the caller's request, whose fixed parameters are checked.
 
     Returns:
-        The calibration, its fit relative to the caller's start.
+        The calibration, its fit relative to the caller's start and with the iterations of
+        all fits.
     """
     fit, explained = explain(fitted.state, fitted.request, fitted.fit)
     state = _judged_places(fitted.state, fit, explained)
@@ -242,16 +254,17 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
 def _judged_places(
     state: Calibration, fit: FitResult, explained: Sequence[Finding]
 ) -> Calibration:
-    """Judge places of spots without a bead, unless another finding explains the residuals.
+    """Judge places of spots without a bead, unless another finding than a misfit forbids
+    using the fit.
 
     Args:
         state: the calibration.
         fit: its fit.
-        explained: findings on the residuals.
+        explained: findings on the residuals; not added.
 
     Returns:
-        The state with further findings, and without `extra_spots` where a displaced bead
-        explains them.
+        The state with at most one further finding, and without `extra_spots` where a
+        displaced bead explains them.
     """
     if not any(f.forbids and f.code != "misfit" for f in explained):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.
@@ -271,8 +284,11 @@ def _fixed_as_asked(
     fit: FitResult,
     explained: list[Finding],
 ) -> tuple[Calibration, FitResult, list[Finding]]:
-    """Fix the parameters that were not requested, if they agree with the data; motion is
-    fitted again.
+    """Fix the parameters that were not requested, if they agree with the data; see
+    `check_fixed`.
+
+    If that changed the free parameters and nothing forbids the fit, a motion is fitted
+    again and residuals explained again.
 
     Args:
         state: the scans and their measurements.
@@ -280,6 +296,9 @@ def _fixed_as_asked(
         free: the request with which `fit` was made.
         fit: the last fit.
         explained: findings on its residuals.
+
+    Returns:
+        State, fit and findings.
     """
     fixed, explained = check_fixed(state, asked, free, fit, explained)
     narrower = list(fixed.values) != list(fit.values)

@@ -17,8 +17,10 @@ from flexdt.twin.errors import GeometryError, TwinError
 def require_scans(scans: Sequence[Scan]) -> None:
     """Check that every scan has frames, each with a pose, as seen from the source.
 
+    Returns nothing; no scans at all pass.
+
     Raises:
-        TwinError: names the scan.
+        TwinError: names the scan, its frames and poses.
         GeometryError: rows are counted upwards, or columns from right to left.
     """
     for scan in scans:
@@ -32,12 +34,12 @@ def require_scans(scans: Sequence[Scan]) -> None:
 
 
 def require_seen_from_source(scan: Scan) -> None:
-    """Check that rows are counted downwards, and columns from left to right.
-
-    Names the first view that is wrong.
+    """Check in each view that rows are counted downwards (v does not point up), and
+    columns from left to right as seen from the source.
 
     Raises:
-        GeometryError: they are not.
+        GeometryError: they are not; names the first view that is wrong, rows before
+            columns.
     """
     p = scan.poses
     beam = ((p.detector - p.source) * np.cross(p.u, p.v)).sum(axis=1)
@@ -57,13 +59,17 @@ def require_seen_from_source(scan: Scan) -> None:
 def require_different(
     scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]
 ) -> None:
-    """Check that no image is given twice, which would count as twice the evidence.
+    """Check that no image is given in two scans, which would count as twice the evidence.
 
     No two images have the same noise, so no image has all its spots at another's places,
-    to the last digit.
+    to the last digit. Frames without spots, and repeats within a scan, are ignored.
+
+    Args:
+        scans: give the names.
+        looks: spots of each frame of each scan.
 
     Raises:
-        TwinError: names two scans that share images.
+        TwinError: names two scans that share images, and the number of frames.
     """
     known: dict[bytes, int] = {}
     for j, some in enumerate(looks):

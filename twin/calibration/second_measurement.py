@@ -33,11 +33,13 @@ LEAST_CONFIRMED = 0.25
 def measure_again(
     state: Calibration, request: CalibrationRequest, fit: FitResult, solids: Scene | None
 ) -> tuple[Calibration, FitResult, int]:
-    """Measure in windows and fit again; once more if the first fit was far off.
+    """Measure in windows and fit again; repeatedly, `MOST_ROUNDS` at most, while the fit
+    moved a prediction by `CLOSE_PX` or more.
 
-    With few frames the first fit is rough, so that a draft comes before the measurement. A
-    measurement that loses the spots of a scan is not fitted: state and fit stay as they were
-    before it, with a finding.
+    With few frames (`FEW_WINDOWS`) the first fit is rough, so that a draft comes before
+    the measurement, repeated while predictions move by more than `FAR_PX`. A measurement
+    that loses the spots of a scan is not fitted: state and fit are those before the first
+    round, with a finding.
 
     Args:
         state: the scans, identified.
@@ -69,7 +71,10 @@ def measure_again(
 def _measured(
     state: Calibration, fit: FitResult, solids: Scene | None, draft: bool
 ) -> tuple[Calibration, list[Windows]]:
-    """Measure the beads of every scan at their fitted places; the lag in the first round only.
+    """Measure the beads of every scan at their fitted places; lag is estimated in the
+    first round only and removed in each, if seen.
+
+    Windows of frames that are not usable become NaN.
 
     Args:
         state: the scans, identified.
@@ -108,8 +113,11 @@ def _measured(
 
 
 def _judge_confirmation(state: Calibration) -> list[Finding]:
-    """Judge whether the second measurement of every scan finds the spots of the first;
-    returns an error for each scan where too few (or none) are confirmed.
+    """Judge whether the second measurement of every scan finds the spots of the first.
+
+    Returns:
+        An error for each scan where less than `LEAST_CONFIRMED` of them, or none, are
+        confirmed; empty if all are well.
     """
     out = []
     scans = zip(state.scans, state.identifications, state.measured, strict=True)
@@ -132,13 +140,16 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
 
 
 def _moved_px(state: Calibration, fit: FitResult, plans: Sequence[Windows]) -> float:
-    """Compute the largest distance that a fit moved a bead from where its window was planned
-    [px].
+    """Compute the largest distance that a fit moved a bead from where its window was
+    planned, over beads with more than half of their spot in view.
 
     Args:
         state: the scans.
         fit: the new geometry.
         plans: windows of each scan.
+
+    Returns:
+        [px]; 0 without such beads.
     """
     worst = 0.0
     for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):

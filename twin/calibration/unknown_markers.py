@@ -47,11 +47,13 @@ def link(
     """Find the marker of each spot.
 
     Tried from the axis centred on the spots and from `start`; the better one is refined
-    with narrower gates, and markers seen too seldom are left out.
+    by two fits (axis and roll free) with narrower gates. Markers seen in fewer than three
+    frames, or than `MIN_SEEN_SHARE` of those with spots, are left out.
 
     Args:
-        detections: spots of each of the n frames.
-        poses: nominal geometry; angles must be right, distances may be off by centimetres.
+        detections: spots of each of the n frames, one at least.
+        poses: nominal geometry; angles must be right, distances may be off by
+            centimetres.
         start: offsets to begin with.
 
     Returns:
@@ -112,15 +114,19 @@ def link(
 
 
 def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Triangulate the point nearest to the rays of each marker, (k, 3) [mm].
+    """Triangulate the point nearest to the rays of each marker, by least squares.
 
     Args:
         tracks: (n, k, 2) pixels (column, row), nan where unseen; each seen twice or more.
         cone: geometry of the n frames.
         shape: detector (rows, cols).
 
+    Returns:
+        (k, 3) [mm].
+
     Raises:
-        TwinError: a marker is seen fewer than twice, or always in the same direction.
+        TwinError: a marker is seen fewer than twice, or always in the same direction;
+            names the first.
     """
     source, ray = _rays(tracks, cone, shape)
     seen: npt.NDArray[np.bool_] = np.asarray(np.isfinite(tracks).all(axis=2))
@@ -142,10 +148,11 @@ def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> Fl
 def centred(
     points: FloatArray, poses: Poses, shape: tuple[int, int], start: Offsets
 ) -> Offsets:
-    """Move the axis in `start` to the mean column of the spots: over a full turn they agree.
+    """Move the axis in `start` (dO_x) to the mean column of the spots: over a full turn
+    they agree. Other offsets stay.
 
     Args:
-        points: (n, m, 2) pixels, not finite without a spot.
+        points: (n, m, 2) pixels, not finite without a spot; one finite at least.
         poses: nominal geometry.
         shape: detector (rows, cols).
         start: offsets to begin with.
@@ -184,16 +191,21 @@ def _rays(
 def _found(
     points: FloatArray, counts: Index, cone: ConeVec, shape: tuple[int, int]
 ) -> FloatArray:
-    """Find positions of markers, those with most spots first, (k, 3).
+    """Find positions of markers, those with most spots first.
 
-    Candidates are where rays of two frames nearly meet; each takes its spots away from
-    the others. (0, 3) for fewer than three frames with spots.
+    Candidates are where rays of two frames nearly meet (closer than the first gate, on
+    the panel), for up to `BASE_FRAMES` frames with two others each. The candidate with
+    most spots in up to `MAX_SCORED_FRAMES` frames is triangulated and takes its spots
+    away from the others, until none has three, and `MIN_SEEN_SHARE` of the frames.
 
     Args:
         points: (n, m, 2) pixels, inf beyond each frame's count.
         counts: (n,) spots in each frame.
         cone: rough geometry.
         shape: detector (rows, cols).
+
+    Returns:
+        (k, 3) [mm]; (0, 3) for fewer than three frames with spots.
     """
     finite = np.where(np.isfinite(points), points, np.nan)
     source, ray = _rays(finite, cone, shape)
