@@ -87,10 +87,12 @@ class Bias:
         return np.asarray(FDK_ERROR_SHARE * np.abs(self.found.data) + flaws, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
-        """Compute the bound at each voxel of a grid, (nz, ny, nx) [1/mm].
+        """Compute the bound of the error at each voxel of a grid, interpolated from the
+        nodes.
 
-        NaN where the grid has no value; None if images and geometry do not belong
-        together.
+        Returns:
+            (nz, ny, nx) [1/mm], NaN where the grid has no value; None if images and
+            geometry contradict each other.
         """
         if self.contradiction is not None:
             return None
@@ -100,16 +102,18 @@ class Bias:
         return out
 
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
-        """Compute the accuracy of the object's uniform regions in a grid.
+        """Compute the relative accuracy of the object's uniform regions in a grid.
 
-        Relative errors. Regions too uneven are left out, if there are others.
+        Nodes within half a node of the grid count; those of evenness up to `MIN_EVENNESS`
+        are left out, if there are others.
 
         Args:
             grid: place and size.
 
         Returns:
-            Bounds for half and for nine of ten regions, with the largest cause; None if the
-            grid holds no such region, or if images and geometry do not belong together.
+            Bounds for half (by `USUAL_SHARE`) and for nine of ten regions, with the cause
+            that is largest in nine of ten; None if the grid holds no node of the object
+            or has too large voxels, or if images and geometry contradict each other.
         """
         if self.contradiction is not None or self.too_coarse(grid):
             return None
@@ -148,7 +152,7 @@ def bias_of(
     shape: tuple[int, int],
     truncation: Truncation | None = None,
 ) -> Bias | None:
-    """Find the possible errors of FDK's volume of a scan.
+    """Find the possible errors of FDK's volume of a scan, from a coarse copy of it.
 
     Args:
         image: gives the line integrals of a view, (rows, cols), by its number.
@@ -157,10 +161,8 @@ def bias_of(
         truncation: of `truncation_of`.
 
     Returns:
-        None where a coarse scan cannot be reconstructed, as of a steep helix.
-
-    Raises:
-        GeometryError: neither a circle nor a helix.
+        None where a coarse scan cannot be reconstructed (any GeometryError), as of a
+        steep helix or of neither a circle nor a helix.
     """
     try:
         return _bias_of(CoarseScan.of(image, cone_vec, shape, truncation))
@@ -171,13 +173,17 @@ def bias_of(
 def _bias_of(scan: CoarseScan) -> Bias:
     """Reconstruct a coarse scan and bound its errors, cause by cause.
 
-    If images and geometry contradict each other, only that is returned, without causes.
+    If images and geometry contradict each other, nothing else is bounded. Bounds are
+    `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
+    the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
+    complete rows their level beside the object ("drift"). A whole scan whose images fit
+    another geometry as well has a contradiction besides its causes.
 
     Args:
         scan: few views and pixels of the whole scan.
 
     Returns:
-        The bound, with the contradiction if images and geometry do not fit each other.
+        The bound, with the contradiction if there is one.
     """
     values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
     data = np.nan_to_num(values)
@@ -227,10 +233,14 @@ def _bias_of(scan: CoarseScan) -> Bias:
 
 
 def _drift(images: Float32Array) -> Float32Array:
-    """Copy the smaller value at a row's two ends, beside the object, to every pixel.
+    """Make images of each view's level beside the object: the smaller value, by size, of
+    its rows' two ends, in every pixel.
 
     Args:
         images: (n, rows, cols); each view's ends are averaged over rows.
+
+    Returns:
+        New images of that shape.
     """
     ends = images[:, :, [0, -1]].mean(axis=1)
     beside = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)
@@ -238,11 +248,15 @@ def _drift(images: Float32Array) -> Float32Array:
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
-    """Compute the weighted root mean square about each node; differences have zeros in places.
+    """Compute the weighted root mean square about each node (Gaussian, 1 node) of the
+    smoothed values; differences have zeros in places.
 
     Args:
         values: (nz, ny, nx).
-        weights: (nz, ny, nx).
+        weights: (nz, ny, nx), above 0.
+
+    Returns:
+        (nz, ny, nx).
     """
     from scipy.ndimage import gaussian_filter
 

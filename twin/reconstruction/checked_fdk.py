@@ -139,8 +139,8 @@ def checked_fdk(
     *,
     errors: bool = True,
 ) -> tuple[Volume, list[str]]:
-    """Reconstruct a volume by FDK, with its accuracy and noise if `errors`, and list warnings
-    for the user.
+    """Reconstruct a volume by FDK, with its accuracy and noise if `errors`, and list
+    warnings for the user; warns of nothing itself.
 
     Args and raises as `fdk`, except for these:
 
@@ -151,8 +151,8 @@ def checked_fdk(
         shape: (rows, cols).
 
     Returns:
-        The volume and the texts of warnings: lost layers, and with `errors` what limits the
-        accuracy.
+        The volume and the texts of warnings: with `errors` first what limits the
+        accuracy, then lost voxels.
     """
     truncation = truncation_of(image, cone_vec, shape)
     volume = fdk_parts(
@@ -169,11 +169,12 @@ def checked_fdk(
 def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
     """List warnings about uniform regions that may deviate, or of which nothing is known.
 
-    At most one cause is told: accuracy unknown (no bias, voxels too large), a
-    contradiction, or what the accuracy warns of; empty if nothing.
+    The first of: accuracy unknown as there is no bias, a contradiction, voxels too large;
+    else those of the accuracy. Empty if there is nothing to warn of, or no uniform region
+    in the grid.
 
     Args:
-        bias: of the scan.
+        bias: of the scan; None if it could not be found.
         grid: of the volume.
     """
     if bias is None:

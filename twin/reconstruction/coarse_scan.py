@@ -94,16 +94,21 @@ class CoarseScan:
         shape: tuple[int, int],
         truncation: Truncation | None,
     ) -> CoarseScan:
-        """Reduce a scan to few views and pixels, by choosing views and averaging pixels; images
-        of repeated angles are averaged.
+        """Reduce a scan to at most `VIEWS` views and about `NODES` columns and rows, by
+        choosing views and averaging pixels; images of repeated angles are averaged.
 
-        A panel on its side is turned; a helix gets its outermost rows twice.
+        A panel on its side is turned; a helix gets its outermost rows twice. Columns stay
+        fine enough for `MIN_AXIS_COLUMNS` beyond the axis. Rows and columns that fill no
+        coarse pixel are left out.
 
         Args:
             image: gives an image by its number, (rows, cols).
             cone_vec: of all views.
             shape: (rows, cols).
             truncation: of the scan; None if the object is not cut off.
+
+        Raises:
+            GeometryError: neither a circle nor a helix, or a panel that lies flat.
         """
         circle = circle_of(cone_vec)
         flip = on_its_side(cone_vec)
@@ -142,7 +147,10 @@ class CoarseScan:
         self, *, all_views: bool = False, least_rows: int = COMPARED_ROWS
     ) -> CoarseScan:
         """Take fewer views and rows of a circle: enough to compare images with the
-        projections of a volume of them gives when it is projected again.
+        projections of a volume made from them.
+
+        About `COMPARED_VIEWS` views a column are chosen, and rows averaged; a rest of
+        rows is left out.
 
         Args:
             all_views: take fewer rows alone.
@@ -180,8 +188,8 @@ class CoarseScan:
 
     @cached_property
     def ends(self) -> tuple[float, float]:
-        """Largest distances from the axis that the panel sees on its two
-        sides, signed, low and high [mm].
+        """Distances from the axis up to which all views see on the panel's two sides,
+        (clockwise, other) [mm]; both positive for an axis on the panel.
         """
         fan = fan_angles(circle_of(self.cone_vec), self.level, self.images.shape[2])
         low, high = reach(fan)
@@ -191,11 +199,11 @@ class CoarseScan:
 
     @cached_property
     def grid(self) -> Volume:
-        """Grid of the field of view, zeros, about the rotation axis, in layers as high as
-        rows.
+        """Grid of the field of view, zeros, about the rotation axis: at most `NODES`
+        columns, in layers as high as rows.
 
-        A scan that rises along z gets at least as many layers as the panel's rows; at
-        most `NODES` layers (then) and columns.
+        A helix, far higher than a panel, gets layers as high as its field of view over
+        their number: at least the panel's rows, at most `NODES`.
         """
         x, y = self.circle.centre.tolist()
         scan = self.cone_vec
@@ -222,8 +230,8 @@ class CoarseScan:
 
     @cached_property
     def rim(self) -> npt.NDArray[np.bool_]:
-        """Mark the voxel columns that are not seen in all views, and those next to them, (ny,
-        nx) bool.
+        """Mark the voxel columns that are not seen in all views, and those within a voxel
+        and a half of them, (ny, nx) bool.
         """
         x, y, _ = self.grid.centers()
         away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
@@ -233,8 +241,9 @@ class CoarseScan:
 
     @cached_property
     def more(self) -> int:
-        """Layers of the object above and below the grid, as far as views see; 0 for one
-        row, and if the images' first and last row are nearly empty.
+        """Layers of the object above and below the grid, as far as views see, at most the
+        rows of the images; 0 for one row, and if the mean of the first and last row is at
+        most `ACCURACY` of the images'.
         """
         count = self.images.shape[1]
         ends = float(np.abs(self.images[:, [0, -1]]).mean())
@@ -245,7 +254,10 @@ class CoarseScan:
 
     @cached_property
     def sparse(self) -> bool:
-        """True if a circle's views leave directions out, or are too few for the columns."""
+        """True if a circle's views leave directions out (gaps, or steps that differ by
+        more than the median), or are fewer than pi / 2 times the columns; False for a
+        helix.
+        """
         step = self.circle.step
         apart = float(np.ptp(step)) > float(np.median(step))
         few = len(self.angles) < 0.5 * np.pi * self.images.shape[2]
@@ -257,7 +269,8 @@ class CoarseScan:
         cone_vec: ConeVec,
         truncation: Truncation | None = None,
     ) -> Float32Array:
-        """Reconstruct the grid by FDK.
+        """Reconstruct the grid by FDK on the processor; voxels that only continued rows
+        show are kept.
 
         The images are not changed.
 
@@ -268,6 +281,9 @@ class CoarseScan:
 
         Returns:
             (nz, ny, nx) [1/mm], NaN where no data cover it.
+
+        Raises:
+            GeometryError: FDK cannot use the views.
         """
         shape = (images.shape[1], images.shape[2])
         volume = fdk_parts(
@@ -282,10 +298,17 @@ class CoarseScan:
         return volume.data
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
-        """Project values on the grid, (nz, ny, nx), in a rung's geometry and reconstruct
-        them by FDK, unseen voxels as zero.
+        """Project values on the grid in a rung's geometry and reconstruct them by FDK.
 
-        Truncation is simulated only for a rung that has it as its flaw.
+        A shifted panel's hidden part (`truncation.beyond`) is weighed as in the scan, but
+        only in a rung with a flaw; rows are never continued.
+
+        Args:
+            thing: (nz, ny, nx).
+            rung: geometry.
+
+        Returns:
+            (nz, ny, nx), 0 where unseen.
         """
         truncation = self.truncation
         if truncation is not None:
@@ -304,13 +327,18 @@ class CoarseScan:
         *,
         fine: bool = True,
     ) -> Float32Array:
-        """Project values on the grid, (nz, ny, nx), as some views see them, (n, rows, cols).
+        """Project values on the grid as some views see them; the outermost layers are
+        repeated above and below (`more`).
 
         Args:
-            thing: the values.
+            thing: the values, (nz, ny, nx).
             views: n of them.
             shape: (rows, cols).
-            fine: two rays a column: the steps of voxels would show as a flaw of their own.
+            fine: average two rays a column: the steps of voxels would show as a flaw of
+                their own.
+
+        Returns:
+            (n, rows, cols) line integrals.
         """
         higher = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
         volume = Volume(higher, self.grid.voxel_mm, self.grid.center_mm)
@@ -323,14 +351,16 @@ class CoarseScan:
     def parallel(
         self, flaw: str, ends: tuple[float, float], turn: FloatArray | None = None
     ) -> Rung:
-        """Make parallel views of a panel that sees given distances from the axis.
+        """Make parallel views of a panel that sees given distances from the axis, one
+        voxel at least.
 
-        The source is far away; the axis falls on the grid's columns.
+        The source is `PARALLEL_SOURCE_RADII` radii away; the axis falls on the grid's
+        columns, and rows on its layers and those above and below.
 
         Args:
             flaw: of the rung.
             ends: distances on the panel's two sides [mm].
-            turn: (n,) angles [rad]; None for even ones around the circle.
+            turn: (n,) angles [rad]; None for `VIEWS` even ones around the circle.
         """
         if turn is None:
             turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False)
@@ -349,12 +379,16 @@ class CoarseScan:
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
     def ladder(self) -> list[Rung]:
-        """List scans from parallel rays of a centred panel to the real scan.
+        """List scans from parallel rays of a centred panel to the real scan, each with
+        one flaw more.
 
-        Returns [] if there is none. A rung has its flaw's name, its geometry and its
-        panel's shape.
+        Flaws in order: "" (none), "aside" (a panel shifted by more than a column), "cone"
+        ("angles" for a sparse fan), "rows" (the object goes on above or below). Flaws
+        that the scan does not have are left out; a helix has "" and the last alone.
 
-        Flaws that the scan does not have are left out.
+        Returns:
+            Rungs with their flaw's name, geometry and panel's shape; empty if the scan
+            has no flaw.
         """
         rows, cols = self.images.shape[1:]
         low, high = self.ends

@@ -144,8 +144,16 @@ def sart(
         projections, cone_vec, like, start, nonnegative, variances: as for `sirt`.
         hardening, surroundings, watch, progress: as for `sirt`.
         iterations: passes through all views.
-        subsets: number of subsets; each takes every k-th view, so it sees all directions.
-        relaxation: part of each step that is taken.
+        subsets: number of subsets, at most one a view; each takes every k-th view, so it
+            sees all directions.
+        relaxation: part of each step that is taken, between 0 and 2.
+
+    Returns:
+        Volume [1/mm] on the grid of `like`.
+
+    Raises:
+        GeometryError: as `sirt`.
+        LimitError: no iterations or subsets, or a relaxation out of its range.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
@@ -190,11 +198,12 @@ def _subset_steps(
         problem: images, geometry and grid.
         parts: views of each part.
         relaxation: factor on the steps.
-        iterations: at most as many; fewer with weights, once the residuals are as large as the
-            noise.
+        iterations: at most as many; with weights fewer, once the mean weighted square of
+            the residuals is 1 or less, as of noise alone.
         start: first volume; zeros without.
         nonnegative: negative values become 0 after each step.
-        watch: called with each iteration's residual.
+        watch: called with each iteration's residual, as it was before each part's step;
+            None: no residual is computed.
         advance: called with the share that is done.
     """
     sums = [problem.scales(part) for part in parts]
@@ -266,9 +275,9 @@ def _cgls(
 
     Args:
         problem: images, geometry and grid.
-        iterations: at most as many; fewer if the gradient vanishes.
+        iterations: at most as many; ends when the gradient is exactly 0.
         start: first volume; zeros without.
-        watch: called with each iteration's residual.
+        watch: called before each step with the residual.
         advance: called with the share that is done.
     """
     x = problem.first(start)
@@ -305,9 +314,16 @@ def em(
 ) -> Volume:
     """Reconstruct by expectation maximisation: x *= A'(b / A x) / A' 1, always positive.
 
-    Negative line integrals (noise) count as zero.
+    Negative line integrals (noise) count as zero. Args: as for `sirt`; a first guess must
+    be positive wherever the object may be, without one all voxels that a ray meets begin
+    with one value.
 
-    Args: as for `sirt`; a first guess must be positive wherever the object may be.
+    Returns:
+        Volume [1/mm] on the grid of `like`; 0 in voxels that no ray meets.
+
+    Raises:
+        GeometryError: shapes that do not fit.
+        LimitError: no iterations.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)

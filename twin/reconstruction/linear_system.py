@@ -99,7 +99,7 @@ class LinearSystem:
         hardening: Polychromatic | None = None,
         surroundings: Volume | Grid | None = None,
     ) -> LinearSystem:
-        """Check the arguments and make the system from them.
+        """Check the arguments and make the system from them; warns of doubts about them.
 
         Args:
             projections: (n, rows, cols) line integrals, also on a device.
@@ -108,11 +108,16 @@ class LinearSystem:
             iterations: only checked.
             variances: (n, rows, cols) of the line integrals; weights are their inverses.
             hardening: expected line integrals of a polychromatic beam.
-            surroundings: volume or grid around the region, whose line integrals are taken off.
+            surroundings: volume or grid around the region, whose voxels are unknowns,
+                too.
+
+        Returns:
+            A `RegionSystem` with surroundings.
 
         Raises:
-            GeometryError: no views, shapes that do not fit, variances that are not above 0,
-                surroundings within the region, or either with images on a device.
+            GeometryError: no views, shapes that do not fit, values that are not finite, a
+                doubt that is a refusal, variances that are not above 0, surroundings
+                within the region, or these or hardening with images on a device.
             LimitError: no iterations.
         """
         if iterations < 1:
@@ -160,8 +165,10 @@ class LinearSystem:
         return self.measured.shape[1], self.measured.shape[2]
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Return start values: a copy of the first guess, or zeros for None; raises
-        GeometryError if the guess is on another grid.
+        """Return start values (nz, ny, nx): a copy of the first guess, or zeros for None.
+
+        Raises:
+            GeometryError: the guess is on another grid.
         """
         if start is None:
             return np.zeros(self.like.shape, np.float32)
@@ -189,8 +196,9 @@ class LinearSystem:
             views: which ones.
 
         Returns:
-            The differences, and how many times as much a step must add to straight line
-            integrals: straight over expected, 1 without `hardening`.
+            The differences (n, rows, cols), and the factor by which a step must be
+            scaled: line integrals at one energy over expected ones, of that shape; 1
+            without `hardening`.
         """
         measured = self.measured[views]
         if self.hardening is None:
@@ -215,6 +223,9 @@ class LinearSystem:
         weights those, and one over the curvature of a paraboloid above the weighted
         squares, which no step overshoots (Erdogan and Fessler 1999). Zero where the sum
         is (nearly) zero.
+
+        Returns:
+            (n, rows, cols) and (nz, ny, nx).
         """
         rows = self.project(ones(self.first(None)), views)
         if self.weights is None:
@@ -227,7 +238,9 @@ class LinearSystem:
         return replace(self.like, data=x)
 
     def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
-        """Report iteration i (from 0) with the residual `rest`."""
+        """Report iteration i (from 0) of `of` to `watch`, with the root mean square of
+        `rest`; does nothing without `watch`.
+        """
         if watch is not None:
             watch(Step(i + 1, of, float(np.sqrt(dot(rest, rest) / rest.size))))
 
@@ -245,8 +258,11 @@ class DeviceProblem(LinearSystem):
 
     @classmethod
     def of_host(cls, problem: LinearSystem) -> DeviceProblem:
-        """Copy a system to the device; line integrals that are there stay, and the result
-        then stays there too.
+        """Copy a system to the device, without hardening; line integrals that are there
+        stay, and the result then stays there too.
+
+        Raises:
+            gpu.DeviceError: the device fails.
         """
         there: Any = DeviceArray.of_images(problem.measured)
         weights: Any = problem.weights
@@ -256,7 +272,9 @@ class DeviceProblem(LinearSystem):
         return cls(there, problem.geometry, problem.like, weights, returns=home)
 
     def first(self, start: Volume | None) -> Any:
-        """Return start values; see `LinearSystem`."""
+        """Return start values on the device: zeros, or a copy of the first guess; see
+        `LinearSystem`.
+        """
         if start is None:
             return DeviceArray.of_volume(DeviceVolume.blank(self.like))
         return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
@@ -266,12 +284,14 @@ class DeviceProblem(LinearSystem):
         return DeviceArray.of_images(forward(x.volume, self.geometry[views], self.shape))
 
     def spread(self, y: Any, views: Some = ALL) -> Any:
-        """Apply the adjoint, into new memory; see `LinearSystem`."""
+        """Apply the adjoint, into new memory on the device; see `LinearSystem`."""
         found: Any = back(y.images, self.geometry[views], self.like)
         return DeviceArray.of_volume(found)
 
     def volume(self, x: Any) -> Any:
-        """Return the voxels, as a `DeviceVolume` if the images were on the device."""
+        """Return the voxels: on the host if the images came from there, else as a
+        `DeviceVolume`.
+        """
         if self.returns:
             return x.volume.to("cpu")
         return x.volume
@@ -297,11 +317,18 @@ class RegionSystem(LinearSystem):
     def within(cls, inner: LinearSystem, about: Volume | Grid) -> RegionSystem:
         """Make the system of a region with surroundings out to `about`.
 
-        The surroundings' voxels are about as large as those of `about`.
+        The surroundings' voxels are about as large as those of `about`, so that a whole
+        number of them, one at least, fills the region along each axis; outermost ones may
+        reach beyond `about`.
+
+        Args:
+            inner: system of the region.
+            about: only its place, size and voxels count.
 
         Raises:
-            GeometryError: `about` does not reach beyond the region, or that is too thin
-                for voxels of nearly that size.
+            GeometryError: `about` does not reach beyond the region on any side, or that
+                takes more than `MAX_VOXEL_RATIO` times the voxels of both, as about a
+                thin region.
         """
         wanted = as_volume(about)
         (low, high) = inner.like.boxes[0]
@@ -333,8 +360,11 @@ class RegionSystem(LinearSystem):
         return cls(**given, outer=Volume(zeros, (dx, dy, dz), (x, y, z)), outside=outside)
 
     def grids(self, x: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Split x into the voxels of region and surroundings, (z, y, x) each, z
+        """Split x into the voxels of region and surroundings, each (nz, ny, nx) with z
         contiguous; both are views of x.
+
+        Args:
+            x: flat, first the region's voxels.
         """
         (nz, ny, nx) = self.like.shape
         (mz, my, mx) = self.outer.shape
@@ -356,6 +386,8 @@ class RegionSystem(LinearSystem):
     def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
         """Compute line integrals of region and surroundings together (n, rows, cols); see
         `LinearSystem`.
+
+        Voxels of the surroundings that are in the region count as 0.
         """
         fine, coarse = self.grids(x)
         geometry = self.geometry[views]
@@ -365,8 +397,9 @@ class RegionSystem(LinearSystem):
         return images
 
     def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
-        """Apply the adjoint to region and surroundings; the result is one vector, overwritten
-        by the next call.
+        """Apply the adjoint to region and surroundings; the result is one vector,
+        overwritten by the next call; 0 in voxels of the surroundings that are in the
+        region.
         """
         fine, coarse = self.grids(self.room)
         geometry = self.geometry[views]
@@ -389,7 +422,16 @@ def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Fo
     """Run a method on the device, if images are there or it has room, else on the
     processor.
 
-    With hardening or surroundings only projections are made on a device.
+    If the device fails with images of the host, the method is run again on the processor.
+    With hardening or surroundings the method always runs on the processor, and only
+    projections are made on a device.
+
+    Args:
+        problem: of the host, but its images may be on a device.
+        method: called with `problem` or its copy on the device.
+
+    Returns:
+        The method's result.
     """
     if problem.hardening is not None or isinstance(problem, RegionSystem):
         return method(problem)
@@ -416,7 +458,7 @@ def inverse(values: Float32Array) -> Float32Array:
 
 @singledispatch
 def ratio(a: Any, b: Any) -> Any:
-    """Compute a / b, zero where b is (nearly) zero."""
+    """Compute a / b, zero where b is at most `MIN_WEIGHT_SHARE` of its largest value."""
     return np.divide(
         a, b, out=np.zeros_like(b), where=b > MIN_WEIGHT_SHARE * float(b.max())
     )

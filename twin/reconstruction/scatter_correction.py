@@ -70,7 +70,13 @@ class Hardening:
 
     def __call__(self, line_integrals: Float32Array) -> Float32Array:
         """Convert measured line integrals to straight ones (without beam hardening) by
-        the table; outside it by its first and last slope.
+        linear interpolation in the table; outside it by its first and last slope.
+
+        Args:
+            line_integrals: of any shape.
+
+        Returns:
+            float32 of that shape.
         """
         x = np.asarray(line_integrals)
         out = np.interp(x, self.measured, self.straight)
@@ -95,10 +101,14 @@ def hardening(
     detector.
 
     Args:
-        material: what the object is made of.
+        material: of the object.
         kV: of the scan.
-        energy_keV: the volume shall hold the attenuation at this energy.
+        energy_keV: the volume shall hold the attenuation at this energy; the nearest in
+            the tables is taken.
         panel, tube: of the scan; default the default ones.
+
+    Returns:
+        Table up to where a 1e-5th of the signal gets through, 1e5 mm at most.
 
     Raises:
         LimitError: there is no spectrum for `kV`.
@@ -183,9 +193,17 @@ class Polychromatic:
         return cls(mu, beam, energy_keV)
 
     def amounts(self, values: Float32Array) -> Iterator[Float32Array]:
-        """Yield each material's density in voxels (...) of these values [1/mm].
+        """Yield each material's density in voxels, relative to the named material's, in
+        the order of `mu`.
 
-        Densities are relative to the named material's.
+        A voxel is of the one material whose attenuation is nearest by ratio; negative
+        values are of the one that attenuates least.
+
+        Args:
+            values: (...) [1/mm].
+
+        Yields:
+            (...), 0 in voxels of other materials.
         """
         order = np.argsort(self.mu)
         of = order[
@@ -197,12 +215,15 @@ class Polychromatic:
     def line_integrals(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Compute the spectrum's line integrals, and the factor to those at one energy.
 
+        A signal is never below exp(-`BLACK`); paths below the line integral `THIN`
+        attenuate as the mean does.
+
         Args:
             paths_mm: float32 (m, ...) through the materials; negative ones, of voxels
                 below zero, harden nothing.
 
         Returns:
-            Two float32 arrays (...).
+            Two float32 arrays (...): line integrals, and those at one energy over these.
         """
         mean = self.beam.mu @ self.beam.signal / self.beam.signal.sum()
         least = np.maximum(paths_mm, np.float32(0))
@@ -221,12 +242,15 @@ class Polychromatic:
 
 
 def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
-    """Check that there are materials, and that a volume separates them.
+    """Check that there are materials, and that a volume separates them: attenuations
+    differ by the share `APART` of the larger.
 
-    Apart are attenuations `mu` that differ by the share `APART`.
+    Args:
+        materials: m of them.
+        mu: (m,) their attenuations.
 
     Raises:
-        LimitError: it does not.
+        LimitError: none, or two that attenuate alike, which it names.
     """
     if not len(materials):
         raise LimitError(
@@ -330,9 +354,13 @@ def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Ar
     """Subtract scatter from line integrals.
 
     Args:
-        line_integrals: (rows, cols) of the signal over the open beam's.
+        line_integrals: (rows, cols) of the signal over the open beam's; above `BLACK`
+            they count as that.
         scatter: (rows, cols), in units of the open beam; at most `MOST` of the signal is
-            taken.
+            subtracted.
+
+    Returns:
+        New line integrals (rows, cols), larger by the scatter's share.
     """
     over = np.exp(np.minimum(line_integrals, np.float32(BLACK)))
     part = np.minimum(scatter * over, np.float32(MOST))
@@ -347,21 +375,26 @@ def scatterer_of(
     settings: ScatterSettings | None = None,
 ) -> Scatterer:
     """Find the scattering object of a circular scan, in rounds of FDK, simulation and
-    subtraction.
+    subtraction: until the scatter changes by less than `SETTLED`, at most `ROUNDS`.
 
-    A voxel that attenuates as much as one of the materials is taken for it; one between two of
-    them, or between one and air, for a mixture. Line integrals are straightened (beam
-    hardening) as those of the material named first.
+    A voxel that attenuates as much as one of the materials is taken for it; one between
+    two of them, or between one and air, for a mixture. Line integrals are straightened
+    (beam hardening) as those of the material named first. Rounds are simulated less
+    exactly than the settings say.
 
     Args:
         line_integrals: float32 (n, rows, cols); coarse ones are enough.
         cone_vec: of the n views.
         chain: tube, panel and materials.
         kV: tube voltage.
-        settings: of the simulation.
+        settings: of the simulation; None: the default ones.
+
+    Returns:
+        The object, the change in each round, and doubts, also if it did not settle.
 
     Raises:
-        As `without_scatter`.
+        GeometryError: as `without_scatter`.
+        LimitError: as `without_scatter`.
     """
     if settings is None:
         wanted = ScatterSettings()
@@ -406,7 +439,13 @@ def scatterer_of(
 
 def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     """Reconstruct straightened line integrals by FDK with a Hann window, for the scatter
-    estimate; voxels without a view are zero.
+    estimate; truncated rows are continued, and voxels without a view are 0, as they
+    scatter nothing.
+
+    Args:
+        stack: (n, rows, cols).
+        cone_vec: n views.
+        grid: of the volume.
     """
     shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
@@ -426,12 +465,15 @@ def shape_of(stack: Float32Array) -> tuple[int, int]:
 def attenuations(
     chain: Chain, kV: float
 ) -> tuple[FloatArray, Callable[[Float32Array], Float32Array]]:
-    """Compute the materials' attenuation at one energy and a function to straighten
-    integrals.
+    """Compute the materials' attenuation at the mean energy of the signal, and a function
+    that straightens line integrals.
 
     Returns:
         (m,) [1/mm], and a function that converts line integrals to those of the first
-            material.
+        material at that energy; of a monochromatic beam it returns them unchanged.
+
+    Raises:
+        LimitError: no material, two that attenuate alike, or no spectrum for `kV`.
     """
     signal = weights_of(chain, kV)[0]
     energies = np.arange(len(signal))
@@ -447,8 +489,8 @@ def attenuations(
 def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
     """Convert the occupied box of a volume to amounts of the materials.
 
-    A value between two materials is a mixture of both, one above the densest is more of it, and
-    one close to 0 is air.
+    A value between two materials is a mixture of both, one above the densest is more of
+    it, and one below `AIR` times the thinnest material's is air.
 
     Args:
         volume: attenuations [1/mm].
@@ -456,8 +498,8 @@ def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
         mu: (k,) their attenuations [1/mm].
 
     Returns:
-        Amounts (nz, ny, nx, k) of the smallest box that holds the object; of the whole volume
-        if it is empty.
+        Amounts (nz, ny, nx, k), relative to the materials' densities, in the smallest box
+        that holds the object; of the whole volume, all 0, if it is empty.
     """
     order = np.argsort(mu)
     knots = np.concatenate([[0.0], mu[order]])
@@ -481,9 +523,10 @@ def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
 
 
 def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> list[str]:
-    """List doubts about a correction, in sentences.
+    """List doubts about a correction, in sentences; empty without doubts.
 
-    Empty without doubts.
+    Doubts are: more than `OFTEN` of the pixels nearly all scatter, nothing in the volume,
+    or a 99th percentile that differs from the densest material by more than `UNLIKE`.
 
     Args:
         dark: share of the pixels whose signal would be nearly all scatter.

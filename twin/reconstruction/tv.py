@@ -156,7 +156,7 @@ def minimise_tv(
 
         def minimise(problem: LinearSystem) -> Minimised:
             """Minimise a problem on the processor or on a device, with the regulariser
-            copied to where the problem is.
+            copied to where the problem is (with new dual variables there).
             """
             there = isinstance(problem, DeviceProblem)
             kept = DeviceRegular.of_host(regular, problem.like) if there else regular
@@ -205,20 +205,25 @@ def _minimise(
 ) -> Minimised:
     """Minimise by passes through subsets of views, then by accelerated steps over all.
 
+    The number of subsets is halved when a pass gains less than `MIN_PASS_GAIN` of the
+    cost, and that pass is undone. Momentum that raises the cost is dropped; a step never
+    does.
+
     Args:
         problem: images, geometry and grid.
         regular: total variation and bounds of the values.
         iterations: at most as many.
         weight: of total variation, relative to the largest back-projected value.
-        tolerance: relative decrease of the cost below which iterations count as stalled; 0:
-            never stop early.
-        subsets: number of parts in the first passes; 1 for none.
+        tolerance: relative decrease of the cost below which iterations count as stalled;
+            0: never stop early.
+        subsets: number of parts in the first passes, at most one a view; 1 for none.
         start: first volume; zeros without.
         watch: called with each iteration's residual.
         advance: called with the share that is done.
 
     Returns:
-        The volume, the costs, and whether the stopping rule ended it.
+        The volume, the costs, and whether the stopping rule ended it; at once, as
+        converged, if no ray meets the grid.
     """
     scale = problem.spread(problem.measured)
     strength = weight * max(float(scale.max()), 0.0)
@@ -238,7 +243,7 @@ def _minimise(
         have stalled.
 
         Stalled: `STALLED_ITERATIONS` in a row reduced it by at most `tolerance` of it;
-        never with tolerance 0.
+        never with tolerance 0. Counts them in `little`.
         """
         nonlocal little
         problem.tell(watch, len(costs) - 1, iterations, at.rest)
@@ -294,7 +299,10 @@ class _At:
 
     def beyond(self, last: _At, part: float) -> _At:
         """Extrapolate from `last` through this point by `part` of their distance;
-        residuals too, so that nothing is projected. Returns this point itself for 0.
+        residuals too, so that nothing is projected.
+
+        Returns:
+            A new point of unknown cost; this point itself for 0.
         """
         if part == 0.0:
             return self
@@ -314,20 +322,35 @@ class _Objective:
     regular: Regular
 
     def at(self, x: Float32Array) -> _At:
+        """Make the point of a volume: its residual, and its cost, half the squared
+        residual plus `strength` times the total variation.
+        """
         rest = self.problem.project(x) - self.problem.measured
         cost = 0.5 * dot(rest, rest) + self.strength * self.regular.variation(x)
         return _At(x, rest, cost)
 
     def step(self, at: _At, step: float) -> Any:
         """Take a step down the gradient of the squares, then the proximal map of the
-        rest.
+        rest; returns a new volume.
+
+        Args:
+            at: point from which the step begins.
+            step: length of the step.
         """
         z = at.x - np.float32(step) * self.problem.spread(at.rest)
         return self.regular.proximal(z, step * self.strength)
 
     def subset_pass(self, x: Float32Array, step: float, count: int) -> Any:
         """Take a step for each subset of views, far apart in turn, and one proximal map
-        at the end; returns a new volume.
+        at the end.
+
+        Args:
+            x: volume, not changed.
+            step: length of a step over all views.
+            count: number of subsets; each takes every `count`-th view.
+
+        Returns:
+            A new volume.
         """
         n = len(self.problem.geometry)
         x = x.copy()
@@ -349,7 +372,8 @@ class Regular:
 
     @classmethod
     def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> Regular:
-        """Create the regulariser of a grid, with all dual variables zero.
+        """Create the regulariser of a grid, with all dual variables zero; differences are
+        scaled by the smallest edge of a voxel over that along their axis.
 
         Args:
             like: the grid.
@@ -393,15 +417,15 @@ class Regular:
         return float(layers.sum())
 
     def proximal(self, z: Any, theta: float) -> Any:
-        """Find the allowed x of least 1/2 sum((x - z)^2) + theta TV(x), approximately, from the
-        last call's dual variables on.
+        """Find the allowed x of least 1/2 sum((x - z)^2) + theta TV(x), approximately, by
+        `DUAL_STEPS` accelerated dual steps from the last call's dual variables on.
 
         Args:
-            z: voxels (nz, ny, nx).
+            z: voxels (nz, ny, nx), not changed.
             theta: weight of total variation; 0 only enforces the bounds.
 
         Returns:
-            x; the dual variables are kept for the next call.
+            A new x; the dual variables are stored for the next call.
         """
         if theta == 0.0:
             return self.allow(z)
@@ -420,8 +444,14 @@ class Regular:
         return x
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """Compute x, in place, from the dual variables, by portions of layers; see
+        """Fill x from the dual variables, by portions of layers; see
         `tv_kernels.primal_step`.
+
+        Args:
+            z: voxels (nz, ny, nx).
+            dual: (3, nz, ny, nx).
+            theta: weight of total variation.
+            x: (nz, ny, nx), changed in place.
         """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
@@ -435,6 +465,12 @@ class Regular:
     ) -> None:
         """Update `self.dual` and `ahead` in place, by portions of layers; see
         `tv_kernels.dual_step`.
+
+        Args:
+            x: voxels (nz, ny, nx).
+            ahead: (3, nz, ny, nx), extrapolated dual variables.
+            rate: length of the step.
+            further: momentum of the extrapolation.
         """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
@@ -450,8 +486,14 @@ class DeviceRegular(Regular):
 
     @classmethod
     def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
-        """Create the same regulariser on the device, with all dual variables zero; raises
-        if the device fails.
+        """Create the same regulariser on the device, with all dual variables zero.
+
+        Args:
+            regular: of the host.
+            like: grid of the volume.
+
+        Raises:
+            gpu.DeviceError: the device fails.
         """
         allowed = DeviceArray.of_voxels(like.like(regular.allowed.astype(np.float32)))
         dual = gpu.demand(lambda: gpu.zeros(3 * allowed.flat.size))
@@ -476,7 +518,9 @@ class DeviceRegular(Regular):
     def dual_step(
         self, x: Any, ahead: Any, rate: np.float32, further: np.float32
     ) -> None:
-        """Update `dual` and `ahead`; see `Regular`."""
+        """Update `dual` and `ahead` in place on the device, without waiting; see
+        `Regular`.
+        """
         self._run(
             "dual_step", x.flat, ahead.flat, self.dual.flat, rate, further, *self._form
         )
@@ -487,9 +531,11 @@ class DeviceRegular(Regular):
         return self.allowed.shape, stride, tuple(self.scale)
 
     def _run(self, name: str, *arguments: Any) -> None:
-        """Launch a kernel with a thread for each voxel.
+        """Launch a kernel with a thread for each voxel; does not wait for the device.
 
-        The name is that of the kernel; the device works on, the host does not wait.
+        Args:
+            name: of the function in `gpu_reconstruction_kernels`.
+            arguments: of the kernel.
 
         Raises:
             gpu.DeviceError: the device fails.

@@ -47,6 +47,10 @@ class UniformNodes:
     def of(cls, values: Float32Array, rim: npt.NDArray[np.bool_]) -> UniformNodes:
         """Find the uniform nodes of a volume.
 
+        Edges are changes of `EDGE_CHANGE_SHARE` of the body's attenuation (`_typical`).
+        Nodes of the object have at least `MIN_NEIGHBOURHOOD_SHARE` of the smooth value
+        and `MIN_BODY_SHARE` of the body's.
+
         Args:
             values: (nz, ny, nx) [1/mm], NaN where no data cover a node.
             rim: voxel columns outside some views, (ny, nx).
@@ -68,8 +72,8 @@ class UniformNodes:
         return away if away.any() else self.inside
 
     def change(self, other: Float32Array) -> float:
-        """Compute what nine of ten uniform nodes change by at most, relative to their
-        values.
+        """Compute the largest relative change of nine of ten uniform nodes; 0 without
+        such nodes.
 
         Args:
             other: smooth values of another volume, (nz, ny, nx) [1/mm].
@@ -81,8 +85,9 @@ class UniformNodes:
 
 
 def smoothed(values: Float32Array) -> Float32Array:
-    """Smooth values of nodes by a Gaussian, less along z if there are few layers, (nz,
-    ny, nx).
+    """Smooth values of nodes by a Gaussian of `SMOOTHING_NODES`, along z at most a
+    quarter of the layers less one; returns a new array (nz, ny, nx), not smoothed along z
+    if there is one layer.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -92,8 +97,14 @@ def smoothed(values: Float32Array) -> Float32Array:
 
 
 def _typical(values: Float32Array) -> float:
-    """Compute the attenuation below which half of the attenuation is: of a body, not of a
-    pin in it.
+    """Compute the attenuation below which half of the summed attenuation is: of a body,
+    not of a pin in it.
+
+    Args:
+        values: of any shape; only those above 0 count.
+
+    Returns:
+        [1/mm]; 0 without any.
     """
     ordered = np.sort(values[values > 0.0], axis=None)
     if not ordered.size:
@@ -103,8 +114,15 @@ def _typical(values: Float32Array) -> float:
 
 
 def _evenness(values: Float32Array, most: float) -> FloatArray:
-    """Compute weights of nodes, 1 where values are uniform, near 0 where they change by
-    more than `most`.
+    """Compute weights of nodes, exp(-(gradient / `most`)^2): 1 where values are uniform,
+    near 0 where they change by more than `most` a node.
+
+    Args:
+        values: (nz, ny, nx).
+        most: change between nodes [1/mm].
+
+    Returns:
+        (nz, ny, nx).
     """
     from scipy.ndimage import gaussian_gradient_magnitude
 

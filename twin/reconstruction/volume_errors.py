@@ -47,9 +47,15 @@ class BoundOf(Protocol):
 def with_errors(
     volume: Volume, noise: SigmaOf | None = None, bias: BoundOf | None = None
 ) -> Volume:
-    """Add a `sigma` and a `bias_bound` to those of a volume.
+    """Return a copy of a volume with sources of its `sigma` and `bias_bound`; None leaves
+    that of the volume.
 
-    Volumes derived from it have none: they are no fields.
+    The data are shared. Volumes derived from it have none: they are no fields.
+
+    Args:
+        volume: not changed.
+        noise: source of `sigma`.
+        bias: source of `bias_bound` and `accuracy`.
     """
     found = replace(volume)
     object.__setattr__(found, "_noise", noise or getattr(volume, "_noise", None))
@@ -58,10 +64,17 @@ def with_errors(
 
 
 def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
-    """Interpolate values on a coarse grid, linearly, at the voxels of another, (nz, ny, nx).
+    """Interpolate values on a coarse grid, trilinearly, at the voxels of another.
 
-    Voxels beyond the outermost nodes have the value of the nearest. Axes are interpolated one
-    after the other, so that a voxel costs two multiplications.
+    Voxels beyond the outermost nodes have the value of the nearest. Axes are interpolated
+    one after the other, so that a voxel costs two multiplications.
+
+    Args:
+        nodes: coarse values.
+        grid: place and size; its values are not used.
+
+    Returns:
+        New array (nz, ny, nx).
     """
     z, y, x = (
         _neighbours(places, known)
@@ -81,12 +94,15 @@ def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
 
 
 def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
-    """Find the known places next to others: lower and upper index, and the share of the upper
-    one for linear interpolation.
+    """Find the known places next to others, for linear interpolation; places outside
+    count as the outermost.
 
     Args:
         places: (n,).
-        known: (m,) increasing.
+        known: (m,) increasing, one at least.
+
+    Returns:
+        Lower and upper index, and the share of the upper one, (n,) each.
     """
     at = np.interp(places, known, np.arange(len(known)))
     lower = np.minimum(at.astype(np.int64), max(len(known) - 2, 0))
