@@ -50,11 +50,13 @@ class Background:
 
 
 def survey(flat: Float32Array, alone: Float32Array) -> Background:
-    """Judge the backgrounds of windows: how far they are from smooth ones, whether they bend,
-    and their planes.
+    """Judge the backgrounds of windows: how far they are from smooth ones, whether they
+    bend, and their planes.
 
-    Windows with too few free blocks count as smooth (ratio 1). The bend is None unless
-    most windows bend.
+    Means of blocks of `BLOCK_PX` without a bead's shadow (`MAX_SHADOW`) are fitted by
+    planes and by polynomials of third degree. Windows with fewer than 24 free blocks
+    count as smooth (ratio 1, plane 0). The bend is None unless the median window bends
+    (`_bends`).
 
     Args:
         flat: (m, side, side) line integrals, nan outside the image.
@@ -102,14 +104,15 @@ def _bends(
     variance: FloatArray,
     valid: npt.NDArray[np.bool_],
 ) -> bool:
-    """Check whether bent terms explain much in the median window, and most of its residuals:
-    they do not explain edges.
+    """Check whether bent terms explain much in the median window (`MIN_BEND_CHI2`), and
+    leave less than 0.3 of that beyond noise: they do not explain edges.
 
     Args:
         gain: (m,) squares that bent terms explain, in units of the variance.
         curved: (m,) sums of squares that they leave.
         variance: (m,) of a block's mean.
-        valid: (m, b) usable blocks.
+        valid: usable blocks, (any number of windows, b); the median window's count is the
+            degrees of freedom.
     """
     free = float(np.median(valid.sum(axis=1)))
     left = float(np.median(curved / np.maximum(variance, 1e-12))) - free
@@ -152,15 +155,14 @@ def _fitted(
     shapes: FloatArray,
     enough: npt.NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit polynomials to each window.
-
-    Windows without enough blocks have coefficients of 0.
+    """Fit polynomials to the usable blocks of each window by least squares (with a ridge
+    of 1e-6).
 
     Args:
-        off: (m, b) block means less the beads.
+        off: (m, b) block means less the beads; 0 in unusable blocks.
         valid: (m, b) usable blocks.
         shapes: (b, p) polynomials.
-        enough: (m,) windows with enough blocks.
+        enough: (m,) windows with enough blocks; others have coefficients of 0.
 
     Returns:
         Sums of squares of the residuals (m,), and coefficients (m, p).

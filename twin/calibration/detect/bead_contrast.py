@@ -26,15 +26,16 @@ kinds."""
 def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
     """Make a spot finder whose limits allow for the beads' sizes and contrasts.
 
-    Contrasts that are not above 0 are left out of the faintest.
+    Radii may be 0.65 times the smallest to 1.5 times the largest that is expected in any
+    view. Contrasts that are not above 0 are left out of the faintest.
 
     Args:
         model: the phantom's beads.
         poses: rough geometry, which converts radii to pixels.
 
     Returns:
-        Limits of radius, of likeness (none if the beads are of several kinds) and of the
-        faintest contrast.
+        Limits of radius, of likeness (none if the beads are of several kinds,
+        `MAX_KIND_RATIO`) and of the faintest contrast.
     """
     sizes = model.bead_radius_mm
     contrasts = model.contrasts
@@ -59,7 +60,8 @@ def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
 def seen_contrasts(
     model: BeadModel, detections: Sequence[Detections], index: npt.NDArray[np.int64]
 ) -> FloatArray:
-    """Estimate the typical contrast of each bead; of an unseen one from the others' ratio.
+    """Estimate the typical contrast of each bead: the median over the frames; of an
+    unseen one the model's, times the seen ones' median ratio to the model.
 
     Args:
         model: the beads, k.
@@ -67,7 +69,7 @@ def seen_contrasts(
         index: (n, k) which spot of a frame is which bead, -1 for none.
 
     Returns:
-        (k,) medians over the frames; nan if no bead was seen.
+        (k,) line integrals; all nan if no bead was seen.
     """
     seen = np.full(index.shape, np.nan)
     for frame, (found, numbers) in enumerate(

@@ -78,11 +78,12 @@ class Detections:
         radii_px: float | FloatArray,
         shape: tuple[int, int],
     ) -> Detections:
-        """Make complete spots at known points, all of contrast and likeness 1.
+        """Make complete spots at known points, all of contrast and likeness 1 and without
+        bias; the order is kept.
 
         Args:
             centers: (k, 2) column and row [px].
-            noise_px: sigma of each coordinate, one or (k,).
+            noise_px: sigma of each coordinate, one or (k,); 0 if exact.
             radii_px: radius of the spots, one or (k,).
             shape: the image's (rows, cols).
         """
@@ -127,13 +128,19 @@ def detect_beads(
 ) -> Detections:
     """Detect the beads in one image.
 
+    Candidates are found in an image averaged by 4 or 2 if the smallest radius allows,
+    then measured at full resolution. Spots unlike a ball, too faint or unlike most others
+    are dropped; those cut by the image's edge are fitted. NaN counts as 0, infinity as 16
+    or 0.
+
     Args:
         image: (rows, cols) line integrals.
         detector: settings; None is the default.
         radius_px: (smallest, largest) radius of a spot, instead of the detector's.
 
     Returns:
-        One row for each spot; `centers` (k, 2) are (column, row) in pixels.
+        One row for each spot, complete ones first, each kind strongest first; `centers`
+        (k, 2) are (column, row) in pixels.
 
     Raises:
         TwinError: the image is not two-dimensional or has no pixel.
@@ -179,7 +186,9 @@ def of_intensity(image: Float32Array) -> Float32Array:
 
 
 def coarser(image: Float32Array, factor: int) -> Float32Array:
-    """Average factor x factor pixels; incomplete blocks at the far edges are dropped.
+    """Average factor x factor pixels into a new image; incomplete blocks at the far edges
+    are dropped.
+
     Factor 1 returns the image itself, one larger than the image an empty array.
     """
     if factor == 1:
@@ -197,8 +206,10 @@ def _candidates(
 ) -> tuple[list[_Candidate], list[_Candidate]]:
     """Find compact bright blobs: those entirely inside, and those at the image's edge.
 
-    Empty for images under 3 x 3. Blobs are sought at several thresholds above the noise,
-    on a background opened by a window wider than a bead.
+    Blobs are sought at several thresholds, halved from half the highest value to the
+    larger of 8 sigmas of noise and the faintest height, above a background opened by a
+    window wider than a bead. Blobs of unsuitable size, and elongated ones inside, are
+    dropped; of several at a place the largest is taken.
 
     Args:
         coarse: (rows, cols) line integrals, averaged.
@@ -206,7 +217,8 @@ def _candidates(
         how: sizes and heights of spots.
 
     Returns:
-        Candidates inside, and at the edge, in pixels of the original image.
+        Candidates inside, and at the edge: (column, row, radius) in pixels of the
+        original image; none for images under 3 x 3.
     """
     low, high = how.radius_px
     rows, cols = coarse.shape
@@ -266,8 +278,15 @@ def _middle(values: Float32Array) -> float:
 
 
 def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
-    """Keep one of several at a place, `reach` of a radius wide: the one with the largest
-    value `by`.
+    """Keep one of several at a place: the one with the largest value.
+
+    Args:
+        found: sequences that begin with column, row and radius [px].
+        by: place of the value that decides.
+        reach: distance within which two are at one place, in radii of the kept one.
+
+    Returns:
+        The kept ones, by falling value.
     """
     out: list[_Found] = []
     for one in sorted(found, key=lambda r: -r[by]):
@@ -279,8 +298,10 @@ def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
 def _window(
     image: Float32Array, x: float, y: float, reach: float
 ) -> tuple[Float32Array, float, float]:
-    """Cut out the pixels within `reach` of a place; also return the column and row of the
-    first.
+    """Cut out the pixels within `reach` of a place, limited to the image.
+
+    Returns:
+        A contiguous window, perhaps empty, and the column and row of its first pixel.
     """
     left = max(int(x - reach), 0)
     top = max(int(y - reach), 0)
@@ -289,7 +310,8 @@ def _window(
 
 
 def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArray | None:
-    """Measure a candidate at full resolution, in a larger window if the first one is too small.
+    """Measure a candidate at full resolution, in a larger window if the spot found may
+    exceed the first one.
 
     Args:
         image: (rows, cols) line integrals.
@@ -297,8 +319,9 @@ def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArr
         how: limits of radius.
 
     Returns:
-        `spot_kernels.RESULTS` values, places in pixels of the image; None if the spot is unlike
-        a ball, too faint or of another size.
+        `spot_kernels.RESULTS` values, places in pixels of the image; None if the spot is
+        cut, unlike a ball (`MIN_LIKENESS`), below 5 sigmas of noise (less for larger
+        spots) or of another size.
     """
     x, y, radius = spot
     result = np.zeros(kernels.RESULTS)
@@ -331,11 +354,11 @@ def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
 def _largest_group(
     found: list[FloatArray], same: float
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Split spots into the largest group of alike spots and the others; among equal groups the
-    stronger counts.
+    """Split spots into the largest group of spots alike to one of them, and the others;
+    among equal groups the one about the stronger spot counts.
 
     Args:
-        found: results of `_measure`.
+        found: results of `_measure`, one at least.
         same: largest factor between contrasts, and between radii, of alike spots.
 
     Returns:
@@ -354,8 +377,8 @@ def _largest_group(
 
 
 def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
-    """Compute typical (median) radius [px] and contrast of each group of similar spots,
-    largest group first.
+    """Compute typical (median) radius [px] and contrast of each group of alike spots
+    (`SpotFinder.same`), largest group first; empty without spots.
     """
     out = []
     while found:
@@ -368,14 +391,14 @@ def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
 def _cut_beads(
     image: Float32Array, spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
-    """Fit balls to spots at the edge, with radius and contrast of the kind that fits best.
-
-    They are left out where the image has no complete bead to compare with.
+    """Fit balls to spots at the edge, with radius and contrast of the kind that fits
+    best.
 
     Args:
         image: (rows, cols) line integrals.
-        spots: rough places and radii [px].
-        found: results of the complete spots, whose kinds are tried.
+        spots: rough places and radii [px]; only the places are used.
+        found: results of the complete spots, whose kinds are tried; without any, no spot
+            is fitted.
 
     Returns:
         Results of the good fits, one for each place.
@@ -394,8 +417,8 @@ def _fitted_cut(
 ) -> FloatArray | None:
     """Fit a ball of a given radius and contrast to a spot at the edge.
 
-    Its variances are larger, by the part of the spot that is cut off; None too if less
-    than 0.3 of it is inside.
+    Its variances are raised by the part of the spot that is cut off, as blur is not known
+    yet (`BLUR_PX` is assumed).
 
     Args:
         image: (rows, cols) line integrals.
@@ -404,7 +427,8 @@ def _fitted_cut(
         peak: its contrast.
 
     Returns:
-        Results of the kernel; None if the misfit is too large.
+        Results of the kernel; None if the fit fails, the misfit reaches `MISFIT`, or at
+        most 0.3 of the spot is inside.
     """
     result = np.zeros(kernels.RESULTS)
     window, left, top = _window(image, x, y, 2.8 * radius + 8.0)

@@ -25,20 +25,25 @@ MEAN_ROUNDS = 10
 def fading(
     contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
 ) -> float:
-    """Estimate how contrast changes with the line integral behind a bead, as a share of it.
+    """Estimate how contrast changes with the line integral behind a bead, as a share of
+    it.
 
     Each bead is compared with itself in other frames, and each frame's mean is
-    subtracted, so beads of several sizes and a beam that drifts have no effect. The
-    estimate is shrunk by its noise (James and Stein), so that no slope gives 0. Contrast
-    C falls by at most as much as the thickness behind grows, if a ball passes nothing but
-    scattered light; where scattered light is uneven it grows with the line integral, by
-    exp(C) - 1 times as much. Values beyond these are an error of the level, which is in
-    the contrast too.
+    subtracted, so beads of several sizes and a beam that drifts have no effect. Outliers
+    (`OUTLIER_RATIO`) are left out in three rounds. The estimate is shrunk by its noise
+    (James and Stein), so that no slope gives 0. Contrast C falls by at most as much as
+    the thickness behind grows, if a ball passes nothing but scattered light; where
+    scattered light is uneven it grows with the line integral, by exp(C) - 1 times as
+    much. Values beyond these are an error of the level, which is in the contrast too: the
+    result is limited to them.
 
     Args:
-        contrast: of each bead in each frame, (n, k).
+        contrast: of each bead in each frame, (n, k), above 0 where seen.
         behind: line integrals behind their middles, (n, k).
         seen: which of them are measured, (n, k).
+
+    Returns:
+        Relative change a unit of line integral; 0 if too few are seen or nothing varies.
     """
     logarithm = np.log(np.where(seen, contrast, 1.0))
     use = seen
@@ -72,14 +77,19 @@ def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> Float
 def evened(
     flat: Float32Array, plane: FloatArray, body: Float32Array | None, slope: float
 ) -> Float32Array:
-    """Return windows (m, side, side) in which each bead has a uniform background: that of
-    its middle.
+    """Scale contrasts so that each bead has a uniform background, that of its middle.
+
+    The bead's part of each pixel is multiplied by exp(-slope times the change of the
+    background from the middle).
 
     Args:
-        flat: line integrals without the phantom's body.
-        plane: of `Background`.
-        body: line integrals of the body, or None.
+        flat: (m, side, side) line integrals without the phantom's body.
+        plane: of `Background`, (m, 3).
+        body: line integrals of the body (m, side, side), or None.
         slope: of the contrast, from `fading`.
+
+    Returns:
+        New windows (m, side, side).
     """
     at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
     value, right, down = plane.astype(np.float32).T[:, :, None, None]

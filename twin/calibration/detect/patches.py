@@ -43,14 +43,16 @@ class Patches:
 def centroids(
     patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
 ) -> FloatArray:
-    """Measure centroids in some windows by the kernel `measure`; zeros elsewhere.
-
-    Returns a row of results for every window. Without `least` no noise is assumed.
+    """Measure centroids in some windows by the kernel `measure`, from the expected places
+    and radii.
 
     Args:
-        patches: the windows.
+        patches: m windows.
         index: of those to measure.
-        least: (m,) noise by which pixels are weighted.
+        least: (m,) least noise, by which pixels are weighted; None: 0.
+
+    Returns:
+        (m, RESULTS); zeros in other windows and where the measurement fails.
     """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     if least is None:
@@ -70,16 +72,19 @@ def fits(
     free_radius: bool,
     masks: npt.NDArray[np.uint8],
 ) -> FloatArray:
-    """Fit balls in some windows by the kernel `fit_ball`; zeros elsewhere.
+    """Fit balls in some windows by the kernel `fit_ball`, from the expected places.
 
-    Returns one row of results for every window, in the order of the patches.
+    The background's slope is fitted for complete spots alone.
 
     Args:
-        patches: the windows.
+        patches: m windows.
         index: of those to fit.
         blur: of the image [px], and the veil.
         free_radius: estimate the radius too.
-        masks: usable pixels of those windows.
+        masks: usable pixels of those windows, (len(index), side, side).
+
+    Returns:
+        (m, RESULTS); zeros in other windows and where the fit fails.
     """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     whole = patches.windows.whole.ravel()
@@ -100,8 +105,8 @@ def fits(
 
 
 def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
-    """Return the median noise of line integrals around complete, valid spots; 0 without
-    any.
+    """Return the median noise of line integrals around the complete spots `entire` that
+    were measured; 0 without any.
     """
     good = results[entire, kernels.OK] > 0
     if good.any():
@@ -115,10 +120,8 @@ def take(
     fitted: npt.NDArray[np.intp],
     whole: npt.NDArray[np.bool_],
 ) -> npt.NDArray[np.intp]:
-    """Replace centroids by fits in `results`: for all partial spots, and for complete ones with
-    a good fit.
-
-    Of complete spots only place, covariance and bias are replaced.
+    """Replace centroids by fits in `results`: entirely for all partial spots, also failed
+    ones, and place, covariance and bias for complete ones with a misfit below `MISFIT`.
 
     Args:
         results: (m, `spot_kernels.RESULTS`) centroids, changed in place.
@@ -147,18 +150,16 @@ def take(
 
 
 def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
-    """Estimate the contrast of each bead: the median over its complete spots, else the expected
-    one, scaled like the others.
-
-    A median needs 3 complete spots. The others' expected contrast is multiplied by the
-    median ratio of found to expected contrast (1 without any).
+    """Estimate the contrast of each bead over all frames: the median of at least 3
+    measured spots, else the expected one times the median ratio of found to expected
+    contrast (1 without any).
 
     Args:
         results: (m, RESULTS) centroids.
-        patches: m windows with expected contrasts.
+        patches: m windows with expected contrasts; those of the first frame count.
 
     Returns:
-        (m,) contrast of each window's bead.
+        (m,) contrast of each window's bead, equal in all frames.
     """
     shape = patches.windows.whole.shape
     seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(
@@ -180,9 +181,8 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
 
 
 def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
-    """Mark usable pixels of some windows: inside the image and free of other beads' spots.
-
-    Other beads' spots are looked at in crowded windows only.
+    """Mark usable pixels of some windows: finite ones, and in crowded windows those free
+    of other beads' spots.
 
     Args:
         patches: the windows.

@@ -120,19 +120,22 @@ def measure_beads(
 ) -> Refined:
     """Measure every bead in its window.
 
-    Complete, free spots get their centroid, cut ones a fit if enough of them is
-    inside; what fails the checks is nan. The body is subtracted if the images show
-    it.
+    Complete, free spots get their centroid (a fit in noisy, blurred images), cut ones a
+    fit if at least `MIN_SHARE` of them is inside. The phantom's body is subtracted if the
+    images show it. Blur, sizes and contrasts are estimated from the spots.
 
     Args:
-        images: (n, k, side, side) line integrals from `crop`.
+        images: (n, k, side, side) line integrals from `crop`; not changed.
         windows: their places.
         cone: geometry the windows were planned with.
         model: the beads.
         contrast: line integral through the middle of a bead, one or (k,), as detected.
         scene: the phantom's solids; all but beads are subtracted. None: only planes are.
-        draft: leave out the correction by rendered beads, which takes most of the time and
-            needs a geometry that is right to a few hundredths of a pixel.
+        draft: leave out the correction by rendered beads, which takes most of the time
+            and needs a geometry that is right to a few hundredths of a pixel.
+
+    Returns:
+        Positions, nan where a spot fails the checks of `_accept`.
     """
     n, k = windows.corner.shape[:2]
     side = windows.side
@@ -199,11 +202,15 @@ def _measured(
     """Measure centroids and fits, corrected by the same measurement of rendered beads.
 
     The rendered spots contain the effects of pixels and blur on a ball, its neighbours,
-    and the displacement of a ball's spot from the projection of its centre.
+    and the displacement of a ball's spot from the projection of its centre; corrections
+    of `LARGEST_PX` or more are not applied. Bent backgrounds and fading are removed
+    first. Complete spots are fitted too where the noise exceeds `FIT_NOISE` and the blur
+    `FIT_BLUR_PX`, unless an edge of the body crosses them.
 
     Args:
         patches: the windows.
-        alone: beads rendered alone without noise, (m, side, side); None: no correction.
+        alone: beads rendered alone without noise, (m, side, side) or (n, k, side, side);
+            None: no correction, and backgrounds are not judged.
         body: line integrals of the body, or None.
         sharp: blur and apparent size.
     """
@@ -254,10 +261,8 @@ def _measured(
 
 
 def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> Patches:
-    """Return the windows with uniform contrast of each bead, by the fading found in some
-    frames.
-
-    Returns the same windows if no fading is found.
+    """Return the windows with uniform contrast of each bead, by the fading found in about
+    `FADING_FRAMES` frames; the same windows if none is found.
 
     Args:
         patches: the windows.
@@ -282,10 +287,11 @@ def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> 
 
 
 def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:
-    """Raise the variance of spots with a foreign background, and drop the worst, unless
-    too many.
+    """Multiply the variance of spots with a foreign background by its misfit, and drop
+    those above `MAX_MISFIT`, unless these are more than `MAX_LOST_SHARE`.
 
-    Spots far from their expected place are not judged: their own rim looks foreign.
+    Spots `NEAR_PX` or more from their expected place are not judged: their own rim looks
+    foreign.
 
     Args:
         results: (m, RESULTS), changed in place.
@@ -306,10 +312,11 @@ def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> 
 def _accept(
     results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp
 ) -> Refined:
-    """Keep the results that pass the checks of place, size, contrast and likeness.
+    """Keep the results that pass the checks; others are nan (bias 0).
 
-    What fails is nan (bias 0): a spot too far from its place, of another size or
-    contrast, or a fit with too large a misfit.
+    All must be within `MISS_PX` of their prediction. Complete spots need likeness above
+    0.9, a radius within 22 % and a contrast within a factor 1.6 of the expected; cut ones
+    a misfit below `MISFIT`.
 
     Args:
         results: (n, k, RESULTS).

@@ -55,8 +55,8 @@ class SeenBody:
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def scene(self, described: Scene) -> Scene:
-        """Return the described body's solids, shifted [mm] and with attenuation scaled,
-        as estimated.
+        """Return a new scene of the described body's solids, each shifted by `shift_mm`
+        and with its attenuation times `factor`.
         """
         return Scene(
             tuple(
@@ -82,11 +82,12 @@ def see_body(
     windows: Windows,
     blur: float = 0.0,
 ) -> SeenBody:
-    """Estimate the body in the rings round the beads.
+    """Estimate attenuation and place of the body in the rings round up to `BODY_SAMPLE`
+    uncrowded beads.
 
     A body that is moved a little moves in each window as its bead would: the image
     changes by the slope of the rendered body along rows and columns, times that shift of
-    the bead.
+    the bead. The shift has a prior of `PRIOR_MM`; at most `ROUNDS` rounds.
 
     Args:
         images: (n, k, side, side) line integrals.
@@ -97,7 +98,8 @@ def see_body(
         blur: of the images [px].
 
     Returns:
-        The body; the described one if no ring shows any of it.
+        The body; as described (factor 1) if no ring would show any of it. Factor 0 if the
+        images do not show it: attenuation below `LEAST_BODY` or a shift above `FAR_MM`.
     """
     frames, beads = np.nonzero(~windows.crowded)
     some = np.linspace(0, len(frames) - 1, min(BODY_SAMPLE, len(frames))).astype(np.intp)
@@ -155,7 +157,7 @@ def see_body(
 def _shift_of_beads(
     cone: ConeVec, model: BeadModel, beads: npt.NDArray[np.intp], shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute how the spot of a bead moves with the bead.
+    """Compute how the spot of a bead moves with the bead, by a difference of 1 mm.
 
     Args:
         cone: m views.
@@ -173,15 +175,26 @@ def _shift_of_beads(
 
 
 def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
-    """Mark pixels around the beads that no bead touches, (m, side, side)."""
+    """Mark pixels around the beads that no bead touches: between 1.15 radii and 2 px, and
+    1.6 radii and 4 px, of the one bead a window.
+
+    Returns:
+        (m, side, side) bool.
+    """
     d2 = distances2(windows.corner, windows.side, windows.predicted)[:, 0]
     radii = windows.radii[:, 0, None, None]
     return np.asarray((d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2))
 
 
 def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArray:
-    """Subtract from the values in each ring their mean, (m, side * side); 0 outside the
-    ring.
+    """Subtract from the values in each ring their mean.
+
+    Args:
+        values: (m, side, side).
+        ring: (m, side, side).
+
+    Returns:
+        (m, side * side); 0 outside the ring.
     """
     inside = np.where(ring, values, 0.0).astype(np.float64)
     mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)
@@ -191,14 +204,18 @@ def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArr
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
-    """Return the weighted median."""
+    """Return the value below which half of the weight is; (m,) values and weights, one at
+    least.
+    """
     order = np.argsort(values)
     heap = np.cumsum(weights[order])
     return float(values[order][int(np.searchsorted(heap, 0.5 * heap[-1]))])
 
 
 def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
-    """Return a copy of a shape moved by `shift` (x, y, z) [mm]."""
+    """Return a copy of a shape (a polyhedron, or one with a centre) moved by `shift` (x,
+    y, z) [mm].
+    """
     if isinstance(shape, ConvexPolyhedron):
         offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(
             shift

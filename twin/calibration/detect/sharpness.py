@@ -48,7 +48,7 @@ _Tried = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
-    """Make a scene of the beads alone.
+    """Make a scene of the beads alone, in the order of the model.
 
     Each attenuates so that its line integral through the centre is the contrast, at least
     0.001.
@@ -72,7 +72,15 @@ def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene
 
 
 def rest_of_blur(blur: float, fine: int) -> float:
-    """Return the blur left to apply after averaging fine x fine rays of a pixel."""
+    """Compute the blur left to apply after averaging fine x fine rays of a pixel.
+
+    Args:
+        blur: of the images [px].
+        fine: rays along a pixel's side.
+
+    Returns:
+        Standard deviation [px], at least 0.1.
+    """
     return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
 
 
@@ -105,7 +113,8 @@ def seen_sharpness(
     cone: ConeVec,
     model: BeadModel,
 ) -> Sharp:
-    """Correct blur and size by the same estimate from rendered beads.
+    """Correct blur, size and contrast by the same estimate from rendered beads, until
+    both agree within `SMALL_STEP`.
 
     The fit's profile is an approximation, and where a spot is cut by the edge its radius
     decides its place.
@@ -118,8 +127,9 @@ def seen_sharpness(
         model: the beads.
 
     Returns:
-        The corrected estimate; `sharp` itself if it is too sharp to matter, or if the
-        correction does not converge.
+        The estimate with corrected `true`, `size` and `lift`; `sharp` itself if it was
+        assumed, if the blur is below `BODY_BLUR_PX`, if the rendered spots cannot be
+        measured, or after `MOST_ROUNDS`.
     """
     if not sharp.seen or sharp.blur < BODY_BLUR_PX:
         return sharp
@@ -147,19 +157,19 @@ def _as_rendered(
     cone: ConeVec,
     model: BeadModel,
 ) -> tuple[Sharp, float]:
-    """Estimate sharpness from beads that are rendered with a known blur, size and contrast, to
-    check the method.
+    """Estimate sharpness from beads that are rendered with a known blur, size and
+    contrast, to check the method.
 
     Args:
         true: estimate for the images, with which the beads are rendered.
         patches: windows of the images.
         sample: indices of the windows to render.
-        cone: geometry of the frames.
+        cone: geometry of all frames.
         model: the phantom's beads.
 
     Returns:
-        The estimate from the rendered windows (`seen` is False if none could be measured), and
-        the rendered contrast over that of the images.
+        The estimate from the rendered windows, and the median rendered contrast over that
+        of the images; if none could be measured, `true` with `seen` False, and 1.
     """
     k = patches.windows.corner.shape[1]
     frames, beads = np.divmod(sample, k)
@@ -188,9 +198,8 @@ def _as_rendered(
 
 
 def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
-    """Estimate blur, veil and apparent size from some complete spots, by the best fit.
-
-    The assumed ones are returned (as not seen) too if no fit succeeds.
+    """Estimate blur, veil and apparent size from some complete spots, by the best fit
+    among `BLURS` and `VEILS` and a parabola about it.
 
     A bead of another size than described shows here too; a spot cut by the edge has its
     centre where its radius puts it.
@@ -198,7 +207,11 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     Args:
         patches: the windows.
         sample: indices of complete spots.
-        blur: assumed, with the expected size, if there are fewer than three [px].
+        blur: assumed, with the expected size [px].
+
+    Returns:
+        The estimate; the assumed values, as not seen, if there are fewer than three spots
+        or good fits.
     """
     if len(sample) < 3:
         return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
@@ -231,7 +244,9 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
         return blurs, misfit, scale
 
     def near(last: _Tried) -> FloatArray:
-        """Return the blurs next to the one that leaves least."""
+        """Return the trial blurs next to the one that leaves least in `last`, and it: two
+        or three of `BLURS`.
+        """
         i = int(np.searchsorted(blurs, last[0][int(last[1].argmin())]))
         return blurs[max(i - 1, 0) : i + 2]
 
@@ -258,11 +273,12 @@ def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
     parabola.
 
     Args:
-        tried: (n,) trial values.
+        tried: (n,) increasing trial values.
         misfit: (n,) their misfits; inf where not tried.
 
     Returns:
-        The minimum between the trials next to the best one; the best trial itself at an end.
+        The minimum between the trials next to the best one; the best trial itself at an
+        end, next to one that was not tried, or if the parabola opens downwards.
     """
     i = int(np.argmin(misfit))
     near = slice(i - 1, i + 2)

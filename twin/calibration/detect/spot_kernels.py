@@ -27,12 +27,16 @@ FIT_FLOOR_PX = 0.0025
 
 @linked
 def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
-    """Return the sphere-centre bias of a centroid weighted by chord^power, chords capped
+    """Compute the sphere-centre bias of a centroid weighted by chord^power, chords capped
     at `ratio`.
 
-    0.8 for full chords (power 1), 2/3 for their squares, 1 for the outline: each level set of
-    chords is the outline of a smaller concentric ball, displaced in proportion to its radius
-    squared. ratio: the cap as a share of the largest chord.
+    0.8 for full chords (power 1), 2/3 for their squares, 1 for the outline: each level
+    set of chords is the outline of a smaller concentric ball, displaced in proportion to
+    its radius squared.
+
+    Args:
+        ratio: the cap as a share of the largest chord; limited to 0.001 to 1.
+        power: of the weight.
     """
     c = min(max(ratio, 1e-3), 1.0)
     c2 = c * c
@@ -43,12 +47,16 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
 
 @linked
 def weight_power(noise):  # type: ignore[no-untyped-def]
-    """Return the power of the line integral that weights the centroid, for its noise.
+    """Return the power of the line integral that weights the centroid: 4 for noise below
+    0.002, 3 below 0.006, 2.5 below 0.02, else 2.
 
     A ball's chord rises from its rim with a vertical slope, which pixels sample badly: a
-    centroid weighted by the chord errs by 0.006 to 0.008 px even without noise, by its square
-    0.0015, by its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower powers (best
-    of a scan over powers and caps).
+    centroid weighted by the chord errs by 0.006 to 0.008 px even without noise, by its
+    square 0.0015, by its cube 0.0005, by its fourth power 0.0001. Noise speaks for lower
+    powers (best of a scan over powers and caps).
+
+    Args:
+        noise: of the line integrals.
     """
     if noise < 0.002:
         return 4.0
@@ -64,9 +72,14 @@ def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
     """Return the line integral above which the weight is constant: a bead's middle is the
     noisiest.
 
-    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3 it is
-    of no use. Below that, a share of the peak (best of the same scan); without noise no cap at
-    all.
+    The noise of a logarithm grows as exp(L / 2) from `noise` at the background; above 0.3
+    it is of no use. Below that, a share of the peak (best of the same scan), 2 at least;
+    twice the peak, no real limit, for noise below 0.002.
+
+    Args:
+        noise: of the background.
+        peak: line integral through the middle.
+        cap: largest result.
     """
     limit = min(cap, max(1.5, 2.0 * math.log(0.3 / max(noise, 1e-6))))
     if noise < 0.002:
@@ -92,12 +105,15 @@ def raised(value, power):  # type: ignore[no-untyped-def]
 
 @linked
 def median(values, n):  # type: ignore[no-untyped-def]
-    """Compute the median of `values[:n]`, n > 0, reordering `values` in place (Hoare's
+    """Compute the median of `values[:n]`, reordering `values` in place (Hoare's
     quickselect).
 
-    For an even n the mean of the two in the middle.
+    For an even n the mean of the two in the middle. numba's own takes three times as long
+    to compile.
 
-    numba's own takes three times as long to compile.
+    Args:
+        values: (n or more,), without NaN.
+        n: above 0.
     """
     middle, low, high = n // 2, 0, n - 1
     while low < high:
@@ -168,16 +184,18 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
     """Fit a robust plane through the ring around (x0, y0), and return its noise.
 
     The ring's median and spread come first, so that a neighbour or an edge in the ring
-    does not pull the plane.
+    does not pull the plane; then two fits without pixels beyond 3 and 2.5 spreads. NaN
+    pixels are left out.
 
     Args:
         image: (rows, cols) line integrals.
         x0, y0: centre [px].
         inner, outer: radii of the ring [px].
-        plane: (3,) value, d/dx and d/dy, written.
+        plane: (3,) value at the centre, d/dx and d/dy, written; the median without slope
+            if a fit fails.
 
     Returns:
-        Standard deviation; -1 if too little of the ring is in the image.
+        Standard deviation; -1 if fewer than 12 pixels of the ring are in the image.
     """
     rows, cols = image.shape
     left, right = max(0, math.floor(x0 - outer)), min(cols - 1, math.ceil(x0 + outer))
@@ -256,16 +274,22 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
 
 @serial
 def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-untyped-def]
-    """Measure the centroid of a complete spot near (x0, y0).
+    """Measure the centroid of a complete spot near (x0, y0), in up to 7 rounds about the
+    last place.
+
+    Fails, which leaves OK 0, if the spot is cut by the image's edge, not brighter than
+    its background, or moves by 1.5 expected radii.
 
     Args:
         image: (rows, cols) line integrals.
         x0, y0: start [px].
-        radius0: expected radius of the spot [px].
+        radius0: expected radius of the spot [px]; the measured one is limited to 0.6 to
+            1.6 times it.
         cap: largest line integral above background; larger ones are cut, lower where they
             are noisier.
         least: least noise, which decides on the weight of pixels.
-        result: (RESULTS,), written; see the names of its places.
+        result: (RESULTS,), written; see the names of its places. SCORE is the likeness to
+            a ball, NOISE the background's.
     """
     rows, cols = image.shape
     plane = np.zeros(3)
@@ -366,6 +390,9 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
     """Write the covariance of a capped centroid: photon noise of a logarithm grows as
     exp(L / 2).
 
+    Pixels at or above the limit add nothing; variances get `FLOOR_PX` squared in
+    addition.
+
     Args:
         image: (rows, cols) line integrals.
         x, y: centroid [px].
@@ -376,7 +403,7 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
         plane: background about (cx, cy).
         cx, cy: its origin [px].
         mass: sum of the weights.
-        result: VAR_X, COV_XY and VAR_Y are written.
+        result: VAR_X, COV_XY and VAR_Y are written [px^2].
     """
     vx, vxy, vy = 0.0, 0.0, 0.0
     for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):
@@ -396,11 +423,10 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
 
 @linked
 def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ignore[no-untyped-def]
-    """Return the correlation of the spot with a ball's profile within 1.3 radii,
-    corrected for noise.
+    """Compute the correlation of the spot with a ball's profile within 1.3 radii and 1
+    px, corrected for noise: a faint ball is no less like one.
 
-    A faint ball is no less like one. At most three quarters of the variance are taken for
-    noise.
+    At most three quarters of the variance are taken for noise; the result may exceed 1.
 
     Args:
         image: (rows, cols) line integrals.
@@ -410,6 +436,9 @@ def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ig
         noise: of the background.
         plane: background about (cx, cy).
         cx, cy: its origin [px].
+
+    Returns:
+        0 if image or profile has no variance.
     """
     limit = min(cap, peak)
     reach = 1.3 * radius + 1.0
@@ -441,14 +470,14 @@ def ball_table(radius, peak, blur, veil, table, slope):  # type: ignore[no-untyp
     their slope.
 
     The blur acts on intensities, before the logarithm, so a strong bead's spot looks
-    smaller.
+    smaller. Approximate: a blur along the radius, corrected by the Laplacian.
 
     Args:
         radius: of the ball [px].
         peak: line integral through its middle.
-        blur: standard deviation [px].
+        blur: standard deviation [px], above 0.
         veil: part of the light about the ball that no ball takes away.
-        table, slope: (n,), written.
+        table, slope: (n,), written; the slope is a pixel's.
     """
     n = table.shape[0]
     half = math.ceil(3.0 * blur * 8.0)
@@ -512,10 +541,13 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
 def fit_ball(  # type: ignore[no-untyped-def]
     image, mask, x0, y0, radius, stretch, peak, blur, veil, sloped, free_radius, result
 ):
-    """Fit a blurred ball to the usable part of a spot, weighted by photon counts.
+    """Fit a blurred ball to the usable part of a spot, weighted by photon counts: place
+    and background's level, in up to 25 damped steps.
 
     Residuals are those of the intensity divided by its square root, which is what a
-    Poisson likelihood weighs; most information about the place comes from the rim.
+    Poisson likelihood weighs; most information about the place comes from the rim. Fails,
+    which leaves `result` 0, with fewer than 20 usable pixels, less than 0.15 of the spot,
+    a singular matrix, or a step of 1.2 radii from the start.
 
     Args:
         image: (rows, cols) line integrals.
@@ -523,15 +555,16 @@ def fit_ball(  # type: ignore[no-untyped-def]
         x0, y0: start [px]; the centre may be outside the image.
         radius: minor semi-axis of the spot [px]; peak: line integral that is seen in its
             middle.
-        stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to
-            the minor one.
+        stretch: (3,) direction of the major semi-axis (unit, column and row) and its
+            ratio to the minor one.
         blur: standard deviation of the image's blur [px].
-        veil: part of the light about the spot that the ball does not take away however thick it
-            is: scattered light, or high energies.
-        sloped: take the background's slope from the ring round the spot; else it is level.
-        free_radius: estimate the radius too.
-        result: filled as by `measure`; SCORE is the share of the spot used, NOISE the misfit as
-            a share of the spot's contrast.
+        veil: part of the light about the spot that the ball does not take away however
+            thick it is: scattered light, or high energies.
+        sloped: take the background's slope from the ring round the spot; else it is
+            level.
+        free_radius: estimate the radius too, 0.8 to 1.25 times the given one.
+        result: filled as by `measure`; SCORE is the share of the spot used, NOISE the
+            misfit as a share of the spot's contrast.
     """
     rows, cols = image.shape
     result[:] = 0.0

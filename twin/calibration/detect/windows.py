@@ -61,7 +61,9 @@ class Windows:
     shape: tuple[int, int]
 
     def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
-        """Select the windows of m (frame, bead) pairs, as if of m frames with one bead each."""
+        """Select the windows of m (frame, bead) pairs, as if of m frames with one bead
+        each: arrays become (m, 1, ...).
+        """
 
         arrays: dict[str, Any] = {
             n: a for n, a in vars(self).items() if n not in ("side", "shape")
@@ -72,8 +74,9 @@ class Windows:
 def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
     """Plan windows around the expected spots of all beads.
 
-    All windows have one odd side, for the largest spot; spots that touch are crowded, and
-    only complete, uncrowded ones are `whole`.
+    All windows have one odd side, for the largest spot. Spots closer than 1.12 times both
+    major semi-axes and 3 px are crowded; only complete, uncrowded ones are `whole`.
+    Windows may be off the image.
 
     Args:
         model: the beads.
@@ -138,16 +141,23 @@ def shadow_ellipses(
 
 
 def _disc_share(t: FloatArray) -> FloatArray:
-    """Return the share of a unit disc on the near side of a line at signed distance `t`
-    from its centre.
+    """Compute the share of a unit disc on the near side of a line at signed distance `t`
+    from its centre: 0 for -1 and less, 1 for 1 and more.
     """
     s = np.clip(t, -1.0, 1.0)
     return np.asarray(0.5 + (s * np.sqrt(1.0 - s * s) + np.arcsin(s)) / math.pi)
 
 
 def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
-    """Cut out the k windows of one frame's image, float32 (k, side, side), nan outside
-    the image.
+    """Cut out the k windows of one frame's image.
+
+    Args:
+        image: (rows, cols).
+        windows: places of all frames' windows.
+        frame: number of the frame.
+
+    Returns:
+        New float32 (k, side, side), nan outside the image.
     """
     data = np.asarray(image)
     side = windows.side
@@ -187,8 +197,10 @@ def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
 def mended(images: Float32Array, windows: Windows) -> Float32Array:
     """Fill dead pixels of the windows from their neighbours.
 
-    A dead pixel is constant over the frames, which noise allows no other pixel, and differs
-    from its neighbours. Parts of more than `WIDEST_DEAD` pixels are left: they may be starved.
+    A dead pixel is constant over `LEAST_SEEN` frames or more (within `MAX_STILL_SPREAD`
+    of the noise), which noise allows no other pixel, and differs from its neighbours by
+    `DEAD_SIGMAS` in some frame. Areas wider than `WIDEST_DEAD` pixels both ways are left:
+    they may be starved.
 
     Args:
         images: (n, k, side, side) line integrals.
@@ -234,7 +246,12 @@ def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
     """Fill dead pixels by the mean of their finite neighbours (of four), from the edges
     of each dead area inwards.
 
-    Areas wider than `WIDEST_DEAD` keep NaN in their middle.
+    Args:
+        image: (rows, cols).
+        dead: (rows, cols).
+
+    Returns:
+        A copy; areas wider than `WIDEST_DEAD` keep NaN in their middle.
     """
     sides = np.pad(np.where(dead, np.float32(np.nan), image), 1, constant_values=np.nan)
     inner = sides[1:-1, 1:-1]
@@ -276,9 +293,9 @@ def render_windows(
     Args:
         scene: solids.
         cone: geometry.
-        windows: their places.
-        fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel does.
-            One ray puts an edge up to half a pixel off.
+        windows: their places; also parts off the image are rendered.
+        fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel
+            does. One ray (1, the default) puts an edge up to half a pixel off.
     """
     if fine == 1:
         return _window_rays(scene, cone, windows, (0.0, 0.0))
@@ -358,14 +375,16 @@ def _window_rays(
 
 
 def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
-    """Check whether an edge of the body crosses a bead's spot or touches its rim, (n, k).
-
-    Columns and rows are looked at, with second differences 4 px wide.
+    """Check whether an edge of the body crosses a bead's spot or is within 2.5 px of it:
+    a second difference of 4 px, along rows or columns, above `step`.
 
     Args:
         body: (n, k, side, side) line integrals of everything but the bead.
         windows: their places.
         step: least height of an edge that counts.
+
+    Returns:
+        (n, k) bool.
     """
     # A ramp has no second difference; an edge has one of its height.
     bend = np.zeros_like(body)
@@ -399,9 +418,14 @@ def distances2(
 
 
 def blur_kernel(blur: float) -> FloatArray:
-    """Make a one-dimensional kernel on pixels whose variance is exactly blur^2 [px].
+    """Make a one-dimensional kernel on pixels whose variance is exactly blur^2, sum 1, of
+    odd length: three values below a variance of 0.35 px^2, else a Gaussian integrated
+    over pixels.
 
     A sampled Gaussian loses most of its variance below half a pixel.
+
+    Args:
+        blur: standard deviation [px].
     """
     variance = blur * blur
     if variance < 0.35:
@@ -415,8 +439,14 @@ def blur_kernel(blur: float) -> FloatArray:
 
 
 def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
-    """Blur line integrals (n, k, side, side) as intensities, exp(-p), by a standard
-    deviation [px]; edges are repeated outwards. Returns line integrals.
+    """Blur line integrals as intensities, exp(-p); edges are repeated outwards.
+
+    Args:
+        line_integrals: (n, k, side, side).
+        blur: standard deviation [px].
+
+    Returns:
+        New line integrals of that shape.
     """
     out = np.empty_like(line_integrals)
     side = line_integrals.shape[-1]
@@ -429,8 +459,8 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
 
 
 def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bool_]:
-    """Mark pixels of this bead's window in this frame that no other bead's spot touches,
-    (side, side).
+    """Mark pixels of this bead's window in this frame that no other bead's spot comes
+    near (within 3 px), (side, side) bool.
     """
     d2 = distances2(windows.corner[frame, bead], windows.side, windows.predicted[frame])
     reach = windows.radii[frame] * windows.stretch[frame, :, 2] + 3.0
@@ -440,17 +470,17 @@ def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bo
 
 
 def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
-    """Estimate the noise of each window's pixels from neighbours in six rows at its top and
-    bottom.
+    """Estimate the noise of each window's pixels from the median difference of neighbours
+    in six rows at its top and bottom.
 
     Args:
         flat: (m, side, side) line integrals, nan outside the image.
         edge: first used row and column.
-        width: number of used rows and columns.
+        width: number of used rows and columns, 7 at least.
 
     Returns:
-        (m,) standard deviations, at least `LEAST_NOISE`; for windows with nan the others'
-        median.
+        (m,) standard deviations, at least `LEAST_NOISE`; for windows with nan in these
+        rows the others' median.
     """
     rows = [
         edge,
