@@ -150,10 +150,11 @@ class Candidates:
     """The table of a fit: its geometry's columns, and those of every cause."""
 
     def __init__(self, fit: FitResult, known: Known, borders: Sequence[Border]) -> None:
-        """Tabulate the residuals' derivatives with respect to all causes, residuals of bad
-        spots weighted less.
+        """Tabulate the residuals' derivatives with respect to all causes, residuals of
+        bad spots (beyond `OUTLIER_SIGMAS`) weighted less.
 
-        Nothing is judged yet; the last rows are of motions.
+        Nothing is judged yet. Residuals are those without the causes that the fit has;
+        the last columns are of motions.
 
         Args:
             fit: of the geometry.
@@ -192,10 +193,8 @@ class Candidates:
         self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
 
     def _moving(self) -> list[str]:
-        """List the free parameters whose motion can be a cause; empty for several scans or few
-        frames.
-
-        Only those of MOVING that the fit estimates.
+        """List the free parameters whose motion can be a cause: those of MOVING that the
+        fit estimates; empty for several scans or fewer than `MIN_MOVING_FRAMES` frames.
         """
         sizes = np.bincount(self.fit.problem.group)
         if len(sizes) != 1 or sizes[0] < MIN_MOVING_FRAMES:
@@ -203,8 +202,14 @@ class Candidates:
         return [n for n in MOVING if n in self.fit.values]
 
     def _motion(self, name: str) -> Iterator[FloatArray]:
-        """Yield the image shifts, scaled to unit length (2 seen, 1), of a parameter that
-        changes over the scan as a ramp or as one to `WAVES` - 1 half waves.
+        """Yield the image shifts of a parameter that changes over the scan as a ramp or
+        as one to `WAVES` - 1 half waves.
+
+        Args:
+            name: of the parameter.
+
+        Yields:
+            `WAVES` columns (2 x seen positions, 1), of unit length.
         """
         problem = self.fit.problem
         n, k = problem.seen.shape
@@ -220,10 +225,12 @@ class Candidates:
             yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
 
     def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
-        """List the causes of the table: shape, beads, arc, panel, borders, motion and priors.
+        """List the causes of the table: shape, beads, arc, panel, borders, motion and
+        priors, in this order.
 
-        Exact beads have no cause of shape or position; beads need enough of them; panel
-        and borders only where the problem has a panel.
+        Exact beads have no cause of shape or position, a stage at rest none of an arc;
+        beads need three at least; panel and borders only where the problem has a panel.
+        Only widths above 1.5 times the stated one are tried.
 
         Args:
             everything: problem with a column for each cause.
@@ -274,15 +281,17 @@ class Candidates:
         return tuple(out)
 
     def judged(self, choice: Choice) -> Judged | None:
-        """Judge a choice.
+        """Judge a choice, once (cached).
 
-        Columns of causes that are chosen or always hold are free within their widths.
+        Columns of causes that are chosen or always hold are free within their widths; the
+        evidence includes the causes' probabilities.
 
         Args:
-            choice: width of each cause.
+            choice: width of each cause, 0 if not chosen; the last is a factor on the
+                priors.
 
         Returns:
-            The judged model, kept for later calls; None if its columns are not separable.
+            The judged model; None if its columns are not separable.
         """
         if choice not in self._judged:
             factor = choice[-1] or 1.0
@@ -315,10 +324,10 @@ class Candidates:
 
     def best(self) -> Choice:
         """Find the choice of causes and widths with the most evidence, by changing one
-        cause at a time from several starts.
+        cause at a time (`_climbed`).
 
-        Starts are no cause and the three best single causes. Returns no cause at all if
-        no single one comes near to it in evidence (a tenth of its likelihood).
+        Starts are no cause and the three best single causes. If no single cause has a
+        tenth of the probability of none, the result is no cause.
         """
         nothing: Choice = (0.0,) * len(self.causes)
         singles = [
@@ -344,8 +353,8 @@ class Candidates:
         return max((self._climbed(start) for start in starts), key=self.evidence)
 
     def _climbed(self, choice: Choice) -> Choice:
-        """Climb from a choice, one cause after the other, until no other width of any has
-        more evidence; returns that choice.
+        """Climb from a choice, one cause after the other and all its widths, until none
+        has more evidence; returns that choice.
         """
         while True:
             before = choice
@@ -358,6 +367,9 @@ class Candidates:
     def odds(self) -> dict[str, float]:
         """Compute the logarithm of the odds of each cause, present to absent, summed over
         all choices judged so far.
+
+        Returns:
+            Name -> log odds; inf or -inf where only one side was judged, nan if none was.
         """
         out = {}
         for i, cause in enumerate(self.causes):
@@ -369,14 +381,19 @@ class Candidates:
         return out
 
     def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
-        """Compute the covariance of the geometry's columns over all judged choices near one,
-        and for that choice alone.
+        """Compute the covariance of the geometry's columns averaged over all judged
+        choices whose evidence is at most `MAX_EVIDENCE_LOSS` below one's, and for that
+        choice alone.
 
-        Choices with wider priors are left out: statements on the scanner are believed where the
-        images do not contradict them.
+        Choices with other widths of the priors are left out: statements on the scanner
+        are believed where the images do not contradict them.
+
+        Args:
+            choice: must be separable.
 
         Returns:
-            Both (columns, columns), the averaged one first.
+            Both (columns, columns), the averaged one first; it includes the differences
+            of their means.
         """
         at = self.judged(choice)
         assert at is not None
@@ -393,7 +410,7 @@ class Candidates:
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
         """Return the phantom's strain (10,) in a choice, in the order of STRAINS, and its
-        covariance; None if the phantom is rigid or the choice cannot be judged.
+        covariance (10, 10); None if a stated strain is 0 or the choice cannot be judged.
         """
         at = self.judged(choice)
         if at is None or not min(self.known.strain) > 0:
@@ -412,16 +429,15 @@ class Candidates:
         return 0.0
 
     def border(self, choice: Choice) -> Border | None:
-        """Find a tile's border that a choice's residuals suggest.
-
-        Also None if the images have several shapes. Borders known already are not found
-        again.
+        """Find a tile's border that a choice's residuals suggest; borders known already
+        are not found again.
 
         Args:
             choice: width of each cause.
 
         Returns:
-            None if no border is likely, or the choice cannot be judged.
+            None if no border is likely, the choice cannot be judged, or the images have
+            several shapes.
         """
         model = self.judged(choice)
         shape = image_shape(self.fit)
@@ -451,11 +467,15 @@ class Candidates:
 
 
 def _arc(column: int, share: float | None) -> list[Cause]:
-    """Make the cause that the object turns while a frame is exposed; empty where it is at rest.
+    """Make the cause that the object turns while a frame is exposed.
 
     Args:
         column: of the squared share of a step.
         share: of a step, by the script; None: not stated.
+
+    Returns:
+        One cause; more probable before the scan, and narrow, if stated. Empty for a share
+        of 0.
     """
     if share is None:
         return [Cause("arc", (column,), (ARC_PRIOR,))]
@@ -467,10 +487,11 @@ def _arc(column: int, share: float | None) -> list[Cause]:
 def explained_by_causes(
     fit: FitResult, known: Known, refit: Refit
 ) -> tuple[FitResult, Found]:
-    """Fit with the most likely causes as columns, and average sigmas over those left open.
+    """Fit with the most likely causes as columns, and average sigmas over those left
+    open.
 
-    Causes, borders between panel tiles among them, are searched again after each new fit,
-    until they stay the same or for `MOST_ROUNDS`.
+    Causes, up to `MOST_BORDERS` borders between panel tiles among them, are searched
+    again after each new fit, until they stay the same or for `MOST_ROUNDS`.
 
     Args:
         fit: of the geometry, the phantom's strain with its prior.
@@ -478,8 +499,9 @@ def explained_by_causes(
         refit: fits again with `strain`, `arc`, `bead_tolerance_mm` and `panel`.
 
     Returns:
-        The new fit and the causes that were found. `fit` itself if a fit with causes is not
-        identifiable, or if the object moves and the causes explain little.
+        The new fit and the causes that were found. `fit` itself without causes if a fit
+        with them is not identifiable; `fit` with the odds alone if the object moves and
+        more than `MAX_REST_SHARE` of the residuals is left.
     """
     first = fit
     borders: tuple[Border, ...] = ()
@@ -529,7 +551,8 @@ def explained_by_causes(
 
 
 def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResult:
-    """Add the differences between likely choices to the covariance of a fit.
+    """Add the differences between likely choices to the covariance of a fit; never
+    narrows it.
 
     Args:
         fit: with the causes of `choice`.
@@ -554,16 +577,15 @@ def _options(
 ) -> dict[str, object]:
     """Make the options of the refit for a choice; falsy where nothing changes.
 
-    strain is None if it is as stated before; panel is None without bends and borders, or
-    where images differ in shape.
-
     Args:
         candidates: the table.
         choice: width of each cause.
         borders: of tiles.
 
     Returns:
-        strain, arc, bead_tolerance_mm and panel.
+        `strain` (None if it is as stated before), `arc` (bool), `bead_tolerance_mm` (None
+        if not chosen) and `panel` (None without bends and borders, or where images differ
+        in shape).
     """
     said = candidates.known.strain
     strain = tuple(
@@ -584,7 +606,7 @@ def _options(
 
 
 def image_shape(fit: FitResult) -> tuple[int, int] | None:
-    """Return (rows, cols) of the images; None where they differ."""
+    """Return (rows, cols) of the images; None where frames differ."""
     sizes = np.unique(2 * fit.problem.origin + 1, axis=0)
     if len(sizes) == 1:
         return (int(sizes[0, 1]), int(sizes[0, 0]))
@@ -612,7 +634,9 @@ def with_pick(choice: Choice, i: int, pick: float) -> Choice:
 
 
 def _total(evidence: Sequence[float]) -> float:
-    """Compute the logarithm of a sum of probabilities from their logarithms; -inf without any."""
+    """Compute the logarithm of a sum of probabilities from their logarithms, without
+    overflow; -inf without any.
+    """
     if not evidence:
         return -math.inf
     top = max(evidence)
@@ -624,15 +648,16 @@ def _with_every_column(
 ) -> tuple[FitProblem, FloatArray]:
     """Add a column for every cause to a problem.
 
-    Layout: the fit's parameters, beads, strain, arc, panel.
+    Layout: the fit's parameters, beads, strain, arc, panel; all beads are free.
 
     Args:
-        problem: of the fit.
+        problem: of the fit; not changed.
         x: (c,) its column values.
         panel: terms of distortion, or None.
 
     Returns:
-        The problem, and values of all columns; 0 for those that the fit does not have.
+        The problem, and values of all columns: those of the fit, and the problem's start
+        for those that it does not have.
     """
     old = problem.layout
     count = old.parameter_count

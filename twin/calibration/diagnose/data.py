@@ -71,18 +71,21 @@ _STATES = {
 def judge_frames(
     scan: Scan, looks: Sequence[FrameSpots], sought: SpotFinder
 ) -> list[Finding]:
-    """Judge missing and dark frames, and frames without a spot like the `sought` ones.
+    """Judge missing, dark and repeated frames, and frames without a bead.
 
-    In the order missing, dark and repeated frames, then frames without beads (an error if
-    none has any).
+    Frames without beads are judged among usable ones; if none shows any, images are
+    searched once more as intensities, and the error says whether that helps. Unusable
+    files are named, `MAX_SHOWN` at most.
 
     Args:
-        scan: gives the name.
+        scan: gives the name, and its images.
         looks: spots and state of each frame.
         sought: sizes of spots.
 
     Returns:
-        Warnings, and errors where no frame is usable; empty if all show beads.
+        At most one finding for each of the three states, then one on beads: warnings, and
+        errors where it holds for all frames (of beads: all usable ones). Empty if all
+        show beads.
     """
     out = []
     name = scan.name
@@ -118,10 +121,12 @@ def judge_frames(
 
 
 def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
-    """Search for spots as if the images held intensities instead of line integrals.
+    """Search for spots as if the images held intensities instead of line integrals; reads
+    all images again.
 
     Returns:
-        A sentence for the finding, with a leading blank; empty if few frames show spots then.
+        A sentence for the finding, with a leading blank; empty if fewer than
+        `SHOWN_AT_LEAST` of the frames show spots then.
     """
     looks = scan.frames.look(replace(sought, intensities=True))
     shown = sum(len(look.detections) > 0 for look in looks)
@@ -139,9 +144,8 @@ def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
 def judge_emptiness(
     scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]], model: BeadModel
 ) -> list[Finding]:
-    """Look for spots of another size in scans where no bead of the expected size was found.
-
-    Nothing where fewer than half of the frames show any round spot.
+    """Look for spots of any size in scans where no bead of the expected size was found;
+    reads their images again.
 
     Args:
         scans: the scans.
@@ -149,7 +153,8 @@ def judge_emptiness(
         model: the beads.
 
     Returns:
-        An error for each scan that shows another phantom.
+        An error for each scan that shows another phantom: round spots in half of its
+        frames or more.
     """
     out = []
     for scan, some in zip(scans, looks, strict=True):
@@ -182,12 +187,17 @@ def explain_identification(
 ) -> Finding | None:
     """Judge an assignment; if it is poor, find the mistake that explains the spots.
 
+    In this order: at most one spot a frame; an ambiguous assignment (error); lost or
+    displaced beads, or other spots (warnings); a mistake (`_alternative`); else nothing
+    for a plausible assignment, or the error "wrong_phantom". Single frames that the
+    others contradict are ignored.
+
     Args:
         found: the assignment; None if no one was found.
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
-        name: of the scan.
+        name: of the scan, the text's beginning.
 
     Returns:
         None for a good assignment.
@@ -264,8 +274,11 @@ def explain_identification(
 
 
 def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
-    """Check whether most frames with all beads in place have further spots; `counts` are
-    all spots.
+    """Check whether more than 0.6 of the frames with nearly all beads have further spots.
+
+    Args:
+        found: the assignment.
+        counts: (n,) all spots of each frame.
     """
     seen = (found.index >= 0).sum(axis=1)
     good = seen >= 0.7 * max(float(np.median(seen)), 1.0)
@@ -273,11 +286,14 @@ def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
 
 
 def _without_bad_frames(found: Identification) -> Identification:
-    """Drop single frames that the others contradict from an assignment.
-
-    Returned unchanged without such frames, or if they are more than a fifth.
+    """Drop single frames that the others contradict from an assignment: those with at
+    most 0.7 of the usual number of beads. Its residual becomes the typical one.
 
     After the fit they are listed; they do not suggest another phantom.
+
+    Returns:
+        A copy; the assignment itself without such frames, or if they are more than a
+        fifth.
     """
     seen = (found.index >= 0).sum(axis=1)
     if seen.any():
@@ -293,11 +309,14 @@ def _without_bad_frames(found: Identification) -> Identification:
 
 
 def _missing(found: Identification) -> list[int]:
-    """List beads without a spot where nearly every spot fits one of the others, at least
-    three of them; empty if the identification is poor or a bead has spots in a part of
-    the frames.
+    """List beads without a spot (in fewer than `STRAY_SHARE` of the frames) where nearly
+    every spot fits one of the others, at least three of them.
 
-    A bead that is hidden at times counts as seen.
+    A bead that is hidden at times, in up to half of the frames, counts as seen.
+
+    Returns:
+        Numbers of beads; empty if the identification is poor or a bead is in neither
+        group.
     """
     if found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
         return []
@@ -315,8 +334,8 @@ def _plausible(found: Identification) -> bool:
 
 
 def _convincing(found: Identification) -> bool:
-    """Check whether an identification explains and finds most spots, closely enough to be
-    believed.
+    """Check whether an identification explains and finds most spots (`GOOD_SHARE`),
+    closely enough (`GOOD_RMS_PX`) to be believed.
     """
     return (
         found.explained >= GOOD_SHARE
@@ -328,7 +347,7 @@ def _convincing(found: Identification) -> bool:
 
 def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
     """Mirror the spot centres of all frames in columns (`axis` 0) or in rows (1); shapes
-    and covariances stay.
+    and covariances stay. Returns copies.
     """
     out = []
     for d in detections:
@@ -345,7 +364,12 @@ def _alternative(
     model: BeadModel,
     poses: Poses,
 ) -> Finding | None:
-    """Find the first mistake that makes phantom and spots agree.
+    """Find the mistake that makes phantom and spots agree best.
+
+    Tried are endpoint errors of the angles, mirrored or turned phantoms and images, a
+    reversed or resting stage, and each bead left out (5 to `MOST_LEFT_OUT` beads). Only
+    if none is convincing and clearly better than `found`: motion, parts of the scan,
+    another turn, and single frames; these not for a plausible assignment.
 
     Args:
         found: the poor assignment, or None.
@@ -354,7 +378,7 @@ def _alternative(
         poses: nominal geometry.
 
     Returns:
-        Its finding; None if no mistake explains the spots.
+        Its finding, an error; None if no mistake explains the spots.
     """
     n = len(poses)
     k = len(model)
@@ -448,16 +472,15 @@ def _in_motion(
 ) -> Finding | None:
     """Check whether the spots are those of the phantom, up to a motion.
 
-    None too if the spots do not fit the beads even with a wide gate, or frames are too
-    few.
-
     Args:
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
 
     Returns:
-        The finding that names the motion, or None.
+        The finding that names the motion; None if there is none, if the spots do not fit
+        the beads even with a gate of `WIDE_GATE_PX`, or for fewer than `LEAST_FRAMES`
+        frames.
     """
     found = attempt(detections, model, poses, search=Search(gate_px=WIDE_GATE_PX))
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
@@ -470,10 +493,10 @@ def _in_motion(
     still = replace(NOMINAL, **{name: getattr(found.parameters, name) for name in SIX})
 
     def fitted(motion: MotionFit | None = None) -> FitResult:
-        """Fit all parameters to the tracks, with the frames displaced by the first of
+        """Fit all six parameters to the tracks, with the frames displaced by the first of
         `motion`; None: at the stated poses.
 
-        Starts from the fit without motion; no bound on the offsets.
+        Starts from the identified geometry; no bound on the offsets.
         """
         if motion is None:
             moved = here
@@ -498,8 +521,7 @@ def _in_parts(
 ) -> Finding | None:
     """Check whether the first or the last frames alone fit the phantom.
 
-    Tried are halves, thirds and quarters until both ends fit. One end that fits: frame
-    numbers; both: a turn or drift between them.
+    Tried are halves, thirds and quarters until both ends fit.
 
     Args:
         detections: spots of each frame.
@@ -507,7 +529,8 @@ def _in_parts(
         poses: nominal geometry.
 
     Returns:
-        An error on frame numbers, or on the change between both ends; None if no part fits.
+        An error: on frame numbers if one end fits, on a turn above `LEAST_TURN_DEG` or
+        else the largest shift between them if both do; None if no part fits.
     """
     n = len(poses)
     ends: dict[str, tuple[slice, Offsets]] = {}
@@ -546,9 +569,8 @@ def _in_parts(
 def _other_turn(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> Finding | None:
-    """Check whether the stage turns by another angle than stated, from neighbouring frames.
-
-    Also None with fewer than four frames at small turns.
+    """Check whether the stage turns by another angle than stated, from the frames within
+    75 deg of the first.
 
     Args:
         detections: spots of each frame.
@@ -556,7 +578,8 @@ def _other_turn(
         poses: nominal geometry.
 
     Returns:
-        An error with the factor; None if no other angle fits.
+        An error with the factor on the angles; None if no other one fits, it is within
+        `LEAST_TURN` of 1, or for fewer than four such frames.
     """
     turned = poses.angle - poses.angle[0]
     n = int(np.count_nonzero(np.abs(turned) <= FEW_TURNED))
@@ -583,9 +606,8 @@ def _other_turn(
 def _one_by_one(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> Finding | None:
-    """Check whether frames fit the phantom one by one, though not together.
-
-    SAMPLED_FRAMES frames are tried; at least 70 % have to fit, each with 5 spots or more.
+    """Check whether frames fit the phantom one by one, though not together:
+    `SAMPLED_FRAMES` are tried, each with 5 spots or more.
 
     Args:
         detections: spots of each frame.
@@ -593,7 +615,7 @@ def _one_by_one(
         poses: nominal geometry.
 
     Returns:
-        An error on the frames' order or angles; None if most do not fit.
+        An error on the frames' order or angles; None if fewer than 70 % fit.
     """
     chosen = np.linspace(0, len(poses) - 1, SAMPLED_FRAMES).astype(int).tolist()
     good = 0

@@ -82,23 +82,21 @@ MOST_FRAMES: Final = 720
 
 
 def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
-    """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a repeated
-    image.
+    """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a
+    repeated image.
 
-    Of one scan in one group of frames, wrong frame numbers come first (`judged` says error
-    or warning). A block of frames at an end, with no drift but the angle's, is an error
-    ("angle_step"). Otherwise "frames_inconsistent": an error for more than 30 % of the
+    A frame is bad if most of its spots are 5 px or more from every prediction, or most of
+    its positions had to be left out of the fit. Of one scan, wrong frame numbers come
+    first. Otherwise a block of frames at an end, with no drift but the angle's, is an
+    error ("angle_step"); else "frames_inconsistent": an error for more than 30 % of the
     frames, else a warning. At most 12 frames are listed, a block as first to last.
-
-    Either most of a frame's spots are far from every prediction, or most of its positions had
-    to be left out of the fit.
 
     Args:
         fit: to all frames.
         looks: spots and state of each frame of each scan.
 
     Returns:
-        A finding that lists the frames, or names their numbers; None if all fit.
+        One finding that lists the frames, or names their numbers; None if all fit.
     """
     detections = [
         nothing(look.detections.shape)
@@ -153,8 +151,10 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
 
 
 def judge_offsets(fit: FitResult) -> Finding | None:
-    """Judge whether the fitted place is within the possible errors of mount and motors:
-    an error if `dO_z` of some group exceeds a share of the SOD, else None.
+    """Judge whether the fitted place is within the possible errors of mount and motors.
+
+    Returns:
+        An error if dO_z of some scan exceeds `PLAUSIBLE_SHARE` of the SOD; else None.
     """
     sod = float(np.median(fit.problem.poses.sod))
     for parameters in fit.group_parameters:
@@ -170,10 +170,8 @@ def judge_offsets(fit: FitResult) -> Finding | None:
 def judge_first_size(
     found: Identification, looks: Sequence[FrameSpots], radii: FloatArray, allowed: float
 ) -> Finding | None:
-    """Judge sizes coarsely from the first measurement.
-
-    The median ratio of complete, identified spots is judged; without any there is no
-    finding.
+    """Judge sizes coarsely from the first measurement: the median ratio of measured to
+    expected radii of complete, identified spots.
 
     Args:
         found: the bead of each spot.
@@ -182,7 +180,8 @@ def judge_first_size(
         allowed: deviation that may be blur, as a share.
 
     Returns:
-        An error on bead sizes; None if they fit.
+        An error on bead sizes; None if the ratio is within `allowed` of 1, or there is no
+        such spot.
     """
     ratios = [
         look.detections.radii_px[j] / radii[f, b]
@@ -200,17 +199,19 @@ def judge_first_size(
 
 
 def judge_size(measured: Refined, radius_px: float) -> Finding | None:
-    """Judge the spots' size against the one of the phantom's beads at the fitted geometry.
+    """Judge the spots' size against the one of the phantom's beads at the fitted
+    geometry.
 
     A phantom of another scale at another distance gives the same bead positions; only the
     beads' own size reveals it.
 
     Args:
-        measured: sizes and blur.
+        measured: size (nan if unknown) and blur.
         radius_px: expected radius of the spots.
 
     Returns:
-        A warning if blur may explain it, else an error; None if the size fits.
+        Beyond `MAX_SIZE_ERROR` a warning if blur may explain it, else an error; None if
+        the size fits or is unknown.
     """
     off = abs(measured.size - 1.0)
     blur = measured.blur_px / radius_px
@@ -228,8 +229,10 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
 
 
 def _other_size(ratio: float) -> Finding:
-    """Make the error that the shadows have another size than predicted; `ratio` is
-    measured over predicted size.
+    """Make the error that the shadows have another size than predicted, in per cent.
+
+    Args:
+        ratio: measured over predicted size.
     """
     return error(
         "bead_size",
@@ -242,11 +245,14 @@ def _other_size(ratio: float) -> Finding:
 
 
 def judge_body(measured: Sequence[Refined]) -> Finding | None:
-    """Judge whether the phantom's body has its described place and attenuation; returns
-    None if so, else one warning: the body is not seen at all in some scan, or in the
-    first scan with a difference how it differs.
+    """Judge whether the phantom's body has its described place and attenuation.
 
-    Scans without an estimate are left out.
+    Args:
+        measured: second measurements; those without an estimate of the body are left out.
+
+    Returns:
+        None if so; else one warning: some scan does not show the body at all, or the
+        first scan that differs (beyond `MAX_BODY_LOG` or `MAX_BODY_MM`) and how.
     """
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):
@@ -270,7 +276,7 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
 
 def judge_lag(lag: Lag) -> Finding:
     """Make the warning that the camera shows part of the frame before (detector lag),
-    with the part [%].
+    with the part [%], whatever its size.
     """
     return warning(
         "lag",
@@ -293,15 +299,20 @@ def explain_residuals(
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name the causes that would explain them.
 
+    A single displaced bead is left out rather than all beads fitted. If the residuals
+    exceed the limit, or too many positions were left out, a factor on the angles is
+    tried; then, beyond the limit, a motion, else the error "misfit" is given.
+
     Args:
-        fit: to be judged.
+        fit: to be judged; nothing is judged if it is not identifiable.
         known: statements on the phantom and the positions.
         refit: fits again with more parameters free.
         sigmas_known: the positions' sigmas were measured, and are no more than compared.
         misfit_px: residual up to which the fit is used, whatever its positions scatter.
 
     Returns:
-        The fit to be reported (with the causes that explain the residuals) and the findings.
+        The fit to be reported (with the causes that explain the residuals) and the
+        findings; only the factor's error, with the original fit, if that explains them.
     """
     if not fit.identifiable:
         return fit, []
@@ -333,15 +344,22 @@ def explain_residuals(
 
 
 def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
-    """Check whether beads that a fit left out explain as much as fitted places of all beads."""
+    """Check whether a fit that left out some beads, three at least being left, explains
+    as much (within `AS_GOOD`) as fitted places of all beads.
+
+    Args:
+        plain: without free beads.
+        moved: with free beads.
+    """
     left_out = _lost_beads(plain)
     enough = bool(left_out) and not any(f.forbids for f in left_out)
     return enough and plain.certificate.rms_px < AS_GOOD * moved.certificate.rms_px
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
-    """List warnings: the strongest drift or jump of a parameter, and errors that the
-    beads of a frame (vibration), or a bead in each turn, share; empty without any.
+    """List warnings: the strongest drift or jump of a parameter, then errors that the
+    beads of a frame share (vibration), then those that a bead repeats in each turn; empty
+    without any.
     """
     certificate = fit.certificate
     out = []
@@ -384,8 +402,8 @@ def _drifts(fit: FitResult) -> list[Finding]:
 
 
 def _looks_alike(column: str) -> str:
-    """Return words on another motion that looks like a change of a parameter, in
-    brackets; "" without one.
+    """Return words on another motion that looks like a change of a parameter (of one
+    scan: NAME@NUMBER), in brackets after a blank; "" without one.
     """
     name = column.split("@")[0]
     if name in ALIKE_MOTION:
@@ -396,8 +414,9 @@ def _looks_alike(column: str) -> str:
 def _lost_beads(fit: FitResult) -> list[Finding]:
     """List beads seen in at least three frames and left out of more than half of them.
 
-    One finding: a warning, or an error if fewer than three beads remain. Without such
-    beads: an error if over 35 % of all positions were left out, else nothing.
+    Returns:
+        One finding: a warning, or an error if fewer than three beads remain. Without such
+        beads: an error if over 35 % of all positions were left out, else empty.
     """
     problem = fit.problem
     used = fit.certificate.used
@@ -419,7 +438,7 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
 
 
 def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) -> float:
-    """Compute the root mean square residual [px] that a right fit exceeds by chance.
+    """Compute the root mean square residual that a right fit exceeds by chance.
 
     Positions scatter by their stated sigmas and, from image to image, by
     `certificate.POSITION_SPREAD_PX` with SPREAD_FREEDOM degrees of freedom.
@@ -427,7 +446,11 @@ def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) 
     Args:
         fit: whose residuals are judged.
         chance: probability of more.
-        sigmas_known: the positions' sigmas were measured, and are no more than compared.
+        sigmas_known: the positions' sigmas were measured, and are no more than compared;
+            else the stated ones are ignored.
+
+    Returns:
+        [px].
     """
     usual = SPREAD_FREEDOM / float(chdtri(SPREAD_FREEDOM, 1.0 - chance))
     certificate = fit.certificate
@@ -440,10 +463,8 @@ def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) 
 
 
 def _explained(better: FitResult, fit: FitResult) -> bool:
-    """Check whether the residuals shrink enough from `fit` to `better`, without many more spots
-    left out.
-
-    Also False if `better` is not identifiable.
+    """Check whether `better` explains the residuals of `fit`: they are halved and may be
+    chance, it is identifiable, and uses at least `MOST_USED` as many positions.
     """
     rms = better.certificate.rms_px
     return (
@@ -457,16 +478,14 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
 def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
     """Fit a factor on the angles, and judge whether it explains the residuals.
 
-    None also where the factor is within 5 sigma of 1. Only the steps 360 / (n - 1) and
-    360 / n are recognised as an endpoint error.
-
     Args:
         fit: without the factor.
         refit: fits again with further parameters, `extra`.
 
     Returns:
-        An error that names the factor, as an endpoint error if it fits n / (n - 1); None if the
-        factor is estimated already or explains nothing.
+        An error that names the factor, as an endpoint error if it is n / (n - 1) or (n -
+        1) / n; None if the factor is estimated already, explains nothing or is within 5
+        sigma of 1.
     """
     if "angle_scale" in fit.certificate.estimates:
         return None
@@ -490,18 +509,18 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
 
 
 def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding | None:
-    """Fit a motion, and name the moving parameter if that explains the residuals.
-
-    The finding is an error: wrong angles or a named turn for alpha, else a drift, or a
-    vibration if it goes from frame to frame. None too for few or very many frames.
+    """Fit a motion of all parameters that may move, and name the moving one if that
+    explains the residuals: halves them, to a chance of `EXPLAINED_CHANCE`.
 
     Args:
         fit: without motion.
         refit: the fit to poses with a motion.
 
     Returns:
-        A finding with the parameter and how it moves; None if no motion explains them, or it
-        cannot be fitted.
+        An error with the parameter that has most effect and how it moves: wrong angles or
+        a named turn for alpha, else a vibration if it goes from frame to frame, or a
+        drift. None if no motion explains them or it cannot be fitted, for scans of fewer
+        than 12 or more than `MOST_FRAMES` frames, or if nothing may move.
     """
     problem = fit.problem
     before = fit.certificate.rms_px
@@ -556,8 +575,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
 
 
 def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
-    """Name the likely cause where an object turns too far: lost frames if by whole steps, else
-    a slip.
+    """Name the likely cause where an object turns too far: lost frames if by a whole
+    number of steps (within 0.05 step), else a slip.
 
     Args:
         turn_deg: the turn beyond the stated one.
@@ -582,13 +601,12 @@ def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
 def _shape(curve: FloatArray) -> tuple[str, int | None]:
     """Describe how a parameter moves over the frames.
 
-    Words: at a frame (a jump), from frame to frame, steadily, or to and fro.
-
     Args:
-        curve: (n,) values of the frames.
+        curve: (n,) values of the frames, two at least.
 
     Returns:
-        Words for the finding, and the frame before a jump; None unless it jumps.
+        Words for the finding (at a frame, from frame to frame, steadily, or to and fro),
+        and the number of the frame before a jump; None unless it jumps.
     """
     steps = np.abs(np.diff(curve))
     jump = int(np.argmax(steps))

@@ -42,16 +42,22 @@ NARROW_CHANCE: Final = 0.01
 
 
 def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float]:
-    """Compute the distance of the data, in sigmas, from the value of each fixed parameter.
+    """Compute the distance of the data, in sigmas, from the value of each fixed
+    parameter.
+
+    Sigmas are those of normal deviates as improbable as Student's with the fit's degrees
+    of freedom.
 
     Args:
         free: the fit with those parameters free too.
-        held: parameter -> value it is fixed at, edge units; those not determined are left out.
+        held: parameter -> value it is fixed at, edge units; those not determined are left
+            out.
 
     Returns:
-        Parameter -> sigmas, and under "" those of all together (a chi2 distance of many, as the
-        normal deviate that is as improbable): correlated ones may contradict the data together
-        where each by itself does not.
+        Parameter -> sigmas, and under "" those of all together (a chi2 distance of many,
+        as the normal deviate that is as improbable): correlated ones may contradict the
+        data together where each by itself does not. Empty if the fit is not identifiable
+        or determines none.
     """
     if not free.identifiable:
         return {}
@@ -75,13 +81,16 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
 
 
 def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
-    """Return an error if the data contradict fixed parameters (see `held_distance`), else None.
-
-    It names each parameter that is off by itself, or the worst where only all together are.
+    """Judge whether the data contradict fixed parameters (see `held_distance`) by more
+    than `HELD_SIGMAS`.
 
     Args:
         free: the fit with those parameters free too.
         held: parameter -> value it is fixed at, edge units.
+
+    Returns:
+        An error that names each parameter that is off by itself, worst first, or the
+        worst where only all together are; None without a contradiction.
     """
     scores = held_distance(free, held)
     if not scores or max(scores.values()) <= HELD_SIGMAS:
@@ -127,7 +136,8 @@ def judge_exact(
 ) -> Finding | None:
     """Judge the dependence on values stated as exact that the images cannot check.
 
-    None also where one of the two fits is not identifiable.
+    All together are not judged: who calls ten values exact gets their small systematic
+    parts, such as a blurred bead's, summed up.
 
     Args:
         fit: with those values.
@@ -135,10 +145,9 @@ def judge_exact(
         exact: parameter -> value, edge units.
 
     Returns:
-        An error if the images contradict one of them by itself, a warning if they cannot
-        decide and sigmas depend on it, else None. (All together are not judged: who calls
-        ten values exact gets their small systematic parts, such as a blurred bead's,
-        summed up.)
+        An error if the images contradict one of them by itself; a warning if sigmas grow
+        more than `MIN_GROWTH` times with its usual prior, or the images narrow that prior
+        by less; else None, also where one of the two fits is not identifiable.
     """
     if not (fit.identifiable and freed.identifiable):
         return None
@@ -175,16 +184,22 @@ def judge_exact(
 def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     """Compare priors with the images.
 
-    Args:
-        exact: parameters that the request states as exact; their priors in `loose` are
-            the usual ones.
-        loose: the fit with `loosened` priors. (In a fit with the priors themselves, strong ones
-            that are wrong leave residuals with structure, which widens the sigmas until nothing
-            is contradicted.)
-
     In units of its loose prior an estimate of covariance C moves from the prior's centre
     by K = 1 - C times the error of the parameter, and by noise of covariance C K.
-    Directions that the images determine less than the loose prior are left out.
+    Directions whose variance the images lower by less than `MIN_VARIANCE_DROP` are left
+    out.
+
+    Args:
+        loose: the fit with `loosened` priors. (In a fit with the priors themselves,
+            strong ones that are wrong leave residuals with structure, which widens the
+            sigmas until nothing is contradicted.)
+        exact: parameters that the request states as exact; their priors in `loose` are
+            the usual ones.
+
+    Returns:
+        Beyond `HELD_SIGMAS` an error and its likely causes; else a factor above 1 if the
+        contradiction's chance is below `NARROW_CHANCE`. No finding and factor 1 without
+        priors, or if the fit is not identifiable.
     """
     c = loose.certificate
     known = [
@@ -275,8 +290,11 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
 
 
 def _other_pixels(fit: FitResult, dD_z: float) -> str:
-    """Describe in words the pixel width [mm] that would look like a panel `dD_z` [mm]
-    further away.
+    """Describe in words the pixel width that would look like a panel `dD_z` further away.
+
+    Args:
+        fit: gives pixel width and SDD, medians over the frames.
+        dD_z: [mm].
     """
     poses = fit.problem.poses
     pixel = float(np.median(np.linalg.norm(poses.u, axis=1)))
@@ -301,6 +319,10 @@ def doubtful(
         fit: with the priors.
         judged: the priors compared with the images.
         without: makes the fit without the prior of a parameter.
+
+    Returns:
+        The same values with wider intervals; `fit` itself without causes. Fits that are
+        not identifiable are ignored.
     """
     for name in judged.causes:
         other = without(name)
@@ -312,7 +334,7 @@ def doubtful(
 
 def narrow_priors(judged: PriorsJudged) -> Finding:
     """Make the warning that all priors are widened by the factor of `judged`, with the
-    causes that alone would explain it.
+    causes that alone would explain it, if any.
     """
     if judged.causes:
         cause = f"; {' or '.join(judged.causes)} alone would explain it"

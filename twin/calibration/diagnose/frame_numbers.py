@@ -59,8 +59,8 @@ class FrameNumbers:
 
     @property
     def _settled(self) -> npt.NDArray[np.int64]:
-        """Shift of frame numbers (n,) without changes that last one frame, or
-        that only the last frame has.
+        """Shift of frame numbers (n,) without changes that last one frame, or that only
+        the last frame has: such frames get the shift before.
         """
         out = self.shift.copy()
         n = len(out)
@@ -70,16 +70,15 @@ class FrameNumbers:
         return out
 
     def judged(self, name: str) -> Finding | None:
-        """Make the finding on wrong numbers of frames.
-
-        An error where frames are lost or repeated (all later numbers are wrong); a
-        warning where single frames do not fit and are left out.
+        """Make the finding on wrong numbers of frames; at most `MAX_SHOWN` are listed.
 
         Args:
             name: of the scan.
 
         Returns:
-            None if all numbers are right.
+            An error where frames are lost or repeated (all later numbers are wrong); a
+            warning where single frames show another angle and are left out; None if all
+            numbers are right.
         """
         if not self.renumbered:
             again = self.again.tolist()
@@ -113,8 +112,12 @@ class FrameNumbers:
 
 
 def _change(frame: int, steps: int) -> str:
-    """Describe in words lost frames (`steps` > 0, their number) or repeated ones (< 0) at
-    a frame, for the finding.
+    """Describe in words lost or repeated frames before a frame, for the finding.
+
+    Args:
+        frame: number of the first frame with the new shift.
+        steps: above 0: so many frames are lost; below 0: the frame before is repeated so
+            many times.
     """
     if steps < 0:
         if steps == -1:
@@ -139,10 +142,12 @@ def frame_numbers(
     offsets: Offsets,
     spread_px: float,
 ) -> FrameNumbers | None:
-    """Find the angle that each frame shows.
+    """Find the angle that each frame shows, up to `MOST_SHIFT` numbers from its own, by
+    the cheapest path: a change of shift costs `CHANGE_COST`, a spot without a bead
+    `ASTRAY_COST`.
 
-    Also None for few frames. A frame that fits no angle has the shift of the one before;
-    shifts are relative to the first frame's.
+    A frame that fits no angle has the shift of the one before; shifts are relative to the
+    first frame's.
 
     Args:
         detections: spots of each of the n frames.
@@ -152,8 +157,8 @@ def frame_numbers(
         spread_px: distance of spots from the beads' projections.
 
     Returns:
-        Shift of each frame's number, and the frames that fit; None where the beads do not
-        determine it.
+        Shift of each frame's number, and the frames that fit; None for fewer than 12
+        frames, or if less than `GOOD_SHARE` of those with two spots fit.
     """
     n = len(poses)
     shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
@@ -182,10 +187,11 @@ def frame_numbers(
 
 
 def _angles(angle: FloatArray, shift: int) -> FloatArray:
-    """Return the angles of frames `shift` numbers further on; beyond the ends, the steps go on.
+    """Return the angles of frames `shift` numbers further on; beyond the ends, the first
+    and the last step go on.
 
     Args:
-        angle: (n,) [rad].
+        angle: (n,) [rad], two at least.
         shift: at most MOST_SHIFT either way.
     """
     n = len(angle)

@@ -40,15 +40,18 @@ PARTS: Final[dict[str, FloatArray]] = {
 
 
 def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding]:
-    """Report the causes of a fit as findings: certain ones by name, doubtful ones together with
-    their rivals.
+    """Report the causes of a fit as findings (warnings): certain ones by name, doubtful
+    ones together in one, with their rivals.
 
-    Empty if there is none. Rivals of a strained phantom are named in its own finding.
+    Rivals of a strained phantom are named in its own finding.
 
     Args:
         fit: with the causes as columns.
-        plain: without them.
+        plain: without them; not used.
         found: which there are, and their odds.
+
+    Returns:
+        In the order shape, arc, beads, panel, doubtful ones; empty if there is none.
     """
     out: list[Finding] = []
     panel = fit.panel
@@ -83,14 +86,15 @@ def _strained(found: Found) -> Finding | None:
     """Make the warning on the phantom's shape, apart from its scale, which images do not
     determine.
 
-    Only parts beyond `SIGNIFICANT` sigmas are named, the largest.
+    Only parts (`TERMS`) beyond `SIGNIFICANT` sigmas are named, those above 0.3 of the
+    largest.
 
     Args:
         found: the causes, with mean and covariance of the strain.
 
     Returns:
-        The warning, with the causes that look alike; None if no part of the strain is
-        significant.
+        The warning, with the causes that look alike; None if the strain is not judged or
+        no part is significant.
     """
     if found.strain is None:
         return None
@@ -132,6 +136,9 @@ def _strained(found: Found) -> Finding | None:
 def _turning(fit: FitResult) -> Finding:
     """Make the warning that the object turns during an exposure, with the arc [deg] and
     its share of a step.
+
+    Args:
+        fit: with an arc column; a negative square counts as 0.
     """
     layout = fit.problem.layout
     share = float(np.sqrt(max(fit.solution.x[layout.arc_column], 0.0)))
@@ -148,7 +155,7 @@ def _turning(fit: FitResult) -> Finding:
 
 def _elsewhere(fit: FitResult) -> Finding:
     """Make the warning that beads lie off the phantom's model and were fitted too, with
-    the largest distance [um] and the prior.
+    the largest distance and the prior [um].
     """
     moved = np.linalg.norm(fit.beads - fit.problem.model.beads, axis=1)
     return warning(
@@ -159,10 +166,11 @@ def _elsewhere(fit: FitResult) -> Finding:
 
 
 def _distorted(fit: FitResult) -> Finding:
-    """Make the warning on the panel's fitted distortion: its largest shift [px], and
-    where each tile begins.
+    """Make the warning on the panel's fitted distortion: its largest shift along an axis
+    [px], on a grid of 9 x 9 points, and where each tile begins.
 
-    The fit must have a panel model.
+    Args:
+        fit: must have a panel model.
     """
     panel = fit.panel
     assert panel is not None

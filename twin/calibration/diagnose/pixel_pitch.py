@@ -40,14 +40,15 @@ def with_rival_pitch(
     """Widen the intervals by a wrong pixel pitch that the images do not exclude.
 
     With a rival pitch the intervals are always widened; the warning comes only if its
-    share is at least TOLD_SHARE.
+    probability is at least `TOLD_SHARE`.
 
     Args:
         fit: to be reported.
         widths: standard deviation of each offset by the scanners [mm, deg].
 
     Returns:
-        The fit, and a warning; None where a wrong pitch is unlikely, or no distance is free.
+        The fit, and a warning; None where a wrong pitch is unlikely. `fit` itself without
+        a rival (`rival_pitch`).
     """
     rival = rival_pitch(fit, widths)
     if rival is None:
@@ -73,12 +74,17 @@ def with_rival_pitch(
 def rival_pitch(fit: FitResult, widths: Mapping[str, float]) -> RivalPitch | None:
     """Find the pixel pitch that would explain the images in place of a freed distance.
 
+    Compared are the distance within the scanners' prior, a distance off by `WRONG_PITCH`
+    of the SDD, and a pitch off by as much.
+
     Args:
-        fit: with the distance of the panel free, or with a wider prior than the scanners'.
+        fit: with the distance of the panel free, or with a wider prior than the
+            scanners'.
         widths: standard deviation of each offset by the scanners [mm, deg].
 
     Returns:
-        None where no distance is free, or the images do not separate the columns.
+        Relative growth of the pitch, change of each parameter and probability; None where
+        no distance is free or known, or the images do not separate the columns.
     """
     problem = fit.problem
     names = problem.layout.names
@@ -109,8 +115,9 @@ class _Explanations:
     """The residuals of a fit, its columns, and that of the pixel pitch."""
 
     def __init__(self, fit: FitResult) -> None:
-        """Prepare the whitened Jacobian rows and residuals of a fit, with one more column
-        for the pixel pitch, and the priors of its parameters (none: mean 0).
+        """Prepare the whitened Jacobian rows and residuals of a fit's used positions,
+        with one more column for the pixel pitch, and the priors of its parameters
+        (without one: mean 0).
         """
         problem = fit.problem
         x = fit.solution.x
@@ -127,14 +134,16 @@ class _Explanations:
     def with_widths(
         self, distances: list[int], width: float, pitch: float | None = None
     ) -> Judged | None:
-        """Judge the residuals.
-
-        None if its columns are not separable.
+        """Judge the residuals with some widths of the priors.
 
         Args:
             distances: columns of the panel's distance.
             width: standard deviation of their priors [mm].
-            pitch: relative standard deviation of the pitch's prior; None: it is right.
+            pitch: relative standard deviation of the pitch's prior; None: it is right and
+                no column.
+
+        Returns:
+            The judged model; None if its columns are not separable.
         """
         widths = self._widths.copy()
         widths[distances] = width

@@ -30,22 +30,25 @@ def likely_border(
     shape: tuple[int, int],
     known: Sequence[Border],
 ) -> Border | None:
-    """Find the border whose shift explains most of the residuals of columns; None if it
-    is chance.
+    """Find the border whose shift explains most of the residuals that the columns leave.
 
     A border is one between two panel tiles, along columns or rows; it leaves every tile
-    its least width and enough positions on either side.
+    `LEAST_TILE` of the panel and `LEAST_SIDE` positions on either side.
 
     Args:
         rows: (2 m, c) of the columns.
         values: (2 m,) to be explained.
-        widths: (c,) of the columns' priors.
+        widths: (c,) of the columns' priors; inf: none.
         noise: standard deviation of the values.
-        places: (m, 2) predicted column and row of each position; by measured ones, a border
-            would part the positions of a bead that keeps its row by their noise.
+        places: (m, 2) predicted column and row of each position; by measured ones, a
+            border would part the positions of a bead that keeps its row by their noise.
         whiten: (m, 3) of the positions.
         shape: (rows, cols) of the image.
         known: borders found before.
+
+    Returns:
+        The border, halfway between two positions; None if its gain is no more than chance
+        gives among all rows and columns.
     """
     m = len(places)
     weight = np.where(np.isinf(widths), 0.0, noise / widths)
@@ -98,8 +101,16 @@ def likely_border(
 
 
 def _allowed(at: FloatArray, side: int, known: Sequence[float]) -> npt.NDArray[np.bool_]:
-    """Mark borders `at` that leave every panel tile its least width: from the ends of a
-    side [px] and from the known borders.
+    """Mark borders that leave every panel tile its least width (`LEAST_TILE`): from the
+    ends of a side and from the known borders.
+
+    Args:
+        at: (m,) places along the side [px].
+        side: length of the side [px].
+        known: places of borders on this axis.
+
+    Returns:
+        (m,) bool.
     """
     least = LEAST_TILE * side
     out = (at > least) & (at < side - least)
