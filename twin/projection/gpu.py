@@ -49,7 +49,8 @@ MIN_CLEARANCE = 1e-9
 """Least distance of a box from source and detector plane, as a share of their
 distance."""
 KINDS = 3
-"""Number of kinds of walks: single rays, slabs, slabs with upright columns."""
+"""Number of kinds of walks: single rays, slabs, slabs with upright columns; the kinds of views
+are these, and again these for panels on their side."""
 LINEAR = 256
 """Threads a block in kernels that treat one number a thread."""
 LOGGER = logging.getLogger("flexdt")
@@ -227,6 +228,15 @@ def on(device: int) -> Any:
     from numba import cuda
 
     return cuda.gpus[device]
+
+
+def current_device() -> int:
+    """Return the number of the current device, whose context this thread has from now on; 0 in
+    the simulator.
+    """
+    from numba import cuda
+
+    return int(getattr(cuda.current_context().device, "id", 0))
 
 
 def finish() -> None:
@@ -531,7 +541,7 @@ def launcher(
     if transposed:
         walks = (kernels.spread_rays, kernels.spread_slabs, kernels.spread_columns)
     else:
-        walks = (kernels.project_rays, kernels.project_slabs, kernels.project_columns)
+        walks = forward_kernels()
     kinds, counts = np.unique(kind, return_counts=True)
 
     def launch() -> None:
@@ -540,29 +550,43 @@ def launcher(
         """
         first = 0
         for which, count in zip(kinds, counts, strict=True):
-            lying_down, walk = divmod(int(which), KINDS)
-            lanes, columns, *steps = (
-                (cols, rows, 1, cols) if lying_down else (rows, cols, cols, 1)
-            )
-            grid = (
-                int(count) * -(-columns // kernels.BLOCK[1]),
-                -(-lanes // kernels.BLOCK[0]),
-            )
+            walk, grid, sizes = launch_sizes(int(which), int(count), (rows, cols))
             walks[walk][grid, kernels.BLOCK](
-                voxels,
-                *box[2:],
-                table,
-                first,
-                int(count),
-                images,
-                lanes,
-                columns,
-                *steps,
-                factor,
+                voxels, *box[2:], table, first, int(count), images, *sizes, factor
             )
             first += int(count)
 
     return launch
+
+
+def forward_kernels() -> tuple[Any, Any, Any]:
+    """Return the forward kernels by the walk's number: single rays, slabs, upright columns."""
+    from flexdt.twin.projection.kernels import gpu_kernels as kernels
+
+    return kernels.project_rays, kernels.project_slabs, kernels.project_columns
+
+
+def launch_sizes(
+    kind: int, count: int, shape: tuple[int, int]
+) -> tuple[int, tuple[int, int], tuple[int, int, int, int]]:
+    """Find what a kernel is launched with for views of one kind.
+
+    Args:
+        kind: KINDS for a panel on its side, plus the walk's number.
+        count: views.
+        shape: the detector's (rows, cols).
+
+    Returns:
+        The walk's number, the grid of blocks, and lanes, columns and their steps in the image.
+    """
+    from flexdt.twin.projection.kernels import gpu_kernels as kernels
+
+    rows, cols = shape
+    lying_down, walk = divmod(kind, KINDS)
+    sizes = (cols, rows, 1, cols) if lying_down else (rows, cols, cols, 1)
+    lanes, columns, *_ = sizes
+    grid = (count * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))
+    return walk, grid, sizes
 
 
 def _chunks(images: Float32Array) -> list[slice]:

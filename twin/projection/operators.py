@@ -40,7 +40,7 @@ from flexdt.twin.geometry.virtual_panel import (
     stretched_steps,
     stretches,
 )
-from flexdt.twin.projection import cpu, fan_plan, gpu
+from flexdt.twin.projection import cpu, fan_plan, gpu, single_view
 from flexdt.twin.projection.cpu import TILE
 from flexdt.twin.projection.fan_plan import FACING, SPREAD, WIDEST
 from flexdt.twin.projection.kernels.fan_types import Box
@@ -203,6 +203,9 @@ def forward(
         >>> round(float(forward(volume, view, (1, 1))[0, 0, 0]), 4)
         0.04
     """
+    image = _single_view(volume, cone_vec, shape, out)
+    if image is not None:
+        return image
     geometry = as_cone_vec(cone_vec)
     shape = geometry.of_shape(shape)
     if isinstance(volume, DeviceVolume):
@@ -231,6 +234,35 @@ def forward(
             views = voxel_rays(in_order(geometry[some], order), layout, shape)
             cpu.project(box_of(layout), views, result[some], fans=fans)
     return result
+
+
+def _single_view(
+    volume: object, cone_vec: object, shape: Shape2 | None, out: Float32Array | None
+) -> Float32Array | None:
+    """Try to project a single view of a volume that has a copy on a CUDA device.
+
+    Args:
+        volume, cone_vec, shape, out: as those of `forward`.
+
+    Returns:
+        The image, (1, rows, cols); None where the view has to be projected as others.
+
+    Raises:
+        GeometryError: shape or out does not fit.
+    """
+    if not isinstance(volume, Volume) or not isinstance(cone_vec, ConeVec):
+        return None
+    if len(cone_vec) != 1:
+        return None
+    layout = volume.layout
+    there = layout.device_copy.there is not None and not layout.empty
+    if not there or not gpu.availability().present:
+        return None
+    shape = cone_vec.of_shape(shape)
+    result = check_out(out, (1, *shape))
+    if single_view.project(volume, box_of(layout), cone_vec.rows[0], result[0]):
+        return result
+    return None
 
 
 def _on_device(

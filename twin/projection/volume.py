@@ -139,11 +139,13 @@ class DeviceCopy:
         flat: the storage.
         there: the same on the device, or None.
         views: number of views projected so far.
+        single_views: what `single_view` keeps for the volume, or None.
     """
 
     flat: Float32Array
     there: Any = None
     views: int = 0
+    single_views: Any = None
 
     def uploaded(self) -> Any:
         """Return the storage on the device, moved there at the first call."""
