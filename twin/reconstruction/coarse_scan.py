@@ -25,9 +25,8 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
     Circle,
     circle_of,
     distinct_angles,
-    fan_angles,
     mean_image,
-    reach,
+    panel_reach,
 )
 from flexdt.twin.reconstruction.acquisition.truncation import ACCURACY, Truncation
 from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
@@ -117,7 +116,7 @@ class CoarseScan:
             shape = (shape[1], shape[0])
         at, same = distinct_angles(circle)
         chosen = np.arange(0, len(at), -(-len(at) // VIEWS))
-        low, high = reach(fan_angles(circle, upright(cone_vec), shape[1]))
+        low, high = panel_reach(circle, upright(cone_vec), shape[1])
         overlap = min(low, high) / (low + high) * shape[1]
         across = min(-(-shape[1] // NODES), max(1, int(overlap / MIN_AXIS_COLUMNS)))
         down = max(min(-(-shape[1] // NODES), shape[0] // 2), -(-shape[0] // NODES), 1)
@@ -191,8 +190,8 @@ class CoarseScan:
         """Distances from the axis up to which all views see on the panel's two sides,
         (clockwise, other) [mm]; both positive for an axis on the panel.
         """
-        fan = fan_angles(circle_of(self.cone_vec), self.level, self.images.shape[2])
-        low, high = reach(fan)
+        circle = circle_of(self.cone_vec)
+        low, high = panel_reach(circle, self.level, self.images.shape[2])
         return float(self.circle.radius * np.sin(low)), float(
             self.circle.radius * np.sin(high)
         )

@@ -23,9 +23,8 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction.acquisition.trajectory import (
     Circle,
-    fan_angles,
     no_fdk,
-    reach,
+    panel_reach,
 )
 
 MIN_SEEN_SHARE: Final = 0.4
@@ -125,9 +124,13 @@ class LostVoxels:
 
         Layers without any value count as lost layers; their voxels are not counted again.
         """
-        lost = np.isnan(data[:, ::4, ::4]).reshape(len(data), -1)
-        held = lost[~lost.all(axis=1)]
-        return cls(len(data), len(data) - len(held), held.size, int(held.sum()))
+        # In the order of memory, where z is contiguous.
+        lost = np.isnan(data.transpose(1, 2, 0)[::4, ::4])
+        each = lost.shape[0] * lost.shape[1]
+        counts = lost.sum(axis=(0, 1), dtype=np.int32)
+        held = counts[counts < each]
+        voxels = each * len(held)
+        return cls(len(data), len(data) - len(held), voxels, int(held.sum()))
 
     def __add__(self, more: LostVoxels) -> LostVoxels:
         """Add the counts of further layers."""
@@ -212,7 +215,7 @@ class Sharing:
         scale = distance / np.linalg.norm(cone_vec.v, axis=1)
         half = np.array(like.size_mm[:2]) / 2
         corner = np.hypot(*(np.abs(np.array(like.center_mm[:2]) - circle.centre) + half))
-        seen = circle.radius * np.sin(max(reach(fan_angles(circle, cone_vec, cols))))
+        seen = circle.radius * np.sin(max(panel_reach(circle, cone_vec, cols)))
         wide = min(float(corner), float(seen))
         axis = ((circle.centre - cone_vec.source[:, :2]) * away[:, :2]).sum(axis=1)
         # The voxels nearest to the source move farthest on the panel.

@@ -189,11 +189,15 @@ def mean_image(
 ) -> Float32Array:
     """Average some views' images, summed as float32 in the given order, (rows, cols).
 
+    A single image may share its memory with the given one.
+
     Args:
         image: gives a view's image by its number.
         views: numbers, at least one.
     """
     total = np.asarray(image(int(views[0])), np.float32)
+    if len(views) == 1:
+        return total
     for view in views[1:].tolist():
         total = total + np.asarray(image(view), np.float32)
     return np.asarray(total / len(views), np.float32)
@@ -318,22 +322,25 @@ def redundancy(
         GeometryError: the axis is off the panel, or some lines are not seen from either
             side.
     """
-    fan = fan_angles(circle, cone_vec, cols)
-    low, high = reach(fan)
+    ends = _end_angles(circle, cone_vec, cols)
+    low, high = reach(ends)
     if min(low, high) <= 0:
         raise GeometryError(
             "the shadow of the rotation axis does not fall on the detector, or within half a "
             "column of its edge; FDK needs it to",
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
-    _check_covered(circle, float(np.abs(fan).max()))
+    _check_covered(circle, float(np.abs(ends).max()))
     column = (low + high) / cols
+    aside = abs(high - low) > column and (circle.full or beyond)
+    if circle.full and not aside:
+        return np.full((len(cone_vec), cols), 0.5)
+    fan = fan_angles(circle, cone_vec, cols)
     overlap = min(low, high)
     least = 0.0 if circle.full else MIN_CONFIDENCE
-    alone = np.zeros_like(
-        fan
-    )  # +1 where only the ray itself falls on the panel, -1 its opposite
-    if abs(high - low) > column and (circle.full or beyond):
+    # +1 where only the ray itself falls on the panel, -1 its opposite
+    alone = np.zeros_like(fan)
+    if aside:
         taper = min(
             overlap, max(TAPER_REACHES * abs(high - low), MIN_TAPER_COLS * column)
         )
@@ -355,7 +362,7 @@ def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
         cone_vec: n upright views.
         cols: columns of the panel.
     """
-    low, high = reach(fan_angles(circle, cone_vec, cols))
+    low, high = panel_reach(circle, cone_vec, cols)
     column = (low + high) / cols
     return abs(high - low) > column and min(low, high) < 2 * MIN_TAPER_COLS * column
 
@@ -475,7 +482,7 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
     Returns:
         (before, after), each 0 for a centred panel.
     """
-    widest = max(reach(fan_angles(circle, cone_vec, cols)))
+    widest = max(panel_reach(circle, cone_vec, cols))
     source = cone_vec.source[:, :2]
     inward = circle.centre - source
     panel = cone_vec.detector[:, :2] - source
@@ -509,12 +516,40 @@ def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
     Returns:
         (n, cols) [rad], positive counter-clockwise seen from above.
     """
-    source = cone_vec.source[:, :2]
-    inward = circle.centre - source
-    offset = np.arange(cols) - (cols - 1) / 2
-    ray = (cone_vec.detector[:, :2] - source)[:, None] + offset[:, None] * cone_vec.u[
-        :, None, :2
-    ]
-    cross = inward[:, None, 0] * ray[..., 1] - inward[:, None, 1] * ray[..., 0]
-    dot = (inward[:, None] * ray).sum(axis=-1)
-    return np.asarray(np.arctan2(cross, dot))
+    return _angles_at(circle, cone_vec, np.arange(cols) - (cols - 1) / 2)
+
+
+def panel_reach(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[float, float]:
+    """Compute `reach` of a panel from as few columns as hold its ends.
+
+    Args:
+        circle: of the sources.
+        cone_vec: n upright views.
+        cols: columns of the panel.
+    """
+    return reach(_end_angles(circle, cone_vec, cols))
+
+
+def _end_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
+    """Compute the fan angles among which the smallest and the largest of each view are, (n,
+    columns) [rad]: those of the outermost columns, or of all.
+    """
+    ends = _angles_at(circle, cone_vec, np.array([-(cols - 1) / 2, (cols - 1) / 2]))
+    # Columns between two that lie on the axis's side of the source have angles between theirs.
+    if np.abs(ends).max() < np.pi / 2:
+        return ends
+    return fan_angles(circle, cone_vec, cols)
+
+
+def _angles_at(circle: Circle, cone_vec: ConeVec, offset: FloatArray) -> FloatArray:
+    """Compute `fan_angles` of columns at distances `offset` (k,) from the panel's middle
+    [columns], (n, k) [rad].
+    """
+    inward_x, inward_y = (circle.centre - cone_vec.source[:, :2]).T[:, :, None]
+    middle_x, middle_y = (cone_vec.detector - cone_vec.source).T[:2, :, None]
+    step_x, step_y = cone_vec.u.T[:2, :, None]
+    x = middle_x + offset * step_x
+    y = middle_y + offset * step_y
+    return np.asarray(
+        np.arctan2(inward_x * y - inward_y * x, inward_x * x + inward_y * y)
+    )

@@ -168,6 +168,7 @@ class OnDevice:
         self._halves: list[tuple[Any, Any]] = []
         self._filter: tuple[Any, ...] = ()
         self._room: Any = None
+        self._tables: dict[tuple[int, ...], Any] = {}
         self.meter: NoiseMeter | None = None
 
         def prepare() -> None:
@@ -400,7 +401,11 @@ class OnDevice:
             -(-nx // kernels.BLOCK[1]),
             ny,
         )
-        views = cuda.to_device(np.ascontiguousarray(table), self._stream)
+        views = self._tables.get(table.shape)
+        if views is None:
+            views = self._tables[table.shape] = cuda.device_array(table.shape, np.float64)
+        # Memory given back would make the host wait for the device; the stream keeps the order.
+        views.copy_to_device(np.ascontiguousarray(table), self._stream)
         kernels.backproject[blocks, (*kernels.BLOCK, 1), self._stream](
             ready.reshape(ready.size), *size, views, *grid, flat.reshape(ny, nx, nz)
         )

@@ -405,8 +405,10 @@ def weighing(
     depth = np.abs((panel * cone_vec.normal).sum(axis=1))
     c = np.arange(cols) - (cols - 1) / 2
     r = np.arange(rows) - (rows - 1) / 2
-    x = panel[:, None, :2] + c[:, None] * u[:, None, :2]
-    z = panel[:, 2, None] + r * v[:, 2, None]
-    along = (x * (inward / radius[:, None])[:, None]).sum(axis=2)
+    x = panel[:, :1] + c * u[:, :1]
+    y = panel[:, 1:2] + c * u[:, 1:2]
+    z = panel[:, 2:] + r * v[:, 2:]
+    ahead = inward / radius[:, None]
+    along = x * ahead[:, :1] + y * ahead[:, 1:]
     factors = weights * along * (circle.step[views] * depth * radius)[:, None]
-    return factors, (x * x).sum(axis=2), z * z
+    return factors, x * x + y * y, z * z

@@ -6,6 +6,7 @@ Two portions take turns, small enough that page-locking them costs little.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -36,7 +37,9 @@ class ImageUpload:
         self._portions: list[Any] = [None, None]
         self._fetched: list[Any] = [None, None]
         self._rooms: dict[str, list[Any]] = {}
+        self._shaped: dict[tuple[Any, ...], Any] = {}
         self._read: list[Any] = [None, None]
+        self._handed = cuda.event()
         self._chunk = 0
 
     def begin(self) -> None:
@@ -67,15 +70,14 @@ class ImageUpload:
         n = len(order)
         cols = images.shape[2]
         count = rows.stop - rows.start
-        there = self._room("images", n * count * cols).reshape(n, count, cols)
+        there = self._room("images", (n, count, cols))
         each = max(1, PORTION_BYTES // max(1, 4 * count * cols))
         for first in range(0, n, each):
-            some = min(each, n - first)
-            portion = self._portion(some * count * cols).reshape(some, count, cols)
-            fdk_kernels.copy_rows(
-                images, order[first : first + some], rows.start, portion
-            )
-            self._fetch(portion, there[first : first + some])
+            some = slice(first, min(first + each, n))
+            size = (some.stop - first, count, cols)
+            portion = self._portion(math.prod(size)).reshape(size)
+            fdk_kernels.copy_rows(images, order[some], rows.start, portion)
+            self._fetch(portion, self._room("images", (n, count, cols), some))
         return there
 
     def table(self, name: str, values: FloatArray | Float32Array) -> Any:
@@ -91,7 +93,7 @@ class ImageUpload:
         Returns:
             Of the same shape, on the device.
         """
-        there = self._room(name, values.size).reshape(values.shape)
+        there = self._room(name, values.shape)
         portion = self._portion(values.size).reshape(values.shape)
         np.copyto(portion, values, casting="same_kind")
         self._fetch(portion, there)
@@ -101,33 +103,41 @@ class ImageUpload:
         """Let the kernels launched from now on wait for the uploads so far; the host does
         not wait.
         """
-        from numba import cuda
-
-        done = cuda.event()
-        done.record(self._writer)
-        done.wait(self._reader)
+        self._handed.record(self._writer)
+        self._handed.wait(self._reader)
 
     def end(self) -> None:
         """Record that the last kernel that reads this chunk has been launched, so that
         its memory may be filled again.
         """
-        from numba import cuda
+        self._read[self._chunk] = _recorded(self._read[self._chunk], self._reader)
 
-        done = cuda.event()
-        done.record(self._reader)
-        self._read[self._chunk] = done
+    def _room(self, name: str, shape: tuple[int, ...], some: slice = slice(None)) -> Any:
+        """Return device memory for the array `name` of this chunk.
 
-    def _room(self, name: str, count: int) -> Any:
-        """Return device memory (count,) float32 for the array `name` of this chunk, kept
-        for later chunks; replaced by new memory where too small. Its content is
-        undefined.
+        It is kept for later chunks and enlarged where too small; so are its views, each of which
+        takes numba longer to make than a small copy.
+
+        Args:
+            name: of the array.
+            shape: of the array.
+            some: part of the first axis.
         """
         from numba import cuda
 
+        count = math.prod(shape)
         pair = self._rooms.setdefault(name, [None, None])
         if pair[self._chunk] is None or pair[self._chunk].size < count:
             pair[self._chunk] = cuda.device_array(count, np.float32)
-        return pair[self._chunk][:count]
+            self._shaped = {
+                key: view
+                for key, view in self._shaped.items()
+                if key[:2] != (name, self._chunk)
+            }
+        key = (name, self._chunk, shape, some.start, some.stop)
+        if key not in self._shaped:
+            self._shaped[key] = pair[self._chunk][:count].reshape(shape)[some]
+        return self._shaped[key]
 
     def _portion(self, count: int) -> Any:
         """Return page-locked memory, after waiting until the device has fetched its
@@ -154,9 +164,15 @@ class ImageUpload:
         """Start the copy of a portion to the device, and record when it is done; does not
         wait.
         """
-        from numba import cuda
-
         there.copy_to_device(portion, self._writer)
-        fetched = cuda.event()
-        fetched.record(self._writer)
-        self._fetched[self._turn] = fetched
+        self._fetched[self._turn] = _recorded(self._fetched[self._turn], self._writer)
+
+
+def _recorded(event: Any, stream: Any) -> Any:
+    """Record how far a stream has got, in an event or, where it is None, a new one."""
+    from numba import cuda
+
+    if event is None:
+        event = cuda.event()
+    event.record(stream)
+    return event
