@@ -516,7 +516,7 @@ def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
     Returns:
         (n, cols) [rad], positive counter-clockwise seen from above.
     """
-    return _angles_at(circle, cone_vec, np.arange(cols) - (cols - 1) / 2)
+    return _angles_at(circle, cone_vec, np.arange(float(cols)) - (cols - 1) / 2)
 
 
 def panel_reach(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[float, float]:
