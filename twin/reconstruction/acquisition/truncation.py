@@ -275,6 +275,12 @@ class Continuation:
         """Select some of the views."""
         return replace(self, plane=self.plane[which])
 
+    def within(self, columns: slice) -> Continuation:
+        """Select some of the columns."""
+        source, ray, step = np.split(self.plane, 3, axis=1)
+        plane = np.hstack([source, ray + columns.start * step, step])
+        return replace(self, plane=plane, fade=self.fade[columns].copy())
+
     @classmethod
     def empty(cls, views: int, rows: int, wide: int) -> Continuation:
         """Make a continuation with nothing beyond the edges: all parts zero, and edge 0.

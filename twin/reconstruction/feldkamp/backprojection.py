@@ -17,6 +17,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
+from flexdt.twin.reconstruction.feldkamp.far_prisms import NearColumns
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
 from flexdt.twin.reconstruction.feldkamp.filtering import (
     filtered,
@@ -86,17 +87,12 @@ class OnProcessor:
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
-        n, wide, cols, rows = views.sizes
+        n, _, cols, rows = views.sizes
         if views.sizes != self._sizes:  # new memory costs as much as filtering
             self._sizes = views.sizes
             self._columns = fdk_kernels.room(n, cols, rows, views.few)
         views = replace(views, images=np.ascontiguousarray(views.images))
-        fitting = min(GROUP, 2 * GROUP * views.images.shape[2] // wide)
-        group = max(1, fitting, PIXELS // (wide * rows))
-        for first in range(0, n, group):
-            some = slice(first, first + group)
-            lines = filtered(_weighed(views.of(some)), views.response)
-            fdk_kernels.stand_up(lines, views.kept.start, self._columns[some])
+        fill_columns(views, self._columns)
         fdk_kernels.backproject(
             self._columns,
             rows,
@@ -113,6 +109,33 @@ class OnProcessor:
     def volume(self) -> Float32Array:
         """Return the sum so far, (ny, nx, nz)."""
         return self._data
+
+
+def fill_columns(views: Views, columns: Float32Array) -> None:
+    """Weigh and filter images on the processor.
+
+    Args:
+        views: n views, their images in C order.
+        columns: (n or more, cols, rows or more) filled with the columns that are kept.
+    """
+    from flexdt.twin.reconstruction.kernels import fdk_kernels, truncation_kernels
+
+    near = NearColumns.of(views)
+    far = None
+    if near is not None:
+        far = near.far(views)
+        views = views.within(near.columns, near.response)
+    n, wide, _, rows = views.sizes
+    on = views.beyond
+    start = views.kept.start
+    fitting = min(GROUP, 2 * GROUP * views.images.shape[2] // wide)
+    group = max(1, fitting, PIXELS // (wide * rows))
+    for first in range(0, n, group):
+        some = slice(first, first + group)
+        lines = filtered(_weighed(views.of(some)), views.response)
+        if far is not None:
+            truncation_kernels.add_bands(lines, start, far[some], on.band, on.share)
+        fdk_kernels.stand_up(lines, start, columns[some])
 
 
 def _weighed(views: Views) -> Float32Array:

@@ -84,6 +84,20 @@ class Views:
             table=self.table[which],
         )
 
+    def within(self, columns: slice, response: Float32Array) -> Views:
+        """Select columns of those that go into the filter, the panel's among them; responses
+        are those of a filter for so many.
+        """
+        return replace(
+            self,
+            before=self.before - columns.start,
+            beyond=self.beyond.within(columns),
+            factors=np.ascontiguousarray(self.factors[:, columns]),
+            across=np.ascontiguousarray(self.across[:, columns]),
+            response=response,
+            kept=slice(self.kept.start - columns.start, self.kept.stop - columns.start),
+        )
+
     @property
     def reach(self) -> int:
         """Least distance in columns between two that do not act on each other."""
@@ -119,6 +133,7 @@ class Views:
         from flexdt.twin.reconstruction.kernels import truncation_kernels
 
         on = self.beyond
+        factors = self.factors if weighed else self.factors[:, :0]
         truncation_kernels.continue_rows(
             np.ascontiguousarray(self.images),
             self.top,
@@ -128,10 +143,10 @@ class Views:
             on.band,
             on.share,
             on.cut,
-            on.fade,
-            self.across,
+            on.fade.astype(np.float32),
+            self.across.astype(np.float32),
             self.up,
-            self.factors if weighed else self.factors[:, :0].copy(),
+            factors.astype(np.float32),
             out,
         )
 

@@ -99,6 +99,11 @@ def taps(response: Float32Array, wide: int, more: int) -> FloatArray:
     return np.pad(values, (0, wide - len(values) + more))
 
 
+def shortened(response: Float32Array, reach: int) -> Float32Array:
+    """Compute the response of the same filter for a smaller reach; see `ramp`."""
+    return response_of_length(response, _even_length(2 * reach)).astype(np.float32)
+
+
 def response_of_length(response: Float32Array, length: int) -> FloatArray:
     """Compute the response of the same filter on rows padded to another length, (length / 2 +
     1,).

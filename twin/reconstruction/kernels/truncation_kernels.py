@@ -17,7 +17,6 @@ from numba import prange
 
 from flexdt.twin.projection.kernels.compiling import kernel, parallel, serial
 
-ONE = np.float32(1)
 PARAMETERS = 6
 MAX_STEPS = 100
 """Largest number of evaluations of a fit: usually a dozen is enough."""
@@ -82,33 +81,44 @@ def _edge_mean(line, before, first, last, lower, upper, share, across, high):
 
 @kernel
 def _continue_side(
-    out, first, last, near, lower, upper, share, across, high, rest, fade, factors
+    out, near, lower, upper, share, across, high, rest, fade, factors, weighed
 ):
-    """Fill columns first <= c < last of a row: the prisms' path, and the rest at the edge
-    fading out; with factors, times these over the rays' lengths.
+    """Fill the columns of a row on one side of the panel: the prisms, and the rest at the edge
+    fading out, times the columns' factors over the rays' lengths, if these are wanted.
 
-    Args:
-        out: (wide,) row, changed in place.
-        first, last: columns.
-        near: first and last of these columns in which some of the rest is left; only read
-            with factors.
-        lower, upper, share, across, high: as for `_edge_mean`.
-        rest: residual at the edge.
-        fade: (wide,) share of it that is left.
-        factors: (wide,), or (0,) for none.
+    All arrays are of these columns. near: first and last in which some of the rest is left.
     """
-    if factors.size == 0:
-        for c in range(first, last):
+    # Counted from 0, an index needs no check for a negative one, and loops are vectorised.
+    if not weighed:
+        for c in range(len(out)):
             model = lower[c] + share * (upper[c] - lower[c])
             out[c] = np.float32(model * math.sqrt(across[c] + high) + rest * fade[c])
         return
     part = np.float32(share)
-    for c in range(first, last):
-        model = lower[c] + part * (upper[c] - lower[c])
-        out[c] = model * np.float32(factors[c])
-    for c in range(near[0], near[1]):
-        inverse = ONE / math.sqrt(np.float32(across[c] + high))
-        out[c] += np.float32(rest * fade[c]) * inverse * np.float32(factors[c])
+    for c in range(len(out)):
+        out[c] = (lower[c] + part * (upper[c] - lower[c])) * factors[c]
+    _add_rest(
+        out[near[0] : near[1]],
+        np.float32(rest),
+        fade[near[0] : near[1]],
+        across[near[0] : near[1]],
+        high,
+        factors[near[0] : near[1]],
+    )
+
+
+@kernel
+def _add_rest(out, rest, fade, across, high, factors):
+    """Add the weighed rest at the edge to columns; arguments as those of `_continue_side`."""
+    for c in range(len(out)):
+        out[c] += rest * fade[c] * factors[c] / math.sqrt(across[c] + high)
+
+
+@kernel
+def _weigh_line(out, line, across, high, factors):
+    """Weigh a row of the panel; arguments as those of `_continue_side`."""
+    for c in range(len(out)):
+        out[c] = line[c] * factors[c] / math.sqrt(across[c] + high)
 
 
 @parallel
@@ -156,9 +166,9 @@ def continue_rows(
         lengths: (n, bands, wide) of `prism_lengths`.
         band, share: (rows,) lower band of each row, and how much the next one counts.
         cut: (rows,) share of the prisms' residual at the edges that is continued.
-        fade: (wide,) part of it that is left in each column.
-        across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n,
-            rows) [mm^2].
+        fade: float32 (wide,) part of it that is left in each column.
+        across, up: squares of the ray's horizontal and vertical parts, float32 (n, wide)
+            and (n, rows) [mm^2].
         factors: (n, wide) that rows are multiplied by, over the rays' lengths, as
             `fdk_kernels.weigh` does; (n, 0) for rows as they are.
         out: float32 (n, rows, wide or more), filled; 0 in columns after these.
@@ -181,32 +191,70 @@ def continue_rows(
         lower = lengths[view, band[r]]
         upper = lengths[view, min(band[r] + 1, bands - 1)]
         flat = across[view]
-        high = up[view, r]
+        high = np.float32(up[view, r])
         part = share[r]
         other = cols - edge
         low = _edge_mean(line, before, 0, edge, lower, upper, part, flat, high)
         top = _edge_mean(line, before, other, cols, lower, upper, part, flat, high)
         row = out[view, r]
         weights = factors[view]
-        rest = low * cut[r]
-        near = (begin, before)
+        weighed = factors.shape[1] > 0
         _continue_side(
-            row, 0, before, near, lower, upper, part, flat, high, rest, fade, weights
+            row[:before],
+            (begin, before),
+            lower[:before],
+            upper[:before],
+            part,
+            flat[:before],
+            high,
+            low * cut[r],
+            fade[:before],
+            weights[:before],
+            weighed,
         )
-        if factors.shape[1]:
-            for c in range(cols):
-                inverse = ONE / math.sqrt(np.float32(flat[before + c] + high))
-                row[before + c] = line[c] * np.float32(weights[before + c]) * inverse
+        inside = row[before:after]
+        if weighed:
+            _weigh_line(inside, line, flat[before:after], high, weights[before:after])
         else:
             for c in range(cols):
-                row[before + c] = line[c]
-        rest = top * cut[r]
-        near = (after, end)
+                inside[c] = line[c]
         _continue_side(
-            row, after, wide, near, lower, upper, part, flat, high, rest, fade, weights
+            row[after:wide],
+            (0, end - after),
+            lower[after:],
+            upper[after:],
+            part,
+            flat[after:],
+            high,
+            top * cut[r],
+            fade[after:],
+            weights[after:],
+            weighed,
         )
         for c in range(wide, padded):
             row[c] = np.float32(0)
+
+
+@parallel
+def add_bands(lines, start, values, band, share):
+    """Add to each row the values of its two bands, mixed.
+
+    lines: float32 (n, rows, columns), changed in place.
+    start: first column that is added to.
+    values: float32 (n, bands, cols).
+    band, share: (rows,) lower band of each row, and how much the next one counts.
+    """
+    n, rows, _ = lines.shape
+    bands, cols = values.shape[1:]
+    for job in prange(n * rows):
+        view = job // rows
+        r = job % rows
+        lower = values[view, band[r]]
+        upper = values[view, min(band[r] + 1, bands - 1)]
+        part = np.float32(share[r])
+        line = lines[view, r]
+        for c in range(cols):
+            line[start + c] += lower[c] + part * (upper[c] - lower[c])
 
 
 @kernel
