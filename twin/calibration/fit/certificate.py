@@ -113,17 +113,25 @@ def spectrum(
 ) -> Conditioning:
     """Analyse whitened Jacobian rows (m, p) in internal units (prior rows included).
 
-    Returns covariance (infinite or nan for what is open), rank, condition, and the null
-    and weak directions in words.
+    A direction among the judged columns is null if it is open (`RANK_TOLERANCE`) or known
+    worse than `bound`, weak if its sigma exceeds its tolerance or its condition
+    `WEAK_CONDITION`. A column worse than `bound` without such a direction makes one null,
+    too; each lowers the rank.
 
     Args:
         jacobian: rows.
         names: columns.
         beads: number of beads seen, for the advice.
-        noise: standard deviation of the whitened residuals, for the sigmas of weak directions.
-        reported: only the first `reported` columns are judged (the rest are nuisance).
-        bound: a direction known worse than this [mm, deg; 0.0025 of it in angle_scale] counts
-            as not determined.
+        noise: standard deviation of the whitened residuals, for the sigmas of weak
+            directions.
+        reported: only the first `reported` columns are judged (the rest are nuisance);
+            None: all.
+        bound: a direction known worse than this [mm, deg; 0.0025 of it in angle_scale]
+            counts as not determined.
+
+    Returns:
+        Covariance for unit noise (infinite or nan for what is open), rank, condition, and
+        the null and weak directions in words.
     """
     unusable = bound / TOLERANCE["mm"]
     p = len(names)
@@ -188,9 +196,14 @@ def spectrum(
 
 
 def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Compute singular values, largest first, and right singular vectors (rows) of (m, p).
+    """Compute singular values, largest first, and right singular vectors (rows) of (m,
+    p).
 
-    From the Gram matrix where that is accurate (it squares the condition number), else by QR.
+    From the Gram matrix where that is accurate (it squares the condition number), else by
+    QR; zeros make up for fewer rows than columns.
+
+    Returns:
+        (p,) and (p, p).
     """
     p = j.shape[1]
     if len(j) >= p:
@@ -289,8 +302,9 @@ class Certificate:
 
     @property
     def limited(self) -> dict[str, str]:
-        """Requested parameters that owe most of their sigma to priors: name -> words on
-        the limit, and the measurement that would reduce it; empty without any.
+        """Requested parameters that owe more than half of their variance to priors: name
+        -> words on the limit, and the measurement that would reduce it; empty without
+        any.
         """
         out = {}
         for name, e in self.estimates.items():
@@ -323,8 +337,8 @@ class Certificate:
         return self._rms(1)
 
     def _rms(self, axis: int) -> FloatArray:
-        """Compute the rms of the used residuals, over frames (`axis` 0, one a bead) or beads
-        (1) [px].
+        """Compute the root mean square of the used residuals over frames (`axis` 0: one a
+        bead) or beads (1: one a frame) [px]; nan where nothing was used.
         """
         square = np.where(self.used[:, :, None], self.residuals_px, 0.0) ** 2
         count = 2 * self.used.sum(axis=axis)
@@ -332,8 +346,11 @@ class Certificate:
             return np.asarray(np.sqrt(square.sum(axis=(axis, 2)) / count))
 
     def mahalanobis2(self, truth: Mapping[str, float]) -> float:
-        """Compute the squared distance of `truth` (edge units, some or all reported
-        columns) in the covariance of those columns.
+        """Compute the squared distance of some values from the estimates, in the
+        covariance of those columns.
+
+        Args:
+            truth: column -> value, edge units, some or all reported columns.
 
         Raises:
             ValueError: a name of `truth` that is not reported.
@@ -344,8 +361,8 @@ class Certificate:
         return float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d))
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
-        """Check whether `truth`, arguments as `mahalanobis2`, is in the joint 95 %
-        ellipsoid of its columns (Hotelling: F distribution).
+        """Check whether values are in the joint 95 % ellipsoid of their columns
+        (Hotelling: F distribution); arguments as `mahalanobis2`.
         """
         p = len(truth)
         return self.mahalanobis2(truth) <= p * float(fdtri(p, self.dof, 0.95))
@@ -354,15 +371,18 @@ class Certificate:
 def widened(
     certificate: Certificate, more: FloatArray | Mapping[str, float]
 ) -> Certificate:
-    """Add a covariance to a certificate.
+    """Add a covariance to a certificate; estimates keep their values.
 
     A covariance widens the images' share of each sigma too, a mapping (of systematic
     errors) does not. Intervals are 95 %.
 
     Args:
-        certificate: of a fit.
+        certificate: of a fit; not changed.
         more: (p, p) covariance that the images leave open, edge units; or column -> its
-            possible error: (off) (off)'.
+            possible error (0 if missing), as the covariance (off) (off)'.
+
+    Returns:
+        A copy with wider covariance, correlation, sigmas and intervals.
     """
     images = np.array([e.images for e in certificate.estimates.values()])
     if isinstance(more, Mapping):
@@ -397,19 +417,24 @@ def certify(
 ) -> Certificate:
     """Make the certificate of column values `x` fitted to the positions `use`.
 
+    The estimate x = U (J' y + W b) with U = (J'J + W)^-1 errs by U J' times the noise of
+    the images and by U W times the error of the prior means b. The covariance is the sum
+    of both, and residuals beyond white noise (correlated, shared, turning, drifting)
+    enlarge only the first. Rank and condition are those of the requested columns, all
+    others given.
+
     Args:
         problem: the data.
         x: column values, internal units.
-        use: (n, k) positions that counted.
+        use: (n, k) positions that counted; seen ones beyond them are outliers.
         prior_noise: spread of the whitened residuals with which the priors were weighed.
-        sampling_px: standard deviation of the part of a detection's error that depends on where
-            in a pixel the spot lies. Beads that stay at one place of the pixel grid in every
-            frame keep it; on beads that wander it averages out.
+        sampling_px: standard deviation of the part of a detection's error that depends on
+            where in a pixel the spot lies. Beads that stay at one place of the pixel grid
+            in every frame keep it; on beads that wander it averages out.
         bound: see `spectrum`.
 
-    The estimate x = U (J' y + W b) with U = (J'J + W)^-1 errs by U J' times the noise of
-    the images and by U W times the error of the prior means b. The covariance is the sum
-    of both, and residuals beyond white noise enlarge only the first.
+    Returns:
+        The certificate, in edge units; inf and nan where not determined.
     """
     names = problem.layout.names
     reported = problem.layout.parameter_count
@@ -520,8 +545,8 @@ def certify(
 
 
 def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning:
-    """Replace covariance, rank and null directions of `given` by those of `whole`, with
-    more columns.
+    """Return `given` with covariance and null directions of `whole`, which has more
+    columns, and its rank lowered to what these leave.
     """
     rank = min(given.rank, len(given.names) - len(whole.null))
     return replace(
@@ -538,7 +563,7 @@ def spread_of_residuals(
     A column costs the part of a degree of freedom that the images, not its prior,
     determine (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a full one.
     Where priors are moved by more than that to fit the images, their shifts count as
-    residuals. A spread that the problem expects counts as SPREAD_FREEDOM residuals.
+    residuals. A spread that the problem expects counts as `SPREAD_FREEDOM` residuals.
 
     Args:
         problem: the data.
@@ -547,7 +572,8 @@ def spread_of_residuals(
         prior_noise: spread of the whitened residuals with which the priors were weighed.
 
     Returns:
-        The standard deviation, nan without degrees of freedom, and their number.
+        The standard deviation and the degrees of freedom; (nan, 0) for `LEAST_FREEDOM` or
+        fewer.
     """
     _, _, norms, _, told, _ = problem.evaluate(x, use, 1)
     weight = problem.prior_weight(prior_noise)
@@ -566,9 +592,10 @@ def spread_of_residuals(
 
 
 def _determined(told: FloatArray, weight: FloatArray) -> float:
-    """Count the columns that the images determine.
+    """Count the columns that the images determine: each by the share of its precision
+    that is not its prior's; the result is no whole number.
 
-    A column that its prior determines counts as little; the result is no whole number.
+    Directions that are open altogether (`ROUNDING_OF_COLUMNS`) do not count.
 
     Args:
         told: (c, c) normal equations of the images.
@@ -586,7 +613,8 @@ def _determined(told: FloatArray, weight: FloatArray) -> float:
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
-    """Compute the part of a sigma from each prior; those of one source together.
+    """Compute the part of a sigma from each prior; those of one source (`SOURCES`)
+    together, as the root of their squares.
 
     Args:
         names: of the priors.
@@ -612,18 +640,22 @@ def _widened(
     prior: FloatArray,
     sampling_px: float,
 ) -> tuple[FloatArray, tuple[bool, bool], tuple[Drift, ...]]:
-    """Enlarge the covariance by the structure of the residuals beyond white noise.
+    """Enlarge the covariance by the structure of the residuals beyond white noise: errors
+    that beads share, places in the pixel grid, errors that repeat with the turn, and
+    drifts.
+
+    A possible but uncertain drift widens the covariance, too, but is not listed.
 
     Args:
         left: residuals.
         predicted: (n, k, 2) [px].
         covariance: (p, p) nominal, edge units.
         prior: (p, p) part of it that comes from priors.
-        sampling_px: see `certify`.
+        sampling_px: see `certify`; 0 for none.
 
     Returns:
         The covariance; whether the beads of a frame err together, and whether errors
-        repeat with the turn; and drifts.
+        repeat with the turn; and drifts, empty unless one is `SIGNIFICANT`.
     """
     reported = len(covariance)
     together = cluster_covariance(left)

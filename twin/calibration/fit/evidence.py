@@ -47,7 +47,7 @@ class Judged:
     evidence: float
 
     def covariance(self, count: int) -> FloatArray:
-        """Return the covariance (count, count) of the first columns."""
+        """Compute the covariance of the first `count` columns, (count, count)."""
         part = np.eye(len(self.columns))[:, :count] * self.scale[:count]
         solved, _ = lapack.dpotrs(self.factor, part)
         return np.asarray(solved[:count] * self.scale[:count, None])
@@ -57,7 +57,13 @@ class Table:
     """Rows of residuals and of all columns that a model may have."""
 
     def __init__(self, rows: FloatArray, values: FloatArray, floor: float) -> None:
-        """Prepare rows (m, q), values (m,), and the least standard deviation of the values."""
+        """Sum up the normal equations of rows; the rows are not kept.
+
+        Args:
+            rows: (m, q).
+            values: (m,) residuals that the columns are to explain.
+            floor: least standard deviation of the values.
+        """
         self._count = len(values)
         self._gram = cross(rows, rows)
         self._push = np.einsum("mq,m->q", rows, values)
@@ -67,15 +73,19 @@ class Table:
     def judged(
         self, columns: Sequence[int], widths: FloatArray, noise: float, means: FloatArray
     ) -> Judged | None:
-        """Judge a model; None if its columns are not separable.
+        """Judge a model: fit its columns with their priors, and compute its evidence.
 
-        The noise is estimated along, in at most `PASSES` rounds.
+        The residuals' standard deviation is estimated along, in at most `PASSES` rounds,
+        never below the floor.
 
         Args:
             columns: that it has.
-            widths: (c,) standard deviations of their priors; inf without one.
+            widths: (c,) standard deviations of their priors, above 0; inf without one.
             noise: start of the search for the standard deviation of the residuals.
             means: (c,) of the priors; any value without one.
+
+        Returns:
+            The model; None if its columns are not separable.
         """
         at = np.asarray(columns, dtype=np.intp)
         gram = self._gram[np.ix_(at, at)]
@@ -128,14 +138,17 @@ def freedom_log(count: int, variance: float) -> float:
 def averaged(
     models: Sequence[Judged], weights: FloatArray, count: int, at: Judged
 ) -> tuple[FloatArray, FloatArray]:
-    """Average the first columns over models: mean (count,) less that of `at`, and
-    covariance about it.
+    """Average the first columns over models, about the mean of one.
 
     Args:
         models: judged on one table, of the same first columns.
         weights: of the models, of sum 1.
         count: first columns.
         at: the model about which is averaged.
+
+    Returns:
+        Mean (count,) less that of `at`, and mean square (count, count) about `at`: the
+        models' covariances and the differences of their means.
     """
     middle = np.zeros(count)
     spread = np.zeros((count, count))

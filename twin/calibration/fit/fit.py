@@ -143,8 +143,10 @@ def solve(
     x: FloatArray | None = None,
     prior_noise: float = 1.0,
 ) -> Solution:
-    """Minimise the robust reprojection error, first with a Huber loss, then without the
-    positions that are far off.
+    """Minimise the robust reprojection error, first with a Huber loss, then by least
+    squares without the positions that are far off, in up to four rounds.
+
+    Ends when the same positions are used again, or when too few would be left.
 
     Args:
         problem: the data and columns.
@@ -154,7 +156,8 @@ def solve(
             weighed.
 
     Returns:
-        Values, used positions, iterations and whether it converged; nothing is raised.
+        Values, used positions, iterations of all rounds and whether the last one
+        converged; a start with a bead behind the source is returned as it is.
     """
     how = Solver() if solver is None else solver
     value = np.array(problem.start if x is None else x, dtype=np.float64)
@@ -191,6 +194,14 @@ def solve(
 def _spread(norms: FloatArray, columns: int, floor: float) -> float:
     """Compute the robust standard deviation of whitened residuals, larger for few degrees
     of freedom: a fit absorbs part of the noise, and a median of few is unreliable.
+
+    Args:
+        norms: (m,) lengths of 2-vectors.
+        columns: number of fitted columns.
+        floor: least result.
+
+    Returns:
+        inf without degrees of freedom.
     """
     dof = 2 * len(norms) - columns
     if dof <= 0:
@@ -208,27 +219,32 @@ def _levenberg(
 ) -> tuple[FloatArray, int, float, bool]:
     """Run Levenberg-Marquardt with Marquardt's diagonal from `x`.
 
-    The first step is tried almost undamped; damping appears only when a step fails. The Huber
-    threshold follows the residuals: `how.huber` times their robust spread. Stops when a step is
-    predicted to change the residuals' rms by less than the tolerance plus a millionth of it.
+    The first step is tried almost undamped; damping appears only when a step fails. The
+    Huber threshold follows the residuals: `how.huber` times their robust spread. Stops
+    when a step is predicted to change the residuals' rms by less than the tolerance plus
+    a millionth of it, after 40 failed steps, or after the iterations allowed.
 
     Args:
         p: the problem.
         x: (columns,) values to start from.
         use: (frames, beads) spots that count.
         how: settings of the solver.
-        prior_noise: noise of the spots, which scales the priors' weight [px].
+        prior_noise: spread of the whitened residuals, which scales the priors' weight.
 
     Returns:
-        (values, iterations, Huber threshold, converged).
+        (values, iterations, Huber threshold, converged); the start, 0 and False if its
+        cost is infinite.
     """
     weight = p.prior_weight(prior_noise)
     rows = max(1, 2 * int(np.count_nonzero(use)))
     huber = math.inf
 
     def at(x: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        """Evaluate cost, norms of the residuals, and Hessian and gradient with the priors in
-        them.
+        """Evaluate cost, norms of the residuals, and Hessian and gradient with the priors
+        in them.
+
+        Returns:
+            The cost is inf if a bead is at or behind the source.
         """
         cost, _, norms, _, hess, grad = p.evaluate(x, use, 1, huber)
         off = x - p.prior_mean
@@ -345,7 +361,9 @@ class RivalPitch:
 
     @property
     def open_change(self) -> dict[str, float]:
-        """Parameter -> standard deviation, with its sign, that the pitch adds to it."""
+        """Parameter -> standard deviation, with its sign, that the pitch adds to it: its
+        change times the root of the probability.
+        """
         part = math.sqrt(self.share)
         return {name: part * change for name, change in self.change.items()}
 
@@ -388,7 +406,9 @@ class FitResult:
 
     @property
     def panel(self) -> Panel | None:
-        """The panel's estimated distortion; None if it was not estimated."""
+        """The panel's estimated distortion with its coefficients; None if it was not
+        estimated.
+        """
         model = self.problem.panel
         first = self.problem.layout.panel_column
         if model is None:
@@ -607,11 +627,13 @@ def require_identifiable(result: FitResult) -> FitResult:
 
 
 def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
-    """Return the result of a chain of fits, counted from the start of the first.
+    """Return the result of a chain of fits, counted from the start of the first;
+    estimates stay.
 
     Args:
         result: the last fit of the chain.
-        start: offsets at which the first fit started; the start cost is computed there.
+        start: offsets of all groups at which the first fit started; the start cost is
+            computed there, for the positions used in the end.
         iterations: of all fits together.
     """
     problem = result.problem
@@ -624,22 +646,20 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
 
 
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
-    """Solve a problem, and weight its priors by the spread of the residuals, in at most four
-    passes.
+    """Solve a problem, and weight its priors by the spread of the residuals.
+
+    Few positions (up to `FEW_VALUES` coordinates a column) may be explained in two ways:
+    by priors that hold and noise, or by priors that are off and hardly any noise. Then
+    smaller spreads (`QUIET_SHARES`) are tried, too, and one is taken if it is more likely
+    by `QUIET_LOG_ODDS`.
 
     Args:
         problem: data, columns and priors.
         solver: settings; the default is robust.
 
-    Few positions may be explained in two ways: by priors that hold and noise, or by
-    priors that are off and hardly any noise. The more likely one is returned.
-
-    Few positions may be explained in two ways: by priors that hold and noise, or by
-    priors that are off and hardly any noise. The more likely one is returned.
-
     Returns:
         The solution, and the spread of the whitened residuals by which its priors were
-        weighted, from the previous pass.
+        weighted.
     """
     found = _weighted(problem, solver, problem.start, 1.0)
     weighed = bool(np.isfinite(problem.prior_sigma).any())
@@ -660,13 +680,18 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
 def _weighted(
     problem: FitProblem, solver: Solver | None, x: FloatArray, noise: float
 ) -> tuple[Solution, float]:
-    """Solve a problem from a spread of the residuals on, until that spread repeats itself.
+    """Solve a problem from a spread of the residuals on, until that spread repeats itself
+    within 1 %, four times at most; once without priors.
 
     Args:
         problem: the data and columns.
         solver: settings.
         x: start of the columns.
         noise: start of the spread of the whitened residuals.
+
+    Returns:
+        The last solution, and the spread by which its priors were weighted, `LEAST_NOISE`
+        at least if it is estimated.
     """
     for _ in range(4):
         solution = solve(problem, solver, x=x, prior_noise=noise)
@@ -751,10 +776,11 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
 def _pitch_variance(
     fit: FitResult, pitch: RivalPitch, group: int, column: float, rows: FloatArray
 ) -> FloatArray:
-    """Compute what another pixel pitch adds to the variances (3,) of the quantities of
+    """Compute the addition of another pixel pitch to the variances of the quantities of
     IN_IMAGES beyond its part of the covariance.
 
-    A column in pixels is nearer to the panel's centre where pixels are wider.
+    A column in pixels is nearer to the panel's centre where pixels are wider; the other
+    two quantities get 0.
 
     Args:
         fit: with the pitch in its covariance.
@@ -762,6 +788,9 @@ def _pitch_variance(
         group: of frames.
         column: of the axis [px].
         rows: (3, p) derivatives of the quantities by the parameters, edge units.
+
+    Returns:
+        (3,), may be negative.
     """
     change = np.array([pitch.change.get(n, 0.0) for n in fit.values])
     alone = rows @ change
@@ -774,7 +803,8 @@ def _pitch_variance(
 def image_slopes(
     problem: FitProblem, x: FloatArray, group: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute the quantities of IN_IMAGES, and their derivatives by the parameters.
+    """Compute the quantities of IN_IMAGES, and their derivatives by the parameters, by
+    central differences of `SLOPE_STEP`.
 
     Args:
         problem: the data.
@@ -782,8 +812,8 @@ def image_slopes(
         group: of frames.
 
     Returns:
-        Values (3,) in the group's first frame, and derivatives (3, p) by the columns that are
-        parameters, edge units.
+        Values (3,) in the group's first frame, and derivatives (3, p) by the columns that
+        are parameters, edge units.
     """
     names = problem.layout.names[: problem.layout.parameter_count]
     slopes = []
@@ -804,12 +834,14 @@ def _axis_at(problem: FitProblem, x: FloatArray, group: int) -> FloatArray:
 def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArray:
     """Compute the values of IN_IMAGES, in its order, of one pose.
 
-    Axis column [px], its angle to the columns [deg], and pixel size at the axis [mm].
-
     Args:
         pose: one frame.
         offsets: of the geometry.
         middle: the detector's centre (column, row) [px].
+
+    Returns:
+        (3,): column where the axis crosses the middle row [px], its angle to the columns
+        [deg], and magnification at the axis.
     """
     cone = pose.cone_vec(offsets)
     # In the object's frame the axis is vertical and passes through tau (`Poses.cone_vec`).
@@ -832,15 +864,15 @@ def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray
     noise of all.
 
     Steps with the same number of frames are listed once; the noise is at least
-    LEAST_NOISE.
+    `LEAST_NOISE`. Priors count; the structure of residuals does not.
 
     Args:
         fit: of n frames.
         count: of steps, evenly spread; 0 gives none.
 
     Returns:
-        (frames, covariance (p, p) of the reported columns in edge units; None where they do not
-        determine it), the last with all frames.
+        (frames, covariance (p, p) of the reported columns in edge units; None where they
+        do not determine it), the last with all frames.
     """
     problem = fit.problem
     n, k = problem.seen.shape

@@ -69,8 +69,8 @@ def _unit(a):  # type: ignore[no-untyped-def]
 
 @linked
 def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
-    """Turn `vector` (x, y, z) about the direction `axis` by `angle` [rad] (Rodrigues); a tuple
-    of three.
+    """Turn `vector` (x, y, z) about the direction `axis`, of any length, by `angle`
+    [rad], right-handed (Rodrigues); returns a tuple of three complex numbers.
     """
     c, s = _wave(angle)
     k = _unit(axis)
@@ -172,18 +172,22 @@ def evaluate(  # type: ignore[no-untyped-def]
 ):
     """Evaluate all observations in one pass.
 
+    Derivatives are by complex steps. A bead at or behind the source ends the evaluation
+    at once; the arrays are then incomplete.
+
     Args:
         data: see `Data`.
         params: (groups, 17) values [mm, rad], in the order of `offsets.NAMES`.
         beads: (k, 3) centres in the object's frame [mm].
         panel: (t,) coefficients of the panel's distortion.
-        use: (n, k) which observations count.
+        use: (n, k) which observations count; others are predicted alone.
         huber: threshold on the whitened residual's length; inf for plain least squares.
         want: 0 cost only, 1 normal equations into hess, grad, 2 unweighted rows into jac.
-        predicted: (n, k, 2) out.
+        predicted: (n, k, 2) out, pixels from the detector's centre.
         norms: (n, k) out: length of the whitened residual; -1 where not used.
         jac: (2 n k, columns) out when want = 2 (rows of unused observations stay zero).
-        hess: (columns, columns), grad: (columns,): out when want = 1, upper triangle.
+        hess: (columns, columns), grad: (columns,): set to 0; out when want = 1, upper
+            triangle.
 
     Returns:
         The cost; inf if a bead is not in front of the source.

@@ -85,7 +85,9 @@ def estimate_motion(
     *,
     search: bool = True,
 ) -> MotionFit:
-    """Estimate the motion in the tracks of a fit.
+    """Estimate the motion in the tracks of a fit, by a linear mixed model about it.
+
+    Frames whose positions were mostly left out of the fit count entirely: that is motion.
 
     Args:
         fit: parameters that are the same in all frames, with poses that hold the motion
@@ -96,7 +98,8 @@ def estimate_motion(
 
     Returns:
         The total motion of each scan, `known` included. A parameter that the scans share
-        has deviations from its mean over all of their frames.
+        has deviations from its mean over all of their frames; one that does not move has
+        deviations 0 and sigmas nan.
 
     Raises:
         UnknownNameError: a name that cannot move.
@@ -168,15 +171,21 @@ def follow_motion(
     refit: Callable[[MotionFit], FitResult],
     known: MotionFit | None = None,
 ) -> tuple[FitResult, MotionFit]:
-    """Estimate motion and the other parameters by turns until the motion stays.
+    """Estimate motion and the other parameters by turns until the motion stays
+    (`MotionFit.near`), `MOST_PASSES` at most.
 
     Args:
-        fit: to poses that hold the motion `known`; None: no motion.
+        fit: to poses that hold the motion `known`.
         names: parameters that may move.
         refit: the fit to poses that hold another motion.
+        known: None: no motion.
 
     Returns:
-        The last fit, and the motion its poses hold. `aware` gives the fit's sigmas with it.
+        The last fit, and the motion its poses hold. `aware` gives the fit's sigmas with
+        it.
+
+    Raises:
+        TwinError: as `estimate_motion`.
     """
     for _ in range(MOST_PASSES):
         found = estimate_motion(fit, names, known)
@@ -188,8 +197,15 @@ def follow_motion(
 
 
 def aware(fit: FitResult, held: MotionFit) -> FitResult:
-    """Add the uncertainty of the motion that is in the poses to the sigmas of a fit;
-    returned unchanged if it is not identifiable.
+    """Add the uncertainty of the motion that is in the poses to the sigmas of a fit, also
+    that of its direction along the beam.
+
+    Args:
+        fit: to the poses with the motion.
+        held: the motion.
+
+    Returns:
+        A wider fit; `fit` itself if it is not identifiable.
     """
     if not fit.identifiable:
         return fit
@@ -200,15 +216,18 @@ def aware(fit: FitResult, held: MotionFit) -> FitResult:
 
 
 def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
-    """Compute the covariance (p, p), edge units, that a motion along the beam adds by its
-    direction.
+    """Compute the covariance that a motion along the beam adds by its direction.
 
     A phantom that grows moves, as seen, away from its mount. The slopes of the direction
-    are two more columns with a prior; the changes that they make are taken as errors.
+    are two more columns with a prior (`BESIDE_BEAM`); the changes that they make are
+    taken as errors.
 
     Args:
         fit: to the poses with the motion.
         held: the motion in them.
+
+    Returns:
+        (p, p), edge units; zeros if dO_z does not move or the columns are not separable.
     """
     problem = fit.problem
     x = fit.solution.x
@@ -244,7 +263,8 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
 
 
 def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
-    """Mark the used positions, and all of a frame whose positions were mostly left out.
+    """Mark the used positions, and all seen ones of a frame whose positions were mostly
+    left out, (n, k).
 
     Single beads left out are outliers, all of them together are motion.
     """
@@ -257,14 +277,17 @@ def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
 def derivative(
     problem: FitProblem, fit: FitResult, name: str, use: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Compute the whitened change (2 n k,) of the positions with one frame's parameter,
-    free or not.
+    """Compute the whitened change of the positions with one frame's parameter, free or
+    not; beads and other parameters stay.
 
     Args:
         problem: of the fit.
         fit: gives the column values.
         name: of the parameter.
-        use: (n, k) positions that count.
+        use: (n, k) positions that count; others have 0.
+
+    Returns:
+        (2 n k,), an internal unit.
     """
     params, beads = problem.spread(fit.solution.x)
     groups = len(params)
@@ -340,16 +363,16 @@ class _Mixed:
         self.freedom = max(len(residual) + int((weight > 0).sum()) - g, 1)
 
     def spectrum(self, i: int, pick: tuple[float, float]) -> list[FloatArray]:
-        """Compute the variance of the amplitude of each scan's cosines, for deviations that are
-        level at the ends.
+        """Compute the variance of the amplitude of each scan's cosines, for deviations
+        that are level at the ends.
 
         Args:
             i: number of the parameter.
-            pick: width and smoothness of its motion.
+            pick: width, in sigmas from one frame, and smoothness of its motion.
 
         Returns:
-            For each scan (frames,), by the number of half waves; the first is that of the
-            width.
+            For each scan (frames,), by the number of half waves, falling; the mean from
+            one half wave on is the squared width.
         """
         width, waves = pick
         one_frame = 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
@@ -382,14 +405,17 @@ class _Mixed:
         return np.concatenate(parts, axis=1)
 
     def _factor(self, moving: Sequence[int], choice: _Choice) -> FloatArray:
-        """Factorise the deviations' normal equations, frame by frame (banded Cholesky).
+        """Factorise the deviations' normal equations, frame by frame (banded Cholesky);
+        raises LinAlgError if they are not positive definite.
 
         Args:
             moving: numbers of the p moving parameters.
-            choice: width and smoothness of each parameter.
+            choice: width and smoothness of each parameter; those of moving ones are not
+                None.
 
         Returns:
-            (2 p + 1, n p) lower Cholesky factor as `scipy.linalg.cho_solve_banded` takes it.
+            (2 p + 1, n p) lower Cholesky factor as `scipy.linalg.cho_solve_banded` takes
+            it.
         """
         n = len(self.pull)
         p = len(moving)
@@ -443,6 +469,12 @@ class _Mixed:
     def likelihood(self, choice: _Choice) -> float:
         """Compute the logarithm of the restricted likelihood of a choice of motions, up
         to a constant; the noise is eliminated.
+
+        Args:
+            choice: width and smoothness of each parameter; None: it does not move.
+
+        Raises:
+            LinAlgError: the equations are singular.
         """
         part = self._eliminated(choice)
         lower = linalg.cholesky(part.left, lower=True, check_finite=False)
@@ -458,14 +490,14 @@ class _Mixed:
     def solved(self, choice: _Choice) -> _Answer:
         """Solve for the deviations of a choice.
 
-        Deviations (n, parameters) are from their mean; sigmas of parameters that do not
-        move are nan, and their deviations 0.
-
         Args:
-            choice: width and smoothness of each parameter.
+            choice: width and smoothness of each parameter; None: it does not move.
 
         Returns:
-            See `_Answer`.
+            See `_Answer`. Deviations (n, parameters) are from their mean, with their
+            sigmas, internal units; parameters that do not move have deviations 0 and
+            sigmas nan. The covariance (g, g) is the one added to the fit's columns, and
+            the last is a factor of 1 or more.
         """
         part = self._eliminated(choice)
         inverse = linalg.inv(part.left)
@@ -542,7 +574,12 @@ class _Eliminated:
 
 
 def _stiffness(size: int, waves: float) -> float:
-    """Return the eigenvalue of the second differences at which amplitudes fall."""
+    """Compute the eigenvalue of the second differences at which amplitudes fall.
+
+    Args:
+        size: frames of the scan.
+        waves: half waves in the scan; inf for as many as frames or more.
+    """
     if waves < size:
         return (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2
     return math.inf
@@ -552,9 +589,18 @@ def _most_likely(model: _Mixed) -> tuple[_Choice, list[float]]:
     """Choose width and smoothness of each parameter, by turns, and the evidence that it
     moves at all.
 
-    One scan hardly determines a width: among the values that it does not reject, the
-    choice leaves most room to motions that turn once with the table, which other
+    Each climbs on the grid of WIDTHS and WAVES from two starts; parameters of less than
+    `MIN_EVIDENCE` are dropped, the least first. One scan hardly determines a width: among
+    the values that it does not reject (`MAX_LIKELIHOOD_LOSS`) and that are no narrower,
+    the choice leaves most room to motions that turn once with the table, which other
     parameters do too.
+
+    Args:
+        model: of all parameters.
+
+    Returns:
+        Width and smoothness of each parameter, None if it does not move; and the gain in
+        log likelihood of each.
     """
     p = model.pairs.shape[1]
     middle = (WIDTHS[3], WAVES[2])

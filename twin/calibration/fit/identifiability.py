@@ -151,7 +151,7 @@ def identifiability(
     def predict(
         beads: BeadModel, plan: Poses, sizes: FloatArray
     ) -> tuple[Forecast, npt.NDArray[np.bool_]]:
-        """Predict what a fit to a planned scan would determine.
+        """Predict the certificate of a fit to a planned scan.
 
         Beads count where they are visible; their places are free if there is a tolerance.
 
@@ -226,15 +226,19 @@ class Forecast:
 
 
 def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
-    """Predict the certificate of a fit to the data of a problem, at its start.
+    """Predict the certificate of a fit to the data of a problem, at its start, for
+    whitened residuals of spread 1.
 
-    Returns sigmas of the asked parameters, those in images (infinite where not
-    determined), covariance and spectrum. With nuisance parameters, rank and condition are
-    of the asked ones, all else given.
+    With nuisance parameters (priors, strain), rank and condition are of the asked ones,
+    all else given.
 
     Args:
         problem: the planned data, with priors.
         bound: as of `identifiability`.
+
+    Returns:
+        Sigmas of the asked parameters and those in images (infinite where not determined,
+        the latter together), covariance and spectrum.
     """
     names = problem.layout.names
     count = problem.layout.asked
@@ -269,15 +273,16 @@ def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
 def visible_beads(
     model: BeadModel, poses: Poses, shape: FloatArray, at: Offsets = NOMINAL
 ) -> npt.NDArray[np.bool_]:
-    """Mark beads that are entirely on the detector, (n, k).
-
-    False too for beads behind the source.
+    """Mark beads whose spots are entirely on the detector.
 
     Args:
         model: the beads.
         poses: n frames.
         shape: (n, 2) detector (rows, cols) of each frame.
         at: geometry offsets.
+
+    Returns:
+        (n, k) bool; False too for beads behind the source.
     """
     cone = poses.cone_vec(at)
     pixels = cone.project_points(model.beads, (1, 1))
@@ -292,9 +297,8 @@ def _worst(sigmas: dict[str, float]) -> float:
 
 
 def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Plan]:
-    """List changes worth trying.
-
-    Placements at two other SODs, to the side, or both; twice the frames; two beads more.
+    """List changes worth trying: a placement at an SOD a quarter less or more, 20 mm to
+    the side, or both; twice the frames; two beads more.
 
     Args:
         model: the beads.

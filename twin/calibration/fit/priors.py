@@ -84,11 +84,9 @@ def known_strain(
     given: Given | None = None,
     bead_tolerance_mm: float | None = None,
 ) -> Strain:
-    """Return standard deviations [1] of the phantom's stretches and shears.
-
-    They are 0 where beads are exactly at their stated places (`bead_tolerance_mm` 0, or
-    every offset of the scanner stated as exact), or are unknowns themselves; less than
-    STRAIN where the phantom's own tolerance is.
+    """Compute standard deviations [1] of the phantom's stretches and shears: `STRAIN`, or
+    the phantom's tolerance over its size (root mean square distance of beads) if that is
+    less.
 
     Args:
         model: the phantom's beads.
@@ -97,7 +95,8 @@ def known_strain(
         bead_tolerance_mm: of the beads, stated by a user; None: not stated.
 
     Returns:
-        Of stretches, and of shears.
+        Of stretches, and of shears, equal. `UNSTRAINED` (0, 0) if a tolerance is stated,
+        0 or not, or every offset of the scanner that is not free is stated as exact.
     """
     stated = exact(free) if given == "none" else given or {}
     if bead_tolerance_mm is not None:
@@ -133,11 +132,12 @@ def prior_widths(
 
 
 def require_widths(priors: Mapping[str, float]) -> Mapping[str, float]:
-    """Return `priors` if each is the standard deviation of a parameter.
+    """Check that each prior is the standard deviation of a parameter, and return them as
+    they are.
 
     Raises:
         UnknownNameError: a name that is no parameter.
-        TwinError: negative, infinite or not a number.
+        TwinError: negative, infinite or not a number; names the first.
     """
     require_names(priors)
     for name, width in priors.items():

@@ -116,7 +116,7 @@ class ColumnLayout:
 
     @property
     def bead_columns(self) -> slice:
-        """Columns of the beads' coordinates; empty if beads are not free."""
+        """Columns of the beads' coordinates, three a bead; empty if beads are not free."""
         if self.bead_column < 0:
             return slice(self.parameter_count, self.parameter_count)
         if self.strain_column < 0:
@@ -127,13 +127,15 @@ class ColumnLayout:
 
     @property
     def strain_columns(self) -> slice:
-        """Columns of the phantom's strain, in the order of STRAINS."""
+        """Columns of the phantom's strain, in the order of STRAINS; empty if it is rigid."""
         last = self.shift_column
         return slice(last if self.strain_column < 0 else self.strain_column, last)
 
     @property
     def shift_column(self) -> int:
-        """First of the columns whose coefficients shift the positions: arc and panel."""
+        """First of the columns whose coefficients shift the positions, arc and panel; the
+        number of columns if there are none.
+        """
         if self.arc_column < 0:
             return self.panel_column
         return self.arc_column
@@ -153,7 +155,8 @@ def require_names(names: Iterable[str]) -> None:
 
 
 def require_tolerance(tolerance_mm: float) -> float:
-    """Return a standard deviation of bead positions if it is one.
+    """Check that a value is a standard deviation of bead positions, and return it; 0 is
+    allowed.
 
     Raises:
         TwinError: negative, infinite or not a number.
@@ -179,10 +182,11 @@ def layout(
     strained: bool = False,
     arc: bool = False,
 ) -> ColumnLayout:
-    """Assign columns.
+    """Assign columns: parameters (requested, then those with a prior alone) in the order
+    of NAMES, then beads, strain, arc, panel.
 
     Where source, object and detector could shift together without priors, the source is
-    held.
+    held. With one group `per_group` has no effect.
 
     Args:
         free: names of free parameters, any order, each once or more.
@@ -305,8 +309,8 @@ class FitProblem:
 
     @property
     def start(self) -> FloatArray:
-        """Values of the columns at the start: the base's for free parameters, the model's
-        for free beads, else zero.
+        """Values of the columns at the start, internal units: the base's for free
+        parameters (of a shared one the last group's), the model's for free beads, else 0.
         """
         x = np.zeros(len(self.layout.names))
         free = self.layout.colmap >= 0
@@ -375,11 +379,14 @@ class FitProblem:
         return out
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return parameter sets (groups, 17) and beads (k, 3) [mm] for the values `x` of
-        the columns.
+        """Compute parameter sets and beads for the values `x` of the columns.
 
         Fixed parameters keep the base's values; without free beads the model's places are
         taken, moved by the strain if that is fitted.
+
+        Returns:
+            (groups, 17) internal units, in the problem's reading, and a new array (k, 3)
+            [mm].
         """
         columns = self.layout.colmap
         own = self.layout.bead_column
@@ -396,15 +403,18 @@ class FitProblem:
 
     @cached_property
     def shift_terms(self) -> FloatArray:
-        """(n, k, 2, m) shifts by a coefficient of 1 of the exposure's arc and the panel's
-        terms."""
+        """(n, k, 2, m) shifts of the positions by a coefficient of 1 of the exposure's
+        arc, if there is one, and each of the panel's terms [px].
+        """
         if self.curvature is None:
             return self.panel_terms
         return np.concatenate([self.curvature, self.panel_terms], axis=-1)
 
     @cached_property
     def panel_terms(self) -> FloatArray:
-        """(n, k, 2, m) shifts by a coefficient of 1 of each term of the panel's distortion."""
+        """(n, k, 2, m) shifts by a coefficient of 1 of each term of the panel's
+        distortion, at the measured places [px]; m is 0 without distortion.
+        """
         if self.panel is None:
             return np.zeros((*self.measured.shape, 0))
         return self.panel.terms(self.measured + self.origin[:, None, :])
@@ -419,17 +429,25 @@ class FitProblem:
     def residuals(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Predict pixels (n, k, 2) on the panel as it is, and lengths (n, k) of whitened
-        residuals.
+        """Predict positions on the panel as it is, and lengths of whitened residuals.
 
-        Lengths are -1 where a position is not used.
+        Args:
+            x: column values, internal units.
+            use: (n, k) positions that count; None: the seen ones.
+
+        Returns:
+            Pixels of the image (n, k, 2) of all beads, and lengths (n, k), -1 where a
+            position is not used.
+
+        Raises:
+            TwinError: a bead is at or behind the source.
         """
         predicted, norms, _ = self._evaluate(x, self.seen if use is None else use, 0)
         return predicted + self.origin[:, None, :], norms
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Compute whitened residuals (n, k, 2), measured minus predicted, in the order of
-        `jacobian`.
+        `jacobian`; 0 where unseen. Raises as `residuals`.
         """
         predicted = self.residuals(x)[0]
         w = self.whiten
@@ -450,11 +468,11 @@ class FitProblem:
     def _evaluate(
         self, x: FloatArray, use: npt.NDArray[np.bool_], want: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Evaluate the problem at `x`, `use` telling the spots that count; see `evaluate` for
-        `want`.
+        """Evaluate the problem at `x`; see `evaluate`, also for the arguments.
 
         Returns:
-            Predictions, norms of the whitened residuals, and the Jacobian.
+            Predictions from the detector's centre, norms of the whitened residuals, and
+            the Jacobian.
 
         Raises:
             TwinError: a bead is at or behind the source.
@@ -473,14 +491,14 @@ class FitProblem:
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Evaluate column values by `fit_kernels.evaluate`.
 
-        With `want` 0 the last four are zero.
-
         Args:
             x: (c,) column values.
             use, want, huber: as of the kernel.
 
         Returns:
-            Cost, predicted, norms, jac, hess (symmetric) and grad.
+            Cost (inf if a bead is at or behind the source), predicted, norms, jac (2 n k,
+            c), hess (c, c, symmetric) and grad (c,). Zeros where `want` leaves them out;
+            jac then has no rows.
         """
         x = np.asarray(x, dtype=np.float64)
         params, beads = self.spread(x)
@@ -565,21 +583,28 @@ def build_problem(
         shape: (rows, cols), of all frames or of each.
         covariances: (n, k, 2, 2) of the tracks [px^2]; `noise_px` without.
         noise_px: sigma of the tracks.
-        groups: (n,) labels of the scans; frames of a label share their parameters.
+        groups: (n,) labels of the scans; frames of a label share their parameters. Groups
+            are numbered in the order of sorted labels.
         per_group: names of free parameters with a value in each scan.
         free_beads: the beads' positions are estimated, too.
         start: offsets to start from, of all scans or of each.
         reading: definition of the offsets of the axis.
-        centre: correction of the spots' centres, or (n, k, 2) [px].
-        bead_tolerance_mm: sigma of the stated bead positions.
-        priors: sigma of each offset; see `fit_geometry`.
-        prior_centre: means of the priors; `start` without.
+        centre: kind of the positions, or bias factors that broadcast to (n, k).
+        bead_tolerance_mm: sigma of the stated bead positions, if they are free; inf: no
+            prior.
+        priors: sigma of each offset; see `fit_geometry`. Widths of 0 have no column.
+        prior_centre: means of the priors; `start` of the first group without.
         panel: distortion of the panel to estimate.
-        strain: distortion of the phantom to estimate, with its prior.
+        strain: distortion of the phantom to estimate, with its prior; (0, 0): none.
         arc: the arc that the object turns during an exposure is estimated, too.
+        expected_spread: see `FitProblem`.
+
+    Returns:
+        The problem; perhaps without any seen position.
 
     Raises:
-        TwinError: shapes do not fit together, or no position was measured.
+        TwinError: shapes or numbers do not fit together, a covariance is not positive
+            definite, or `per_group` is not free.
         UnknownNameError: a name that is no parameter.
     """
     poses = as_poses(geometry)
@@ -666,11 +691,11 @@ def curvature(
     group: npt.NDArray[np.int64],
     reading: Reading,
 ) -> FloatArray:
-    """Compute shifts (n, k, 2, 1) [px] of the beads' mean positions by exposures of a
-    full step.
+    """Compute shifts of the beads' mean positions by exposures of a full step, the median
+    step of the frame's group.
 
-    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the fourth
-    power of the arc: 2e-4 px of 100 px for a step of 15 deg.
+    A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the
+    fourth power of the arc: 2e-4 px of 100 px for a step of 15 deg.
 
     Args:
         poses: nominal geometry of the n frames.
@@ -678,6 +703,9 @@ def curvature(
         base: (groups, 17) offsets, internal units, in the reading.
         group: (n,) of each frame.
         reading: of eq. 5.4.
+
+    Returns:
+        (n, k, 2, 1) [px]; 0 in groups of one frame.
     """
     out = np.zeros((len(poses), len(model), 2, 1))
     for g, row in enumerate(base):
@@ -700,9 +728,11 @@ def curvature(
 
 
 def frame_shapes(shape: Shape, frames: int) -> FloatArray:
-    """Return the detector (rows, cols) of each frame, (n, 2).
+    """Return the detector (rows, cols) of each frame, (n, 2) float64.
 
-    None: the default machine's.
+    Args:
+        shape: of all frames, or of each; None: the default machine's.
+        frames: n.
 
     Raises:
         TwinError: `shape` is neither (2,) nor (n, 2).
@@ -731,10 +761,13 @@ def as_poses(geometry: Poses | ConeVec) -> Poses:
 def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:
     """Return the sphere-centre bias factor of every position, (n, k).
 
+    Args:
+        centre: kind of the positions, a value for all, or an array that broadcasts; NaN
+            becomes 0.
+        shape: (n, k).
+
     Raises:
         TwinError: an array of another shape.
-
-    A value for all, or an array that broadcasts; NaN becomes 0.
     """
     value = centre.value if isinstance(centre, Centre) else centre
     try:
@@ -747,15 +780,20 @@ def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> Floa
 def whitening(
     covariances: npt.ArrayLike | None, noise_px: float, seen: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Compute upper triangular W with W C W' = 1 for each detection, as (n, k, 3): w0, w1, w2.
+    """Compute upper triangular W with W C W' = 1 for each detection.
 
     Args:
         covariances: (n, k, 2, 2) [px^2], or None.
         noise_px: standard deviation of all coordinates, without covariances.
-        seen: (n, k) positions that were measured; others get 0.
+        seen: (n, k) positions that were measured; others get 0 with covariances, and 1 /
+            noise_px without.
+
+    Returns:
+        (n, k, 3): w0, w1, w2 of (w0, w1; 0, w2) [1/px].
 
     Raises:
-        TwinError: a covariance of a seen bead is not positive definite, or noise_px <= 0.
+        TwinError: covariances of another shape, one of a seen bead is not positive
+            definite, or noise_px <= 0.
     """
     out = np.zeros((*seen.shape, 3))
     if covariances is None:

@@ -91,13 +91,19 @@ class Residuals:
 
 
 def drifts(left: Residuals) -> tuple[Drift, ...]:
-    """Find drifts and jumps of single parameters in the residuals, strongest first.
+    """Find drifts and jumps of single parameters (MOVING) in the residuals, strongest
+    first, in each group of at least 12 frames.
+
+    A column's ramp and 11 jumps are compared. If some drift exceeds `SIGNIFICANT`, hints
+    of others (`HINT_SIGMAS`) count, too.
 
     Args:
         left: residuals with their derivatives, covariance and noise.
 
     Returns:
-        The certain ones; if none is certain, the possible ones.
+        With a certain drift, it and the hints; else the possible ones, unsorted (jumps
+        beyond `SUSPECT_STEP`, steady drifts beyond `SUSPECT_SIGMAS`). Empty for few
+        residuals or without noise.
     """
     problem = left.problem
     jacobian = left.jacobian
@@ -166,15 +172,18 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
 
 
 def cluster_covariance(left: Residuals) -> FloatArray | None:
-    """Compute the covariance that allows for errors all beads of a frame share.
+    """Compute the covariance that allows for errors all beads of a frame share (a
+    sandwich estimate by frames).
 
-    Judged by the parameters that may move from frame to frame.
+    Judged by the parameters that may move from frame to frame: the residuals of a frame
+    must act on one of them together by `CLUSTER_SIGMAS`.
 
     Args:
         left: residuals with their derivatives, covariance and noise.
 
     Returns:
-        (p, p); None if beads of a frame do not err together, or for few frames.
+        (p, p); None if beads of a frame do not err together, or for fewer than 12 frames
+        or twice the columns without a prior.
     """
     problem = left.problem
     jacobian = left.jacobian
@@ -215,16 +224,16 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
 def turning_errors(left: Residuals) -> FloatArray | None:
     """Compute the covariance to add for errors of a bead that repeat as the object turns.
 
-    Bead positions that are off, a background that pulls centroids, distortion of the detector:
-    each bead's error is then a smooth function of the angle. Its harmonics 0 to 3 are sought in
-    every bead's columns and rows. An error found in one bead is assumed in all, and in harmonic
-    0, most of which the fit hides, as much as in any other.
+    Bead positions that are off, a background that pulls centroids, distortion of the
+    detector: each bead's error is then a smooth function of the angle. Its harmonics 0 to
+    3 are sought in every bead's columns and rows. An error found in one bead is assumed
+    in all, and in harmonic 0, most of which the fit hides, as much as in any other.
 
     Args:
         left: residuals with their derivatives, covariance and noise.
 
     Returns:
-        (p, p); None if there are no such errors, or for few frames.
+        (p, p); None if there are no such errors, or for fewer than 16 frames.
     """
     problem = left.problem
     jacobian = left.jacobian
@@ -303,9 +312,8 @@ def _excess(
     which: npt.NDArray[np.bool_],
     parameters: int,
 ) -> FloatArray | None:
-    """Compute squared amplitudes of some columns beyond noise.
-
-    Also None for too few residuals. Else (number judged,), 0 where noise explains it.
+    """Compute squared amplitudes of some columns beyond noise, if together they are
+    significant (chance 1e-3).
 
     Args:
         gram: (c, c) products of the columns.
@@ -315,7 +323,8 @@ def _excess(
         parameters: number of fitted columns.
 
     Returns:
-        None if not significant.
+        (number judged,), 0 where noise explains it; None if not significant, or for fewer
+        than three residuals a direction.
     """
     part = gram[np.ix_(which, which)]
     power = np.maximum(np.diag(part), 1e-30)
@@ -344,6 +353,10 @@ def _excess(
 def larger(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute the smallest covariance of a's shape that is at least as wide as both in
     every direction.
+
+    Args:
+        a: (p, p), positive diagonal.
+        b: (p, p).
     """
     # Of exact positions `a` is the priors' alone and of lower rank.
     low = np.linalg.cholesky(a + 1e-12 * np.diag(np.diag(a)))
@@ -358,14 +371,18 @@ def correlation_length(
 ) -> float:
     """Estimate the correlation length of residuals along the frames.
 
-    It is 1 + 2 sum(rho) over the lags until the correlation first falls below noise: the
-    number of frames that count as one. It stays 1 unless lag one is significant (4 sigma), so
-    that white residuals keep the nominal covariance.
+    It is 1 + 2 sum(rho) over the lags until the correlation first falls below noise (2
+    sigma), half of the frames at most: the number of frames that count as one. It stays 1
+    unless lag one is significant (4 sigma), so that white residuals keep the nominal
+    covariance, and for fewer than 8 frames or 24 used coordinates.
 
     Args:
         residual: (n, k, 2) px.
         use: (n, k).
         group: (n,) frames of different groups are not neighbours.
+
+    Returns:
+        1 or more [frames].
     """
     n = len(residual)
     clean = np.where(use[:, :, None], residual, 0.0)
@@ -376,11 +393,9 @@ def correlation_length(
     power /= count
 
     def rho(lag: int) -> tuple[float, int]:
-        """Compute the correlation of residuals `lag` frames apart in the same scan, and the
-        number of values it is from.
-
-        The value is a share of the variance; 0.0 from 0 values where no two frames have
-        it.
+        """Compute the correlation of residuals `lag` frames apart in the same scan, as a
+        share of the variance, and the number of values it is from; (0, 0) where no two
+        frames have that distance.
         """
         together = use[:-lag] & use[lag:] & (group[:-lag] == group[lag:])[:, None]
         pairs = 2 * int(together.sum())

@@ -88,12 +88,11 @@ def tolerance_of(column: str) -> float:
 
 
 def advise(names: Sequence[str], beads: int) -> str:
-    """Advise on data that would determine a direction.
-
-    Returns one sentence, of the first case that holds.
+    """Advise on data that would determine a direction: one sentence, of the first case
+    that holds; a general one if none does.
 
     Args:
-        names: its columns.
+        names: its columns; the group (@NUMBER) matters in one case alone.
         beads: number of beads seen.
     """
     involved = {n.split("@")[0] for n in names}
@@ -164,9 +163,9 @@ def weak_direction(
 ) -> Direction:
     """Name one direction of the column-scaled parameter space.
 
-    Columns below a tenth of the largest share are left out. The first part leads with
-    factor 1; others are its change relative to it. Size [edge unit of the lead]; inf
-    where it is not determined.
+    Columns below a tenth of the largest share are left out. The column that is most
+    uncertain against its tolerance leads with factor 1; others are its change relative to
+    it.
 
     Args:
         vector: (columns,) direction.
@@ -174,6 +173,9 @@ def weak_direction(
         names: of the columns.
         sigma: along the vector, scaled units; inf where it is not determined.
         beads: beads seen.
+
+    Returns:
+        With its sigma in the lead's edge unit; inf where it is not determined.
     """
     order = np.argsort(-np.abs(vector))
     kept = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]
@@ -195,7 +197,13 @@ def weak_direction(
 
 def _sparse(basis: FloatArray) -> FloatArray:
     """Transform a basis so that each vector lacks the others' leading parameter (reduced
-    echelon form, with pivots), of unit length; returns a new one.
+    echelon form, with pivots), of unit length.
+
+    Args:
+        basis: (columns, r), of rank r.
+
+    Returns:
+        A new basis (columns, r) of the same space, no longer orthogonal.
     """
     m = basis.T.copy()
     r = len(m)
