@@ -56,11 +56,11 @@ def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
 
     @wraps(find)
     def found(*args: P.args, **options: P.kwargs) -> Alignment:
-        """Call `find`; where it raises NotIdentifiableError, return an alignment that refuses
-        every parameter for that reason.
+        """Call `find`; where it raises NotIdentifiableError, return an alignment that
+        refuses every parameter for that reason.
 
         The refused parameters are axis_column_px, det_roll, det_yaw, source_row_px and
-        those of UNTOLD.
+        those of UNTOLD, which keep their own reasons; offsets are None and frames 0.
         """
         try:
             return find(*args, **options)
@@ -87,6 +87,9 @@ def align_turn(
 ) -> Alignment:
     """Estimate axis column, roll, yaw and the source's row from the frames of a turn.
 
+    Without a full turn only the axis column is estimated, from opposite rays; the
+    correction is never refused for the other parameters.
+
     Args:
         image: line integrals of a frame, (rows, cols).
         poses: nominal poses of all frames.
@@ -100,7 +103,9 @@ def align_turn(
         panel: the distortion that is undone in the images.
 
     Returns:
-        The alignment; parameters that the scan does not determine are in `refused`.
+        The alignment; parameters that the scan does not determine are in `refused`. If it
+        determines no axis column, offsets are None and all are refused; no
+        NotIdentifiableError is raised.
     """
     scan = CircularScan.of(image, poses, present, shape, base, priors)
     plane = find_plane(scan, panel, random)
@@ -172,7 +177,7 @@ def _plane_parameters(
 def _motion(
     planes: TurnPlanes, turn: Turn, corrected: Offsets, random: np.random.Generator
 ) -> Motion:
-    """Find the shifts of single frames.
+    """Find the shifts of single frames as a motion of the sample.
 
     Args:
         planes: pairs of the turn's frames.
@@ -181,7 +186,8 @@ def _motion(
         random: for the image of noise.
 
     Raises:
-        NotIdentifiableError: frames are repeated, or the images do not determine shifts.
+        NotIdentifiableError: frames are repeated, too many, or the images do not
+            determine shifts.
     """
     if turn.repeated:
         raise NotIdentifiableError(
@@ -193,10 +199,9 @@ def _motion(
 
 
 def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]:
-    """List doubts about the scan: gap of the panel, repeated and missing frames, a jump.
-
-    First that opposite rays disagree; "gap" is one between tiles of the panel, found or
-    not excluded.
+    """List doubts about the scan, in this order: opposite rays disagree with the mean; a
+    gap between tiles of the panel was found; one is not excluded; repeated frames;
+    missing frames; a step of more than `STEP_TOLD` to the right.
 
     Args:
         plane: of symmetry.

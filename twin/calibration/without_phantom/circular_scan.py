@@ -61,16 +61,19 @@ class CircularScan:
         base: Offsets,
         priors: Mapping[str, float],
     ) -> CircularScan:
-        """Check that the frames that are present form one circle.
+        """Check that the frames that are present form one circle, and make the scan.
 
         Raises:
-            NotIdentifiableError: no frame is present, or source or panel move.
+            NotIdentifiableError: no frame is present, or source or panel move by more
+                than `STANDS`.
         """
         refuse_if(len(present) == 0, "no frame is there")
         return cls(image, poses, present, shape, base, priors, _standing(poses, present))
 
     def offsets(self, values: FloatArray) -> Offsets:
-        """Put parameters into the offsets in force."""
+        """Put parameters, the first ones of `FREE`, into a copy of the offsets in force;
+        missing ones stay.
+        """
         return replace(self.base, **dict(zip(FREE, values.tolist(), strict=False)))
 
     def view(self, values: FloatArray) -> FloatArray:
@@ -78,8 +81,11 @@ class CircularScan:
         return np.asarray(about_axis(self.pose, self.offsets(values)).rows[0])
 
     def column(self, values: FloatArray, row: float | None = None) -> float:
-        """Return the column in which the axis crosses a row, the panel's middle one if
-        None [px].
+        """Compute the column in which the axis crosses a row [px].
+
+        Args:
+            values: parameters in the order of `FREE`.
+            row: None: the panel's middle one.
         """
         rows, cols = self.shape
         middle = np.array([(cols - 1) / 2, (rows - 1) / 2 if row is None else row])
@@ -97,16 +103,15 @@ class CircularScan:
         return float(shown.project_points(level, self.shape)[0, 0, 1])
 
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
-        """Compute the change of the axis' column with each parameter, by differences.
-
-        The differences are central, a tenth of a step to each side.
+        """Compute the change of the axis' column with each parameter, by central
+        differences of a tenth of a step to each side.
 
         Args:
             values: (k,) parameters.
             scales: (k,) their steps.
 
         Returns:
-            (k,) [px].
+            (k,) [px per unit of the parameter].
         """
         steps = np.diag(0.1 * scales)
         return np.array(
@@ -170,10 +175,16 @@ def about_axis(poses: Poses, offsets: Offsets) -> ConeVec:
 
 
 def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:
-    """Return the pose that all frames share but for the angle of the stage.
+    """Return the pose (of the first frame) that all frames share but for the angle of the
+    stage.
+
+    Args:
+        poses: of all frames.
+        present: frames that are compared, one at least.
 
     Raises:
-        NotIdentifiableError: source or panel move, so the scan is not on one circle.
+        NotIdentifiableError: source or panel move by more than `STANDS`, so the scan is
+            not on one circle.
     """
     chosen = np.array(present)
     table = np.hstack(

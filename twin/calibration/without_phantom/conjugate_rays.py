@@ -124,8 +124,8 @@ class Profile:
         sigma: FloatArray,
         soft: float,
     ) -> Profile:
-        """Look for steps at all columns but those of the last bins: with one bin beyond,
-        a wall that turns back there looks the same.
+        """Make a profile that looks for steps at all columns but those of the last
+        `BEYOND` bins: with one bin beyond, a wall that turns back there looks the same.
 
         Args:
             radius: of columns from the axis, (k,) [px].
@@ -138,10 +138,16 @@ class Profile:
         return cls(at, _basis(radius, weight, place, at, soft), shift, sigma)
 
     def best(self) -> Step:
-        """Return the most significant step; up to a part of the bins, which fit it worst,
-        is left out in turn, and `least` contains the effect of that choice.
+        """Find the most significant step, by its width over `least`; it need not be
+        significant.
 
-        NO_STEP if none is narrow and clear of the bins left out.
+        One bin after the other, up to one of `LEAST_BINS`, is left out where it fits
+        worst; `least` contains the effect of that choice. A step must be narrower than
+        `MAX_WIDTH_PX`, more than `BESIDE` bins from those left out, and have a bin
+        inside. Its sigma contains the choice among radii.
+
+        Returns:
+            NO_STEP if none is so.
         """
         sigma = self.sigma
         found = [NO_STEP]
@@ -165,8 +171,11 @@ class Profile:
         return max(found, key=lambda one: abs(one.width) / one.least)
 
     def at(self, radius: float) -> Step:
-        """Return the step at the radius [px] beside the axis; its sigma and least are inf
-        unless there is a bin further inside.
+        """Estimate the step at the radius next to one beside the axis; its sigma and
+        least are inf unless the innermost bin is inside it.
+
+        Args:
+            radius: distance from the axis [px].
         """
         place = int(np.abs(self.radii - radius).argmin())
         step = self.beside_axis(radius)
@@ -175,9 +184,12 @@ class Profile:
         return step._replace(sigma=math.inf, least=math.inf)
 
     def beside_axis(self, radius: float) -> Step:
-        """Return the step at the radius next to one, also if only the innermost bin
+        """Estimate the step at the radius next to one, also if only the innermost bin
         separates it from a shift of the axis; structures that pass the axis itself move
         that bin.
+
+        Args:
+            radius: distance from the axis [px].
         """
         place = int(np.abs(self.radii - radius).argmin())
         return self._steps(self._widened(self.sigma, place))[0][place]
@@ -188,8 +200,14 @@ class Profile:
         return np.asarray(self.basis[:, 0, 2] < MOST_MOVED)
 
     def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit the steps of each row by weighted least squares: values (r, 3), their
-        covariances, and residuals in sigmas, (r, m).
+        """Fit shift, yaw and step of each radius by weighted least squares, the yaw with
+        a prior of `YAW_PX`.
+
+        Args:
+            sigma: (m,) of the bins [px]; inf for one that does not count.
+
+        Returns:
+            Values (r, 3), their covariances (r, 3, 3), and residuals in sigmas, (r, m).
         """
         scaled = self.basis / sigma[:, None]
         aim = self.shift / sigma
@@ -200,12 +218,12 @@ class Profile:
         return values, np.asarray(inverse, dtype=np.float64), rest
 
     def _steps(self, sigma: FloatArray) -> tuple[list[Step], FloatArray]:
-        """Estimate the step at each radius.
-
-        `least` of each is the step that chance would give, in view of the number tried.
+        """Estimate the step at each radius; `least` of each is the step that occurs by
+        chance (`CHANCE`), in view of the number of radii and of bins left out.
 
         Args:
-            sigma: (m,) standard deviations of the values; inf for one that does not count.
+            sigma: (m,) standard deviations of the values; inf for one that does not
+                count.
 
         Returns:
             The steps (r of them), and the fits' residuals in sigmas, (r, m).
@@ -223,14 +241,14 @@ class Profile:
 
     def _widened(self, sigma: FloatArray, place: int) -> FloatArray:
         """Widen the standard deviations of bins until the residuals of a step at a radius
-        are usual, (m,).
-
-        All by one common amount, added in quadrature; returned as they are if usual
-        already.
+        are usual, all by one common amount added in quadrature.
 
         Args:
             sigma: (m,) of the bins [px].
             place: index of the radius.
+
+        Returns:
+            (m,); `sigma` itself if the residuals are usual already.
         """
         only = Profile(self.radii[[place]], self.basis[[place]], self.shift, sigma)
         free = int(np.isfinite(sigma).sum()) - 2
@@ -249,13 +267,16 @@ class Profile:
 
 
 def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_]) -> float:
-    """Compute the standard deviation of widths (r,) over radii that explain shifts about
-    as well.
+    """Compute the standard deviation of widths over radii, weighted by how well they
+    explain shifts: exp of half the chi square lost to the best.
 
     Args:
         widths: of steps at the radii, (r,) [px].
         rest: residuals of each in sigmas, (r, m).
-        usable: whether a radius counts, (r,).
+        usable: whether a radius counts, (r,); one at least.
+
+    Returns:
+        [px].
     """
     chi_square = np.square(rest).sum(axis=1)
     less = np.minimum(chi_square[usable].min() - chi_square, 0.0)
@@ -271,8 +292,9 @@ def _basis(
     at: FloatArray,
     soft: float,
 ) -> FloatArray:
-    """Compute shares of a common shift, a yaw and of steps at radii (r,) in each bin, (r,
-    m, 3).
+    """Compute the shares of a common shift, a yaw (`YAW_PX` at the outermost column,
+    growing as the square) and of steps at radii in each bin, as weighted means of its
+    columns.
 
     Args:
         radius: of columns from the axis, (k,) [px].
@@ -280,6 +302,9 @@ def _basis(
         place: their bins, (k,).
         at: the radii (r,) [px].
         soft: sigma of the smoothing [px].
+
+    Returns:
+        (r, m, 3).
     """
     one_of = (place == np.arange(place.max() + 1)[:, None]) * weight
     one_of /= one_of.sum(axis=1, keepdims=True)
@@ -304,11 +329,14 @@ class ConjugateRays:
     def __init__(
         self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float
     ) -> None:
-        """Smooth the images along their rows and prepare them for interpolation.
+        """Smooth the images along their rows and prepare splines over views and columns.
+
+        The smoothing is `cols / SMOOTHING`, one column and the step between views at
+        least.
 
         Args:
             scan: a full turn.
-            band: (views, groups, cols) means of groups of rows.
+            band: (views, groups, cols) means of groups of rows, at even steps.
             rows: (groups,) the groups' middle rows [px].
             step: angle between views [rad].
         """
@@ -330,14 +358,17 @@ class ConjugateRays:
 
     @classmethod
     def of(cls, scan: CircularScan, turn: Turn) -> ConjugateRays:
-        """Take the rows near the source's plane from the frames of a turn."""
+        """Take the rows near the source's plane from the frames of a turn, interpolated
+        at even angles if they are uneven.
+        """
         azimuth = scan.azimuth(turn.band_frames)
         band, step = _evenly(np.asarray(turn.band, dtype=np.float64), azimuth)
         return cls(scan, band, np.array(turn.band_rows), step)
 
     def closed(self, column: int, width: float) -> ConjugateRays:
         """Return rays with a gap between panel tiles closed: columns from `column` on
-        move back by its `width` [px].
+        move back by its `width` [px], those in it repeat its edge. The rays themselves
+        stay.
         """
         there = np.arange(self.cols, dtype=np.float64)
         at = there - np.clip(there - (column - 0.5), 0.0, width)
@@ -352,14 +383,15 @@ class ConjugateRays:
         return float(self.rows.mean())
 
     def column(self, values: FloatArray) -> tuple[FloatArray, float]:
-        """Move the first of the parameters of the plane until both ends of rays agree.
+        """Move the first of the parameters of the plane until both ends of rays agree, in
+        up to `ROUNDS` steps.
 
         Args:
-            values: parameters in the order of `circular_scan.FREE`, (k,).
+            values: parameters in the order of `circular_scan.FREE`, (k,); not changed.
 
         Returns:
-            The parameters, and the standard deviation of the column [px]; inf: too little
-            turns.
+            The parameters, and the standard deviation of the column by sectors [px]; inf
+            if too little turns (`MIN_CORRELATION`), with the parameters of the last step.
         """
         values = values.copy()
         slope = self.scan.slopes(values, self.scan.scales[: len(values)])[0]
@@ -374,15 +406,16 @@ class ConjugateRays:
         return values, sigma / 2.0
 
     def profile(self, values: FloatArray) -> Profile | None:
-        """Read the distance between both ends of rays at each distance from the axis.
+        """Read the distance between both ends of rays at each distance from the axis, in
+        bins.
 
-        Bins with too little correlation are left out.
+        Bins of less correlation than `MIN_CORRELATION` are left out.
 
         Args:
             values: parameters in the order of `circular_scan.FREE`, (k,).
 
         Returns:
-            The profile; None if too little of the object turns.
+            The profile; None if fewer than `MIN_BINS` bins are left.
         """
         radius, moved, told, power = self._sums(values)
         if len(radius) == 0:
@@ -416,15 +449,17 @@ class ConjugateRays:
     def _sums(
         self, values: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Sum up differences and slopes of both ends of rays.
+        """Sum up differences and slopes of both ends of rays, without their means over
+        the turn.
 
         Args:
             values: parameters in the order of `circular_scan.FREE`.
 
         Returns:
-            Distances from the axis (k,); sums over each sector, group of rows and
-            distance of differences times slopes and of slopes of one end times those of
-            the other, (SECTORS, groups, k) each; the power of slopes (k,).
+            Distances from the axis (k,), as far as both sides of the panel reach, perhaps
+            none; sums over each sector, group of rows and distance of differences times
+            slopes and of slopes of one end times those of the other, (SECTORS, groups, k)
+            each; the power of slopes (k,).
         """
         axis = self.scan.column(values, self.row)
         apart_px = max(1.0, self.smoothing / PER_SIGMA)
@@ -451,9 +486,8 @@ class ConjugateRays:
     def _both(
         self, group: int, values: FloatArray, columns: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Read rays to columns of a group of rows from both ends in all n views.
-
-        Interpolated between views and columns.
+        """Read rays to columns of a group of rows from both ends in all n views,
+        interpolated between views and columns.
 
         Args:
             group: number of the group of rows.
@@ -461,7 +495,7 @@ class ConjugateRays:
             columns: (k,) [px].
 
         Returns:
-            Values read forwards and from the opposite side, (n, k) each.
+            Line integrals read forwards and from the opposite side, (n, k) each.
         """
         view = self.scan.view(values)
         middle = (np.array(self.scan.shape[::-1]) - 1) / 2
@@ -485,12 +519,13 @@ class ConjugateRays:
         )
 
     def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
-        """Interpolate one group of rows between views and columns.
+        """Interpolate one group of rows between views (cyclic) and columns by cubic
+        splines.
 
         Args:
             group: number of the group.
-            view: (n, k) view numbers, also between two.
-            columns: (k,) or (n, k) columns of the panel [px].
+            view: (n, k) view numbers, also between two and beyond a turn.
+            columns: (k,) or (n, k) columns of the panel [px]; those off it take its edge.
 
         Returns:
             (n, k) line integrals.
@@ -506,14 +541,16 @@ class ConjugateRays:
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
-    """Compute a ratio of sums, and its sigma from leaving out each term.
+    """Compute a ratio of sums, and its sigma from leaving out each term (jackknife), 1e-6
+    at least.
 
     Args:
         moved: (n,) terms of the numerator, by sector or row.
         told: (n,) terms of the denominator.
 
     Returns:
-        Ratio and sigma; 0 and inf where one term has all of the denominator.
+        Ratio and sigma; 0 and inf where the denominator, or it without one term, is not
+        positive.
     """
     count = len(told)
     rest = told.sum() - told
@@ -525,16 +562,17 @@ def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
 
 
 def _evenly(band: FloatArray, azimuth: FloatArray) -> tuple[FloatArray, float]:
-    """Sort views by their azimuth, and interpolate them at even steps over a turn.
+    """Sort views by their azimuth, and interpolate them linearly at even steps over a
+    turn.
 
-    Nearly even ones are returned sorted, not interpolated.
+    Steps that differ by less than 2 % are taken as even: those views are only sorted.
 
     Args:
         band: (n, groups, cols).
         azimuth: (n,) [rad].
 
     Returns:
-        The views, and the step [rad].
+        The views, perhaps of another number, and the step [rad].
     """
     around = azimuth % (2 * math.pi)
     order = np.argsort(around, kind="stable")

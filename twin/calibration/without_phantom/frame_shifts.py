@@ -43,9 +43,10 @@ class Shifts(NamedTuple):
 def find_shifts(
     pairs: PlanePairs, at: FloatArray, angle: FloatArray, random: np.random.Generator
 ) -> Shifts:
-    """Estimate the shifts of all frames, without those that an offset of the object explains.
+    """Estimate the shifts of all frames, without those that an offset of the object
+    explains (constant, cosine and sine of the angle).
 
-    Values are reduced by the part that noise has in them.
+    Values are reduced by the part that noise and disagreement have in them.
 
     Args:
         pairs: the frames' pairs.
@@ -54,8 +55,9 @@ def find_shifts(
         random: for the image of noise.
 
     Returns:
-        Shifts right and down [px] with sigmas, and the evidence of each direction; 0 and nan in
-        a direction without evidence.
+        Shifts right and down with sigmas [px of the binned frames], and the evidence of
+        each direction (gain in log likelihood). In a direction of no more than
+        `MIN_EVIDENCE`, or less than `MIN_SQUARE_RATIO`, shifts are 0 and sigmas nan.
     """
     n = len(angle)
     modes = np.column_stack([np.ones(n), np.cos(angle), np.sin(angle)])
@@ -95,9 +97,10 @@ class _System:
     """Equations for changes of shifts, at given ones."""
 
     def __init__(self, pairs: PlanePairs, at: FloatArray, shifts: FloatArray) -> None:
-        """Set up the normal equations of shifts of all frames.
+        """Set up the normal equations of shifts of all frames, with pairs of one distance
+        weighted by their usual disagreement.
 
-        A weak prior about no shift keeps them solvable.
+        A weak prior about no change keeps them solvable.
 
         Args:
             pairs: of views.
@@ -132,16 +135,15 @@ class _System:
         return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)
 
     def _slopes(self, sums: Float32Array) -> FloatArray:
-        """Compute the change of the differences with both shifts of the first view, then of the
-        second.
-
-        For each of q pairs, right and down.
+        """Compute the change of the differences with both shifts of the first view, then
+        of the second, by central differences of a pixel.
 
         Args:
             sums: running sums of the images.
 
         Returns:
-            (q, 4, k).
+            (q, 4, k): for each of q pairs right and down of the first view, right and
+            down of the second.
         """
         parts = []
         for first in (6, 9):
@@ -160,8 +162,11 @@ class _System:
         return np.stack([parts[a][side] for side in (0, 1) for a in (0, 1)], axis=1)
 
     def share(self, noise: Float32Array) -> FloatArray:
-        """Compute the share of noise in the squared slopes for either shift (columns,
-        rows), (2,).
+        """Compute the share of noise in the squared slopes for either shift (right,
+        down), (2,).
+
+        Args:
+            noise: images of noise, laid out as `PlanePairs.sums`.
         """
         own, all_ = (
             np.einsum("qak,qak,q->a", slopes, slopes, self.weight)
@@ -176,8 +181,14 @@ class _System:
         return self._difference(self.pairs.integrals(self.at, self.views, sums)[0])
 
     def solve(self, rest: FloatArray) -> FloatArray:
-        """Solve by weighted least squares for the frames' shifts (n, 2) that would leave
-        such differences (q, k).
+        """Solve by weighted least squares for the frames' shifts that would leave such
+        differences.
+
+        Args:
+            rest: (q, k).
+
+        Returns:
+            (n, 2) right and down [px].
         """
         right = np.zeros(len(self.normal))
         np.add.at(

@@ -52,17 +52,21 @@ def find_gap(
 ) -> GapFound:
     """Find the gap between two tiles of the panel, if there is one.
 
-    The gap is marked as beside the axis if its place leaves the width to the prior.
-    Hidden ones are judged only if none was found and none is closed.
+    A gap counts if single frames show it and both ends of rays agree, if it is a likely
+    hidden one, or if both ends of rays show a significant step. Its width is that of both
+    ends of rays. The gap is marked as beside the axis if its place leaves the width to
+    the prior. Hidden ones are judged only if none is closed.
 
     Args:
         rays: both ends of rays of a turn.
-        values: parameters of the plane of symmetry in the order of `circular_scan.FREE`, (k,).
+        values: parameters of the plane of symmetry in the order of `circular_scan.FREE`,
+            (k,).
         frames: line integrals of `tile_gap.averaged_rows`, some of the turn.
         closed: columns of borders next to which the images are filled in.
 
     Returns:
-        The gap, None without; and the judgement of gaps that stay hidden.
+        The gap, None without; and the judgement of gaps that stay hidden, None with a
+        gap.
 
     Raises:
         NotIdentifiableError: there are two gaps.
@@ -107,13 +111,15 @@ def find_gap(
 
 
 def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:
-    """Check whether both ends of rays agree with a gap that single frames show.
+    """Check whether both ends of rays agree with a gap that single frames show: a step
+    (beyond `SIGMAS`) of its sign, or, within two smoothings of the axis, no step and too
+    little precision to see one.
 
     Args:
         gap: column and width [px].
         profile: steps that both ends of rays show.
         axis: its column [px].
-        smoothing: of the profile [px]; gaps close to the axis need no step.
+        smoothing: of the profile [px].
     """
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
@@ -123,7 +129,14 @@ def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> boo
 
 
 def _refuted(gap: Gap, profile: Profile, axis: float) -> bool:
-    """Check whether both ends of rays leave less than half of a gap that single frames show."""
+    """Check whether both ends of rays leave less than half of the width of a gap that
+    single frames show, with `SIGMAS` to spare.
+
+    Args:
+        gap: column and width [px].
+        profile: steps that both ends of rays show.
+        axis: its column [px].
+    """
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
     return step.width * float(np.sign(beside)) + SIGMAS * step.sigma < gap.width / 2
@@ -153,7 +166,8 @@ def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
         gap: first estimate.
 
     Returns:
-        The gap with width and sigma [px] of the last round that could be read.
+        The gap with width (0 or more) and sigma [px] of the last round that could be read
+        and was no less sure than the one before; `gap` itself if none was.
     """
     for _ in range(ROUNDS):
         closed, again = _closed(rays, values, gap.column, gap.width)
@@ -173,18 +187,16 @@ def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
 def _require_one(
     rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequence[Gap]
 ) -> None:
-    """Check that no other gap is left when one is closed.
-
-    A gap is one between two panel tiles.
+    """Check that no other gap between panel tiles is left when one is closed.
 
     Args:
         rays: both ends of rays of a turn.
         values: parameters of the plane.
         gap: to close.
-        others: further gaps seen in frames.
+        others: further gaps seen in frames; any is one too many.
 
     Raises:
-        NotIdentifiableError: there is another gap.
+        NotIdentifiableError: there is another gap; names the columns of two.
     """
     closed, again = _closed(rays, values, gap.column, gap.width)
     profile = closed.profile(again)

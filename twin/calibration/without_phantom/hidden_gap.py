@@ -133,11 +133,11 @@ class Evidence:
 def hidden_gap(
     frames: Sequence[Float32Array], axis: float, profile: Profile | None, smoothing: float
 ) -> HiddenGap | None:
-    """Judge the gaps that both ends of rays do not reveal; None for images of too few columns.
+    """Judge the gaps between panel tiles that both ends of rays do not reveal, near the
+    axis.
 
-    A gap is one between panel tiles. The result has the range of columns in which one may
-    be hidden, its probability, the error of the axis column [px], and the likeliest gap
-    if it is likely enough.
+    Compared are the likelihoods by single frames and by both ends of rays, without those
+    that outlines explain, with a prior of `CHANCE`.
 
     Args:
         frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
@@ -145,6 +145,11 @@ def hidden_gap(
         profile: distances between both ends of rays; None: too little of the object
             turns.
         smoothing: sigma of the columns' smoothing in the profile [px].
+
+    Returns:
+        The range of columns in which one may be hidden, its probability, its root mean
+        square width, and the likeliest gap if its odds exceed `REPORTED_ODDS`; None for
+        images of too few columns about the axis.
     """
     if profile:
         reach = _hidden_radius(profile, smoothing)
@@ -185,15 +190,28 @@ def hidden_gap(
 
 
 def _gap_at(column: int, share: FloatArray) -> Gap:
-    """Return the gap at a column from the probabilities of its widths (w,)."""
+    """Make the gap at a column: mean width and standard deviation, at least that of
+    `local_sigma`.
+
+    Args:
+        column: first column beyond the gap.
+        share: probabilities of WIDTHS_PX, (w,).
+    """
     width = float(share @ WIDTHS_PX)
     spread = math.sqrt(float(share @ np.square(WIDTHS_PX - width)))
     return Gap(column, width, max(spread, float(local_sigma(width))))
 
 
 def _hidden_radius(profile: Profile, smoothing: float) -> float:
-    """Return the distance from the axis up to which both ends of rays do not determine
-    steps [px].
+    """Find the distance from the axis up to which both ends of rays do not determine
+    steps to `MIN_HIDDEN_PX` [px].
+
+    Args:
+        profile: steps that they show.
+        smoothing: of the profile [px].
+
+    Returns:
+        At least twice the smoothing; the largest radius if no step is determined.
     """
     told = np.array(
         [SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX for r in profile.radii.tolist()]
@@ -205,12 +223,15 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
 
 
 def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
-    """Return the evidence (w, c) that outlines leave, where edges turn back at both sides of
-    the axis: that of the border at the other side.
+    """Compute the evidence that outlines leave, where edges turn back at both sides of
+    the axis: the largest about the mirrored border, 0 or more.
 
     Args:
         found: logarithm of the likelihood of a gap over none, (w, c).
         beside: of each border from the axis, even steps of a column, (c,) [px].
+
+    Returns:
+        (w, c); 0 for borders within `SIDE` of the axis or without a mirrored one.
     """
     places = np.arange(len(beside))
     mirror = np.rint(-2.0 * beside).astype(np.intp) + places
@@ -222,8 +243,16 @@ def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
 def _evidence_of_rays(
     columns: npt.NDArray[np.intp], axis: float, profile: Profile
 ) -> FloatArray:
-    """Compute log likelihood ratios (w, c), of a gap of each width at each column to
-    none, from the steps of both ends of rays.
+    """Compute log likelihood ratios of a gap of each width at each column to none, from
+    the steps of both ends of rays (Student).
+
+    Args:
+        columns: (c,) first columns beyond a gap.
+        axis: column of the axis [px].
+        profile: steps that both ends of rays show.
+
+    Returns:
+        (w, c).
     """
     beside = columns - 0.5 - axis
     steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
@@ -236,11 +265,15 @@ def _evidence_of_rays(
 def _evidence(images: FloatArray) -> Evidence:
     """Judge gaps by single frames.
 
-    All places with most change tell whether there is a gap. Whether one would be visible
-    is told by the edges among them that pass its border: noise shows none.
+    The `EDGE_SHARE` of all places with most change (at most `MOST_EDGES`) tell whether
+    there is a gap. Whether one would be visible is told by the edges among them that pass
+    its border: noise shows none. The larger evidence of both counts.
 
     Args:
         images: frames of columns about the axis, (n, rows, c + 2 SIDE - 1).
+
+    Returns:
+        By width and border, (w, c).
     """
     table = (images - images.mean(axis=0)).reshape(-1, images.shape[2])
     around = np.lib.stride_tricks.sliding_window_view(
@@ -264,9 +297,8 @@ def _evidence_of(
     frames: int,
     evenly: bool,
 ) -> Evidence:
-    """Judge gaps by some of the differences of neighbouring columns.
-
-    Zero evidence if no difference counts.
+    """Judge gaps by some of the differences of neighbouring columns, for all WIDTHS_PX,
+    averaged over BLURS_PX.
 
     Args:
         around: differences about each border, (m, c, 2 SIDE - 1).
@@ -274,6 +306,9 @@ def _evidence_of(
         seen: those that count, (m, c).
         frames: number of frames, of m / frames rows each.
         evenly: a gap would be as visible at each border; else by the number that counts.
+
+    Returns:
+        By width and border; zero evidence if no difference counts.
     """
     row, border = np.nonzero(seen)
     places = power.shape[1]
@@ -327,7 +362,8 @@ def _beside_others(gains: FloatArray, count: FloatArray) -> Judged:
 
     Args:
         gains: in log likelihood of a gap over none, by frame and border, (n, c).
-        count: edges that pass each border, (c,): so visible a gap would be there.
+        count: edges that pass each border, (c,): so visible a gap would be there; one
+            above 0 at least.
     """
     whole = gains.sum(axis=0)
     passed = np.maximum(count, 1.0)

@@ -81,7 +81,11 @@ def mirror_map(view: FloatArray) -> FloatArray:
 
 
 def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
-    """Find the column about which the mean is most symmetric.
+    """Find the column, to half a pixel, about which the mean is most symmetric, within
+    `REACH` of the nominal one.
+
+    Compared are bands of rows, smoothed; columns with less than `MIN_OVERLAP` of the
+    panel mirrored are not tried.
 
     Args:
         mean: (rows, cols).
@@ -89,7 +93,7 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
 
     Returns:
         The column, and the ratio of the squares of the next best column's asymmetry to
-        its own; 0 if the best is at the end of the search.
+        its own: inf without another, 0 if the best is at the end of the search.
     """
     cols = mean.shape[1]
     bands = np.stack([b.mean(axis=0) for b in np.array_split(mean, min(12, len(mean)))])
@@ -111,15 +115,15 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
 
 
 def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
-    """Find the least cost, and how much higher the next minimum is.
+    """Find the least cost, and how much higher the next local minimum is.
 
     Args:
-        cost: (n,) costs of equally spaced trials.
+        cost: (n,) costs of equally spaced trials; inf: not tried.
         apart: least distance between two minima, in trials.
 
     Returns:
-        Index of the least cost, and the next minimum's cost over it: inf without another, 0 if
-        the least cost is at an end.
+        Index of the least cost, and the next minimum's cost over it: inf without another,
+        0 if the least cost is at an end or next to a trial that was not made.
     """
     best = int(cost.argmin())
     inner = cost[1:-1]
@@ -142,20 +146,24 @@ def find_symmetry(
     border: int | None = None,
     held_px: float | None = None,
 ) -> Symmetry:
-    """Estimate the plane of symmetry, coarse to fine.
+    """Estimate the plane of symmetry from coarse to fine smoothings (LEVELS), each from
+    the last one's values; without a border the search ends at the first that does not
+    converge.
 
     Args:
         turn: the frames' mean.
         view: parameters to a view.
         start: of the parameters, (k,).
-        scales: change of each parameter that moves the image's ends by about a pixel, (k,).
+        scales: change of each parameter that moves the image's ends by about a pixel,
+            (k,).
         priors: sigma of each parameter about its start, inf for none, (k,).
-        border: first column beyond a gap between two tiles, whose width is the last parameter
-            [px].
+        border: first column beyond a gap between two tiles, whose width is the last
+            parameter [px].
         held_px: that width, where it is no parameter [px].
 
     Returns:
-        The estimate of the level with the best first two parameters.
+        The estimate of the level that determines the first two parameters best among the
+        converged ones; the coarsest, not converged, if none did.
     """
     found = []
     values = start
@@ -186,7 +194,8 @@ class _Level:
         border: int | None,
         held_px: float | None,
     ) -> None:
-        """Smooth the mean image by `sigma` and choose the places that are compared.
+        """Smooth the mean image by `sigma` and choose the places that are compared, two a
+        sigma each way and two sigmas from the edges.
 
         Args:
             turn: mean image with its doubts and noise.
@@ -195,7 +204,7 @@ class _Level:
             mean: (p,) means of the priors.
             priors: (p,) standard deviations.
             sigma: smoothing [px].
-            border: column of a gap in the panel; None without.
+            border: first column beyond a gap in the panel; None without.
             held_px: width of that gap if it is fixed.
         """
         self.view = view
@@ -226,16 +235,18 @@ class _Level:
         self.at = np.stack([a.ravel() for a in np.meshgrid(c, r)]).astype(np.float64)
 
     def solve(self, start: FloatArray) -> Symmetry:
-        """Find the root of the estimating equation.
+        """Find the root of the estimating equation, with the priors as observations.
 
         Stops after `ROUNDS`, at a step well below the uncertainty (converged), at values
-        that are not finite, or if the slopes are singular; the last estimate is returned.
+        that are not finite, or if the slopes are singular; steps move the image by at
+        most four sigmas of the smoothing.
 
         Args:
-            start: of the parameters, (k,).
+            start: of the parameters, (k,); not changed.
 
         Returns:
-            The plane; not converged if the pixels with a mirror image are too few.
+            The last estimate; not converged, perhaps with infinite covariance, if the
+            pixels with a mirror image are too few.
         """
         values = start.copy()
         k = len(start)
@@ -279,13 +290,16 @@ class _Level:
         return found
 
     def _mirrored(self, values: FloatArray, at: FloatArray) -> FloatArray:
-        """Compute mirror images (2, k) of pixels, across a gap if there is one.
-
-        The gap is that between two panel tiles: fixed, or the last parameter.
+        """Compute mirror images of pixels, across a gap between two panel tiles if there
+        is one: fixed, or the last parameter.
 
         Args:
             values: parameters.
             at: (2, k) columns and rows.
+
+        Returns:
+            (2, k) columns and rows, perhaps off the panel; images in the gap are at its
+            border.
         """
         middle = (np.array(self.shape[::-1]) - 1)[:, None] / 2
         begins = math.inf
@@ -310,7 +324,13 @@ class _Level:
 
     def _pairs(self, here: FloatArray) -> _MirrorPairs | None:
         """Collect the pixels with a mirror image well on the panel, each pair once, away
-        from a tile's border; None if they are too few.
+        from a tile's border.
+
+        Args:
+            here: parameters.
+
+        Returns:
+            None for fewer than 100 pairs or `MIN_OVERLAP` / 4 of the places.
         """
         image = self._mirrored(here, self.at)
         room = 4.0 * self.sigma + self.margin
@@ -330,8 +350,8 @@ class _MirrorPairs:
     def __init__(self, level: _Level, here: FloatArray, at: FloatArray) -> None:
         """Mirror places and read both ends, their weights and slopes.
 
-        Weights are less where noise, or steps between panel parts, are larger; odd
-        polynomials are taken out of the slopes.
+        Weights are less where noise, or steps between rows or columns, are larger; odd
+        polynomials, errors of the flat field, are taken out of the slopes.
 
         Args:
             level: smoothed images.
@@ -374,8 +394,10 @@ class _MirrorPairs:
         return np.asarray(self.own[which] - read_spline(self.level.soft[which], image))
 
     def score(self, values: FloatArray) -> FloatArray:
-        """Evaluate the estimating equation at some parameters: the difference of mirrored pairs
-        along its slopes, less what noise adds.
+        """Evaluate the estimating equation at some parameters: the weighted difference of
+        mirrored pairs along its slopes, less what noise adds.
+
+        Weights and slopes stay those of `here`.
 
         Args:
             values: (p,) parameters.
@@ -400,14 +422,16 @@ class _MirrorPairs:
         return np.asarray(rest - self.odd @ (self.to_odd @ rest))
 
     def _power(self) -> tuple[float, float]:
-        """Compute mean squares of the residual and of noise alone."""
+        """Compute weighted mean squares of the residual (without odd polynomials), and of
+        noise alone, above 0.
+        """
         white = (self.white[0] + self.white[1]) / (4.0 * math.pi * self.level.sigma**2)
         rest = float(np.average(np.square(self._rest()), weights=self.w))
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
     def asymmetry(self) -> float:
-        """Compute how much mirrored pairs differ beyond noise, as a share of the images'
-        structure.
+        """Compute the root mean square by which mirrored pairs differ beyond noise, over
+        that of the image about its mean; 0 if noise explains it.
         """
         rest, noise = self._power()
         own = self.own[0] - np.average(self.own[0], weights=self.w)
@@ -417,12 +441,15 @@ class _MirrorPairs:
     def covariance(self, inverse: FloatArray) -> FloatArray:
         """Compute the covariance of the parameters from noise and doubts.
 
-        Errors of steps at edges, and of systematic doubts, are added.
-
-        The noise is widened where blocks scatter more or residuals are larger.
+        The noise is widened where blocks of rows or columns scatter more or residuals are
+        larger. Errors of sampling at edges (the diagonal alone), and of systematic doubts
+        of the mean, are added.
 
         Args:
             inverse: (k, k) of the slopes of the equation.
+
+        Returns:
+            (k, k).
         """
         z = self.slopes * self.w[:, None]
         images = np.stack([self._spread(column) for column in z.T])
@@ -461,10 +488,13 @@ class _MirrorPairs:
 
     def _spread(self, column: FloatArray) -> FloatArray:
         """Compute the image whose product with the mean is column' r (smoothing and
-        reading, adjoint).
+        reading, linear, adjoint).
 
         Args:
             column: (m,) of the pairs.
+
+        Returns:
+            (rows, cols).
         """
         rows, cols = self.level.shape
         out = np.zeros(rows * cols)
@@ -489,7 +519,8 @@ def sharpness(mean: FloatArray) -> float:
         mean: line integrals, (rows, cols).
 
     Returns:
-        1 for pixels that are points, 0.4 for square ones without blur, 0 without edges.
+        1 for pixels that are points, 0.4 for square ones without blur, 0 without edges
+        above the noise.
     """
     noise = np.full(mean.shape, np.median(_noise(mean)) / MEDIAN_OF_CHI_SQUARE)
     edges, left = _edges(mean, noise)
@@ -522,11 +553,11 @@ def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
 
     Args:
         mean: (rows, cols) mean image.
-        noise: its variance; weaker edges count as 0.
+        noise: its variance, (rows, cols); edges below `MIN_EDGE_SIGMAS` count as 0.
 
     Returns:
-        Edges (rows, cols), and the strength at half the sampling's frequency over that at a
-        quarter, at most 1.
+        Edges (rows, cols), and the strength at half the sampling's frequency over that at
+        a quarter, at most 1; 0 without edges.
     """
     change = np.diff(mean, axis=0, append=mean[-1:])
 

@@ -83,7 +83,8 @@ class OppositeRays:
         priors: FloatArray,
         random: np.random.Generator,
     ) -> None:
-        """List the pairs of views that see a line from both ends.
+        """List the pairs of views that may see a line from both ends, at most
+        `MOST_PAIRS`, and draw an image of noise.
 
         Args:
             frames: (n, rows, cols) line integrals of a band of rows.
@@ -96,7 +97,8 @@ class OppositeRays:
             random: for images of noise.
 
         Raises:
-            NotIdentifiableError: too few pairs; the message names a turn that would do.
+            NotIdentifiableError: fewer than `FEWEST_PAIRS` see a line from both ends at
+                the start; the message names a turn that would do.
         """
         self.frames = frames
         self.top = top
@@ -127,11 +129,12 @@ class OppositeRays:
             )
 
     def first(self) -> tuple[FloatArray, float]:
-        """Find the start parameters, with the axis column about which opposite rays agree
-        best, and the ratio of its disagreement to the next best column's; see
-        `first_column`.
+        """Find the start parameters with the axis column about which opposite rays agree
+        best; columns within `REACH` of the start are tried.
 
-        Columns within `REACH` of the start are tried.
+        Returns:
+            The parameters, and the ratio of the next best column's disagreement to its
+            own; see `best_dip`.
         """
         cols = self.shape[1]
         level = _Level(self, cols / LEVELS[0])
@@ -143,9 +146,15 @@ class OppositeRays:
         return tried[best], ratio
 
     def find(self, values: FloatArray) -> Symmetry:
-        """Estimate the parameters from coarse to fine images; returns the level with the
-        least sigma of the first parameter among those that converged (the first, if
-        none did).
+        """Estimate the parameters from coarse to fine images, each from the last
+        converged values.
+
+        Args:
+            values: (k,) to start from.
+
+        Returns:
+            The level with the least sigma of the first parameter among those that
+            converged; the first, not converged, if none did.
         """
         found = []
         for part in LEVELS:
@@ -159,14 +168,13 @@ class OppositeRays:
     ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Locate the other's source in each view of pairs.
 
-        Only columns are checked for the panel's range.
-
         Args:
             values: parameters, (k,).
             pairs: of views, (q, 2).
 
         Returns:
-            Columns and rows (2, 2, q), and whether both panels contain them (q,).
+            Columns and rows (side, column and row, q) [px], and whether the columns are
+            on both panels (q,); rows are not checked.
         """
         rows = self.views(values)
         out = np.empty((2, 2, len(pairs)))
@@ -196,8 +204,15 @@ class _Level:
         self.images, self.alone = (self._soft(i) for i in (rays.frames, rays.noise))
 
     def _soft(self, images: Float32Array) -> FloatArray:
-        """Compute spline coefficients of all images, smoothed by the level's sigma,
-        stacked below each other with mirrored rows between.
+        """Compute spline coefficients of all images, smoothed by the level's sigma along
+        rows and columns, stacked below each other with `EDGE_ROWS` mirrored rows on
+        either side.
+
+        Args:
+            images: (n, rows, cols).
+
+        Returns:
+            (n (rows + 2 EDGE_ROWS), cols) float32.
         """
         soft = gaussian_filter(images, (0, self.sigma, self.sigma))
         for axis in (1, 2):
@@ -208,11 +223,12 @@ class _Level:
     def read(
         self, image: FloatArray, places: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> FloatArray:
-        """Read the values of both views of pairs.
+        """Read the values of both views of pairs by cubic splines; rows off the band take
+        its edge.
 
         Args:
             image: spline coefficients of all views, one above the other.
-            places: (2, q, 2) column and row in each view [px].
+            places: (side, column and row, q) [px of the panel].
             pairs: (q, 2) numbers of the views.
 
         Returns:
@@ -229,8 +245,12 @@ class _Level:
         return read_spline(image, np.stack([column, row]))
 
     def disagreement(self, values: FloatArray, pairs: npt.NDArray[np.intp]) -> float:
-        """Compute the mean square of the differences over that of the images; infinite
-        for few rays.
+        """Compute the mean square of the differences of both ends over the variance of
+        the values; infinite for fewer than half of `FEWEST_PAIRS` rays.
+
+        Args:
+            values: parameters, (k,).
+            pairs: of views, (q, 2); those off the panel do not count.
         """
         places, inside = self.rays._places(values, pairs)
         if inside.sum() < FEWEST_PAIRS // 2:
@@ -239,16 +259,18 @@ class _Level:
         return float(np.square(both[0] - both[1]).mean() / max(both.var(), 1e-30))
 
     def solve(self, start: FloatArray) -> Symmetry:
-        """Find the root of the estimating equation.
+        """Find the root of the estimating equation, with the priors as observations.
 
-        Stops after `ROUNDS`, at a step well below the first sigma (converged), or if
-        pairs are too few or have too little signal.
+        Stops after `ROUNDS`, at a step of the first parameter well below its sigma
+        (converged), with fewer than `FEWEST_PAIRS` pairs, too little signal
+        (`MIN_SIGNAL_RATIO`), or values that are not finite.
 
         Args:
-            start: of the parameters, (k,).
+            start: of the parameters, (k,); not changed.
 
         Returns:
-            The estimate; not converged with few pairs.
+            The last estimate; not converged, with infinite covariance if no step was
+            made.
         """
         rays = self.rays
         values = start.copy()
@@ -292,9 +314,11 @@ class _Level:
     def _equations(
         self, values: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Compute differences and slopes of pairs, and those of noise.
+        """Compute differences and slopes of pairs, and those of noise, weighted by photon
+        counts.
 
-        Odd polynomials across the panel are taken out; sets `structure`.
+        Odd polynomials across the panel are taken out. Sets `structure`, the weighted
+        squares of the values about their mean.
 
         Args:
             values: parameters, (k,).
@@ -341,9 +365,13 @@ class _Level:
         """Bound the sum of slopes times differences that are no noise: in phase within a
         patch (Cauchy-Schwarz), at random from patch to patch.
 
+        A patch is `PATCH` sigmas of the distance between both columns by one of `SECTORS`
+        sectors.
+
         Args:
             slope: of the differences with the column, (m,).
-            excess: squares of the differences less those of noise, (m,).
+            excess: squares of the differences less those of noise, (m,); negative sums
+                count as 0.
             w: weights, (m,).
             pairs: of views, (q, 2).
             values: parameters, (k,).
@@ -365,15 +393,18 @@ class _Level:
         pairs: npt.NDArray[np.intp],
         values: FloatArray,
     ) -> FloatArray:
-        """Compute the covariance of sums over all rays of slopes times differences.
-
-        It contains the noise of the flat field, which all frames share.
+        """Compute the covariance of sums over all rays of slopes times differences: from
+        the scatter of pairs, widened where distances or frames scatter more, and the
+        noise of the flat field, which all frames share.
 
         Args:
             slopes: weighted, (k, m).
             rest: differences, (m,).
             pairs: of views, (q, 2).
             values: parameters, (k,).
+
+        Returns:
+            (k, k).
         """
         rays = self.rays
         of_pairs = (len(slopes), len(pairs), -1)

@@ -33,18 +33,21 @@ def sum_planes(
 ) -> None:
     """Integrate both views of each pair over bins of planes.
 
-    The rows that a bin covers follow from its two planes column by column; sums of g down each
-    column then give its share without a walk along them, and pixels are cut where planes cut
-    them.
+    The rows that a bin covers follow from its two planes column by column; sums of g down
+    each column then give its share without a walk along them, and pixels are cut where
+    planes cut them. Planes off the panel are limited to its edges; columns behind the
+    source add nothing.
 
     Args:
         sums: (n, cols, rows + 1), sums of g from the first row down.
-        views: (n, 12) source, panel's centre, u, v; the axis is z through the origin [mm].
+        views: (n, 12) source, panel's centre, u, v; the axis is z through the origin
+            [mm].
         pairs: (q, 2) indices of views.
-        inwards: (q, 2) horizontal unit vector from the line through the sources to the axis.
+        inwards: (q, 2) horizontal unit vector from the line through the sources to the
+            axis.
         edges: (q, k + 1) dz over distance along `inwards` of the planes between the bins.
-        columns: (n, 2) first column of a view that the object can reach, and the one after
-            them.
+        columns: (n, 2) first column of a view that the object can reach, and the one
+            after them.
         integrals: (q, 2, k) integrals of g, written.
         ones: the same of 1 instead of g, written.
     """

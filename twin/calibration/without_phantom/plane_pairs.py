@@ -72,20 +72,20 @@ class PlanePairs:
         views: Views,
         start: FloatArray,
     ) -> None:
-        """List pairs of views whose sources' connection is clear of the object, and the planes
-        through it.
-
-        Also raised if the object reaches beyond the panel in most pairs' planes.
+        """List pairs of views whose sources' connection is clear of the object, and the
+        bins of planes through it.
 
         Args:
-            frames: (n, rows, cols) line integrals, binned.
+            frames: (n, rows, cols) line integrals, binned, sorted by angle.
             mean: image over the turn, not binned.
             factor: of the binning.
             views: geometry of parameters.
             start: (p,) parameters to start from.
 
         Raises:
-            NotIdentifiableError: the object reaches so far that too few pairs are clear of it.
+            NotIdentifiableError: the object reaches so far that fewer than n pairs are
+                clear of it, it reaches beyond the panel in the planes of more than 1 -
+                `FEWEST_PAIRS` of them, or there is nothing but air.
         """
         self.shape = mean.shape
         self.factor = factor
@@ -149,12 +149,15 @@ class PlanePairs:
         rows: FloatArray | None = None,
         sums: Float32Array | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Compute integrals of both views of each pair, (q, 2, k), and those of 1, (q, k).
+        """Compute integrals of both views of each pair over bins of planes.
 
         Args:
             at: arguments of `views`; the planes rise with the panel's height.
             rows: views to use instead, (n, 12).
             sums: of other images, laid out as `self.sums`.
+
+        Returns:
+            Integrals (q, 2, k), and those of 1, the mean of both views, (q, k).
         """
         edges = (self.heights + self.rise * (at[0] - self.start[0])) / self.away[:, None]
         found, ones = np.zeros((2, len(self.pairs), 2, edges.shape[1] - 1))
@@ -169,16 +172,16 @@ class PlanePairs:
         return found, ones.mean(axis=1)
 
     def costs(self, at: FloatArray, sums: Float32Array | None = None) -> FloatArray:
-        """Compute sums of squared differences, without offsets common to all bins (air
-        that is not 0).
+        """Compute sums of squared differences between both views, without offsets common
+        to all bins (air that is not 0); bins that are not valid do not count.
 
         Args:
             at: arguments of `views`.
             sums: of other images, laid out as `self.sums`.
 
         Returns:
-            For each of `LEVELS`, of each pair and then of each distance and block of heights,
-            (levels, q + distances * BLOCKS).
+            For each of `LEVELS`, of each pair and then of each distance and block of
+            heights, (levels, q + distances * BLOCKS).
         """
         found, ones = self.integrals(at, sums=sums)
         rest = found[:, 0] - found[:, 1]
@@ -203,6 +206,9 @@ class PlanePairs:
     def scales(self, costs: FloatArray) -> FloatArray:
         """Compute 1 / usual cost of pairs as far apart as each one, laid out as `costs`;
         0 where that cost is 0.
+
+        Args:
+            costs: of `costs`.
         """
         pairs = costs[:, : len(self.pairs)]
         usual = np.add.reduceat(pairs, self.starts, axis=1) / self.sizes
@@ -220,13 +226,15 @@ class PlanePairs:
         return parts[..., len(self.pairs) :].reshape(*parts.shape[:-1], -1, BLOCKS)
 
     def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
-        """Estimate standard deviations of `total`.
-
-        The widest of the estimates counts.
+        """Estimate standard deviations of `total`; the widest of the estimates counts.
 
         Args:
             parts: (..., q + distances * BLOCKS).
-            blocks: whether sums over heights and over distances count too.
+            blocks: whether sums over heights and over distances count too, not only those
+                over frames and sectors.
+
+        Returns:
+            (...).
         """
         worst = np.square(
             spread(parts[..., : len(self.pairs)], self.pairs, len(self.sums))
@@ -253,11 +261,16 @@ class PlanePairs:
     def _valid(
         self, here: FloatArray, border: tuple[FloatArray, FloatArray, FloatArray]
     ) -> npt.NDArray[np.bool_]:
-        """Mark bins of planes that leave the panel of neither view within the object, (q, k).
+        """Mark bins of planes that leave the panel of neither view within the object,
+        with two bins to spare.
 
         Args:
             here: (n, 12) views.
-            border: places at the object's upper end, lower end and sides, see `_support`.
+            border: places at the object's upper end, lower end and sides, see `_support`;
+                empty where the object ends on the panel.
+
+        Returns:
+            (q, k) bool.
         """
         edges = self.heights
         step = float(np.diff(self.heights).mean())
@@ -267,9 +280,15 @@ class PlanePairs:
         for v in (here[self.pairs[:, 0]], here[self.pairs[:, 1]]):
 
             def heights(at: FloatArray, v: FloatArray = v) -> FloatArray:
-                """Compute the heights on the detector, times `away`, in which rays from
-                each source reach the points `at` (their two coordinates along the
-                detector's axes).
+                """Compute dz over the distance inwards, times `away`, of rays from each
+                source to points on its panel.
+
+                Args:
+                    at: (k, 2) columns and rows from the panel's centre.
+                    v: (q, 12) views.
+
+                Returns:
+                    (q, k) [mm].
                 """
                 to = v[:, None, 3:6] - v[:, None, :3] + at[:, :1] * v[:, None, 6:9]
                 to = to + at[:, 1:] * v[:, None, 9:12]
@@ -290,10 +309,18 @@ class PlanePairs:
 
 
 def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Array:
-    """Draw noise as large as that of images (n, cols, rows).
+    """Draw noise as large as that of images.
 
-    Its variance grows as 1 / exp(-g), as that of counted photons; its size is the median
-    over all pixels of second differences along rows, so mostly of air.
+    Its variance grows as 1 / exp(-g), as that of counted photons, up to `DARKEST`; its
+    size is the median over all pixels of second differences along the second axis, so
+    mostly of air.
+
+    Args:
+        images: line integrals (n, cols, rows).
+        random: generator, advanced.
+
+    Returns:
+        New images of that shape.
     """
     power = np.exp(np.minimum(images, DARKEST))
     change = np.square(np.diff(images, 2, axis=1)) / 6
@@ -305,8 +332,9 @@ def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Arra
 def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray:
     """Estimate standard deviations of sums over pairs of frames.
 
-    Pairs that share a frame, or one of a sector, are not independent: of squares of the sums
-    over all that do, those that count pairs twice are taken away. The largest of three counts.
+    Pairs that share a frame, or one of `SECTORS` sectors, are not independent: of squares
+    of the sums over all that do, those that count pairs twice are taken away. The largest
+    of three counts: independent pairs, frames, sectors.
 
     Args:
         parts: (..., q) terms of the sums.
@@ -332,8 +360,15 @@ def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray
 def without(
     part: FloatArray, whole: FloatArray, used: npt.NDArray[np.bool_] | None = None
 ) -> FloatArray:
-    """Subtract from `whole` (..., k), where it is used, its part along `part`; 0 with
-    hardly any used.
+    """Subtract from `whole`, where it is used, its part along `part`.
+
+    Args:
+        part: (..., k).
+        whole: (..., k).
+        used: (..., k); None: all.
+
+    Returns:
+        (..., k); 0 where not used, and for all with fewer than `FEWEST_BINS` used.
     """
     if used is not None:
         used = used & (used.sum(axis=-1) >= FEWEST_BINS)[..., None]
@@ -352,7 +387,7 @@ def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]
         radius: of the object about the axis [mm].
 
     Returns:
-        (n, 2) first column, and the one after the last.
+        (n, 2) first column, and the one after the last; (0, cols) if it reaches none.
     """
     i = np.arange(cols) - (cols - 1) / 2
     x, y = (
@@ -368,9 +403,11 @@ def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]
 def _support(
     frames: Float32Array, mean: FloatArray, view: FloatArray
 ) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Measure the extent of the object.
+    """Measure the extent of the object, from the mean and from the frames' largest
+    values: what is thin and far from the axis hardly shows in the mean.
 
-    Raises NotIdentifiableError if the images show nothing but air.
+    A pixel shows no air if it exceeds the rim's level by `MAX_AIR_SHARE` of the range or
+    `AIR_SIGMAS` of noise.
 
     Args:
         frames: line integrals (n, rows, cols).
@@ -379,7 +416,11 @@ def _support(
 
     Returns:
         Its radius about the axis [mm], and places (column, row) about the panel's centre
-        at its upper end, its lower end and its sides where the image shows no air.
+        at its upper end, its lower end and its sides where the image shows no air at the
+        panel's edge.
+
+    Raises:
+        NotIdentifiableError: the images show nothing but air.
     """
     rows, cols = mean.shape
     full = np.zeros((rows, cols), dtype=bool)

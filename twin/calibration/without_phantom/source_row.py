@@ -51,6 +51,9 @@ def find_height(
 ) -> tuple[float, float]:
     """Estimate the panel's height above the stated one, and its standard deviation [px].
 
+    The level of smoothing with the least sigma counts; the sigma contains noise, the
+    scatter of other sure levels, and the doubtful parameters.
+
     Args:
         fine: pairs of views.
         coarse: the same binned twice as much, for the search.
@@ -99,19 +102,20 @@ def _settle(
     up: FloatArray,
     random: np.random.Generator,
 ) -> tuple[_Bowl, float, float]:
-    """Find the minimum by steps.
+    """Find the minimum by steps from the best height of a grid, `ROUNDS` at most; the
+    first evaluation is of the coarse pairs.
 
     Args:
         fine, coarse: pairs of views.
-        grid: trial heights [px].
+        grid: trial heights, evenly spaced [px].
         up: direction of the height among the arguments.
         random: for the images of noise.
 
     Returns:
-    The minimum, its place, and the half width of the steps that found it [px].
+        The minimum, its place, and the half width of the steps that found it [px].
 
     Raises:
-        NotIdentifiableError: as `find_height`.
+        NotIdentifiableError: as `find_height`, or if the steps do not settle.
     """
     at = _first(coarse, grid, up, random)
     h = float(grid[1] - grid[0])
@@ -137,7 +141,8 @@ def _first(
     """Find the height on a grid at which the views agree best.
 
     A minimum at the grid's end, or in a spike, does not count. Of the levels the surest
-    one is taken.
+    one is taken; it must be better than any height but its neighbours by
+    `MIN_LEAD_SIGMAS`.
 
     Args:
         pairs: of views.
@@ -145,8 +150,12 @@ def _first(
         up: direction of the height among the arguments.
         random: for the images of noise.
 
+    Returns:
+        The height [px].
+
     Raises:
-        NotIdentifiableError: as `find_height`.
+        NotIdentifiableError: no height is so; the message says by how much the best is
+            better.
     """
     costs = np.stack([pairs.costs(pairs.start + y * up) for y in grid])
     scale = pairs.scales(costs.min(axis=0))
@@ -178,10 +187,11 @@ def _first(
 
 
 def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
-    """Evaluate slope, curvature and sigma of all levels' costs about a height.
+    """Evaluate slope, curvature and sigma of all levels' costs about a height, by
+    differences.
 
     Sigmas are widened where one part of the heights decides, and inf where the curvature
-    is not sure.
+    is below `MIN_BEND_SIGMAS` or two blocks of heights have it all.
 
     Args:
         pairs: of views.
@@ -190,8 +200,8 @@ def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
         up: (p,) the parameters' change by a pixel of height.
 
     Returns:
-        The heights of least cost and their sigmas [px], inf where a level has no minimum, and
-        the curvatures.
+        The heights of least cost and their sigmas [px], inf where a level has no minimum,
+        the curvatures, and the scales of the costs.
     """
     low, mid, high = (pairs.costs(pairs.start + (at + s * h) * up) for s in (-1, 0, 1))
     scale = pairs.scales(mid)

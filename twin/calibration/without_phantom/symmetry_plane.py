@@ -103,8 +103,9 @@ class OppositeColumn(NamedTuple):
 
     @property
     def floor_px(self) -> float:
-        """Systematic part missing in the mean's sigma, as far as opposite
-        rays show it [px]; the mean's own sigma if theirs is infinite.
+        """Systematic part missing in the mean's sigma, as far as opposite rays show it
+        [px]: their distance and sigma, the less the better the mean is known; the mean's
+        own sigma if theirs is infinite.
         """
         if not math.isfinite(self.sigma_px):
             return self.mean_sigma_px
@@ -113,8 +114,8 @@ class OppositeColumn(NamedTuple):
 
     @property
     def warning(self) -> str | None:
-        """Warning that opposite rays and the mean image find different axis columns,
-        beyond their uncertainty; None where they agree.
+        """Warning that opposite rays and the mean image find different axis columns, by
+        more than `APART_SIGMAS` sigmas and `LEAST_APART_PX`; None where they agree.
         """
         sigma = math.hypot(self.mean_sigma_px, self.sigma_px)
         if not abs(self.apart_px) > max(APART_SIGMAS * sigma, LEAST_APART_PX):
@@ -173,7 +174,7 @@ def find_plane(
     """Find the plane of symmetry.
 
     A gap between two panel tiles is fitted along, unless the fit shows that there is
-    none. Also raised if the axis column is too uncertain.
+    none.
 
     Args:
         scan: its images, without distortion.
@@ -181,7 +182,8 @@ def find_plane(
         random: for images of noise.
 
     Raises:
-        NotIdentifiableError: the images are symmetric about no plane, about several, or hardly.
+        NotIdentifiableError: the images are symmetric about no plane, about several, or
+            hardly; the panel has two gaps; or column or roll is too uncertain.
     """
     first = _first_column(scan, random)
     _require_one_column(scan, first)
@@ -203,6 +205,10 @@ def find_plane(
 def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColumn:
     """Search for the axis in the mean over a full turn, or else in opposite rays.
 
+    Args:
+        scan: to align; its frames are read.
+        random: for images of noise.
+
     Raises:
         NotIdentifiableError: neither determines it; the message has both reasons.
     """
@@ -222,6 +228,14 @@ def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColum
 def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
     """Search for the axis's column in the mean image of a full turn, and set the start
     values to it; yaw alone has a prior.
+
+    Args:
+        scan: to align.
+        turn: its frames.
+
+    Returns:
+        With three parameters; ratio 0 if the best column is at the end of the search (not
+        raised here).
     """
     nominal = scan.column(scan.start)
     values = scan.start[:OF_TURN]
@@ -237,13 +251,19 @@ def _first_in_rays(
 ) -> FirstColumn:
     """Search for the axis in opposite rays.
 
-    Roll, yaw and the distances have the given priors; the axis column has none. Sets the
-    roll's scale of `scan.scales` by the columns.
+    Roll, yaw and the distances have the given priors; the axis column has none. The
+    roll's scale is that of the columns.
 
     Args:
         scan: to align.
         no_turn: why there is no turn; the messages of errors begin with it.
         random: for images of noise.
+
+    Returns:
+        With all five parameters of `FREE`.
+
+    Raises:
+        NotIdentifiableError: hardly two views see a line from both ends.
     """
     scales = scan.scales
     given = scan.priors
@@ -265,16 +285,15 @@ def _first_in_rays(
 
 
 def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
-    """Check that the images are symmetric about one column.
-
-    As good: `ratio` below `LEAST_RATIO`.
+    """Check that the images are symmetric about one column: another one is as good if
+    `ratio` is below `LEAST_RATIO`.
 
     Args:
         scan: gives the shape.
         first: the best column.
 
     Raises:
-        NotIdentifiableError: no column within reach, or another one as good.
+        NotIdentifiableError: no column within `REACH`, or another one as good.
     """
     reach = REACH * scan.shape[1]
     refuse_if(
@@ -292,8 +311,18 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
 
 
 def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFound:
-    """Look for a gap between two panel tiles that the known panel does not close already;
-    nothing without a full turn.
+    """Look for a gap between two panel tiles that the known panel does not close already.
+
+    Args:
+        scan: to align.
+        first: the axis, and the turn.
+        panel: known distortion; None: none.
+
+    Returns:
+        Nothing found without a full turn.
+
+    Raises:
+        NotIdentifiableError: there are two gaps.
     """
     if first.turn is None:
         return GapFound(None, None)
@@ -304,8 +333,9 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
 
 
 def _closes(found: Symmetry, gap: Gap) -> bool:
-    """Check whether the fit converged, determines the gap's width better than its prior,
-    and leaves no gap; False if it is beside the axis.
+    """Check whether the fit shows that there is no gap: it converged, determines the
+    width at least twice as well as its prior, and leaves no width above `SIGMAS`; False
+    if the gap is beside the axis.
     """
     if gap.beside_axis:
         return False
@@ -316,8 +346,8 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
     """Make the width of the gap between two panel tiles the last parameter, with its
-    prior; fixed if the gap lies beside the axis, where the plane does not determine
-    it.
+    prior; not if the gap lies beside the axis, where the plane does not determine it.
+    Errors begin with the gap's text in either case.
     """
     if gap.beside_axis:
         return replace(first, preface=f"{gap.text}; ")
@@ -331,12 +361,16 @@ def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
 
 
 def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
-    """Fit all parameters of the plane, in the mean over the turn or else in opposite rays.
+    """Fit all parameters of the plane, in the mean over the turn or else in opposite
+    rays.
 
     Args:
         scan: to align.
         first: first estimate of the axis.
-        gap: of the panel, closed in the fit; None without.
+        gap: of the panel, whose width is fitted, or fixed beside the axis; None without.
+
+    Returns:
+        The plane, perhaps not converged.
     """
     if first.turn is None:
         assert first.rays is not None
@@ -353,9 +387,12 @@ def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
 
 
 def _require_symmetric(found: Symmetry, preface: str) -> None:
-    """Check that a plane was found, and that the images are symmetric about it.
+    """Check that a plane was found (converged), and that at most `MOST_ASYMMETRY` of the
+    images' structure is not symmetric about it.
 
-    They are allowed an asymmetry of `MOST_ASYMMETRY` of the mean.
+    Args:
+        found: the plane.
+        preface: beginning of errors.
 
     Raises:
         NotIdentifiableError: they are not.
@@ -385,12 +422,14 @@ def _plane(
     """Collect the results, with the uncertainty that the fit does not contain.
 
     Added are half of a step, doubts of the axis column, an open or hidden gap between
-    panel tiles, and a floor of the roll. With opposite rays the roll in force is kept.
+    panel tiles, and a floor of the roll. The gap is closed in images and mean. With
+    opposite rays the roll in force is kept, and neither roll nor yaw counts as told; a
+    parameter is told if the images know it twice as well as its prior.
 
     Args:
         scan: the scan.
         first: start of the fit.
-        found: its result.
+        found: its result; not changed.
         gap_found: the gap, and what is hidden.
         panel: the distortion that was undone, or None.
     """
@@ -450,19 +489,17 @@ def _opposite_column(
     covariance: FloatArray,
     gap: Gap | None,
 ) -> OppositeColumn | None:
-    """Compare the column of the mean with that of opposite rays.
-
-    Columns apart [px], sigma of the opposite rays' column and of the mean's. With a gap,
-    the rays are those of the panel without it.
+    """Compare the column of the mean with that of opposite rays, in the row that these
+    are read in.
 
     Args:
         scan: the scan.
         first: start of the fit.
         values, covariance: of the parameters, (k,) and (k, k).
-        gap: between two tiles, or None.
+        gap: between two tiles, closed in the rays; or None.
 
     Returns:
-        None without a full turn.
+        Their distance and both sigmas [px]; None without a full turn.
     """
     if first.turn is None:
         return None
@@ -506,7 +543,12 @@ def _keep_roll(
 
 
 def _require_precise(plane: SymmetryPlane, preface: str) -> None:
-    """Check the uncertainty of column and roll.
+    """Check the uncertainty of the column (`MOST_COLUMN`), and of the roll (`MOST_ROLL`)
+    if the images determine it.
+
+    Args:
+        plane: of symmetry.
+        preface: beginning of errors.
 
     Raises:
         NotIdentifiableError: it is too large.
@@ -527,10 +569,11 @@ def _opposite_rays(
     known: FloatArray,
     random: np.random.Generator,
 ) -> OppositeRays:
-    """Collect the rays near the plane of the source that two views see from opposite ends.
+    """Collect the rays near the plane of the source that two views see from opposite
+    ends.
 
-    At most `MOST_VIEWS` views are read, by angle; rows far from the plane of the source
-    are refused.
+    At most `MOST_VIEWS` views are read, by angle. Rows within `BAND` of the plane are
+    kept; averaged to one if the panel ends there.
 
     Args:
         scan: the scan.
@@ -538,7 +581,8 @@ def _opposite_rays(
         random: for the image of noise.
 
     Raises:
-        NotIdentifiableError: there are hardly any.
+        NotIdentifiableError: there are hardly any, or the plane is too far from the
+            panel's rows.
     """
     rows, cols = scan.shape
     angle = (

@@ -71,8 +71,16 @@ class Gap(NamedTuple):
         )
 
     def panel(self, shape: tuple[int, int], undone: Panel | None = None) -> Panel:
-        """Make the panel of images (rows, cols) with this gap, in addition to the
-        distortion undone already.
+        """Make the panel of images with this gap, in addition to the distortion undone
+        already.
+
+        Args:
+            shape: (rows, cols) of the images.
+            undone: that distortion; None: a flat panel.
+
+        Returns:
+            A new panel with one border more, at its place before the distortion was
+            undone.
         """
         one = undone or Panel.flat(shape)
         at = np.array([self.column - 0.5, (shape[0] - 1) / 2])
@@ -91,15 +99,20 @@ def averaged_rows(image: Float32Array) -> Float32Array:
 def local_gaps(
     frames: Sequence[Float32Array], axis: float, closed: Sequence[float] = ()
 ) -> list[Gap]:
-    """Return the border, or the two, whose likelihood of a gap is significant.
+    """Find the borders between panel tiles, at most two, whose likelihood of a gap is
+    significant: `EVIDENCE`, and `STANDS_OUT` times that at other borders.
 
-    A border is one between panel tiles. Empty for few columns, without edges, or if no
-    border stands out.
+    Edges that mirrored edges at the other side of the axis explain do not count, nor do
+    dead columns.
 
     Args:
         frames: line integrals of `averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
         closed: columns of borders next to which the images are filled in.
+
+    Returns:
+        Gaps with their likeliest width, the best first; empty for fewer than 8 SIDE
+        columns, without edges, or if no border stands out.
     """
     stack = np.asarray(frames, dtype=np.float64)
     if stack.shape[2] < 8 * SIDE:
@@ -155,13 +168,16 @@ def local_sigma(width: FloatArray | float) -> FloatArray:
 def _gains(
     edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute gains of gaps of all widths at each border over none, less the scatter of
-    frames, (w, b).
+    """Compute gains in log likelihood of gaps of all WIDTHS at each border over none,
+    less the scatter of frames.
 
     Args:
         edges: differences of neighbouring columns, (k, 2 SIDE - 1).
         place: of each in a table of frames and borders, (k,).
         shape: of that table.
+
+    Returns:
+        (w, b).
     """
     of_distance = squares_by_distance(edges)
     without = likelihood(edges, of_distance, 0.0)
@@ -174,11 +190,14 @@ def _gains(
 
 
 def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
-    """Return the mean square of the difference of two columns by their distance, 1 and more
-    [px].
+    """Fit the mean square of the difference of two columns by their distance, 1 and more
+    [px]; continued linearly beyond the columns compared.
 
     Args:
         edges: differences of neighbouring columns, (k, 2 SIDE - 1).
+
+    Returns:
+        Function of the distance.
     """
     place = np.cumsum(np.pad(edges, ((0, 0), (1, 0))), axis=1)
     far = np.arange(1, 2 * SIDE)
@@ -195,12 +214,14 @@ def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
 def likelihood(
     edges: FloatArray, of_distance: PchipInterpolator, width: float, blur: float = 0.0
 ) -> FloatArray:
-    """Return the logarithm of the likelihood of each row of differences about a gap, (k,).
+    """Compute the logarithm of the likelihood of each row of differences about a gap,
+    (k,), but for a constant and whatever the row's scale (Student).
 
     Args:
-        edges: differences of neighbouring columns, each row at its own scale, (k, 2 SIDE - 1).
+        edges: differences of neighbouring columns, each row at its own scale, (k, 2 SIDE
+            - 1).
         of_distance: as `squares_by_distance` gives it.
-        width: of the gap [px].
+        width: of the gap [px]; 0: none.
         blur: standard deviation over which the gap is smeared [px].
     """
     columns = np.arange(2 * SIDE)

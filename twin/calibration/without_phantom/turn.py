@@ -102,7 +102,8 @@ def read_turn(
     lost: tuple[int, ...] = (),
     source_row: float = 0.0,
 ) -> Turn:
-    """Read the frames, twice where some are repeated.
+    """Read the frames and combine them; all once more, without them, where some are found
+    repeated.
 
     Repeated ones are found in the first reading unless they are given. The result has the
     mean, the noise, sample frames, bands of rows and the largest step.
@@ -111,12 +112,14 @@ def read_turn(
         image: line integrals of a frame, (rows, cols).
         angle: of the stage in every frame, (n,) [rad].
         present: indices of the frames that are there.
-        repeated: frames among them that are known to be repeated.
-        lost: frames before which one may be missing, although no angle is.
+        repeated: frames among them that are known to be repeated; they are left out.
+        lost: frames before which one may be missing, although no angle is; it only adds
+            doubts.
         source_row: row of the plane in which the source turns.
 
     Raises:
-        NotIdentifiableError: they are too few, or do not close a turn.
+        NotIdentifiableError: they are too few, do not close a turn, or have too few rows
+            or columns.
     """
     kept = [i for i in present if i not in repeated]
     index = np.array(
@@ -177,7 +180,17 @@ def read_turn(
 
 def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
     """Divide the rows about `middle`, where the plane of the source meets the panel, into
-    at most `GROUPS` groups, (top, end) each.
+    at most `GROUPS` groups.
+
+    `BAND` rows or a `BAND_PART` of the columns on either side are used, moved inwards at
+    the panel's edges.
+
+    Args:
+        rows, cols: of the panel.
+        middle: row [px].
+
+    Returns:
+        (top, end) of each, of a row at least.
     """
     half = max(BAND, cols // BAND_PART)
     centre = min(
@@ -190,15 +203,14 @@ def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
 
 
 def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
-    """Check that angles cover a full turn.
-
-    Repeated angles count as one direction.
+    """Check that angles cover a full turn: at least `MIN_DIRECTIONS`, and no gap above
+    `WIDEST_GAP` times the usual (median) one. Repeated angles count as one direction.
 
     Args:
-        angle: (n,) of the frames [rad].
+        angle: (n,) of the frames, sorted modulo a turn [rad].
 
     Returns:
-        The gaps after each sorted angle (n,), and the usual one [rad].
+        The gaps after each angle (n,), and the usual one [rad].
 
     Raises:
         NotIdentifiableError: too few directions, or a wide gap.
@@ -222,15 +234,17 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArray:
-    """Compute the weight of each frame in the mean and in the doubts, (1 + k, n).
-
-    Row 0 is the mean, row 1 half the difference of even and odd views, the others what
-    wide arcs without views may do.
+    """Compute the weight of each frame in the mean and in the doubts.
 
     Args:
         angle: sorted, (n,) [rad].
         gaps: after each, (n,) [rad].
         usual: of the gaps [rad].
+
+    Returns:
+        (1 + k, n). Row 0 is the mean, row 1 half the difference of even and odd views,
+        the others what gaps above 1.5 times the usual may do: the change by leaving out
+        as many frames next to them; at most `GAP_IMAGES`, shared with alternating signs.
     """
     n = len(angle)
     keep = np.ones(n, dtype=bool)
@@ -249,8 +263,12 @@ def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArr
 
 
 def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
-    """Compute weights of the trapezoidal rule on the circle for the kept angles, 0 for
-    the others.
+    """Compute weights of the trapezoidal rule on the circle for the kept angles, of sum
+    1; 0 for the others.
+
+    Args:
+        angle: (n,) sorted modulo a turn [rad].
+        keep: (n,).
     """
     around = angle[keep] % (2 * np.pi)
     gaps = np.diff(around, append=around[:1] + 2 * np.pi)
@@ -261,9 +279,10 @@ def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
 
 def _thumb(image: Float32Array) -> Float32Array:
     """Average over square blocks, to about `THUMB_COLUMNS` columns; incomplete blocks at
-    the ends are left out.
+    the ends are left out. Narrower images stay as they are.
 
-    Raises NotIdentifiableError if the image has fewer than two blocks a side.
+    Raises:
+        NotIdentifiableError: the image has fewer than two blocks a side.
     """
     factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
     if min(image.shape) < 2 * factor:
@@ -278,11 +297,12 @@ def _thumb(image: Float32Array) -> Float32Array:
 
 
 def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
-    """Find frames that repeat the one before although the stage turned, and those after a
-    missing one.
+    """Find frames that repeat the one before although the stage turned, and one after a
+    missing frame.
 
     Two exposures of the same differ by noise alone, in which neighbouring pixels are
-    independent; the change by a turn spreads over several.
+    independent; the change by a turn spreads over several. A frame after a missing one
+    changes more than `LOST_RATIO` times the usual.
 
     Args:
         views: (n, rows, cols), sorted by angle.
@@ -290,7 +310,7 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
 
     Returns:
         Places of both kinds: of missing ones at most one; none at all if more than a
-        quarter of the frames look like one.
+        quarter of the frames look repeated.
     """
     soft = gaussian_filter(
         views, (0, 2, 2)
@@ -332,18 +352,19 @@ def _step(
 ) -> tuple[tuple[float, float], int]:
     """Find the largest step between neighbours.
 
-    Each frame is compared with the third-order interpolation of its four neighbours on the
-    circle. A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the
-    other.
+    Each frame is compared with the third-order interpolation of its four neighbours on
+    the circle. A shift d between frame i - 1 and frame i leaves -d/2 in one of them and
+    +d/2 in the other. A step and its return count as one.
 
     Args:
         views: (n, rows, cols), sorted by angle.
-        gaps: after each, (n,) [rad].
+        gaps: after each, (n,) [rad]; places near uneven ones are not judged.
         first: place of the frame that was taken first.
 
     Returns:
-        The step (columns, rows) and the place before it; 0 if no step is significant or
-        separable.
+        The step (columns, rows) [px of the views] and the place before it; zeros if no
+        step is significant (`MIN_STEP_RATIO`, `MIN_LEAD_RATIO`) or the images do not
+        separate both directions.
     """
     n = len(views)
     soft = gaussian_filter(views, (0, 1, 1))

@@ -59,7 +59,7 @@ class TurnPlanes:
         covariance: FloatArray,
         priors: Mapping[str, float],
     ) -> None:
-        """Sort the frames of a turn by angle; images are read later.
+        """Sort the frames of a turn by angle; images are read later, when pairs are made.
 
         Args:
             image: reads the line integrals of a frame.
@@ -67,7 +67,7 @@ class TurnPlanes:
             turn: the used frames and their mean.
             offsets: of parameters.
             values: (p,) parameters found in the plane of symmetry.
-            covariance: (p, p) of them.
+            covariance: (p, p) of them, positive definite.
             priors: standard deviation of each offset.
         """
         self.image = image
@@ -85,8 +85,11 @@ class TurnPlanes:
         self.stack: Float32Array | None = None
 
     def _of(self, at: FloatArray) -> Offsets:
-        """Return offsets for the panel's height above the stated one [px], three doubts
+        """Compute offsets for the panel's height above the stated one [px], three doubts
         of the plane of symmetry and those of SDD and pitch [sigma].
+
+        Args:
+            at: (6,) in this order; zeros are the offsets found so far.
         """
         given = self.offsets(self.values + self.doubts @ at[1:4])
         return replace(
@@ -100,7 +103,11 @@ class TurnPlanes:
     def _pairs(self, stride: int, coarser: int = 1) -> PlanePairs:
         """Make pairs of every `stride`-th frame, binned by a further factor `coarser`.
 
-        The stack of images is read when the frames change, and kept.
+        The stack of images is read when the number of frames changes, and kept for later
+        calls.
+
+        Raises:
+            NotIdentifiableError: too few pairs are clear of the object.
         """
         frames = self.sorted[::stride]
         if self.stack is None or len(self.stack) != len(frames):
@@ -117,19 +124,20 @@ class TurnPlanes:
         )
 
     def row(self, random: np.random.Generator) -> tuple[Offsets, AlignEstimate]:
-        """Estimate the panel's height and the row of the source's plane.
+        """Estimate the panel's height and the row of the source's plane, from at most
+        `MOST_FRAMES` frames.
 
-        Refused unless the images tell it clearly better than the priors. The offsets hold
-        the height as `dD_y` [mm].
+        The sigma contains sampling, the sharpness of edges and a step of the images.
 
         Args:
             random: for the images of noise.
 
         Returns:
-            Offsets with the height, and the row [px].
+            Offsets with the height, as `dD_y` [mm], and the row [px].
 
         Raises:
-            NotIdentifiableError: the images do not determine it.
+            NotIdentifiableError: the images do not determine it, or not twice as well as
+                the priors of dD_y and axis_tilt_x.
         """
         stride = -(-len(self.sorted) // MOST_FRAMES)
         fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
@@ -154,9 +162,13 @@ class TurnPlanes:
     def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
         """Estimate shifts of single frames as shifts of the sample, dO_x and dO_y.
 
+        Args:
+            corrected: offsets; only the panel's height and angle_scale are used.
+            random: for the image of noise.
+
         Raises:
-            NotIdentifiableError: the images do not determine them, or there are too many
-                frames.
+            NotIdentifiableError: the images have too few pairs of views, or there are
+                more than `MOST_SHIFTS` frames.
         """
         n = len(self.sorted)
         refuse_if(
@@ -168,9 +180,15 @@ class TurnPlanes:
         return self._as_motion(find_shifts(self._pairs(1), at, angle, random))
 
     def _as_motion(self, shifts: Shifts) -> Motion:
-        """Convert shifts on the detector [px] into motions of the object, `dO_x` and
-        `dO_y` [mm], of all frames; frames that were not used get motion 0 and the
-        shifts' rms as sigma.
+        """Convert shifts on the detector into motions of the object, `dO_x` and `dO_y`,
+        of all frames; frames that were not used get motion 0 and the shifts' rms as
+        sigma.
+
+        Args:
+            shifts: of the used frames, sorted by angle [px of the binned frames].
+
+        Returns:
+            [mm]; sigmas nan in a direction without evidence.
         """
         pose = self.poses[self.sorted[:1]]
         scale = self.factor * float(pose.sod[0] / pose.sdd[0])
