@@ -164,14 +164,15 @@ def _products(light: Float32Array, shadow: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _bent(light: npt.NDArray[Any], use: npt.NDArray[np.bool_]) -> FloatArray:
-    """Subtract a paraboloid, fitted to the usable pixels of each window (the body), from them.
+    """Subtract a paraboloid, fitted to the usable pixels of each window (the body), from
+    them.
 
     Args:
-        light: (n, k, rows, cols) values of the windows.
-        use: (n, k, rows, cols) usable pixels.
+        light: (n, k, side, side) values of the windows, square.
+        use: (n, k, side, side) usable pixels.
 
     Returns:
-        The residuals (n, k, rows, cols); 0 in pixels that are not usable.
+        The residuals, of that shape; 0 in pixels that are not usable.
     """
     x = np.linspace(-1.0, 1.0, light.shape[-1])
     right, down = np.broadcast_arrays(x[None, :], x[:, None])

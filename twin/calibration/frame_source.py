@@ -171,8 +171,8 @@ class SpotFrames:
         return list(self.looks)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows (n, k, side, side) of every frame; all nan if there are no
-        images.
+        """Cut the windows (n, k, side, side) of every frame from its images; all nan if
+        there are only positions.
         """
         if self.images is not None:
             return self.images.windows(plan)

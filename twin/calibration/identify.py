@@ -271,10 +271,14 @@ class _Shadows:
 
     @classmethod
     def of(cls, detections: Sequence[Detections]) -> _Shadows:
-        """Pack the spots of all frames into arrays (n frames, largest number of spots).
+        """Pack the spots of all frames into arrays (n frames, largest number of spots, at
+        least one).
 
-        Points [px] are from the image's centre; padding is infinite in points, NaN in
-        covariances, else 0. Raises ValueError without any frame.
+        Points are from the image's centre [px]; padding is infinite in points, NaN in
+        covariances, else 0.
+
+        Args:
+            detections: spots of each frame, one frame at least.
         """
         counts = np.array([len(d) for d in detections], dtype=np.int64)
         n = len(detections)

@@ -38,8 +38,8 @@ def fit_with_motion(
         still = [m.applied(p, -1.0) for p, m in zip(still, state.motions, strict=True)]
 
     def moved(motion: MotionFit) -> Calibration:
-        """Return the state with an estimated motion, applied to the poses that the scans began
-        with.
+        """Return a copy of the state with an estimated motion, applied to the poses that
+        the scans had without motion.
         """
         scans = tuple(
             replace(s, poses=m.applied(p))

@@ -375,8 +375,11 @@ class RegionSystem(LinearSystem):
         )
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Return start values of region and surroundings as one vector: `start` or zeros in the
-        region, zeros around it.
+        """Return start values of region and surroundings as one flat vector: `start` or
+        zeros in the region, zeros around it.
+
+        Raises:
+            GeometryError: `start` is on another grid than the region's.
         """
         x = np.zeros(math.prod(self.like.shape) + self.outside.size, np.float32)
         if start is not None:

@@ -171,15 +171,15 @@ class Polychromatic:
         """Compute the model of a beam from tube and detector.
 
         Args:
-            materials: of the object.
+            materials: of the object, in any order.
             kV: tube voltage.
             energy_keV: at which the volume's attenuations hold.
             panel: detector; the default one without.
             tube: the default one without.
 
         Raises:
-            LimitError: no material, two that attenuate alike, no spectrum for `kV`, or an
-                energy that the tables do not have.
+            LimitError: no material, two that attenuate alike (`require_apart`), no
+                spectrum for `kV`, or an energy that the tables do not have.
         """
         ends = tables().energy_keV[[0, -1]]
         require_within("energy_keV", energy_keV, float(ends[0]), float(ends[1]), "keV")

@@ -121,7 +121,7 @@ def _bends(
 
 
 def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
-    """Compute means of blocks of BLOCK_PX x BLOCK_PX pixels.
+    """Compute means of blocks of BLOCK_PX x BLOCK_PX pixels, row by row.
 
     Args:
         windows: (m, side, side).
@@ -138,8 +138,17 @@ def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
 
 
 def _shapes(places: FloatArray, side: int) -> FloatArray:
-    """Evaluate polynomials up to third degree on a grid of places, (places^2, 10), planes
-    first.
+    """Evaluate the ten polynomials up to third degree (1, x, y, x x, x y, y y, ...) on a
+    square grid, planes first.
+
+    Coordinates are -1 to 1 over a window, from its middle.
+
+    Args:
+        places: (p,) places along a side [px].
+        side: of the window [px].
+
+    Returns:
+        (p^2, 10), row by row.
     """
     t = (places - (side - 1) / 2) / (side / 2)
     y, x = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))

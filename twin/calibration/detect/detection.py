@@ -180,7 +180,9 @@ def detect_beads(
 
 
 def of_intensity(image: Float32Array) -> Float32Array:
-    """Convert an image of intensities to line integrals, relative to its brightest pixels."""
+    """Convert an image of intensities to line integrals, relative to the percentile
+    `BRIGHT_PERCENT` of its pixels; intensities count as `LEAST_LIGHT` of that at least.
+    """
     bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
     return np.asarray(-np.log(np.maximum(image / bright, LEAST_LIGHT)), dtype=np.float32)
 
@@ -462,14 +464,12 @@ def _fitted_cut(
 def _pack(
     whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]
 ) -> Detections:
-    """Sort measured spots into `Detections`: complete ones first, among these the strong ones
-    first.
-
-    Spots at the edge come last, the strong ones first, too.
+    """Sort measured spots into `Detections`: complete ones first, those at the edge last,
+    each kind by falling contrast.
 
     Args:
-        whole: results of complete spots.
-        cut: results of spots at the image's edge.
+        whole: results of complete spots; may be empty.
+        cut: results of spots at the image's edge; may be empty.
         shape: the image's (rows, cols).
     """
     rows = np.array([*whole, *cut]).reshape(-1, kernels.RESULTS)

@@ -219,15 +219,16 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     blurs = np.array(BLURS)
 
     def tried(veil: float, blurs: FloatArray) -> _Tried:
-        """Fit the windows with each blur, from the least on, until one leaves much more than
-        the one before.
+        """Fit the windows with each blur, from the least on, until one leaves more than
+        1.5 times the misfit of the one before.
 
         Args:
             veil: part of the light about a bead that it does not take away.
             blurs: increasing blurs [px].
 
         Returns:
-            `blurs`; the median misfits, inf where not tried; and fitted over predicted radii.
+            `blurs`; the median misfits, inf where not tried or with fewer than three good
+            fits; and median fitted over predicted radii, 1 there.
         """
         misfit = np.full(len(blurs), np.inf)
         scale = np.ones(len(blurs))

@@ -112,9 +112,9 @@ def shadow_ellipses(
 ) -> tuple[FloatArray, FloatArray]:
     """Compute the ellipses that the beads cast on the detector.
 
-    A ball's spot is the section of its tangent cone (half-angle beta, axis at theta from the
-    detector's normal): semi-axes f sin b / sqrt(cos^2 t - sin^2 b) and, towards the foot point,
-    cos b / sqrt(cos^2 t - sin^2 b) times that.
+    A ball's spot is the section of its tangent cone (half-angle beta, axis at theta from
+    the detector's normal): semi-axes f sin b / sqrt(cos^2 t - sin^2 b) and, towards the
+    foot point, cos b / sqrt(cos^2 t - sin^2 b) times that.
 
     Args:
         model: k beads.
@@ -123,8 +123,9 @@ def shadow_ellipses(
         shape: (rows, cols) of the detector.
 
     Returns:
-        Minor semi-axes (n, k) [px]; direction of the major ones and major over minor axis, (n,
-        k, 3).
+        Minor semi-axes (n, k) [px of columns]; direction of the major ones (unit, column
+        and row; (1, 0) at the foot point) and major over minor axis, 1 at least, (n, k,
+        3).
     """
     ray = model.beads[None] - cone.source[:, None]
     distance = np.linalg.norm(ray, axis=2)
@@ -169,9 +170,8 @@ def crop(image: npt.ArrayLike, windows: Windows, frame: int) -> Float32Array:
 
 
 def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
-    """Return the part that a window shares with its image.
-
-    Both are empty where they do not overlap.
+    """Return the part that a window shares with its image; both slices are empty where
+    they do not overlap.
 
     Args:
         windows: of all frames.
@@ -268,15 +268,13 @@ def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
 
 
 def without_beads(scene: Scene, model: BeadModel) -> Scene:
-    """Remove the balls that are the model's beads from a scene."""
+    """Return a new scene without the balls that are the model's beads (`_is_bead`)."""
     return Scene(tuple(s for s in scene.solids if not _is_bead(s, model)))
 
 
 def _is_bead(solid: Solid, model: BeadModel) -> bool:
-    """Check whether a solid of the scene is one of the phantom's beads: a sphere within half a
-    radius of its place.
-
-    False for any other shape.
+    """Check whether a solid of the scene is one of the phantom's beads: a sphere whose
+    centre is within half a radius of the nearest bead's; False for any other shape.
     """
     if not isinstance(solid.shape, Sphere):
         return False
@@ -344,7 +342,8 @@ def lattice(fine: int) -> list[tuple[float, float]]:
 def _window_rays(
     scene: Scene, cone: ConeVec, windows: Windows, place: tuple[float, float]
 ) -> Float32Array:
-    """Render line integrals of windows, for rays through one place in each pixel.
+    """Render line integrals of windows, for rays through one place in each pixel; also
+    pixels off the image.
 
     Args:
         scene: to render.

@@ -614,8 +614,8 @@ def image_shape(fit: FitResult) -> tuple[int, int] | None:
 
 
 def panel_of(fit: FitResult, borders: Sequence[Border]) -> PanelModel | None:
-    """Make a panel model with every term that a distortion may have; None for images of
-    several shapes.
+    """Make a panel model with every term that a distortion may have, of width 1 px, and
+    the given borders; None for images of several shapes.
     """
     shape = image_shape(fit)
     if shape is None:

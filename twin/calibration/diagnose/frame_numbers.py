@@ -205,8 +205,14 @@ def _angles(angle: FloatArray, shift: int) -> FloatArray:
 
 
 def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
-    """Find the path (n,) of least total cost through `costs` (n frames, states); every
-    change of state adds `CHANGE_COST`.
+    """Find the path of least total cost through the states of all frames; every change of
+    state adds `CHANGE_COST`.
+
+    Args:
+        costs: (n frames, states).
+
+    Returns:
+        (n,) state of each frame.
     """
     n, states = costs.shape
     total = costs[0].copy()

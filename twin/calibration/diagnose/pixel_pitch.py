@@ -156,8 +156,15 @@ class _Explanations:
 
 
 def _pitch_column(problem: FitProblem, x: FloatArray) -> FloatArray:
-    """Compute whitened shifts (2 n k,) of the positions for a unit change of the
-    logarithm of the pixel pitch.
+    """Compute whitened shifts of the positions for a unit change of the logarithm of the
+    pixel pitch: towards the panel's centre.
+
+    Args:
+        problem: the data.
+        x: column values, internal units.
+
+    Returns:
+        (2 n k,), of unused positions as well.
     """
     predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
     w = problem.whiten

@@ -252,9 +252,9 @@ def _levenberg(
         return cost + 0.5 * float(weight @ off**2), norms, hess, grad + weight * off
 
     def threshold(norms: FloatArray) -> float:
-        """Compute the residual norm [px] beyond which Huber's loss is linear: `how.huber`
-        times the spread of the residuals in use, at least times `how.floor_px` (the
-        spread is 0 where none is in use).
+        """Compute the residual norm beyond which Huber's loss is linear: `how.huber`
+        times the robust spread of the used residuals, or `how.floor_px` if that is larger
+        [whitened units]; the floor without used ones.
         """
         if use.any():
             spread = float(np.median(norms[use])) / RAYLEIGH_MEDIAN
@@ -317,12 +317,13 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
     """Solve the column-scaled, damped normal equations.
 
     Args:
-        hess: (c, c).
+        hess: (c, c), not changed.
         grad: (c,).
-        damping: added to the scaled diagonal.
+        damping: added to the scaled diagonal, which is 1.
 
     Returns:
-        The step; None where the equations are not positive definite.
+        The step (c,) down the gradient; None where the equations are not positive
+        definite, or only by rounding (`LEAST_PIVOT`).
     """
     diagonal = np.diag(hess)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -335,8 +336,8 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
 
 
 def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
-    """Compute half the sum of squared whitened residuals; inf where a bead would be
-    behind the source.
+    """Compute half the sum of squared whitened residuals of the positions `use`, without
+    priors; inf where a bead would be behind the source.
     """
     try:
         norms = problem.residuals(x)[1]
@@ -603,12 +604,11 @@ def fit_geometry(*args: Any, **options: Any) -> FitResult:
 
 
 def require_identifiable(result: FitResult) -> FitResult:
-    """Return `result` if every parameter is determined.
-
-    The message lists the open directions.
+    """Check that every parameter is determined, and return the result as it is.
 
     Raises:
-        NotIdentifiableError: otherwise; data has rank, parameters and the directions.
+        NotIdentifiableError: lists the open directions, with advice; its data has rank,
+            parameters and directions.
     """
     spectrum = result.certificate.spectrum
     if not spectrum.full:
@@ -706,13 +706,13 @@ def _weighted(
 
 
 def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> float:
-    """Compute the logarithm of the likelihood of the positions used, all columns integrated
-    out (Laplace), but for a constant.
+    """Compute the logarithm of the likelihood of the positions used, with the expected
+    spread and priors, all columns integrated out (Laplace), but for a constant.
 
     Args:
         problem: the data and columns.
-        solution: about which is integrated; positions that it leaves out are outliers of
-            TRIMMED_SPREADS times the noise.
+        solution: about which is integrated; each coordinate that it leaves out is an
+            outlier of TRIMMED_SPREADS times the noise, or times 1 if that is larger.
         noise: spread of the whitened residuals.
     """
     use = solution.use
@@ -743,16 +743,15 @@ def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> fl
 
 
 def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
-    """Compute the quantities of IN_IMAGES, in the first frame of each group of frames.
-
-    Each is quantity -> estimate with value, sigma and 95 % interval; a rival pixel pitch
-    adds to the variance.
+    """Compute the quantities of IN_IMAGES, in the first frame of each group of frames, to
+    first order; a rival pixel pitch adds to the variance.
 
     Args:
         fit: whose estimates are all determined.
 
     Returns:
-        One dictionary for each group. Sigmas follow from the fit's covariance to first order.
+        One dictionary for each group: quantity -> estimate with value, sigma, 95 %
+        interval and unit.
     """
     t = float(stdtrit(fit.certificate.dof, 0.975))
     out = []

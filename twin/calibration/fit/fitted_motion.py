@@ -327,18 +327,17 @@ class _Mixed:
         weight: FloatArray,
         off: FloatArray,
     ) -> None:
-        """Sum up the normal equations.
-
-        Columns are scaled to unit length.
+        """Sum up the normal equations, with columns scaled to unit length; the rows are
+        not kept.
 
         Args:
-            rows: (m, g).
+            rows: (m, g) derivatives by the fit's columns.
             residual: (m,).
             motion: (m, p) derivatives by the parameters of each row's frame.
             frame: (m,) of each row.
             sizes: frames of each scan.
             column: (n, p), see the class.
-            weight: (g,) of the priors.
+            weight: (g,) of the priors; 0 without.
             off: (g,) distance of their means.
         """
         n = sum(sizes)
@@ -384,14 +383,16 @@ class _Mixed:
         return out
 
     def _diagonals(self, i: int, pick: tuple[float, float]) -> FloatArray:
-        """Compute the prior precision of a parameter's deviations, a banded matrix.
+        """Compute the prior precision of a parameter's deviations, a banded matrix: (1 +
+        D'D / stiffness^2) / variance of each scan.
 
         Args:
             i: number of the parameter.
             pick: width and smoothness of its motion.
 
         Returns:
-            (3, n) the main diagonal and the two below it, for n frames.
+            (3, n) the main diagonal and the two below it, for n frames; scans are not
+            connected.
         """
         parts = []
         for size, variance in zip(self.sizes, self.spectrum(i, pick), strict=True):
@@ -433,16 +434,16 @@ class _Mixed:
         )
 
     def _eliminated(self, choice: _Choice) -> _Eliminated:
-        """Eliminate the deviations of a choice from the normal equations (Schur complement).
-
-        If nothing moves, the equations are returned as they are.
+        """Eliminate the deviations of a choice from the normal equations (Schur
+        complement).
 
         Args:
-            choice: width and smoothness of each parameter; None for one that does not move.
+            choice: width and smoothness of each parameter; None for one that does not
+                move.
 
         Returns:
             The reduced equations, and the factors with which deviations follow from their
-            solution.
+            solution; the equations as they are, with empty factors, if nothing moves.
         """
         moving = [i for i, pick in enumerate(choice) if pick is not None]
         if not moving:

@@ -57,15 +57,22 @@ def known(
     """Return standard deviations of every offset before its images are seen.
 
     Args:
-        free: parameters that are estimated; only a user's own width is a prior of these.
-        given: widths that a user states; None: no widths.
-        scanners: widths of the scanners, of which the widest counts.
+        free: parameters that are estimated; only a user's own width is a prior of these,
+            and 0 is ignored for them.
+        given: widths that a user states, in place of all others; None: no widths; "none":
+            all that are not free are exact.
+        scanners: widths of the scanners, of which (and of `FIXED`) the widest counts.
 
     Returns:
         Parameter -> standard deviation [mm, deg, 1]; 0 is exactly known.
 
-    >>> known()["dD_z"], known(given={"dD_z": 0.05})["dD_z"], known(given="none")["dD_z"]
-    (1.0, 0.05, 0.0)
+    Raises:
+        UnknownNameError: a name that is no parameter.
+        TwinError: a width that is negative or not finite.
+
+    Example:
+        >>> known()["dD_z"], known(given={"dD_z": 0.05})["dD_z"], known(given="none")["dD_z"]
+        (1.0, 0.05, 0.0)
     """
     if given == "none":
         return exact(free)

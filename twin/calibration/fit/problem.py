@@ -142,10 +142,10 @@ class ColumnLayout:
 
 
 def require_names(names: Iterable[str]) -> None:
-    """Check that every name is a parameter.
+    """Check that every name is a parameter; returns nothing.
 
     Raises:
-        UnknownNameError: lists the allowed names.
+        UnknownNameError: the first that is not; lists the allowed names.
     """
     for name in names:
         if name not in NAMES:
@@ -323,8 +323,9 @@ class FitProblem:
 
     @cached_property
     def data(self) -> kernels.Data:
-        """The problem's arrays as the kernels take them: poses by frame, spots, weights
-        and layout.
+        """The problem's arrays as the kernels take them: poses by frame, beads,
+        positions, weights and columns. Cached; the beads' first column is -1 if neither
+        beads nor strain are free.
         """
         p = self.poses
         return kernels.Data(
@@ -362,8 +363,9 @@ class FitProblem:
 
     @cached_property
     def _columns_of_kernel(self) -> FloatArray | None:
-        """Matrix (kernel's columns, columns) by which the kernel's columns follow from
-        those of the layout; None where they are the same (without strain).
+        """Matrix (kernel's columns, columns) by which the kernel's columns, which always
+        have the beads' coordinates, follow from those of the layout; None where they are
+        the same (without strain).
         """
         if self.layout.strain_column < 0:
             return None

@@ -54,9 +54,8 @@ class Direction:
     @property
     def text(self) -> str:
         """One line for a report: a parameter against those it trades with, its sigma
-        ("not determined at all" if infinite), and the advice.
-
-        At most `MAX_SHOWN` others are named, the rest counted.
+        ("not determined at all" if it is not finite), and the advice; at most `MAX_SHOWN`
+        others are named, the rest counted.
         """
         first, *rest = self.parts
         against = ", ".join(f"{n} ({c:+.3g} {unit_of(n)})" for n, c in rest[:MAX_SHOWN])

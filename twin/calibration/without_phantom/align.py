@@ -50,8 +50,8 @@ NEEDS_TURN: Final = (
 
 def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
     """Wrap a search so that it does not raise NotIdentifiableError: it then returns an
-    alignment that refuses all parameters, with the error's message as reason. Other
-    errors are raised.
+    alignment without offsets that refuses all parameters, with the error's message as
+    reason. Other errors are raised.
     """
 
     @wraps(find)
@@ -144,14 +144,16 @@ def align_turn(
 def _plane_parameters(
     plane: SymmetryPlane,
 ) -> tuple[dict[str, AlignEstimate], dict[str, str]]:
-    """Split the parameters into those that the plane of symmetry determines and the others.
+    """Split the parameters into those that the plane of symmetry determines and the
+    others.
 
     Args:
         plane: of symmetry, found in the images.
 
     Returns:
-        Estimates by name: `axis_column_px` always, roll and yaw [deg] where the images
-        determine them; and name -> reason for the others.
+        Estimates by name: `axis_column_px` always, roll and yaw [deg] where they are
+        told, the yaw's sigma with that of a panel shifted sideways, which looks alike;
+        and name -> reason for the others, with both sigmas.
     """
     column = plane.scan.column(plane.values)
     parameters = {"axis_column_px": AlignEstimate(column, plane.column_sigma_px, "px")}

@@ -138,8 +138,8 @@ class CircularScan:
 
     @property
     def scales(self) -> FloatArray:
-        """Change of each parameter (those of `FREE`, in [mm] and [rad]) that moves the
-        ends of the image by about a pixel, (5,).
+        """Change of each parameter of `FREE` [mm, rad] that moves the ends of the image
+        (for roll, the upper and lower ones) by about a pixel, (5,).
         """
         rows, cols = self.shape
         pitch = self.pitch_mm

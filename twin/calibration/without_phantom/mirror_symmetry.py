@@ -66,12 +66,15 @@ class Symmetry:
 
 
 def mirror_map(view: FloatArray) -> FloatArray:
-    """Compute the homography (3, 3) from (column, row, 1) about the panel's centre to its
-    mirror image.
+    """Compute the homography that takes a pixel to its mirror image in the plane through
+    source and axis.
 
     Args:
-        view: source, panel centre, u, v in a frame with the axis along z through its origin,
-            (12,).
+        view: source, panel centre, u, v in a frame with the axis along z through its
+            origin, (12,).
+
+    Returns:
+        (3, 3), of (column, row, 1) from the panel's centre.
     """
     source, detector, u, v = view.reshape(4, 3)
     rays = np.column_stack([u, v, detector - source])

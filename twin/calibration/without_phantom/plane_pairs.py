@@ -249,8 +249,11 @@ class PlanePairs:
         return np.asarray(np.sqrt(worst))
 
     def noise(self, random: np.random.Generator) -> Float32Array:
-        """Draw images of noise as large as that of the frames, summed along columns like
-        `sums`.
+        """Draw images of noise as large as that of the frames, summed down their columns
+        like `sums`, (n, cols, rows + 1).
+
+        Args:
+            random: generator, advanced.
         """
         out = np.zeros_like(self.sums)
         np.cumsum(

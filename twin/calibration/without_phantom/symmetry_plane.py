@@ -514,7 +514,10 @@ def _opposite_column(
 
 
 def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Turn]:
-    """Close a gap between panel tiles in the images (as they are read) and in their mean."""
+    """Close a gap between panel tiles in the images (each as it is read) and in their
+    mean; returns copies of scan and turn, whose doubts, samples and bands stay as they
+    were.
+    """
     own = gap.panel(scan.shape)
     image = scan.image
     mean = own.undistorted(turn.mean.astype(np.float32)).astype(float)
@@ -523,8 +526,13 @@ def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Tur
 
 
 def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> float:
-    """Compute the motion of the axis in the panel's middle row by the roll, if other rows
-    were read [px].
+    """Compute the motion of the axis in the panel's middle row by the roll's uncertainty,
+    as other rows were read [px]; 0 if one (averaged) row was.
+
+    Args:
+        scan: gives the number of rows.
+        rays: with the rows read.
+        roll_rad: standard deviation of the roll [rad].
     """
     read = rays.frames.shape[1]
     return float(roll_rad * (rays.top - (scan.shape[0] - read) / 2) * (read > 1))
@@ -533,8 +541,13 @@ def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> flo
 def _keep_roll(
     values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
 ) -> None:
-    """Replace, in place, the roll's value and covariance by the one in force, [rad]: few
-    rows gave values up to six sigma off.
+    """Replace, in place, the roll's value and variance by those in force, and its
+    covariances by 0: few rows gave values up to six sigma off.
+
+    Args:
+        values: (k,), the roll second.
+        covariance: (k, k).
+        roll_rad, sigma_rad: in force [rad].
     """
     values[1] = roll_rad
     covariance[1] = 0.0

@@ -264,18 +264,20 @@ class OnDevice:
                     )
 
     def _transformed(self, views: Views, order: npt.NDArray[np.intp], length: int) -> Any:
-        """Weigh and filter columns of the images by a Fourier transform on the device.
+        """Weigh and filter columns of the images by a Fourier transform on the device;
+        the host does not wait.
 
-        The host does not wait. The filter's tables are made at the first call.
+        The filter's tables are uploaded at the first call and kept.
 
         Args:
-            views: n views with their weights and response.
-            order: (n,) order in which the images are uploaded.
+            views: n views with their weights and response, sorted; images in the order of
+                arrival.
+            order: (n,) number of the image of each view.
             length: of the transform, a power of 2.
 
         Returns:
-            The filtered images (n, cols, rows) on the device, ready when its stream comes to
-            them.
+            The filtered images (n, cols, rows) on the device, ready when its stream comes
+            to them, until the next call.
         """
         from flexdt.twin.reconstruction.kernels import (
             gpu_reconstruction_kernels as kernels,
@@ -461,8 +463,8 @@ class OnDevice:
         layout_kernels.touch(out.reshape(-1))  # while the device is still at work
 
         def fetch() -> None:
-            """Wait for the device and copy the volume into `out`, and the difference of both
-            half volumes into the noise meter.
+            """Wait for the device and copy the volume into `out`; with a noise meter,
+            also write the plus less the minus volume into its data.
             """
             self._stream.synchronize()
             self._flat.copy_to_host(out.reshape(-1))

@@ -186,16 +186,18 @@ def _add_all(
     target: Backprojector,
     progress: Progress | None,
 ) -> None:
-    """Add the images of all views to a volume.
+    """Add the images of all views to a volume, part by part.
 
     Args:
         plan: views, weights and filter.
         parts: the images in order, (k, rows, cols) each.
         target: the volume.
-        progress: called with the share of the views that is done.
+        progress: called after each part with the share of the views that is done; None
+            for nothing.
 
     Raises:
         GeometryError: images of another shape, or another number of them.
+        gpu.DeviceError: the target is a device, and failed.
     """
     done = 0
     for part in parts:

@@ -46,7 +46,9 @@ def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
 
 
 def _even_length(least: int) -> int:
-    """Find the first even length, `least` or more, whose real Fourier transform is fast."""
+    """Find an even length, `least` or more, whose real Fourier transform is fast: the
+    first even one of SciPy's fast lengths.
+    """
     from scipy import fft
 
     length = int(fft.next_fast_len(least, real=True))

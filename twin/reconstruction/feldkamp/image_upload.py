@@ -161,8 +161,8 @@ class ImageUpload:
         return portion[:count]
 
     def _fetch(self, portion: Any, there: Any) -> None:
-        """Start the copy of a portion to the device, and record when it is done; does not
-        wait.
+        """Start the copy of a host portion to the device on the upload's stream, and
+        record its end for this turn's portion; does not wait.
         """
         there.copy_to_device(portion, self._writer)
         self._fetched[self._turn] = _recorded(self._fetched[self._turn], self._writer)

@@ -182,7 +182,8 @@ class NoiseMeter:
         )
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
-        """Place points on a spiral about the centre.
+        """Place POINTS points on a spiral about the rotation axis, at which the shared
+        variance is computed.
 
         Radii grow geometrically from a quarter of a pixel's size at the axis to the
         grid's corner; the first is 0.

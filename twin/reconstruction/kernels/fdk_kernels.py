@@ -527,8 +527,8 @@ def _add_tile(
 
 
 def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
-    """Compile `backproject` for a number of `lanes`, which is part of the disk cache's
-    key, and return it; nothing is run.
+    """Make `backproject`, to be compiled at its first call, for a number of `lanes`,
+    which is part of the disk cache's key; nothing is run.
     """
 
     @parallel
@@ -802,7 +802,7 @@ def stand_up(rows_first, start, out):
     Args:
         rows_first: float32 (n, rows, columns before the cut).
         start: first column that is kept.
-        out: float32 (n, cols, rows or more), filled.
+        out: float32 (n, cols, rows or more); further rows stay as they are.
     """
     n, cols = out.shape[:2]
     rows = rows_first.shape[1]

@@ -451,8 +451,8 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @cuda.jit(device=True, inline=True)
 def differences(x, i, k, column, counts, stride, scale):
-    """Compute the scaled differences of a voxel to the next along z, y and x; 0 behind the
-    last.
+    """Compute the scaled differences of a voxel to the next along z, y and x, a tuple of
+    three; 0 for the last of an axis.
 
     Args:
         x: flat voxels.
