@@ -69,14 +69,14 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
                 attempt, detections, state.model, scan.poses, start=request.start
             )
             found = seek()
-        told = explain_identification(
+        finding = explain_identification(
             found, detections, state.model, scan.poses, scan.name
         )
-        if request.per_frame and told is not None and told.code in OF_MOTION:
+        if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
             found = seek(search=Search(gate_px=WIDE_GATE_PX)) or found
-            told = None
-        findings += listed(told)
+            finding = None
+        findings += listed(finding)
         if found is None:
             break
         out.append(found)

@@ -123,11 +123,11 @@ def settled(
         ['scans: no image 17; give 359 views']
     """
     before = f"{where}: " if where else ""
-    told = []
+    texts = []
     for one in findings:
         if one.severity is Severity.REFUSAL:
             facts = {"check": one.kind, "asked": one.figure, "allowed": one.remedy}
             raise error(before + one.said, facts)
         if one.severity is Severity.WARNING:
-            told.append(before + one.said)
-    return told
+            texts.append(before + one.said)
+    return texts

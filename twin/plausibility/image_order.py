@@ -123,8 +123,8 @@ def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
             example.
     """
     like = next(name for name in names if name not in others)
-    told = ", ".join(others[:MAX_NAMES_SHOWN])
-    cause = f"{told} {_is(others)} named otherwise than the rest, such as {like}"
+    listed = ", ".join(others[:MAX_NAMES_SHOWN])
+    cause = f"{listed} {_is(others)} named otherwise than the rest, such as {like}"
     remedy = "frames=PATTERN says which are projections"
     return Finding("other name", cause, remedy, Severity.WARNING, float(len(others)))
 

@@ -158,12 +158,12 @@ def checked_fdk(
     volume = fdk_parts(
         parts, cone_vec, shape, like, window, progress, truncation, errors=errors
     )
-    said = LostVoxels.of(volume.data).warnings()
+    lost = LostVoxels.of(volume.data).warnings()
     if not errors:
-        return volume, said
+        return volume, lost
     bias = bias_of(image, cone_vec, shape, truncation)
     volume = with_errors(volume, bias=bias)
-    return volume, [*bias_warnings(bias, volume), *said]
+    return volume, [*bias_warnings(bias, volume), *lost]
 
 
 def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:

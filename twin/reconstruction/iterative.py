@@ -168,9 +168,9 @@ def sart(
     )
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
-        said = f"{subsets} subsets, relaxation {relaxation:g}"
+        given = f"{subsets} subsets, relaxation {relaxation:g}"
         raise LimitError.instead(
-            said, [subsets, relaxation], "at least 1, and between 0 and 2"
+            given, [subsets, relaxation], "at least 1, and between 0 and 2"
         )
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
     with long_work.during("solving by SART", progress) as advance:

@@ -121,8 +121,8 @@ class LinearSystem:
             LimitError: no iterations.
         """
         if iterations < 1:
-            said = f"iterations is {iterations!r}"
-            raise LimitError.instead(said, repr(iterations), "a whole number from 1")
+            message = f"iterations is {iterations!r}"
+            raise LimitError.instead(message, repr(iterations), "a whole number from 1")
         geometry = as_cone_vec(cone_vec)
         if not len(geometry):
             raise GeometryError(
@@ -140,9 +140,9 @@ class LinearSystem:
                 spread.shape != values.shape
                 or not (np.isfinite(spread) & (spread > 0.0)).all()
             ):
-                said = f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}"
+                message = f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}"
                 wanted = f"one above 0 for each line integral, {values.shape}"
-                raise GeometryError.instead(said, list(spread.shape), wanted)
+                raise GeometryError.instead(message, list(spread.shape), wanted)
             weights = 1.0 / spread
         system = cls(values, geometry, as_volume(like), weights, hardening)
         box = system.like.boxes[0]
@@ -153,8 +153,8 @@ class LinearSystem:
         found = examine(Operation.ITERATE, geometry, system.shape, images=given, grid=box)
         warn_of(found, GeometryError)
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
-            said = "images on a device, with hardening or surroundings"
-            raise GeometryError.instead(said, "device", "images of the host")
+            message = "images on a device, with hardening or surroundings"
+            raise GeometryError.instead(message, "device", "images of the host")
         if surroundings is None:
             return system
         return RegionSystem.within(system, surroundings)
@@ -175,9 +175,9 @@ class LinearSystem:
         if start.shape != self.like.shape or not np.allclose(
             [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
         ):
-            said = f"the first guess is {start!r}"
+            message = f"the first guess is {start!r}"
             wanted = f"on the grid of {self.like!r}"
-            raise GeometryError.instead(said, list(start.shape), wanted)
+            raise GeometryError.instead(message, list(start.shape), wanted)
         return np.array(start.data, dtype=np.float32)
 
     def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
@@ -337,18 +337,18 @@ class RegionSystem(LinearSystem):
         beyond = np.stack([low - wanted.boxes[0, 0], wanted.boxes[0, 1] - high]) / edge
         below, above = np.ceil(np.maximum(beyond - 1e-6, 0.0))
         if not (below.any() or above.any()):
-            said = f"surroundings {wanted!r} within the region {inner.like!r}"
+            message = f"surroundings {wanted!r} within the region {inner.like!r}"
             raise GeometryError.instead(
-                said, list(wanted.shape), "a grid that reaches beyond it"
+                message, list(wanted.shape), "a grid that reaches beyond it"
             )
         counts = below + parts + above
         most = MAX_VOXEL_RATIO * (math.prod(wanted.shape) + math.prod(inner.like.shape))
         if counts.prod() > most:
-            said = (
+            message = (
                 f"{counts.prod():.3g} voxels, none larger than the region {inner.like!r}"
             )
             less = f"{most}, by a larger region or nearer surroundings"
-            raise GeometryError.instead(said, counts.tolist(), less)
+            raise GeometryError.instead(message, counts.tolist(), less)
         nx, ny, nz = (int(n) for n in counts)
         outside = np.ones((nz, ny, nx), dtype=np.bool_)
         cut = [slice(int(b), int(b + p)) for b, p in zip(below, parts, strict=True)]

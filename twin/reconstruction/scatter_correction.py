@@ -259,8 +259,8 @@ def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
     for one, other in pairwise(np.argsort(mu)):
         if mu[other] - mu[one] < APART * mu[other]:
             names = [materials[i].name for i in (one, other)]
-            said = f"{' and '.join(names)} attenuate alike: a volume does not tell them apart"
-            raise LimitError.instead(said, names, f"{100 * APART:g} % apart")
+            reason = f"{' and '.join(names)} attenuate alike: a volume does not tell them apart"
+            raise LimitError.instead(reason, names, f"{100 * APART:g} % apart")
 
 
 ROUNDS = 8

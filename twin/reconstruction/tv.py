@@ -159,10 +159,12 @@ def minimise_tv(
             copied to where the problem is (with new dual variables there).
             """
             there = isinstance(problem, DeviceProblem)
-            kept = DeviceRegular.of_host(regular, problem.like) if there else regular
+            regulariser = (
+                DeviceRegular.of_host(regular, problem.like) if there else regular
+            )
             return _minimise(
                 problem,
-                kept,
+                regulariser,
                 iterations,
                 weight,
                 tolerance,

@@ -246,18 +246,18 @@ class Candidates:
             first = layout.strain_columns.start
             last = layout.strain_columns.stop
             parts = range(first, first + STRETCHES), range(first + STRETCHES, last)
-            for name, part, said in zip(SHAPES, parts, known.strain, strict=True):
-                widths = tuple(w for w in STRAIN_WIDTHS if w > 1.5 * said)
-                out.append(Cause(name, tuple(part), widths, always=said))
+            for name, part, stated in zip(SHAPES, parts, known.strain, strict=True):
+                widths = tuple(w for w in STRAIN_WIDTHS if w > 1.5 * stated)
+                out.append(Cause(name, tuple(part), widths, always=stated))
             k = len(everything.model)
             if 3 * k - 7 >= 2:  # less a rigid motion and a scale
                 size = float(np.ptp(everything.model.beads, axis=0).max())
-                said = known.bead_tolerance_mm or 0.0
-                widths = tuple(w for s in BEAD_SHARES if (w := s * size) > 1.5 * said)
+                stated = known.bead_tolerance_mm or 0.0
+                widths = tuple(w for s in BEAD_SHARES if (w := s * size) > 1.5 * stated)
                 columns = tuple(
                     range(layout.bead_columns.start, layout.bead_columns.stop)
                 )
-                out.append(Cause("beads", columns, widths, always=said))
+                out.append(Cause("beads", columns, widths, always=stated))
         out += _arc(layout.arc_column, known.arc)
         panel = everything.panel
         if panel is not None:
@@ -587,9 +587,9 @@ def _options(
         if not chosen) and `panel` (None without bends and borders, or where images differ
         in shape).
     """
-    said = candidates.known.strain
+    stated = candidates.known.strain
     strain = tuple(
-        candidates.width(choice, n) or w for n, w in zip(SHAPES, said, strict=True)
+        candidates.width(choice, n) or w for n, w in zip(SHAPES, stated, strict=True)
     )
     beads = candidates.width(choice, "beads")
     bent = candidates.width(choice, "panel")
@@ -598,7 +598,7 @@ def _options(
     if shape is not None and (bent or borders):
         panel = PanelModel(bent or NO_PANEL_PX, shape, tuple(borders))
     return {
-        "strain": None if strain == said else strain,
+        "strain": None if strain == stated else strain,
         "arc": bool(candidates.width(choice, "arc")),
         "bead_tolerance_mm": beads or None,
         "panel": panel,

@@ -90,10 +90,10 @@ def judge_frames(
     out = []
     name = scan.name
     n = len(looks)
-    for state, (code, what) in _STATES.items():
+    for state, (code, words) in _STATES.items():
         some = [look for look in looks if look.state is state]
         files = sorted({look.unusable for look in some if look.unusable})
-        text = f"{name}: {len(some)} of {n} frames are {what}; the others are used"
+        text = f"{name}: {len(some)} of {n} frames are {words}; the others are used"
         if files:
             if len(files) > MAX_SHOWN:
                 more = f" (and {len(files) - MAX_SHOWN} more)"
@@ -383,7 +383,7 @@ def _alternative(
     n = len(poses)
     k = len(model)
     trials: list[tuple[str, str, dict[str, Any]]] = []
-    for factor, true, said in (
+    for factor, true, stated in (
         ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ()
     ):
         turned = replace(
@@ -392,7 +392,7 @@ def _alternative(
         text = (
             f"the angles are off by a factor {factor:.5f}: the frames turn by 360 / "
             f"{true}, not "
-            f"360 / {said} (endpoint error)"
+            f"360 / {stated} (endpoint error)"
         )
         trials.append(("angle_endpoint", text, {"poses": turned}))
     across, along = (_flipped(detections, axis) for axis in (0, 1))

@@ -107,8 +107,8 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     ]
     predicted = fit.problem.residuals(fit.solution.x)[0]
     seen = fit.problem.seen.sum(axis=1)
-    kept = fit.certificate.used.sum(axis=1)
-    bad = np.flatnonzero((seen >= 2) & (kept < 0.5 * seen)).tolist()
+    used = fit.certificate.used.sum(axis=1)
+    bad = np.flatnonzero((seen >= 2) & (used < 0.5 * seen)).tolist()
     for i, d in enumerate(detections):
         places = d.centers[d.whole]
         if len(places) < 2:
@@ -121,7 +121,7 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     if not bad:
         return None
     n = len(detections)
-    spread = float(np.nanmedian(fit.certificate.rms_per_frame[kept > 0]))
+    spread = float(np.nanmedian(fit.certificate.rms_per_frame[used > 0]))
     if len(looks) == 1 and len(fit.group_parameters) == 1:
         numbers = frame_numbers(
             detections, fit.beads, fit.problem.poses, fit.parameters, 2.0 * spread
@@ -318,12 +318,12 @@ def explain_residuals(
         return fit, []
     plain = fit
     fit, causes = explained_by_causes(fit, known, refit)
-    told = named_causes(fit, plain, causes)
+    named = named_causes(fit, plain, causes)
     if "beads" in causes.applied and _one_is_elsewhere(plain, fit):
         fit = plain
-        told = []
+        named = []
     certificate = fit.certificate
-    out = [*_lost_beads(fit), *_drifts(fit), *told]
+    out = [*_lost_beads(fit), *_drifts(fit), *named]
     limit = max(misfit_px, largest_residual(fit, MISFIT_CHANCE, sigmas_known))
     bad = certificate.rms_px >= limit
     if bad or plain.certificate.used.sum() < MOST_USED * plain.problem.seen.sum():
@@ -421,8 +421,8 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
     problem = fit.problem
     used = fit.certificate.used
     seen = problem.seen.sum(axis=0)
-    kept = used.sum(axis=0)
-    lost = np.flatnonzero((seen >= 3) & (kept < 0.5 * seen)).tolist()
+    used_frames = used.sum(axis=0)
+    lost = np.flatnonzero((seen >= 3) & (used_frames < 0.5 * seen)).tolist()
     if lost:
         text = f"bead {', '.join(map(str, lost))} is not where the phantom's model has it and was"
         if len(problem.model) - len(lost) >= 3:
@@ -544,7 +544,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     motion = max(found.motions, key=lambda m: float(np.ptp(m.values[:, first])))
     name = names[first]
     curve = motion.values[:, first]
-    said = [
+    motions = [
         f"{n} by {to_edge(n, float(np.ptp(motion.values[:, i]))):.3g} {UNITS[n]}"
         for i, n in sorted(enumerate(names), key=lambda pair: -effects[pair[0]])
         if effects[i] > 0.3 * effects[first]
@@ -568,7 +568,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         code = "drift"
     return error(
         code,
-        f"{', '.join(said)} moves during the scan, {how}{_looks_alike(name)}: --per-frame "
+        f"{', '.join(motions)} moves during the scan, {how}{_looks_alike(name)}: --per-frame "
         f"{','.join(names)} follows it",
         per_frame=names,
     )

@@ -172,10 +172,10 @@ def judge_exact(
         f"{n} to {after[n].sigma:.2g} {after[n].unit} instead of {fit.sigmas.get(n, 0.0):.2g}"
         for n in worst
     )
-    said = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
+    assumed = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
     return warning(
         "held_unchecked",
-        f"{said} is taken as exact, and the images cannot tell whether it is: with the "
+        f"{assumed} is taken as exact, and the images cannot tell whether it is: with the "
         "usual prior "
         f"sigmas grow: {listed}; give prior 0 only to what was measured",
     )
@@ -219,8 +219,8 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     some = values < 1.0 - MIN_VARIANCE_DROP
     if not some.any():
         return PriorsJudged(None, 1.0)
-    kept = 1.0 - values[some]
-    spread = kept * (kept / LOOSE_FACTOR**2 + values[some])
+    image_share = 1.0 - values[some]
+    spread = image_share * (image_share / LOOSE_FACTOR**2 + values[some])
     square = float(np.sum((vectors.T @ moved)[some] ** 2 / spread))
     count = int(some.sum())
     chance = _chance(square, count, c.dof)

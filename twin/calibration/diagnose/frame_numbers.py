@@ -84,7 +84,7 @@ class FrameNumbers:
             again = self.again.tolist()
             if not again:
                 return None
-            said = "; ".join(
+            described = "; ".join(
                 f"frame {i} shows what frame {i + int(self.shift[i])} should"
                 for i in again[:MAX_SHOWN]
             )
@@ -92,11 +92,11 @@ class FrameNumbers:
                 "frames_inconsistent",
                 f"{name}: in {len(again)} of {len(self.shift)} frames the shadows are "
                 "not where "
-                f"the others put them: {said}; those frames are not used",
+                f"the others put them: {described}; those frames are not used",
             )
         settled = self._settled
         changes = np.flatnonzero(np.diff(settled)) + 1
-        said = "; ".join(
+        described = "; ".join(
             _change(int(i), int(settled[i] - settled[i - 1]))
             for i in changes[:MAX_SHOWN].tolist()
         )
@@ -106,7 +106,7 @@ class FrameNumbers:
             more = f" (and {len(changes) - MAX_SHOWN} more)"
         return error(
             "frame_numbers",
-            f"{name}: {said}{more}: the frames' angles are those of other frames; number them "
+            f"{name}: {described}{more}: the frames' angles are those of other frames; number them "
             "anew, or scan again",
         )
 

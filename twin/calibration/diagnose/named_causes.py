@@ -71,12 +71,12 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
         rivals = dict.fromkeys(
             CAUSE_WORDS.get(n, f"a {n}") for n in [*doubtful, *found.open]
         )
-        said = " or ".join(rivals)
+        alternatives = " or ".join(rivals)
         out.append(
             warning(
                 "causes_open",
-                f"the residuals have a cause that the images do not tell for certain: {said}; "
-                "the intervals contain what they differ by",
+                "the residuals have a cause that the images do not tell for certain: "
+                f"{alternatives}; the intervals contain what they differ by",
             )
         )
     return out
@@ -114,7 +114,7 @@ def _strained(found: Found) -> Finding | None:
     if not certain:
         return None
     most = max(map(abs, certain.values()))
-    said = ", ".join(
+    strains = ", ".join(
         f"{100 * v:+.2g} % {n}" for n, v in certain.items() if abs(v) > 0.3 * most
     )
     alike = [
@@ -126,7 +126,7 @@ def _strained(found: Found) -> Finding | None:
         rival = ""
     return warning(
         "phantom_strained",
-        f"the phantom is not as its file says: {said}{rival}. Its shape was fitted along; how "
+        f"the phantom is not as its file says: {strains}{rival}. Its shape was fitted along; how "
         "large it is as a whole images do not tell, so lengths, dO_z and the "
         "magnification hold "
         "as far as its millimetre: measure it, or give --bead-tolerance",

@@ -122,11 +122,11 @@ class _Explanations:
         problem = fit.problem
         x = fit.solution.x
         use = fit.solution.use
-        kept = np.repeat(use.ravel(), 2)
+        used_rows = np.repeat(use.ravel(), 2)
         rows = np.column_stack([problem.jacobian(x, use), _pitch_column(problem, x)])
         self._noise = fit.certificate.noise
-        left = problem.whitened(x).ravel()[kept]
-        self._table = Table(rows[kept], left, self._noise)
+        left = problem.whitened(x).ravel()[used_rows]
+        self._table = Table(rows[used_rows], left, self._noise)
         self._means = np.append(problem.prior_mean - x, 0.0)
         self._means[~np.isfinite(self._means)] = 0.0
         self._widths = problem.prior_sigma

@@ -575,10 +575,10 @@ def spread_of_residuals(
         The standard deviation and the degrees of freedom; (nan, 0) for `LEAST_FREEDOM` or
         fewer.
     """
-    _, _, norms, _, told, _ = problem.evaluate(x, use, 1)
+    _, _, norms, _, normal, _ = problem.evaluate(x, use, 1)
     weight = problem.prior_weight(prior_noise)
     count = 2.0 * int(use.sum())
-    dof = count - _determined(told, weight)
+    dof = count - _determined(normal, weight)
     if not dof > LEAST_FREEDOM:
         return math.nan, 0.0
     square = float(np.sum(norms[use] ** 2))

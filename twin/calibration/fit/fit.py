@@ -717,10 +717,10 @@ def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> fl
     """
     use = solution.use
     x = solution.x
-    told = problem.evaluate(x, use, 1)[4]
+    normal = problem.evaluate(x, use, 1)[4]
     precision = 1.0 / problem.prior_sigma**2
     with_prior = precision > 0.0
-    whole = told / noise**2 + np.diag(precision)
+    whole = normal / noise**2 + np.diag(precision)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
     volume = (
         np.linalg.slogdet(whole * np.outer(scale, scale))[1] - 2.0 * np.log(scale).sum()
@@ -886,11 +886,11 @@ def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray
         np.ceil(n * np.arange(1, count + 1) / max(count, 1)).astype(int)
     ):
         some = parts[:frames].reshape(frames * 2 * k, -1)
-        told = np.einsum("mi,mj->ij", some, some) + np.diag(problem.prior_weight(noise))
-        scale = np.sqrt(np.diag(told))
+        normal = np.einsum("mi,mj->ij", some, some) + np.diag(problem.prior_weight(noise))
+        scale = np.sqrt(np.diag(normal))
         matrix = None
         if (scale > 0).all():
-            values, vectors = np.linalg.eigh(told / np.outer(scale, scale))
+            values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
             if values[0] > 1e-12:
                 inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
                 matrix = (noise**2 * inverse * np.outer(factor, factor))[

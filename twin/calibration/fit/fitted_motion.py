@@ -160,8 +160,8 @@ def estimate_motion(
     factor = np.array([edge_factor(column) for column in problem.layout.names[:count]])
     more = added[:count, :count] * np.outer(factor, factor)
     if fit.identifiable:
-        told = fit.certificate.spectrum.unit_covariance[:count, :count]
-        more = more + (inflation - 1.0) * noise**2 * told
+        unit_covariance = fit.certificate.spectrum.unit_covariance[:count, :count]
+        more = more + (inflation - 1.0) * noise**2 * unit_covariance
     return MotionFit(motions, more, choice)
 
 
@@ -548,8 +548,8 @@ class _Mixed:
             both = with_fixed @ into.T
             fixed_covariance = inverse + both + both.T + into @ of_means @ into.T
             # What the data add to each deviation's prior is what they take of the freedom.
-            told = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
-            taken = float(np.sum(np.minimum(told * square, 1.0)))
+            information = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
+            taken = float(np.sum(np.minimum(information * square, 1.0)))
             sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(
                 n, p
             )

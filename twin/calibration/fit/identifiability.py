@@ -183,9 +183,9 @@ def identifiability(
         return forecast(problem, bound), visible
 
     sizes = frame_shapes(shape, len(poses))
-    told, visible = predict(model, poses, sizes)
-    spec = told.spectrum
-    sigmas = told.sigmas
+    expected, visible = predict(model, poses, sizes)
+    spec = expected.spectrum
+    sigmas = expected.sigmas
     suggestions: list[Suggestion] = []
     before = _worst(sigmas)
     if spec.null or spec.weak or before > 1.0:
@@ -197,8 +197,8 @@ def identifiability(
         suggestions.sort(key=lambda s: s.worst)
     return Prediction(
         sigmas=sigmas,
-        image_sigmas=told.image_sigmas,
-        covariance=told.covariance,
+        image_sigmas=expected.image_sigmas,
+        covariance=expected.covariance,
         rank=spec.rank,
         condition=spec.condition,
         null=spec.null,

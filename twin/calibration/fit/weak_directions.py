@@ -177,12 +177,12 @@ def weak_direction(
         With its sigma in the lead's edge unit; inf where it is not determined.
     """
     order = np.argsort(-np.abs(vector))
-    kept = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]
+    involved = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]
     # The parameter that is most uncertain leads; prefer geometry over beads, detector over
     # stage.
     change = vector / scale
-    lead = max(kept, key=lambda i: abs(change[i]) / tolerance_of(names[i]))
-    rest = [i for i in kept if i != lead]
+    lead = max(involved, key=lambda i: abs(change[i]) / tolerance_of(names[i]))
+    rest = [i for i in involved if i != lead]
     parts = (
         (names[lead], 1.0),
         *((names[i], float(change[i] / change[lead])) for i in rest),

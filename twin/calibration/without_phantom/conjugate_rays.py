@@ -396,10 +396,10 @@ class ConjugateRays:
         values = values.copy()
         slope = self.scan.slopes(values, self.scan.scales[: len(values)])[0]
         for _ in range(ROUNDS):
-            _, moved, told, power = self._sums(values)
-            if not told.sum() > MIN_CORRELATION * power.sum():
+            _, moved, information, power = self._sums(values)
+            if not information.sum() > MIN_CORRELATION * power.sum():
                 return values, math.inf
-            shift, sigma = _left_out(moved.sum(axis=(1, 2)), told.sum(axis=(1, 2)))
+            shift, sigma = _left_out(moved.sum(axis=(1, 2)), information.sum(axis=(1, 2)))
             values[0] -= shift / 2.0 / slope
             if abs(shift) < NEAR * sigma:
                 break
@@ -417,33 +417,34 @@ class ConjugateRays:
         Returns:
             The profile; None if fewer than `MIN_BINS` bins are left.
         """
-        radius, moved, told, power = self._sums(values)
+        radius, moved, information, power = self._sums(values)
         if len(radius) == 0:
             return None
-        weight = told.sum(axis=(0, 1))
+        weight = information.sum(axis=(0, 1))
         place = (
             radius / max(MIN_BIN_SIGMAS * self.smoothing, radius[-1] / MAX_BINS)
         ).astype(np.intp)
         count = int(place[-1]) + 1
         of_bin = (place[:, None] == np.arange(count)).astype(np.float64)
         moved = moved @ of_bin
-        told = told @ of_bin
+        information = information @ of_bin
         good = np.bincount(place, weight) > MIN_CORRELATION * np.bincount(place, power)
         shift, sigma = np.ones((2, count))
         for i in np.flatnonzero(good).tolist():
             ways = [
-                _left_out(*(t[..., i].sum(axis=a) for t in (moved, told))) for a in (1, 0)
+                _left_out(*(t[..., i].sum(axis=a) for t in (moved, information)))
+                for a in (1, 0)
             ]
             shift[i] = ways[0][0]
             sigma[i] = max(way[1] for way in ways)
         good &= np.isfinite(sigma)
         if good.sum() < MIN_BINS:
             return None
-        kept = good[place]
+        in_good_bin = good[place]
         renumbered = np.cumsum(good) - 1
-        radius = radius[kept]
-        weight = weight[kept].clip(1e-30)
-        place = renumbered[place[kept]]
+        radius = radius[in_good_bin]
+        weight = weight[in_good_bin].clip(1e-30)
+        place = renumbered[place[in_good_bin]]
         return Profile.of(radius, weight, place, shift[good], sigma[good], self.smoothing)
 
     def _sums(
@@ -477,11 +478,11 @@ class ConjugateRays:
             own[:, i], other[:, i] = ((b - a) / (2.0 * little) for a, b in ends)
         for table in (apart, own, other):
             table -= table.mean(axis=0)
-        moved, told = np.zeros((2, SECTORS, len(self.rows), len(radius)))
+        moved, information = np.zeros((2, SECTORS, len(self.rows), len(radius)))
         np.add.at(moved, self.sector, apart * (own + other) / 2.0)
-        np.add.at(told, self.sector, own * other)
+        np.add.at(information, self.sector, own * other)
         power = (np.square(own) + np.square(other)).sum(axis=(0, 1)) / 2.0
-        return radius, moved, told, power
+        return radius, moved, information, power
 
     def _both(
         self, group: int, values: FloatArray, columns: FloatArray

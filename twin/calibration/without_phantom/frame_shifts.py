@@ -70,8 +70,8 @@ def find_shifts(
     image = pairs.noise(random)
     noise = system.of(image)
     # Slopes that are noise in part make the equations stiffer than what there is to be seen.
-    told = np.maximum(1.0 - system.share(image), LEAST_TOLD)
-    scatter = (free @ system.solve(noise)).var(axis=0) / np.square(told)
+    object_share = np.maximum(1.0 - system.share(image), LEAST_TOLD)
+    scatter = (free @ system.solve(noise)).var(axis=0) / np.square(object_share)
     # What planes disagree by beyond noise (sampling, beam hardening) is in the shifts as well.
     # A face along the beam is sampled alike in all pairs of a frame: more than they tell.
     scatter *= ERROR_FACTOR**2 * max(1.0, system.power(system.rest) / system.power(noise))

@@ -213,13 +213,13 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
     Returns:
         At least twice the smoothing; the largest radius if no step is determined.
     """
-    told = np.array(
+    determined = np.array(
         [SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX for r in profile.radii.tolist()]
     )
     inner = 2.0 * smoothing
-    if not told.any():
+    if not determined.any():
         return max(inner, float(profile.radii[-1]))
-    return max(inner, float(profile.radii[int(told.argmax())]))
+    return max(inner, float(profile.radii[int(determined.argmax())]))
 
 
 def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
@@ -285,9 +285,9 @@ def _evidence(images: FloatArray) -> Evidence:
     of_rows = power.reshape(images.shape[0], -1)
     noise = np.quantile(of_rows, NOISE_QUANTILE, axis=0) / NOISE_QUANTILE_POWER
     edges = places & (of_rows > EDGE_NOISE * noise).reshape(power.shape)
-    told = _evidence_of(around, power, places, len(images), evenly=True)
-    shown = _evidence_of(around, power, edges, len(images), evenly=False)
-    return Evidence(np.maximum(told.found, shown.found), told.width)
+    of_places = _evidence_of(around, power, places, len(images), evenly=True)
+    of_edges = _evidence_of(around, power, edges, len(images), evenly=False)
+    return Evidence(np.maximum(of_places.found, of_edges.found), of_places.width)
 
 
 def _evidence_of(

@@ -340,8 +340,8 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
     if gap.beside_axis:
         return False
     sigma = float(np.sqrt(found.covariance[-1, -1]))
-    told = sigma < gap.sigma / 2
-    return found.converged and told and not found.values[-1] > SIGMAS * sigma
+    precise = sigma < gap.sigma / 2
+    return found.converged and precise and not found.values[-1] > SIGMAS * sigma
 
 
 def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
@@ -447,10 +447,10 @@ def _plane(
         scales = scales[:OF_TURN]
         scan, turn = _closed(scan, turn, gap)
         panel = gap.panel(scan.shape, panel)
-    told = found.images[1:3] < first.priors[1:3] / 2
+    determined = found.images[1:3] < first.priors[1:3] / 2
     beside = 0.0
     if first.rays is not None:
-        told[:] = False
+        determined[:] = False
         beside = _beside_rows(scan, first.rays, first.priors[1])
         _keep_roll(values, covariance, scan.base.det_roll, first.priors[1])
     if turn is None:
@@ -473,7 +473,7 @@ def _plane(
         covariance,
         found.images[1:3],
         first.priors[1:3],
-        told,
+        determined,
         sigma,
         gap,
         panel,

@@ -121,9 +121,9 @@ def read_turn(
         NotIdentifiableError: they are too few, do not close a turn, or have too few rows
             or columns.
     """
-    kept = [i for i in present if i not in repeated]
+    remaining = [i for i in present if i not in repeated]
     index = np.array(
-        sorted(kept, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp
+        sorted(remaining, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp
     )
     gaps, usual = _require_turn(angle[index])
     weights = _coefficients(angle[index], gaps, usual)
@@ -136,7 +136,7 @@ def read_turn(
             weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
     total: FloatArray | float = 0.0
     noise: FloatArray | float = 0.0
-    used = tuple(sorted(kept))
+    used = tuple(sorted(remaining))
     thumbs = []
     samples = []
     bands = []

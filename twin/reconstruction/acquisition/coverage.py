@@ -146,19 +146,19 @@ class LostVoxels:
         if more than `LOST_SHARE` of those examined; both are NaN in the volume. Empty if
         all is well.
         """
-        said = []
+        sentences = []
         if self.lost_layers:
-            said.append(
+            sentences.append(
                 f"{self.lost_layers} of {self.layers} layers of the grid lie outside what "
                 "the panel sees; their voxels are NaN"
             )
         if self.lost_voxels > LOST_SHARE * self.voxels:
             share = 100.0 * self.lost_voxels / self.voxels
-            said.append(
+            sentences.append(
                 f"{share:.0f} % of the voxels are not seen from all sides and are NaN: "
                 "more angles, a panel nearer to the middle, or a smaller grid"
             )
-        return said
+        return sentences
 
 
 LOST_SHARE = 0.5

@@ -170,8 +170,9 @@ class Truncation:
     @property
     def otherwise(self) -> Truncation:
         """The same with rows continued in another way, to see how much depends on it:
-        they fade out if prisms explained them; else they follow the best of the prisms
-        that do not explain the images (`others`), and fade out later where there is none.
+        without prisms, fading out, if prisms explained all rows that are cut off; else by
+        the best of the prisms that do not explain the images (`others`), the rest fading
+        out over twice the length.
         """
         if self.explained:
             return replace(self, prisms=(None,) * len(self.prisms))

@@ -82,14 +82,14 @@ class Contradiction:
                 f"they fit as well if {self._explanations}; values would then differ by "
                 f"{100.0 * self.change:.2g} % in a tenth of the uniform regions"
             )
-        said = (
+        sentence = (
             "no accuracy is claimed: images and geometry contradict each other; the volume, "
             f"projected again, differs from the images {self.misfit:.2g} times as much "
             "as it should"
         )
         if not self.kinds:
-            return f"{said}. {UNEXPLAINED}"
-        return f"{said}, {100.0 * self.better:.0f} % of it if {self._explanations}"
+            return f"{sentence}. {UNEXPLAINED}"
+        return f"{sentence}, {100.0 * self.better:.0f} % of it if {self._explanations}"
 
     @property
     def _explanations(self) -> str:
@@ -106,9 +106,9 @@ class Contradiction:
 def compared(scan: CoarseScan) -> Comparison | None:
     """Compare a scan's images with the projections of its volume.
 
-    Some views and rows are tried first; all views if the expected residual of some is too
-    large. Where the misfit is below `MIN_DOUBTFUL_MISFIT`, the comparison is not
-    `doubtful` and repeated with at least `RIVALS_ROWS` rows.
+    Some views and rows are tried first; all views if the expected residual of values or
+    edges is too large. Where the misfit is below `MIN_DOUBTFUL_MISFIT`, the comparison is
+    not `doubtful`, and is made once more with some views and at least `RIVALS_ROWS` rows.
 
     Args:
         scan: coarse.
@@ -254,5 +254,5 @@ class Comparison:
         """
         figures = {one.suspect.kind: one.suspect.figure for one in as_good}
         kinds = tuple(figures)
-        told = tuple(figures.values())
-        return Contradiction(self._trial.excess, kinds, score, told, change)
+        figure_texts = tuple(figures.values())
+        return Contradiction(self._trial.excess, kinds, score, figure_texts, change)

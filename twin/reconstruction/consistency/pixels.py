@@ -260,8 +260,8 @@ def _no_feature(
 
     A bead on the axis stands before one pixel in all views, as a defect does. Columns
     that are bad over more than half of their rows are defects, and so are means over the
-    views that exceed the range of values elsewhere by `EXPLAINED_ABOVE`, or fall below it
-    by `EXPLAINED_BELOW`, of that range.
+    views that exceed the range of values elsewhere, with 0 in it, by `EXPLAINED_ABOVE`,
+    or fall below it by `EXPLAINED_BELOW`, of that range.
 
     Args:
         views: line integrals (rows, cols), at least one.
@@ -373,9 +373,9 @@ class _Usual:
         if self.count % VIEWS_AN_OUTLIER == 0:
             self._largest.append(np.zeros_like(square))
         rest = square
-        for kept in self._largest:
-            smaller = np.minimum(kept, rest)
-            np.maximum(kept, rest, out=kept)
+        for largest in self._largest:
+            smaller = np.minimum(largest, rest)
+            np.maximum(largest, rest, out=largest)
             rest = smaller
 
     def root(self) -> Float32Array:

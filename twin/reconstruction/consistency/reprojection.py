@@ -91,8 +91,8 @@ class Reprojection:
         rest = self.again - self.images
         least = np.finfo(np.float32).tiny
         parts = [
-            [max(_mean_square(arc), least) for arc in np.array_split(what, ARCS)]
-            for what in (rest, _changes(rest))
+            [max(_mean_square(arc), least) for arc in np.array_split(values, ARCS)]
+            for values in (rest, _changes(rest))
         ]
         return np.array(parts)
 
@@ -108,8 +108,8 @@ class Reprojection:
             _noise_of(self.images) - _noise_of(self.again), 0.0
         )
         residual, signal = (
-            np.array([_mean_square(what), _mean_square(_changes(what))])
-            for what in (rest, self.images)
+            np.array([_mean_square(values), _mean_square(_changes(values))])
+            for values in (rest, self.images)
         )
         return residual, signal, noise * NOISE_OF_CHANGES
 

@@ -230,9 +230,9 @@ class Trial:
 
     def _offset(self, columns: float) -> Tried:
         """Try the panel moved along its rows [coarse columns]."""
-        said = f"by {columns * self.scan.binned[1]:+.1f} px along its rows"
+        figure = f"by {columns * self.scan.binned[1]:+.1f} px along its rows"
         moved_panel = moved(self.scan.cone_vec, columns)
-        return self._tried(Suspect("offset", self.scan.images, moved_panel, said))
+        return self._tried(Suspect("offset", self.scan.images, moved_panel, figure))
 
     def _beside(self, far: bool) -> list[Tried]:
         """Try panels moved along their rows (offset axis): towards the side where images

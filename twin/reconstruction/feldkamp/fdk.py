@@ -206,8 +206,8 @@ def _add_all(
         if progress is not None:
             progress(done / plan.count)
     if done != plan.count:
-        said = f"{done} projections"
-        raise GeometryError.instead(said, done, f"one for each of {plan.count} views")
+        given = f"{done} projections"
+        raise GeometryError.instead(given, done, f"one for each of {plan.count} views")
 
 
 def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:

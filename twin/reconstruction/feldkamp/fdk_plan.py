@@ -169,9 +169,9 @@ class FdkPlan:
         else:
             images = part
         if images.shape[1:] != panels.seen or views.stop > self.count:
-            said = f"projections of shape {images.shape} after {done} views"
+            given = f"projections of shape {images.shape} after {done} views"
             allowed = f"{self.count} views of {panels.seen}"
-            raise GeometryError.instead(said, list(images.shape), allowed)
+            raise GeometryError.instead(given, list(images.shape), allowed)
         if panels.upright is not panels.recorded:
             both = panels.recorded[views], panels.upright[views]
             images = rectified(images, *both, panels.shape[1])
@@ -341,8 +341,8 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
     moved = float(np.ptp(columns))
     if not moved <= MAX_SIDEWAYS_SHARE * shape[1]:
         most = MAX_SIDEWAYS_SHARE * shape[1]
-        said = f"the panel moves {moved:.1f} columns sideways between the views (a tiled scan?)"
-        raise no_fdk(f"{said}; FDK takes {most:.1f} at most", moved, most)
+        reason = f"the panel moves {moved:.1f} columns sideways between the views (a tiled scan?)"
+        raise no_fdk(f"{reason}; FDK takes {most:.1f} at most", moved, most)
 
 
 def _widths(

@@ -41,8 +41,8 @@ def lanes() -> int:
 
     The features of numba's setting CPU_FEATURES count, else those of this processor.
     """
-    asked = config.CPU_FEATURES
-    features = (get_host_cpu_features() if asked is None else asked).split(",")
+    stated = config.CPU_FEATURES
+    features = (get_host_cpu_features() if stated is None else stated).split(",")
     if "+fma" not in features:
         return 1
     return 16 if "+avx512f" in features else 8 if "+avx2" in features else 1
