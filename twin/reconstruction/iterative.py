@@ -244,7 +244,17 @@ def cgls(
     """Reconstruct by conjugate gradients for least squares: the residual falls every
     iteration.
 
+    Ends early if the gradient is exactly 0. Values may be negative.
+
     Args: as for `sirt`.
+
+    Returns:
+        Volume [1/mm] on the grid of `like`.
+
+    Raises:
+        GeometryError: shapes that do not fit, or surroundings that do not reach beyond
+            the grid.
+        LimitError: no iterations.
 
     Examples:
         >>> from flexdt.twin.projection import forward

@@ -312,7 +312,11 @@ def without_scatter(
     kV: float,
     settings: ScatterSettings | None = None,
 ) -> Float32Array:
-    """Subtract the scatter from line integrals of a circular scan.
+    """Subtract the scatter from line integrals of a circular scan: finds the object
+    (`scatterer_of`), simulates its scatter by the settings and subtracts it, at most
+    `MOST` of a pixel's signal.
+
+    Doubts about the correction are not reported; `scatterer_of` returns them.
 
     Args:
         line_integrals: (n, rows, cols), of the signal over the open beam's.
@@ -320,7 +324,7 @@ def without_scatter(
         chain: tube and panel, and the materials that the object is made of (see
             `scatterer_of`).
         kV: tube voltage.
-        settings: of the simulation.
+        settings: of the simulation; None: the default ones.
 
     Returns:
         float32 (n, rows, cols).

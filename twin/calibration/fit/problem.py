@@ -846,7 +846,10 @@ def from_printed_reading(p: Offsets, reading: Reading) -> Offsets:
 
 
 def edge_factor(column: str) -> float:
-    """Return the edge units per internal unit of a column (deg per rad, else 1)."""
+    """Return the edge units per internal unit of a column: deg per rad for angles, else
+    1, also for columns that are no parameters; of a group's column (NAME@NUMBER) as of
+    the parameter.
+    """
     name = column.split("@")[0]
     if name in NAMES:
         return to_edge(name, 1.0)
