@@ -48,12 +48,13 @@ class UniformNodes:
         """Find the uniform nodes of a volume.
 
         Edges are changes of `EDGE_CHANGE_SHARE` of the body's attenuation (`_typical`).
-        Nodes of the object have at least `MIN_NEIGHBOURHOOD_SHARE` of the smooth value
-        and `MIN_BODY_SHARE` of the body's.
+        Nodes of the object are seen by all views and have at least
+        `MIN_NEIGHBOURHOOD_SHARE` of the smooth value and `MIN_BODY_SHARE` of the body's.
+        Nodes that some view does not see have hardly any weight (1e-3).
 
         Args:
             values: (nz, ny, nx) [1/mm], NaN where no data cover a node.
-            rim: voxel columns outside some views, (ny, nx).
+            rim: voxel columns outside some views, (ny, nx); they count as 0.
         """
         unseen = np.isnan(values) | rim
         sharp = np.where(rim, np.float32(0.0), np.nan_to_num(values))

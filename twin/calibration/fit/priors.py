@@ -125,12 +125,19 @@ def exact(free: Container[str] = SIX) -> dict[str, float]:
 def prior_widths(
     machine: Machine | None = None, profile: Profile | None = None
 ) -> dict[str, float]:
-    """Return the standard deviation of each offset of a scanner [mm, deg, 1].
+    """Return the standard deviation of each offset of a scanner: the profile's where that
+    states one, else the machine's, else the assumed one (`ASSUMED`).
 
-    It is the profile's where that states one, else the machine's, else the assumed one.
+    Args:
+        machine: None: states none.
+        profile: None: states none.
 
-    >>> prior_widths()["dD_z"]
-    1.0
+    Returns:
+        Parameter -> standard deviation [mm, deg, 1], in a new dictionary.
+
+    Example:
+        >>> prior_widths()["dD_z"]
+        1.0
     """
     out = dict(ASSUMED)
     for stated in (machine, profile):

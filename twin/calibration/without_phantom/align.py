@@ -203,7 +203,7 @@ def _motion(
 def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]:
     """List doubts about the scan, in this order: opposite rays disagree with the mean; a
     gap between tiles of the panel was found; one is not excluded; repeated frames;
-    missing frames; a step of more than `STEP_TOLD` to the right.
+    missing frames; a step of more than `STEP_TOLD` along the rows.
 
     Args:
         plane: of symmetry.

@@ -111,11 +111,12 @@ def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
 
 
 def circle_of(cone_vec: ConeVec) -> Circle:
-    """Fit a circle, or else a helix about z, to a scan's sources.
+    """Fit a helix about z, or else a circle, to a scan's sources.
 
     The centre is fitted by least squares in x and y. A helix is recognised by a steady
-    rise over a turn or more; else the sources must keep to a horizontal circle within
-    `MAX_CIRCLE_DEVIATION` of its radius. "Gaps" are arcs without views.
+    rise over a turn or more (`_helix`); else the sources must keep to a horizontal
+    circle. Both may deviate from the radius by `MAX_CIRCLE_DEVIATION` of it. "Gaps" are
+    arcs without views.
 
     Args:
         cone_vec: n views.
