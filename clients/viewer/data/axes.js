@@ -14,7 +14,7 @@ const GROUPS = [
     ],
     ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
-const TURN = { rot_obj: "turn of sample" }; // with what is set most
+const TURN = { rot_obj: "Turn of sample" }; // with what is set most, in plain words first
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 const sod = (s) => s.geometry.SOD_mm;
 const sdd = (s) => s.geometry.SDD_mm;
@@ -219,6 +219,7 @@ function build(state) {
 }
 function axisRow(name, axis, what) {
     const [low, high] = axis.limits;
+    const said = name in TURN ? [what, name] : [name, what];
     const slider = el("input", {
         type: "range",
         min: low,
@@ -279,7 +280,7 @@ function axisRow(name, axis, what) {
         }, wait);
     };
     slider.addEventListener("change", () => void slid());
-    box.append(el("div", { class: "top" }, el("span", { title: what }, el("span", { class: "name" }, name), el("span", { class: "what" }, what)), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))), el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
+    box.append(el("div", { class: "top" }, el("span", { title: what }, el("span", { class: "name" }, said[0]), el("span", { class: "what" }, said[1])), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))), el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
     rows.set(name, row);
     return box;
 }

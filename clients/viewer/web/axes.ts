@@ -16,7 +16,7 @@ const GROUPS: Array<[title: string, tint: string, axes: Record<string, string>]>
   ],
   ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
-const TURN = { rot_obj: "turn of sample" }; // with what is set most
+const TURN = { rot_obj: "Turn of sample" }; // with what is set most, in plain words first
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 interface Row {
   name: string;
@@ -264,6 +264,7 @@ function build(state: State) {
 
 function axisRow(name: string, axis: AxisState, what: string) {
   const [low, high] = axis.limits;
+  const said = name in TURN ? [what, name] : [name, what];
   const slider = el("input", {
     type: "range",
     min: low,
@@ -330,8 +331,8 @@ function axisRow(name: string, axis: AxisState, what: string) {
       el(
         "span",
         { title: what },
-        el("span", { class: "name" }, name),
-        el("span", { class: "what" }, what),
+        el("span", { class: "name" }, said[0]),
+        el("span", { class: "what" }, said[1]),
       ),
       el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm")),
     ),
