@@ -5,8 +5,8 @@ rendering.
 
 Starts a lab of its own, unless it is given the address of one whose machine stands at home.
 Writes viewer-first.png, viewer-four-views.png, viewer-scan-it.png, viewer-scan.png,
-viewer-design.png and viewer-virtual.png, in COLORS colours. Needs Debian's chromium, playwright
-and Pillow.
+viewer-design.png and viewer-virtual.png, in COLORS colours, and viewer-turning.gif; `--only`
+writes those of one function. Needs Debian's chromium, playwright and Pillow.
 """
 
 from __future__ import annotations
@@ -37,6 +37,22 @@ FADED_MS = 6000
 """A scene fades in once its parts have come."""
 COLORS = 256
 PATIENCE_MS = 300_000
+TURNING_DEG = 36.0
+"""Angle between two teeth of the gear."""
+TURNING_FRAMES = 12
+TURNING_PX = 720
+TURNING_COLORS = 128
+TURNING_BELOW_PX = 110
+"""Of the scene, below the radiograph's lower edge."""
+TURNING_MS = 110
+SETTLED_MS = 2500
+"""From a motor's rest to a picture that shows it."""
+TURNED = """
+(angle) => {
+  const { position, moving } = flexdt.store.state.axes.rot_obj;
+  return !moving && Math.abs(position - angle) < 1e-3;
+}
+"""
 WRONG = "flexdt.call('calibration.apply', {parameters: {dO_x: 0.3, dO_z: -0.4}, comment: 'wrong'})"
 """A correction by which the beads stand beside where they are seen, until a fit puts it
 right."""
@@ -156,12 +172,55 @@ def virtual(browser: Any, url: str, to: Path) -> None:
     page.close()
 
 
+def turning(browser: Any, url: str, to: Path) -> None:
+    """Film the gear while it turns by the angle after which it looks the same: the scene, near
+    the sample, and its radiograph.
+    """
+    page = opened(browser, url, "iso", "move")
+    page.evaluate("flexdt.call('session.control', {action: 'force'})")
+    page.evaluate("flexdt.call('sample.set', {name: 'gear'})")
+    page.locator(".view .look").click()
+    page.wait_for_timeout(FADED_MS)
+    page.add_style_tag(
+        content=".view button, .view .tag, #notes, #film ~ * { visibility: hidden }"
+    )
+    box = page.locator("#views").bounding_box()
+    film = page.locator("#film").bounding_box()
+    part = {
+        "x": box["x"],
+        "y": film["y"],
+        "width": SIZE["width"] - box["x"],
+        "height": film["height"] + TURNING_BELOW_PX,
+    }
+    frames = []
+    for k in range(TURNING_FRAMES):
+        angle = TURNING_DEG * k / TURNING_FRAMES
+        page.evaluate(
+            "angle => flexdt.call('axes.move', {targets: {rot_obj: angle}})", angle
+        )
+        page.wait_for_function(TURNED, arg=angle)
+        page.wait_for_timeout(SETTLED_MS)
+        raw = Image.open(io.BytesIO(page.screenshot(clip=part))).convert("RGB")
+        high = round(raw.height * TURNING_PX / raw.width)
+        frames.append(raw.resize((TURNING_PX, high), Image.Resampling.LANCZOS))
+    palette = frames[-1].quantize(TURNING_COLORS, Image.Quantize.MAXCOVERAGE, kmeans=3)
+    few = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in frames]
+    film_of = {"save_all": True, "append_images": few[1:], "duration": TURNING_MS}
+    few[0].save(to / "viewer-turning.gif", loop=0, optimize=True, **film_of)
+    page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 0}})")
+    page.close()
+
+
+PICTURES = (first, four_views, turning, scan, virtual, scan_it)
+
+
 def main() -> None:
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     parser.add_argument("--url", help="of a page that is served already")
+    parser.add_argument("--only", choices=[one.__name__ for one in PICTURES])
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     with (
@@ -169,8 +228,9 @@ def main() -> None:
         sync_playwright() as play,
     ):
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        for picture in (first, four_views, scan, virtual, scan_it):
-            picture(browser, url, chosen.out)
+        for picture in PICTURES:
+            if chosen.only in (None, picture.__name__):
+                picture(browser, url, chosen.out)
         browser.close()
 
 
