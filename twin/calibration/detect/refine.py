@@ -40,6 +40,7 @@ from flexdt.twin.calibration.detect.sharpness import (
     sharpness,
 )
 from flexdt.twin.calibration.detect.windows import (
+    Balls,
     Windows,
     blurred_windows,
     edged,
@@ -166,14 +167,16 @@ def measure_beads(
     first = centroids(patches, sample)
     patches = replace(patches, peaks=contrasts(first, patches))
     sharp = sharpness(patches, sample, BLUR_PX)
-    if not draft:
-        sharp = seen_sharpness(sharp, patches, sample, cone, model)
-    balls = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
+    if draft:
+        plain = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
+        balls: Balls = ((plain, None),)
+    else:
+        sharp, balls = seen_sharpness(sharp, patches, sample, cone, model)
     if sharp.blur < BODY_BLUR_PX:
         if draft:
             alone = None
         else:
-            alone = render_windows(balls, cone, windows)
+            alone = render_windows(Scene(()), cone, windows, 1, balls)
     else:
         # A blurred image comes from pixels that integrate, so an edge must not be put where the
         # nearest ray is.
@@ -182,14 +185,13 @@ def measure_beads(
         else:
             fine = 2
         rest = rest_of_blur(sharp.true, fine)
-        beads = render_windows(balls, cone, windows, fine)
+        beads = render_windows(Scene(()), cone, windows, fine, balls)
         alone = blurred_windows(beads, rest)
         if body is not None:
             # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
             # body adds to the line integral depends on the bead in front of it.
             seen = see_body(images, described, cone, model, windows, sharp.true)
-            whole = Scene((*balls.solids, *seen.scene(described).solids))
-            both = render_windows(whole, cone, windows, fine)
+            both = render_windows(seen.scene(described), cone, windows, fine, balls)
             data = images - (blurred_windows(both, rest) - alone)
             patches = replace(patches, flat=data.reshape(n * k, side, side))
     measured = _measured(patches, None if draft else alone, body, sharp)

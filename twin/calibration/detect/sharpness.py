@@ -15,10 +15,22 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
+from flexdt.twin.calibration.detect.bead_hardening import (
+    ATTENUATIONS,
+    LEAST_LIGHT,
+    Hardening,
+    hardening,
+)
 from flexdt.twin.calibration.detect.patches import Patches, centroids, fits, usable
 from flexdt.twin.calibration.detect.windows import (
+    Balls,
+    blur_kernel,
+    blurred_light,
     blurred_windows,
+    distances2,
+    lattice,
     render_windows,
+    window_rays,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
@@ -43,6 +55,12 @@ second order."""
 MOST_ROUNDS = 6
 BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
+ALIKE = 1.1
+"""Ratio of the contrasts of two beads below which they harden the beam alike."""
+PROFILES = 12
+"""Number of spots from which a hardening is estimated."""
+OPEN_LIGHT = 0.999
+"""Light of the softest term from which a pixel lies beside a bead."""
 _Tried = tuple[FloatArray, FloatArray, FloatArray]
 """Trial blurs with one veil, the misfits of their fits and the fitted sizes."""
 
@@ -112,12 +130,12 @@ def seen_sharpness(
     sample: npt.NDArray[np.intp],
     cone: ConeVec,
     model: BeadModel,
-) -> Sharp:
-    """Correct blur, size and contrast by the same estimate from rendered beads, until
-    both agree within `SMALL_STEP`.
+) -> tuple[Sharp, Balls]:
+    """Correct blur and size by the same estimate from rendered beads, which harden the beam as
+    those of the images.
 
     The fit's profile is an approximation, and where a spot is cut by the edge its radius
-    decides its place.
+    decides its place. Images without blur keep their blur of none.
 
     Args:
         sharp: the estimate of the images.
@@ -127,18 +145,18 @@ def seen_sharpness(
         model: the beads.
 
     Returns:
-        The estimate with corrected `true`, `size` and `lift`; `sharp` itself if it was
-        assumed, if the blur is below `BODY_BLUR_PX`, if the rendered spots cannot be
-        measured, or after `MOST_ROUNDS`.
+        The corrected estimate, and the beads as they attenuate; `sharp` itself if nothing was
+        seen or can be measured in the rendered spots, or after `MOST_ROUNDS`.
     """
-    if not sharp.seen or sharp.blur < BODY_BLUR_PX:
-        return sharp
     trial = replace(sharp, true=sharp.blur, size=1.0)
+    if not sharp.seen:
+        return sharp, hardened_balls(sharp, patches, cone, model)
     for _ in range(MOST_ROUNDS):
-        found, dimmed = _as_rendered(trial, patches, sample, cone, model)
+        balls = hardened_balls(trial, patches, cone, model)
+        found, dimmed = _as_rendered(trial, balls, patches, sample, cone)
         if not found.seen:
-            return sharp
-        step = sharp.blur - found.blur
+            break
+        step = 0.0 if sharp.blur < BODY_BLUR_PX else sharp.blur - found.blur
         trial = replace(
             trial,
             true=max(trial.true + step, BLURS[0]),
@@ -146,26 +164,107 @@ def seen_sharpness(
             lift=trial.lift / dimmed,
         )
         if max(abs(step) / trial.true, abs(dimmed - 1.0)) < SMALL_STEP:
-            return trial
-    return sharp
+            return trial, hardened_balls(trial, patches, cone, model)
+    return sharp, hardened_balls(sharp, patches, cone, model)
+
+
+def hardened_balls(
+    sharp: Sharp, patches: Patches, cone: ConeVec, model: BeadModel
+) -> Balls:
+    """Group the beads by contrast, and estimate how each group hardens the beam.
+
+    Args:
+        sharp: blur and size of the images.
+        patches: the windows.
+        cone: geometry of the frames.
+        model: the beads.
+
+    Returns:
+        Scenes of beads with their hardening, which is None where too few spots show it.
+    """
+    k = patches.windows.corner.shape[1]
+    contrast = sharp.lift * patches.peaks[:k]
+    order = np.argsort(contrast)
+    breaks = np.flatnonzero(np.diff(np.log(contrast[order])) > math.log(ALIKE)) + 1
+    out = []
+    for group in np.split(order, breaks):
+        solids = balls_of(model, contrast, sharp.size).solids
+        ball = Scene(tuple(solids[i] for i in group))
+        spots = patches.entire[np.isin(patches.entire % k, group)]
+        spots = spots[
+            np.linspace(0, len(spots) - 1, min(PROFILES, len(spots))).astype(int)
+        ]
+        out.append((ball, _hardening_of(ball, sharp, patches, spots, cone)))
+    return tuple(out)
+
+
+def _hardening_of(
+    ball: Scene,
+    sharp: Sharp,
+    patches: Patches,
+    spots: npt.NDArray[np.intp],
+    cone: ConeVec,
+) -> Hardening | None:
+    """Estimate the hardening of alike beads from some of their spots.
+
+    Args:
+        ball: the beads, for one energy.
+        sharp: blur of the images.
+        patches: the windows.
+        spots: indices of complete spots of these beads.
+        cone: geometry of the frames.
+
+    Returns:
+        The hardening; None without spots.
+    """
+    if len(spots) == 0:
+        return None
+    k = patches.windows.corner.shape[1]
+    frames, beads = np.divmod(spots, k)
+    few = patches.windows.pick(frames, beads)
+    sharply = sharp.blur < BODY_BLUR_PX
+    places = [(0.0, 0.0)] if sharply else lattice(CHECK_FINE)
+    factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None]
+    light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
+    most = 0.0
+    for place in places:
+        rays = window_rays(ball, cone[frames], few, place)[:, 0]
+        most = max(most, float(rays.max()))
+        light += np.exp(factors * rays)
+    light /= len(places)
+    if not sharply:
+        kernel = blur_kernel(rest_of_blur(sharp.true, CHECK_FINE))
+        light = blurred_light(light, kernel)
+    shadow = light[-1] < OPEN_LIGHT
+    seen = patches.flat[spots]
+    beside = np.where(shadow, np.nan, seen)
+    level = np.nanmedian(beside.reshape(len(spots), -1), axis=1)[:, None, None]
+    seen_light = np.exp(level - seen)
+    use = np.isfinite(seen) & (
+        distances2(few.corner, few.side, few.predicted)[:, 0]
+        < (1.15 * few.radii[:, 0, None, None] + 2.0) ** 2
+    )
+    terms = light[:, use].T.astype(np.float64) - 1.0
+    weight = 1.0 / np.sqrt(np.maximum(seen_light[use], LEAST_LIGHT))
+    return hardening(terms, seen_light[use].astype(np.float64), weight, 1.1 * most)
 
 
 def _as_rendered(
     true: Sharp,
+    balls: Balls,
     patches: Patches,
     sample: npt.NDArray[np.intp],
     cone: ConeVec,
-    model: BeadModel,
 ) -> tuple[Sharp, float]:
     """Estimate sharpness from beads that are rendered with a known blur, size and
     contrast, to check the method.
 
     Args:
         true: estimate for the images, with which the beads are rendered.
+        balls: the beads.
         patches: windows of the images.
         sample: indices of the windows to render.
-        cone: geometry of all frames.
-        model: the phantom's beads.
+        cone: geometry of the frames.
 
     Returns:
         The estimate from the rendered windows, and the median rendered contrast over that
@@ -174,9 +273,11 @@ def _as_rendered(
     k = patches.windows.corner.shape[1]
     frames, beads = np.divmod(sample, k)
     few = patches.windows.pick(frames, beads)
-    balls = balls_of(model, true.lift * patches.peaks[:k], true.size)
-    rays = render_windows(balls, cone[frames], few, CHECK_FINE)
-    seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
+    if true.blur < BODY_BLUR_PX:
+        seen = render_windows(Scene(()), cone[frames], few, 1, balls)
+    else:
+        rays = render_windows(Scene(()), cone[frames], few, CHECK_FINE, balls)
+        seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
     side = few.side
     every = np.arange(len(sample))
     rendered = replace(

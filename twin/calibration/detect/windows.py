@@ -15,12 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.bead_hardening import Hardening
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 Part = tuple[slice, slice]
+Balls = tuple[tuple[Scene, Hardening | None], ...]
+"""Beads of one contrast each, and how they harden the beam; None: not at all."""
 LEAST_NOISE = 1e-3
 """Noise of line integrals that is assumed at least: no pixel counts a million photons."""
 LEAST_SEEN = 4
@@ -284,7 +287,7 @@ def _is_bead(solid: Solid, model: BeadModel) -> bool:
 
 
 def render_windows(
-    scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1
+    scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1, balls: Balls = ()
 ) -> Float32Array:
     """Render line integrals of a scene in every window, (n, k, side, side).
 
@@ -294,16 +297,17 @@ def render_windows(
         windows: their places; also parts off the image are rendered.
         fine: fine x fine rays in a pixel; their intensities are averaged, as a real pixel
             does. One ray (1, the default) puts an edge up to half a pixel off.
+        balls: beads that harden the beam, besides the scene.
     """
     if fine == 1:
-        return _window_rays(scene, cone, windows, (0.0, 0.0))
+        return _hardened_rays(scene, cone, windows, (0.0, 0.0), balls)
     return np.asarray(
-        -np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32
+        -np.log(window_intensities(scene, cone, windows, fine, balls)), dtype=np.float32
     )
 
 
 def window_intensities(
-    scene: Scene, cone: ConeVec, windows: Windows, fine: int
+    scene: Scene, cone: ConeVec, windows: Windows, fine: int, balls: Balls = ()
 ) -> Float32Array:
     """Render the transmitted share of the open beam in every window.
 
@@ -312,6 +316,7 @@ def window_intensities(
         cone: n views.
         windows: k windows in each.
         fine: rays along each side of a pixel, which are averaged.
+        balls: beads that harden the beam, besides the scene.
 
     Returns:
         (n, k, side, side), from 0 to 1.
@@ -319,7 +324,7 @@ def window_intensities(
     n, k = windows.corner.shape[:2]
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
     for place in lattice(fine):
-        total += np.exp(-_window_rays(scene, cone, windows, place))
+        total += np.exp(-_hardened_rays(scene, cone, windows, place, balls))
     return total * np.float32(1.0 / fine**2)
 
 
@@ -339,7 +344,24 @@ def lattice(fine: int) -> list[tuple[float, float]]:
     return out
 
 
-def _window_rays(
+def _hardened_rays(
+    scene: Scene,
+    cone: ConeVec,
+    windows: Windows,
+    place: tuple[float, float],
+    balls: Balls,
+) -> Float32Array:
+    """Render line integrals of a scene and of beads that harden the beam, (n, k, side, side),
+    for rays through one place in each pixel.
+    """
+    parts = [window_rays(scene, cone, windows, place)] if scene.solids else []
+    for ball, curve in balls:
+        rays = window_rays(ball, cone, windows, place)
+        parts.append(rays if curve is None else curve(rays))
+    return np.asarray(sum(parts[1:], parts[0]))
+
+
+def window_rays(
     scene: Scene, cone: ConeVec, windows: Windows, place: tuple[float, float]
 ) -> Float32Array:
     """Render line integrals of windows, for rays through one place in each pixel; also
@@ -447,14 +469,21 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
     Returns:
         New line integrals of that shape.
     """
-    out = np.empty_like(line_integrals)
-    side = line_integrals.shape[-1]
-    kernel = blur_kernel(blur)
-    for i, window in enumerate(np.exp(-line_integrals.reshape(-1, side, side))):
+    out = blurred_light(np.exp(-line_integrals), blur_kernel(blur))
+    return np.asarray(-np.log(out), dtype=np.float32)
+
+
+def blurred_light(light: Float32Array, kernel: FloatArray) -> Float32Array:
+    """Blur intensities (..., side, side) by a kernel along rows and columns; edges are
+    repeated outwards.
+    """
+    out = np.empty_like(light)
+    side = light.shape[-1]
+    for i, window in enumerate(light.reshape(-1, side, side)):
         out.reshape(-1, side, side)[i] = cv2.sepFilter2D(
             window, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE
         )
-    return np.asarray(-np.log(out), dtype=np.float32)
+    return out
 
 
 def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bool_]:
