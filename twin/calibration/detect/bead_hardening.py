@@ -51,27 +51,41 @@ class Hardening:
         return out
 
 
-def hardening(
-    terms: FloatArray, light: FloatArray, weight: FloatArray, most: float
-) -> Hardening | None:
-    """Estimate the hardening by least squares with weights that are not negative.
+@dataclass(frozen=True, eq=False)
+class Profiles:
+    """The light behind alike beads in m pixels.
 
-    Args:
-        terms: (m, terms) light of each term in m pixels, less the open beam's.
+    Attributes:
+        terms: (m, terms) light that each term leaves, less the open beam's.
+        spread: (m, terms) its change with the variance of the blur [1/px^2].
         light: (m,) light in the images over that beside the beads.
-        weight: (m,) of the pixels.
         most: largest line integral to tabulate.
-
-    Returns:
-        The hardening; None where no term explains the light.
     """
-    heavy = terms * weight[:, None]
-    shares = non_negative(heavy.T @ heavy, heavy.T @ (weight * (light - 1.0)))
-    if not shares.any():
-        return None
-    given = np.linspace(0.0, most, TABLE_STEPS)
-    left = np.expm1(-given[:, None] * np.array(ATTENUATIONS)) @ shares
-    return Hardening(given, -np.log(np.maximum(1.0 + left, 1e-6)))
+
+    terms: FloatArray
+    spread: FloatArray
+    light: FloatArray
+    most: float
+
+    def fitted(self, variance: float) -> tuple[Hardening | None, float]:
+        """Estimate the hardening by least squares with weights that are not negative.
+
+        Args:
+            variance: of the blur, besides that in the terms [px^2].
+
+        Returns:
+            The hardening, None where no term explains the light; and the misfit.
+        """
+        weight = 1.0 / np.sqrt(np.maximum(self.light, LEAST_LIGHT))
+        heavy = (self.terms + variance * self.spread) * weight[:, None]
+        taken = weight * (self.light - 1.0)
+        shares = non_negative(heavy.T @ heavy, heavy.T @ taken)
+        misfit = float(np.square(heavy @ shares - taken).sum())
+        if not shares.any():
+            return None, misfit
+        given = np.linspace(0.0, self.most, TABLE_STEPS)
+        left = np.expm1(-given[:, None] * np.array(ATTENUATIONS)) @ shares
+        return Hardening(given, -np.log(np.maximum(1.0 + left, 1e-6))), misfit
 
 
 def non_negative(normal: FloatArray, right: FloatArray) -> FloatArray:

@@ -176,7 +176,8 @@ def measure_beads(
         if draft:
             alone = None
         else:
-            alone = render_windows(Scene(()), cone, windows, 1, balls)
+            rays = render_windows(Scene(()), cone, windows, 1, balls)
+            alone = blurred_windows(rays, sharp.true)
     else:
         # A blurred image comes from pixels that integrate, so an edge must not be put where the
         # nearest ray is.

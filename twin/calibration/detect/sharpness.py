@@ -8,6 +8,7 @@ not seen.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +18,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.bead_hardening import (
     ATTENUATIONS,
-    LEAST_LIGHT,
-    Hardening,
-    hardening,
+    Profiles,
 )
 from flexdt.twin.calibration.detect.patches import Patches, centroids, fits, usable
 from flexdt.twin.calibration.detect.windows import (
@@ -59,6 +58,10 @@ ALIKE = 1.1
 """Ratio of the contrasts of two beads below which they harden the beam alike."""
 PROFILES = 12
 """Number of spots from which a hardening is estimated."""
+SLIGHT_BLURS = 4
+"""Number of trial blurs of nearly sharp images."""
+UNIT_BLUR_PX = 0.1
+"""Blur at which the change of light by blur is taken, which is linear in its variance there."""
 OPEN_LIGHT = 0.999
 """Light of the softest term from which a pixel lies beside a bead."""
 _Tried = tuple[FloatArray, FloatArray, FloatArray]
@@ -148,29 +151,34 @@ def seen_sharpness(
         The corrected estimate, and the beads as they attenuate; `sharp` itself if nothing was
         seen or can be measured in the rendered spots, or after `MOST_ROUNDS`.
     """
-    trial = replace(sharp, true=sharp.blur, size=1.0)
     if not sharp.seen:
-        return sharp, hardened_balls(sharp, patches, cone, model)
+        return sharp, hardened_balls(sharp, patches, cone, model)[0]
+    slight = sharp.blur < BODY_BLUR_PX
+    trial = replace(sharp, true=sharp.blur, size=1.0)
     for _ in range(MOST_ROUNDS):
-        balls = hardened_balls(trial, patches, cone, model)
-        found, dimmed = _as_rendered(trial, balls, patches, sample, cone)
+        balls, blur = hardened_balls(trial, patches, cone, model)
+        found, dimmed = _as_rendered(
+            replace(trial, true=blur), balls, patches, sample, cone
+        )
         if not found.seen:
             break
-        step = 0.0 if sharp.blur < BODY_BLUR_PX else sharp.blur - found.blur
+        step = 0.0 if slight else sharp.blur - found.blur
         trial = replace(
             trial,
-            true=max(trial.true + step, BLURS[0]),
+            true=blur if slight else max(trial.true + step, BLURS[0]),
             size=trial.size * sharp.scale / found.scale,
             lift=trial.lift / dimmed,
         )
-        if max(abs(step) / trial.true, abs(dimmed - 1.0)) < SMALL_STEP:
-            return trial, hardened_balls(trial, patches, cone, model)
-    return sharp, hardened_balls(sharp, patches, cone, model)
+        if slight or max(abs(step) / trial.true, abs(dimmed - 1.0)) < SMALL_STEP:
+            balls, blur = hardened_balls(trial, patches, cone, model)
+            return replace(trial, true=blur), balls
+    balls, blur = hardened_balls(sharp, patches, cone, model)
+    return replace(sharp, true=blur), balls
 
 
 def hardened_balls(
     sharp: Sharp, patches: Patches, cone: ConeVec, model: BeadModel
-) -> Balls:
+) -> tuple[Balls, float]:
     """Group the beads by contrast, and estimate how each group hardens the beam.
 
     Args:
@@ -180,32 +188,53 @@ def hardened_balls(
         model: the beads.
 
     Returns:
-        Scenes of beads with their hardening, which is None where too few spots show it.
+        Scenes of beads with their hardening, which is None where too few spots show it; and the
+        blur [px], estimated where `sharp` says that there is hardly any.
     """
     k = patches.windows.corner.shape[1]
     contrast = sharp.lift * patches.peaks[:k]
     order = np.argsort(contrast)
     breaks = np.flatnonzero(np.diff(np.log(contrast[order])) > math.log(ALIKE)) + 1
-    out = []
+    solids = balls_of(model, contrast, sharp.size).solids
+    groups = []
     for group in np.split(order, breaks):
-        solids = balls_of(model, contrast, sharp.size).solids
-        ball = Scene(tuple(solids[i] for i in group))
         spots = patches.entire[np.isin(patches.entire % k, group)]
         spots = spots[
             np.linspace(0, len(spots) - 1, min(PROFILES, len(spots))).astype(int)
         ]
-        out.append((ball, _hardening_of(ball, sharp, patches, spots, cone)))
-    return tuple(out)
+        ball = Scene(tuple(solids[i] for i in group))
+        groups.append((ball, _profiles_of(ball, sharp, patches, spots, cone)))
+    blur = sharp.true
+    if sharp.blur < BODY_BLUR_PX:
+        blur = _slight_blur([profiles for _, profiles in groups if profiles is not None])
+    variance = blur**2 if sharp.blur < BODY_BLUR_PX else 0.0
+    return tuple(
+        (ball, None if profiles is None else profiles.fitted(variance)[0])
+        for ball, profiles in groups
+    ), blur
 
 
-def _hardening_of(
+def _slight_blur(groups: Sequence[Profiles]) -> float:
+    """Return the blur of nearly sharp images with which rendered beads fit best [px]."""
+    if not groups:
+        return 0.0
+    tried = np.linspace(0.0, BODY_BLUR_PX**2, SLIGHT_BLURS)
+    misfit = np.array([sum(g.fitted(v)[1] for g in groups) for v in tried.tolist()])
+    i = min(max(int(misfit.argmin()), 1), SLIGHT_BLURS - 2)
+    bend, slope, _ = np.polyfit(tried[i - 1 : i + 2], misfit[i - 1 : i + 2], 2)
+    if bend <= 0.0:
+        return math.sqrt(float(tried[int(misfit.argmin())]))
+    return math.sqrt(float(np.clip(-slope / (2.0 * bend), tried[i - 1], tried[i + 1])))
+
+
+def _profiles_of(
     ball: Scene,
     sharp: Sharp,
     patches: Patches,
     spots: npt.NDArray[np.intp],
     cone: ConeVec,
-) -> Hardening | None:
-    """Estimate the hardening of alike beads from some of their spots.
+) -> Profiles | None:
+    """Collect the light behind alike beads in some of their spots.
 
     Args:
         ball: the beads, for one energy.
@@ -215,38 +244,40 @@ def _hardening_of(
         cone: geometry of the frames.
 
     Returns:
-        The hardening; None without spots.
+        The profiles; None without spots.
     """
     if len(spots) == 0:
         return None
-    k = patches.windows.corner.shape[1]
-    frames, beads = np.divmod(spots, k)
+    frames, beads = np.divmod(spots, patches.windows.corner.shape[1])
     few = patches.windows.pick(frames, beads)
-    sharply = sharp.blur < BODY_BLUR_PX
-    places = [(0.0, 0.0)] if sharply else lattice(CHECK_FINE)
+    slight = sharp.blur < BODY_BLUR_PX
+    places = [(0.0, 0.0)] if slight else lattice(CHECK_FINE)
     factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None]
     light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
     most = 0.0
     for place in places:
         rays = window_rays(ball, cone[frames], few, place)[:, 0]
         most = max(most, float(rays.max()))
-        light += np.exp(factors * rays)
-    light /= len(places)
-    if not sharply:
-        kernel = blur_kernel(rest_of_blur(sharp.true, CHECK_FINE))
-        light = blurred_light(light, kernel)
-    shadow = light[-1] < OPEN_LIGHT
+        light += np.exp(factors * rays) / np.float32(len(places))
+    if slight:
+        spread = (
+            blurred_light(light, blur_kernel(UNIT_BLUR_PX)) - light
+        ) / UNIT_BLUR_PX**2
+    else:
+        light = blurred_light(light, blur_kernel(rest_of_blur(sharp.true, CHECK_FINE)))
+        spread = np.zeros_like(light)
     seen = patches.flat[spots]
-    beside = np.where(shadow, np.nan, seen)
+    beside = np.where(light[-1] < OPEN_LIGHT, np.nan, seen)
     level = np.nanmedian(beside.reshape(len(spots), -1), axis=1)[:, None, None]
-    seen_light = np.exp(level - seen)
-    use = np.isfinite(seen) & (
-        distances2(few.corner, few.side, few.predicted)[:, 0]
-        < (1.15 * few.radii[:, 0, None, None] + 2.0) ** 2
+    reach = 1.15 * few.radii[:, 0, None, None] + 2.0
+    near = distances2(few.corner, few.side, few.predicted)[:, 0] < reach**2
+    use = np.isfinite(seen) & np.isfinite(level) & near
+    return Profiles(
+        light[:, use].T.astype(np.float64) - 1.0,
+        spread[:, use].T.astype(np.float64),
+        np.exp(level - seen)[use].astype(np.float64),
+        1.1 * most,
     )
-    terms = light[:, use].T.astype(np.float64) - 1.0
-    weight = 1.0 / np.sqrt(np.maximum(seen_light[use], LEAST_LIGHT))
-    return hardening(terms, seen_light[use].astype(np.float64), weight, 1.1 * most)
 
 
 def _as_rendered(
@@ -274,7 +305,8 @@ def _as_rendered(
     frames, beads = np.divmod(sample, k)
     few = patches.windows.pick(frames, beads)
     if true.blur < BODY_BLUR_PX:
-        seen = render_windows(Scene(()), cone[frames], few, 1, balls)
+        rays = render_windows(Scene(()), cone[frames], few, 1, balls)
+        seen = blurred_windows(rays, true.true)
     else:
         rays = render_windows(Scene(()), cone[frames], few, CHECK_FINE, balls)
         seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
