@@ -13,6 +13,7 @@ import ctypes
 import importlib
 import logging
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -92,7 +93,9 @@ class SingleViews:
             RuntimeError: the driver failed.
         """
         try:
-            memory = self._memory(image.shape)
+            memory = self._memory((image.shape[0], image.shape[1]))
+            if memory is None:
+                return False
             done = memory.project(self, row, image)
         except ABSENT as error:
             LOGGER.debug("single views go through numba: %s", error)
@@ -101,14 +104,21 @@ class SingleViews:
         self.spare.append(memory)
         return done
 
-    def _memory(self, shape: tuple[int, ...]) -> ViewMemory:
-        """Take spare memory for images of this shape on the current device, or make new."""
+    def _memory(self, shape: tuple[int, int]) -> ViewMemory | None:
+        """Take the memory that was spared last, if it is for images of this shape on the
+        current device, or make new; None where the device has no room.
+        """
         device = gpu.current_device()
-        while self.spare:
-            memory = self.spare.pop()
+        spared: list[ViewMemory] = []
+        # Another thread may have taken it meanwhile.
+        with suppress(IndexError):
+            spared.append(self.spare.pop())
+        for memory in spared:
             if (memory.shape, memory.device) == (shape, device):
                 return memory
-        return ViewMemory(device, (shape[0], shape[1]))
+        if not gpu.has_room(4 * shape[0] * shape[1]):
+            return None
+        return ViewMemory(device, shape)
 
 
 class ViewMemory:

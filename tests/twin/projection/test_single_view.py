@@ -131,6 +131,28 @@ for case in drawn(range(12), 1, 5):
 assert {"level", "rolled", "far"} <= taken, taken
 assert len(volume.layout.device_copy.single_views.spare) == 1
 
+# Without room, or with memory for another shape, a view is right all the same.
+volume = Volume(case.data, tuple(case.voxel_mm), tuple(case.center_mm))
+usual(volume, scan, case.shape)
+gpu.free_bytes = lambda: gpu.SPARE_BYTES
+assert forward(volume, scan, case.shape).max() > 0
+assert volume.layout.device_copy.single_views.spare == []
+gpu.free_bytes = lambda: None
+for shape in (case.shape, (3, 4), case.shape):
+    driver.calls.clear()
+    assert np.array_equal(forward(volume, scan, shape), usual(volume, scan, shape))
+    assert driver.calls == FOUR, (shape, driver.calls)
+
+# A call while another is under way has memory of its own.
+inner = []
+def call_again(image):
+    driver.spoils = lambda image: None
+    inner.append(forward(volume, scan, case.shape))
+driver.spoils = call_again
+assert np.array_equal(forward(volume, scan, case.shape), right)
+assert np.array_equal(inner[0], right)
+assert len(volume.layout.device_copy.single_views.spare) == 2
+
 # A driver that gives an error gives the device up, in one line; the processor computes.
 for name in FOUR:
     gpu._failed.clear(), said.clear()
