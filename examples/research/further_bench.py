@@ -27,7 +27,7 @@ import time
 import timeit
 import tracemalloc
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -167,24 +167,26 @@ def fdk_names(size: str) -> list[str]:
 
 def fdk_entries(
     size: str, wanted: Callable[[str], bool], part: frozenset[str]
-) -> list[Entry]:
-    """FDK of four kinds of images, against RTK's, without and with `errors`.
+) -> Iterator[Entry]:
+    """Yield FDK of four kinds of images, against RTK's, without and with `errors`, one by one:
+    RTK may take minutes for each.
 
     Processor seconds and the most memory that arrays take beside the images come from calls of
     their own, and are also told as multiples of those of the object seen whole.
     """
     geometry, grid = fdk_scan(size)
-    entries: list[Entry] = []
+    first = None
     for name, kind in zip(fdk_names(size), KINDS, strict=True):
         if wanted(name):
             images = KINDS[kind](geometry, FDK_SHAPE)
             what = f"{fdk_what(size)}, {kind}; error: of the middle's mean"
-            entries.append(fdk_entry(name, kind, what, images, geometry, grid, part))
-    first = next((entry for entry in entries if entry["name"] == size), None)
-    for entry in entries if first is not None else ():
-        entry["times_whole"] = entry["cpu_ms"] / first["cpu_ms"]
-        entry["memory_times_whole"] = entry["peak_MB"] / first["peak_MB"]
-    return entries
+            entry = fdk_entry(name, kind, what, images, geometry, grid, part)
+            if kind == FIRST:
+                first = entry
+            if first is not None:
+                entry["times_whole"] = entry["cpu_ms"] / first["cpu_ms"]
+                entry["memory_times_whole"] = entry["peak_MB"] / first["peak_MB"]
+            yield entry
 
 
 def fdk_entry(
@@ -783,7 +785,7 @@ def mesh_paths(
 
 
 Wanted = Callable[[str], bool]
-GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Entry]]] = {
+GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], Iterable[Entry]]] = {
     ("scene-C1", "scene-C3"): lambda wanted, part: scenes(),
     ("mesh",): lambda wanted, part: meshes(part),
     tuple(adjoint_names()): lambda wanted, part: adjoint(wanted),
