@@ -32,9 +32,12 @@ from flexdt.twin.calibration.detect.patches import (
 from flexdt.twin.calibration.detect.seen_body import NO_BODY, SeenBody, see_body
 from flexdt.twin.calibration.detect.sharpness import (
     BODY_BLUR_PX,
+    CHECK_FINE,
+    RADIUS_RAYS,
     SAMPLE,
     Sharp,
     balls_of,
+    fine_rays,
     rest_of_blur,
     seen_sharpness,
     sharpness,
@@ -62,7 +65,9 @@ FIT_BLUR_PX = 0.4
 """Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015
 px."""
 FEW_WINDOWS = 600
-"""Up to so many windows the body is rendered with 3 x 3 rays a pixel, else 2 x 2."""
+"""Up to so many windows a bead is rendered with `RADIUS_RAYS` along its radius."""
+FEWER_RADIUS_RAYS = 12
+"""Rays along a bead's radius in more windows, and in drafts."""
 FADING_FRAMES = 60
 """Frames from which it is read how beads fade behind a body, at least if there are as many."""
 LARGEST_PX = 0.6
@@ -182,9 +187,9 @@ def measure_beads(
         # A blurred image comes from pixels that integrate, so an edge must not be put where the
         # nearest ray is.
         if n * k <= FEW_WINDOWS and not draft:
-            fine = 3
+            fine = fine_rays(windows, RADIUS_RAYS, CHECK_FINE)
         else:
-            fine = 2
+            fine = fine_rays(windows, FEWER_RADIUS_RAYS, 2)
         rest = rest_of_blur(sharp.true, fine)
         beads = render_windows(Scene(()), cone, windows, fine, balls)
         alone = blurred_windows(beads, rest)

@@ -23,6 +23,7 @@ from flexdt.twin.calibration.detect.bead_hardening import (
 from flexdt.twin.calibration.detect.patches import Patches, centroids, fits, usable
 from flexdt.twin.calibration.detect.windows import (
     Balls,
+    Windows,
     blur_kernel,
     blurred_light,
     blurred_windows,
@@ -46,8 +47,12 @@ BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
 """Trial blurs [px]."""
 VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
 """Trial veils, as a share of the light."""
+RADIUS_RAYS = 18
+"""Rays along a bead's radius where that estimate is checked on rendered beads."""
 CHECK_FINE = 3
-"""Rays along a pixel's side where that estimate is checked on rendered beads."""
+"""Least number of rays along a pixel's side there."""
+MOST_FINE = 6
+"""Largest number of rays along a pixel's side."""
 SMALL_STEP = 0.05
 """Relative change of blur and contrast below which corrections stop; the remainder is of
 second order."""
@@ -58,8 +63,12 @@ ALIKE = 1.1
 """Ratio of the contrasts of two beads below which they harden the beam alike."""
 PROFILES = 12
 """Number of spots from which a hardening is estimated."""
-SLIGHT_BLURS = 4
-"""Number of trial blurs of nearly sharp images."""
+SLIGHT_BLUR_PX = 0.45
+"""Blur of the images below which what pixels do not explain of it is estimated from profiles."""
+MOST_VARIANCE_PX2 = 0.15
+"""Largest variance of a slight blur, besides the pixel's."""
+SLIGHT_BLURS = 5
+"""Number of trial variances of a slight blur."""
 UNIT_BLUR_PX = 0.1
 """Blur at which the change of light by blur is taken, which is linear in its variance there."""
 OPEN_LIGHT = 0.999
@@ -100,9 +109,26 @@ def rest_of_blur(blur: float, fine: int) -> float:
         fine: rays along a pixel's side.
 
     Returns:
-        Standard deviation [px], at least 0.1.
+        Standard deviation [px], not negative.
     """
-    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
+    return math.sqrt(max(blur**2 - pixel_variance(fine), 0.0))
+
+
+def fine_rays(windows: Windows, rays: int, least: int) -> int:
+    """Return the rays along a pixel's side with which a bead's radius has a number of rays.
+
+    Args:
+        windows: of the beads.
+        rays: along the radius of the typical bead.
+        least: fewest along a pixel's side.
+    """
+    fine = math.ceil(rays / float(np.median(windows.radii)))
+    return min(max(fine, least), MOST_FINE)
+
+
+def pixel_variance(fine: int) -> float:
+    """Return the variance that averaging fine x fine rays of a pixel gives to an image [px^2]."""
+    return (1.0 - 1.0 / fine**4) / 12.0
 
 
 @dataclass(frozen=True)
@@ -153,7 +179,7 @@ def seen_sharpness(
     """
     if not sharp.seen:
         return sharp, hardened_balls(sharp, patches, cone, model)[0]
-    slight = sharp.blur < BODY_BLUR_PX
+    slight = sharp.blur < SLIGHT_BLUR_PX
     trial = replace(sharp, true=sharp.blur, size=1.0)
     for _ in range(MOST_ROUNDS):
         balls, blur = hardened_balls(trial, patches, cone, model)
@@ -162,14 +188,19 @@ def seen_sharpness(
         )
         if not found.seen:
             break
-        step = 0.0 if slight else sharp.blur - found.blur
+        if slight:
+            step = blur - trial.true
+        else:
+            step = max(sharp.blur - found.blur, BLURS[0] - trial.true)
+        still = slight or abs(step) < SMALL_STEP * trial.true
+        change = sharp.scale / found.scale
         trial = replace(
             trial,
-            true=blur if slight else max(trial.true + step, BLURS[0]),
-            size=trial.size * sharp.scale / found.scale,
+            true=trial.true + step,
+            size=trial.size * change,
             lift=trial.lift / dimmed,
         )
-        if slight or max(abs(step) / trial.true, abs(dimmed - 1.0)) < SMALL_STEP:
+        if still and max(abs(dimmed - 1.0), abs(change - 1.0)) < SMALL_STEP:
             balls, blur = hardened_balls(trial, patches, cone, model)
             return replace(trial, true=blur), balls
     balls, blur = hardened_balls(sharp, patches, cone, model)
@@ -204,10 +235,16 @@ def hardened_balls(
         ]
         ball = Scene(tuple(solids[i] for i in group))
         groups.append((ball, _profiles_of(ball, sharp, patches, spots, cone)))
+    variance = 0.0
     blur = sharp.true
-    if sharp.blur < BODY_BLUR_PX:
-        blur = _slight_blur([profiles for _, profiles in groups if profiles is not None])
-    variance = blur**2 if sharp.blur < BODY_BLUR_PX else 0.0
+    if sharp.blur < SLIGHT_BLUR_PX:
+        variance = _slight_blur(
+            [profiles for _, profiles in groups if profiles is not None]
+        )
+        blur = math.sqrt(variance)
+        if sharp.blur >= BODY_BLUR_PX:
+            fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
+            blur = math.sqrt(variance + pixel_variance(fine))
     return tuple(
         (ball, None if profiles is None else profiles.fitted(variance)[0])
         for ball, profiles in groups
@@ -215,16 +252,16 @@ def hardened_balls(
 
 
 def _slight_blur(groups: Sequence[Profiles]) -> float:
-    """Return the blur of nearly sharp images with which rendered beads fit best [px]."""
+    """Return the variance of a slight blur with which rendered beads fit best [px^2]."""
     if not groups:
         return 0.0
-    tried = np.linspace(0.0, BODY_BLUR_PX**2, SLIGHT_BLURS)
+    tried = np.linspace(0.0, MOST_VARIANCE_PX2, SLIGHT_BLURS)
     misfit = np.array([sum(g.fitted(v)[1] for g in groups) for v in tried.tolist()])
     i = min(max(int(misfit.argmin()), 1), SLIGHT_BLURS - 2)
     bend, slope, _ = np.polyfit(tried[i - 1 : i + 2], misfit[i - 1 : i + 2], 2)
     if bend <= 0.0:
-        return math.sqrt(float(tried[int(misfit.argmin())]))
-    return math.sqrt(float(np.clip(-slope / (2.0 * bend), tried[i - 1], tried[i + 1])))
+        return float(tried[int(misfit.argmin())])
+    return float(np.clip(-slope / (2.0 * bend), tried[i - 1], tried[i + 1]))
 
 
 def _profiles_of(
@@ -250,8 +287,10 @@ def _profiles_of(
         return None
     frames, beads = np.divmod(spots, patches.windows.corner.shape[1])
     few = patches.windows.pick(frames, beads)
-    slight = sharp.blur < BODY_BLUR_PX
-    places = [(0.0, 0.0)] if slight else lattice(CHECK_FINE)
+    slight = sharp.blur < SLIGHT_BLUR_PX
+    sampled = sharp.blur < BODY_BLUR_PX
+    fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
+    places = [(0.0, 0.0)] if sampled else lattice(fine)
     factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None]
     light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
     most = 0.0
@@ -264,7 +303,7 @@ def _profiles_of(
             blurred_light(light, blur_kernel(UNIT_BLUR_PX)) - light
         ) / UNIT_BLUR_PX**2
     else:
-        light = blurred_light(light, blur_kernel(rest_of_blur(sharp.true, CHECK_FINE)))
+        light = blurred_light(light, blur_kernel(rest_of_blur(sharp.true, fine)))
         spread = np.zeros_like(light)
     seen = patches.flat[spots]
     beside = np.where(light[-1] < OPEN_LIGHT, np.nan, seen)
@@ -308,8 +347,9 @@ def _as_rendered(
         rays = render_windows(Scene(()), cone[frames], few, 1, balls)
         seen = blurred_windows(rays, true.true)
     else:
-        rays = render_windows(Scene(()), cone[frames], few, CHECK_FINE, balls)
-        seen = blurred_windows(rays, rest_of_blur(true.true, CHECK_FINE))
+        fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
+        rays = render_windows(Scene(()), cone[frames], few, fine, balls)
+        seen = blurred_windows(rays, rest_of_blur(true.true, fine))
     side = few.side
     every = np.arange(len(sample))
     rendered = replace(
