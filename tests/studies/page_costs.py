@@ -245,7 +245,7 @@ def rest(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
         browser = (ended.browser_s - begun.browser_s) / seconds
         print(
             f"rest: servers {100 * servers:.1f} % of a core, browser {100 * browser:.1f} % "
-            f"in {seconds:.0f} s"
+            f"in {seconds:.0f} s: {ended.since(begun)}"
         )
         if shots:
             page.screenshot(path=shots / "rest.png")
