@@ -50,14 +50,15 @@ def openrpc_document(
     (https://spec.open-rpc.org, version 1.3).
 
     Schemas of parameters and results are in components, once each, with the errors by
-    name.
+    name (code and message). Line breaks in descriptions of fields become spaces.
 
     Args:
         methods: method table of the server.
         title: title of the document.
 
     Returns:
-        A dict with the keys openrpc, info, methods and components.
+        A dict with the keys openrpc, info, methods (a list, in the order of the table)
+        and components.
     """
     models: list[type[BaseModel]] = [m.params for m in methods.values()]
     models += [m.result for m in methods.values()]
@@ -93,7 +94,8 @@ def openrpc_document(
 def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
     """Describe one method as OpenRPC does.
 
-    The order of parameters is that of the model's fields.
+    Parameters are a list in the order of the model's fields, each a dict with the keys
+    name, required, schema and, where the field has one, description.
 
     Args:
         method: the method.
