@@ -66,11 +66,17 @@ def _scattering() -> dict[str, FloatArray]:
 def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     """Compute the cross-sections of substances at their densities; the arrays are read-only.
 
-    Total, coherent and incoherent ones [1/mm] (m, e), with form factors and shells over
-    the momentum transfer.
+    Coherent and incoherent ones are integrals over the sphere: the Thomson or Klein-Nishina
+    cross-section times the squared form factor or incoherent function of the atoms. Total
+    ones are those of `Substance.attenuation`.
 
     Args:
         substances: m materials, at least one.
+
+    Returns:
+        Total, coherent and incoherent cross-sections [1/mm] (m, e) at the e energies of the
+        tables; form factors and shells (m, q) over the momentum transfer, whose root has
+        equal steps, and the cumulated form factors (m, q), 0 at first.
 
     Example:
         >>> water = cross_sections((Substance.of("water", "H2O", 1.0),))

@@ -61,6 +61,8 @@ class Tables:
 def tables() -> Tables:
     """Load the shipped tables: energies [keV], tube spectra by kV, and molar mass,
     attenuation and edges by element, with their provenance.
+
+    Later calls return the same value; its arrays are read-only.
     """
     arrays, provenance = stored_arrays("tables.npz")
     symbols = [str(s) for s in arrays["symbols"]]
@@ -79,7 +81,8 @@ def tables() -> Tables:
 def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Load the arrays of a file of this package by name, numbers as float64, read-only.
 
-    Texts stay as they are.
+    Texts stay as they are. The entry "provenance" is parsed as JSON and left out of the
+    arrays.
 
     Args:
         file: its name in the package's folder `data`.
@@ -165,8 +168,11 @@ class Substance:
     def parse(cls, text: str) -> Substance:
         """Parse a substance written FORMULA@DENSITY [g/cm3], such as Al@2.70.
 
+        Spaces around the formula are ignored; the substance's name is the whole text.
+
         Raises:
-            UnknownNameError, LimitError: as `of`, or it is not written so.
+            UnknownNameError: as `of`.
+            LimitError: as `of`, or the density is missing or no number.
         """
         formula, _, density = text.partition("@")
         try:
@@ -179,7 +185,7 @@ class Substance:
     @classmethod
     def called(cls, text: str) -> Substance:
         """Look up a substance by the name of a sample's material, such as
-        aluminium, or parse FORMULA@DENSITY.
+        aluminium; a text with @ is parsed as FORMULA@DENSITY.
 
         Raises:
             UnknownNameError: lists the materials there are; or an element without a
@@ -214,6 +220,9 @@ class Substance:
 def _mass_at(row: int, energy_keV: float) -> float:
     """Interpolate mu/rho of an element, log-log from the two nearest bins with no edge between.
 
+    The slope is `ABSORPTION_EXPONENT` if fewer than two bins have no edge between them and
+    the energy. Energies beyond the bins are extrapolated.
+
     Args:
         row: of the element in the tables.
         energy_keV: photon energy.
@@ -238,13 +247,14 @@ def _mass_at(row: int, energy_keV: float) -> float:
 def parse_formula(formula: str) -> dict[str, float]:
     """Parse a formula to symbol -> number of atoms. Parentheses and decimal counts are allowed.
 
-    Counts must be above 0; nothing may stay open.
+    Repeated elements are added up. An element or group without a count counts once. Counts
+    must be above 0, parentheses closed and the formula not empty.
 
     Args:
         formula: such as CaSO4(H2O)2.
 
     Raises:
-        LimitError: it cannot be read; names the place.
+        LimitError: it cannot be read; names the character, counted from 1.
         UnknownNameError: an element the table does not have.
     """
     levels: list[dict[str, float]] = [{}]
@@ -275,8 +285,16 @@ def parse_formula(formula: str) -> dict[str, float]:
 
 
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
-    """Compute the mass fractions of a compound's elements, by symbol, from its numbers of
-    atoms.
+    """Compute the mass fractions of a compound's elements from its numbers of atoms.
+
+    Args:
+        atoms: symbol -> number of atoms, above 0.
+
+    Returns:
+        symbol -> fraction, in the same order; they add up to 1.
+
+    Raises:
+        UnknownNameError: the tables lack an element.
     """
     masses = {
         symbol: n * float(tables().molar_mass[_row(symbol)])
@@ -287,7 +305,7 @@ def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
 
 
 def _row(symbol: str) -> int:
-    """Return an element's row of the tables.
+    """Return an element's row of the tables, by its symbol (case matters).
 
     Raises:
         UnknownNameError: the tables lack the element.
@@ -300,7 +318,10 @@ def _row(symbol: str) -> int:
 
 
 def _unreadable(formula: str, at: int) -> LimitError:
-    """Make the error for a formula that cannot be parsed at character `at`."""
+    """Make, but not raise, the error for a formula that cannot be parsed at character `at`.
+
+    `at` counts from 0; the message counts from 1.
+    """
     allowed = (
         "element symbols with counts and parentheses, such as C15H17N or Ca5(PO4)3OH"
     )
