@@ -20,7 +20,7 @@ def flexdt_twin(
     request: pytest.FixtureRequest, tmp_path: Path
 ) -> Iterator[testing.InProcessTwin]:
     """Provide a twin in process (`flexdt.testing.twin`), its data in `tmp_path`, one for
-    each test.
+    each test, and close it after the test.
 
     Arguments of `twin` come by indirect parameters:
     `@pytest.mark.parametrize("flexdt_twin", [{"machine": "micro_ct"}], indirect=True)`.

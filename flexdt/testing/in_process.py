@@ -59,8 +59,9 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self, rng: random.Random | None = None, start: float = 0.0) -> None:
-        """Make a loop whose clock starts at `start` [s] and jumps; `rng` draws delays of
-        thread work.
+        """Make a loop whose clock starts at `start` [s] and jumps.
+
+        `rng` draws delays of thread work from `LATER_S`; None: no delay.
         """
         self._now = start
         self._rng = rng
@@ -79,7 +80,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run the loop until a future is done, and return its result.
 
-        Only this call jumps the clock when nothing else is left to happen.
+        Meanwhile a wait without timers raises Deadlock; otherwise it waits for real, as
+        another thread may end it.
 
         Raises:
             Deadlock: no event is left that could complete it.
@@ -91,7 +93,10 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
             self.alone = False
 
     def come_to_rest(self) -> None:
-        """Stop the loop if another thread runs it, and wait for that thread's end."""
+        """Stop the loop if another thread runs it, and wait for that thread's end.
+
+        If no thread runs it, nothing happens.
+        """
         for thread in threading.enumerate():
             if thread.ident == self._thread_id:  # type: ignore[attr-defined]
                 self.call_soon_threadsafe(self.stop)
@@ -102,7 +107,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     ) -> asyncio.Future[Any]:
         """Run `func` in the loop's thread, soon; `executor` is ignored.
 
-        With a generator after a drawn delay, else in the next turn.
+        With a random generator after a delay drawn from `LATER_S` [virtual s], else in the
+        next turn. The future gets the result or the error.
         """
         done: asyncio.Future[Any] = self.create_future()
         later = 0.0 if self._rng is None else self._rng.choice(LATER_S)
@@ -115,7 +121,7 @@ def _work(
 ) -> None:
     """Run a function to its end, even if its future was cancelled, as a thread would.
 
-    The result or error then goes to the future, if it was not cancelled.
+    The result, or the `Exception` raised, then goes to the future, if it was not cancelled.
     """
     try:
         result = func(*args)
@@ -138,7 +144,11 @@ class _Jumps(selectors.DefaultSelector):
     def select(self, timeout: float | None = None) -> list[Any]:
         """Look for events without waiting; if there are none, let the clock jump by `timeout`.
 
-        Without a time-out it waits for real if the loop is shared, else raises Deadlock.
+        Without a time-out (None: no timer is set) it waits for real unless the loop runs
+        until one future is done (`run_until_complete`), and raises Deadlock if it does.
+
+        Returns:
+            Events as of the base class; [] after a jump.
         """
         if timeout is None and not self._loop.alone:
             return super().select()
@@ -230,8 +240,8 @@ class InProcessTransport(asyncio.Transport):
         self._server.data_received(self._wire.send(message))
 
     async def receive(self) -> list[Message]:
-        """Wait for data and return the messages that it completes; [] once the connection
-        has ended.
+        """Wait for data and return the messages that it completes, at least one; [] once the
+        connection has ended.
         """
         messages: list[Message] = []
         while not messages and (data := await self._inbox.get()):
@@ -246,7 +256,7 @@ class InProcessTransport(asyncio.Transport):
     def close(self) -> None:
         """End the connection, from either side; a second call does nothing.
 
-        A waiting `receive` returns [].
+        A waiting `receive` returns []; the server learns of the end in the loop's next turn.
         """
         server, self._server = self._server, None
         if server is not None:
@@ -291,7 +301,10 @@ class InProcessTwin:
     client: TwinClient
 
     def __init__(self, loop: SimulatedLoop, server: TwinServer) -> None:
-        """Take a loop and a server; connections use the server's own shell, without sockets."""
+        """Take a loop and a server; connections use the server's own shell, without sockets.
+
+        Starts neither of them and connects nothing; `client` is set by `twin`.
+        """
         self.loop, self.server, self.data = loop, server, server.root
         self._shell = TcpServer(
             partial(TwinSession, server), ConnectionLimits(), None, METHODS
@@ -317,7 +330,8 @@ class InProcessTwin:
 
         Raises:
             Deadlock: no event is left that could end the wait.
-            RuntimeError: called in an event loop, where it would wait for itself.
+            RuntimeError: called in an event loop, where it would wait for itself; the
+                coroutine is closed.
         """
         here = asyncio._get_running_loop()
         if self.loop.is_running() and here is not self.loop:
