@@ -88,6 +88,10 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
         volume: is seen from above, from the front and from the right.
         window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
 
+    Returns:
+        A page; each slider chooses among at most `MOST_PICTURES` layers and starts at the
+        middle one. The line below tells the window.
+
     Raises:
         TwinError: the window is not two growing numbers.
     """
@@ -116,14 +120,15 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
 def data_page(data: ImageSet) -> NotebookPage:
     """Show the projections of a data set behind a slider, and the sinogram of its middle row.
 
-    At most `MOST_PICTURES` images, all in one grey window. Raises TwinError without
-    projections.
+    At most `MOST_PICTURES` of the projections that are present, evenly spread, all in one
+    grey window by percentiles. The sinogram has the rows of these, views downwards.
 
     Args:
         data: line integrals are shown, or counts where there is no flat image.
 
     Raises:
         DatasetError: an image cannot be read.
+        TwinError: no projection is present.
     """
     present = data.present
     has_flat = bool(data.flats) or (
@@ -156,7 +161,8 @@ def data_page(data: ImageSet) -> NotebookPage:
 def geometry_page(cone_vec: ConeVec) -> NotebookPage:
     """Draw source, panel and sample of each view, with one scale along all axes.
 
-    A slider chooses among at most `MOST_PICTURES` views.
+    A slider chooses among at most `MOST_PICTURES` views, from the first one on. The
+    line below tells the drawing's width [mm].
 
     Args:
         cone_vec: views in the object's frame; without a detector's shape the panel is a point.
@@ -205,7 +211,9 @@ class _Drawing:
     def of(cls, cone_vec: ConeVec) -> _Drawing:
         """Choose the scale at which sources, panels and sample fit into the drawing.
 
-        The sample's radius is what a view's fan sees at the axis.
+        The width is the diagonal of their bounding box, the origin included, with `MARGIN`
+        at both ends. The sample's radius is half the panel's width scaled to the axis by
+        the nearest source; a panel without shape is 1 pixel wide.
 
         Args:
             cone_vec: all views.
@@ -227,7 +235,7 @@ class _Drawing:
 
     def point(self, place: npt.ArrayLike) -> tuple[float, float]:
         """Return the pixel (right, down) at which the oblique drawing has a place (x, y,
-        z) [mm].
+        z) [mm]; x points right, y and z up.
         """
         x, y, z = np.asarray(place, dtype=float) - self.middle
         slope = np.radians(ELEVATION_DEG)
@@ -237,7 +245,9 @@ class _Drawing:
 
     def still(self, cone_vec: ConeVec) -> str:
         """Draw (SVG) what all views share: axes, places of the source, and the sample as a
-        circle at the origin of at least 2 px.
+        circle at the origin, with a radius of at least 2 px.
+
+        The source is a dot in each of at most `MOST_PICTURES` views.
         """
         dots = "".join(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT_PX}" fill="#d33" opacity=".6"/>'
@@ -256,7 +266,11 @@ class _Drawing:
         )
 
     def axes(self) -> str:
-        """Draw the object's axes from its origin, each with its name and a length in mm."""
+        """Draw the object's axes from its origin, each with its name and length [mm], as
+        SVG.
+
+        The length is a quarter of the drawing's width, rounded by `round_length`.
+        """
         length = round_length(self.millimetres / 4)
         x0, y0 = self.point((0.0, 0.0, 0.0))
         parts = []
@@ -300,6 +314,8 @@ class _Drawing:
 def _slider_indices(count: int) -> list[int]:
     """Choose at most `MOST_PICTURES` indices below `count`, evenly spread, of which a
     slider shows one.
+
+    They ascend from 0 to count - 1; all if there are no more; [] for 0.
     """
     if not count:
         return []
@@ -324,7 +340,7 @@ def _slider(count: int, what: str, handler: str, start: int) -> str:
     Args:
         count: positions.
         what: its label.
-        handler: JavaScript to call when it moves.
+        handler: JavaScript to run when it moves.
         start: first position.
 
     Its values are 0 to count - 1.
@@ -344,10 +360,11 @@ def _sliding(
 ) -> str:
     """Write pictures, of which a slider shows one.
 
-    Returns HTML with the pictures as PNG; each is scaled to `SIDE_PX`.
+    Returns HTML with the pictures as PNG; the longer side of each
+    is scaled to `SIDE_PX`.
 
     Args:
-        pictures: name and pixels of each.
+        pictures: name and grey pixels (rows, columns) of each, at least one.
         what: name of the pictures.
         tall: height of a pixel over its width.
         start: index of the one that is shown at first.

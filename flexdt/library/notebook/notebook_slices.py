@@ -40,14 +40,16 @@ def window_of(
 ) -> tuple[float, float]:
     """Return the values of black and white.
 
-    At most about MOST_VALUES values are looked at. Equal percentiles give high = low + 1.
+    At most about MOST_VALUES values are looked at, in even steps along each axis. Equal
+    percentiles give white = black + 1.
 
     Args:
-        values: whose percentiles are taken where no window is given; NaN is left out.
-        window: (black, white).
+        values: whose percentiles are taken where no window is given; NaN and infinite ones
+            are left out.
+        window: (black, white), or None for the PERCENTILES.
 
     Returns:
-        (black, white), black the smaller one; (0, 1) if all values are NaN.
+        (black, white), black the smaller one; (0, 1) if no value is finite.
 
     Raises:
         TwinError: not two numbers, the first the smaller one.

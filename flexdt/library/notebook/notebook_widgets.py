@@ -25,12 +25,13 @@ def volume_widgets(
 ) -> Any:
     """Make three linked slices of a volume: a slider for each axis, and one for the window.
 
-    None chooses the window by the values.
+    They begin at the middle of each axis, and are drawn again when a slider has moved.
 
     Args:
         widgets: the package ipywidgets.
         volume: is seen from above, from the front and from the right.
-        window: attenuation of black and of white at first [1/mm].
+        window: attenuation of black and of white at first [1/mm]; its slider reaches
+            `REACH` times the width beyond both. None: percentiles of the volume.
 
     Returns:
         A box of widgets, which a notebook shows.
