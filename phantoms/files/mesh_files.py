@@ -152,9 +152,12 @@ def filled_mesh(
 
     Args:
         mesh: its triangles; not changed.
-        unit, material, name, place: as for `mesh_phantom`.
+        unit, material, name, place: as for `mesh_phantom`; the defaults are mm, abs and mesh.
         label: of the mesh, for errors.
         at_mm: place of its middle, or of the origin it keeps, in the object's frame [mm].
+
+    Returns:
+        The phantom; its size is that of the box about the object's origin that holds it.
 
     Raises:
         PhantomError, UnknownNameError: as `mesh_phantom`.
@@ -212,10 +215,10 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
     """Read the triangles of a machine's part [mm], from a GLB (m) or STL file (mm); they
     may be open.
 
-    Bytes, triangles and extent have limits of their own for parts.
+    Limits are MAX_PART_BYTES, MAX_PART_FACES and an extent above 0 and at most MAX_PART_MM.
 
     Args:
-        path: of the file.
+        path: of the file; its suffix, one of PART_FORMATS, is its format.
 
     Raises:
         PhantomError: no such file, its format, size or content; the message lists the
@@ -261,8 +264,8 @@ def voxel_phantom(
 ) -> Phantom:
     """Make a phantom from a ready grid.
 
-    The size is that of the box about the origin; labels and several materials are not
-    made here.
+    The phantom's size is that of the box about the object's origin that holds the grid;
+    labels and several materials are not made here.
 
     Args:
         data: [z, y, x], attenuation [1/mm].
@@ -273,7 +276,7 @@ def voxel_phantom(
             attenuation over the material's. None: water of varying density.
 
     Raises:
-        PhantomError: shape, values or voxel size.
+        PhantomError: shape, values or voxel size (finite, above 0).
 
     Example:
         >>> voxel_phantom(np.full((4, 6, 8), 0.02, np.float32), 0.5).size_mm
@@ -302,7 +305,7 @@ def _read(
 ) -> tuple[bytes, str, str]:
     """Read a mesh file, or take its bytes; check size and format.
 
-    A file that is too large is not read. Bytes need `file_type`.
+    A file of more than `MAX_BYTES` is not read. Bytes need `file_type`.
 
     Args:
         source: path or content.
@@ -410,7 +413,8 @@ def _check_ply(raw: bytes) -> None:
     """Check that a PLY header is there, small, and claims no more elements than there are
     bytes.
 
-    Lines that are not of elements are not looked at.
+    The header must end within `MAX_PLY_HEADER` bytes. Each element line has three words;
+    other lines are ignored.
 
     Args:
         raw: content of the file.
@@ -463,15 +467,17 @@ def _check_gltf(document: Any, total: int) -> None:
     """Check the JSON document of a GLB file: extensions, data in the file, sizes, places,
     number of triangles.
 
-    Also refused: sparse data, a node with two places, triangle fans, and more than
-    `MAX_FACES` triangles.
+    Also refused: sparse data, a node with two places, triangle fans, more than `MAX_PARTS`
+    nodes and parts, and more than 3 `MAX_FACES` corners in all that are drawn. Required
+    extensions must begin with one of `HARMLESS_EXTENSIONS`.
 
     Args:
         document: of the file's JSON part.
         total: size of the file [bytes].
 
     Raises:
-        ValueError: extensions, other files, numbers beyond the size, or too many parts.
+        ValueError: names the first problem.
+        AttributeError, LookupError, TypeError: the document lacks a key or has another form.
     """
     for name in document.get("extensionsRequired", []):
         if not name.startswith(HARMLESS_EXTENSIONS):
@@ -554,7 +560,7 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
         label: of the mesh, for messages.
 
     Returns:
-        `mesh`, or a new one where faces had to be turned.
+        `mesh`, or a new one where neighbouring faces had to be turned to agree.
 
     Raises:
         PhantomError: it is open.
@@ -582,7 +588,7 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
 def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Turn faces so that neighbours agree, in each body the way most of its faces already are.
 
-    The mesh must be closed; a tie leaves them.
+    The mesh must be closed. In a tie either half of a body's faces may be turned.
 
     Every face has two nodes, as it is and turned; neighbours link those that agree. A
     body then falls into two components, mirror images of each other, and either is a
@@ -620,7 +626,8 @@ def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | None:
     """Convert a mesh to half-spaces if it is convex and has at most `MAX_PLANES`.
 
-    Planes equal to 1e-7 count once.
+    Planes count once if normals, and offsets over the largest coordinate, agree when
+    rounded to 7 decimals.
 
     Args:
         mesh: closed, outward.

@@ -47,7 +47,7 @@ Each becomes up to 1280 triangles where shapes are drawn and checked for collisi
 def read_phantom_file(path: Path) -> Phantom:
     """Read the phantom of a TOML or JSON file; meshes that a scene names are beside it.
 
-    The format follows from the content, not from the suffix.
+    The text is UTF-8; TOML or JSON follows from the content, not from the suffix.
 
     Raises:
         PhantomError: names file, key path, value and allowed values.
@@ -95,10 +95,17 @@ def load_phantom_file(
 
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
-    """Make the phantom of a document in any of the three forms;
-    raises as `load_phantom_file`.
+    """Make the phantom of a document in any of the three forms.
 
-    With `scene` a saved phantom, with `solid` or `mesh` a scene file, else a bead file.
+    With the key `scene` it is a saved phantom, with `solid` or `mesh` a scene file, else a
+    bead file.
+
+    Args:
+        document: parsed TOML or JSON.
+        folder: of the meshes that a scene file names; None: none may be named.
+
+    Raises:
+        TwinError: names key path, value and allowed values.
     """
     if "scene" in document:
         return Phantom.from_dict(document)
@@ -124,7 +131,8 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
         folder: where its meshes are; None: none may be named.
 
     Raises:
-        PhantomError: too many solids, or as its parts.
+        PhantomError: more than `MAX_SOLIDS` entries of solid, as its parts, or as
+            `require_replaced`.
     """
     given = reading.fields(
         document,
@@ -160,16 +168,16 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
 def require_replaced(phantom: Phantom, solids: object) -> None:
     """Check that the material that solids of a scene file replace is there, once.
 
-    Voxelised coarsely, solids and meshes of that material must have no clearly negative
-    attenuation anywhere. `replaces` of the document's solids are looked at; others are
-    ignored.
+    Solids and meshes of that material are voxelised with `CHECKED_VOXELS_ALONG` voxels
+    along the longest side; none may be below minus `MAX_ABSENT_SHARE` of the material's
+    attenuation. Solids of the document without `replaces` are ignored.
 
     Args:
         phantom: of the scene's meshes and solids.
-        solids: of the document.
+        solids: of the document, a list or one entry.
 
     Raises:
-        PhantomError: names the material.
+        PhantomError: names the first material of which more is replaced than there is.
     """
     from flexdt.phantoms.voxelise import voxelise
 
@@ -208,7 +216,8 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
         where: its place, for messages.
 
     Returns:
-        The solid, after the hole that it fills if it replaces another material.
+        The solid alone or, if it replaces another material, two: first the same shape with
+        minus the other's attenuation, then the solid.
 
     Raises:
         PhantomError, UnknownNameError: names the key path, the value and the allowed
@@ -238,7 +247,7 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
         folder: where the mesh's file is; None: none may be named.
 
     Returns:
-        The mesh's phantom and priority.
+        The mesh's phantom, as of `mesh_phantom`, and priority.
 
     Raises:
         PhantomError: names the field, its value and the allowed ones.
@@ -281,7 +290,7 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
     Without a body the beads are in air and the size is that around them about the origin.
     Exactly one of beads and spiral must be given. Only listed beads are checked for
-    overlap.
+    overlap. The default description counts the beads and names the body's material or air.
 
     Args:
         document: of the file.
@@ -367,10 +376,11 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
         where: its place, for messages.
 
     Returns:
-        Number of beads, radius [mm] (2 if left out), material (steel).
+        Number of beads, radius [mm] (2 if left out), material (steel if left out).
 
     Raises:
-        PhantomError: names the field, its value and the allowed ones.
+        PhantomError: names the field, its value and the allowed ones; the number must be
+            whole and above 0, the radius above 0.
     """
     others = {"radius_mm": reading.positive, "material": reading.string}
     given = reading.fields(value, where, {"beads": reading.positive}, others)
@@ -387,8 +397,8 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
     """Parse the phantom of a text that names no other file, and check its size and its
     meshes.
 
-    There are limits for solids, triangles and extent; voxels must be alone. The size is
-    at least the stated one.
+    Limits are `MAX_SENT_SOLIDS`, `MAX_FACES` triangles and `MAX_EXTENT_MM`; voxels must be
+    alone. The size is at least the stated one; that of voxels is the stated one.
 
     Args:
         text: UTF-8, TOML or JSON.

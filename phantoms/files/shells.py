@@ -17,14 +17,16 @@ Faces = npt.NDArray[Any]
 def filled_twice(vertices: FloatArray, faces: Faces) -> int:
     """Count the shells turned outwards inside other filled shells.
 
-    0 for one shell, or more than `MAX_SHELLS`; one point of each decides.
+    0 for one shell, or more than `MAX_SHELLS`. A shell counts if its box is strictly within
+    the box of another, its volume is above 0, and the winding number of all others about
+    one of its vertices is above 0.5.
 
     Such a shell changes nothing: where bodies overlap, path counts once. Cavities turn
     inwards.
 
     Args:
-        vertices: (v, 3).
-        faces: (f, 3), of closed shells.
+        vertices: (v, 3), in any unit of length.
+        faces: (f, 3), indices of vertices, of closed shells.
     """
     shells = _shells(vertices, faces)
     if not 1 < len(shells) <= MAX_SHELLS:
@@ -51,7 +53,7 @@ def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
         faces: (f, 3).
 
     Returns:
-        Indices of faces, an array for each surface.
+        Indices of faces, ascending, an array for each surface.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
