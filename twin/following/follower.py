@@ -194,10 +194,12 @@ class Follower:
     def linked(
         self, mirror: Mirror, connected: bool, now: float, why: str = ""
     ) -> Mirror:
-        """Update the mirror after the link has come up or gone down, which forgets
-        commands under way.
+        """Update the mirror after the link has come up or gone down, the latter of
+        which forgets commands under way.
 
-        Going down is an error alarm with the reason, and motors count as at rest.
+        Coming up ends the alarms of the link and forgets nothing. Going down is an error
+        alarm with the reason `why`; motors count as at rest, and the next due time of the
+        script is dropped.
         """
         if connected:
             return replace(mirror.cleared("link"), connected=True)
@@ -210,7 +212,8 @@ class Follower:
         """Return the mirror with the alarms of `ahead`: new ones are added, those that
         are over end.
 
-        Alarms of other origin stay; an active one is not added again.
+        Alarms whose subject does not begin with "ahead" stay; an active one is not added
+        again.
         """
         found = tuple(alarms)
         still = {(a.kind, a.about) for a in found}
@@ -320,7 +323,9 @@ class Follower:
     def _end_overdue(self, mirror: Mirror, component: str, now: float) -> Mirror:
         """End the commands whose predicted time is over, and apply their settings.
 
-        A command without a prediction is over at once; each ends once.
+        A command without a prediction is over at once; each ends once: it is marked as
+        superseded, stays in `waiting`, and gets no line or alarm here. Lateness of the
+        message is added to its time.
 
         Args:
             mirror: present state.
@@ -796,8 +801,8 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
     """Add log lines for the commands that the sender has not waited for, now that another
     follows.
 
-    Questions get none, and each command one only; a move with a trigger took the time
-    until now, any other 0 s.
+    Questions get none, and each command one only. A move with a trigger took the time
+    until now, with the wait POS; any other 0 s, with "no wait". They are marked as written.
 
     Args:
         mirror: present state.
@@ -821,7 +826,8 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
     """Format the log line of a command that a script can have, once; empty for others.
 
-    A tuple of one line or of none.
+    Empty if a line is written already, or if the message is not a command of the language.
+    A move under another name is written as "move absolute" with its target.
 
     Args:
         waiting: record of the command.
