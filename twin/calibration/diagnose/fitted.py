@@ -318,7 +318,7 @@ def explain_residuals(
         return fit, []
     plain = fit
     fit, causes = explained_by_causes(fit, known, refit)
-    named = named_causes(fit, plain, causes)
+    named = named_causes(fit, causes)
     if "beads" in causes.applied and _one_is_elsewhere(plain, fit):
         fit = plain
         named = []

@@ -39,7 +39,7 @@ PARTS: Final[dict[str, FloatArray]] = {
 }
 
 
-def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding]:
+def named_causes(fit: FitResult, found: Found) -> list[Finding]:
     """Report the causes of a fit as findings (warnings): certain ones by name, doubtful
     ones together in one, with their rivals.
 
@@ -47,7 +47,6 @@ def named_causes(fit: FitResult, plain: FitResult, found: Found) -> list[Finding
 
     Args:
         fit: with the causes as columns.
-        plain: without them; not used.
         found: which there are, and their odds.
 
     Returns:
