@@ -21,7 +21,12 @@ GOLDEN_DEG = 222.4922
 
 
 def main() -> None:
-    """Scan the LEGO phantom at the twin of this machine."""
+    """Scan the LEGO phantom at the twin of this machine until the wanted sigmas are reached.
+
+    At most 90 frames, at golden angles, are exposed; each is fitted as it comes. The first
+    argument of the command line gives the wanted sigmas (name=value, by commas). Prints the
+    sigmas after each fit, then the job's state and its frames.
+    """
     wanted = assignments((sys.argv[1:] or ["tau_x=0.0002,tau_z=0.0002"])[0].split(","))
     with TwinClient() as twin:
         twin.set_sample("lego")

@@ -35,11 +35,18 @@ class Assets:
     """A RunEngine callback: which files the stream documents point at, per data key."""
 
     def __init__(self) -> None:
+        """Start without files, counts or known resources."""
         self.files: dict[str, list[Path]] = {}
         self.counts: Counter[str] = Counter()
         self._resources: dict[str, Mapping[str, Any]] = {}
 
     def __call__(self, name: str, document: Mapping[str, Any]) -> None:
+        """Count a document by its name; keep a stream resource, and list the files that a
+        stream datum points at under its resource's data key.
+
+        Other documents are only counted. A resource that is no series of TIFF images fails an
+        assertion; a datum needs its resource before it.
+        """
         self.counts[name] += 1
         if name == "stream_resource":
             assert document["mimetype"] == "multipart/related;type=image/tiff"
@@ -51,12 +58,22 @@ class Assets:
 
 
 def _files(resource: Mapping[str, Any], indices: Mapping[str, int]) -> Iterator[Path]:
+    """Yield the paths of images start <= i < stop of a stream resource: a URI, a template."""
     folder = Path(unquote(urlsplit(resource["uri"]).path))
     for i in range(indices["start"], indices["stop"]):
         yield folder / resource["parameters"]["template"].format(i)
 
 
 def main(host: str, port: int, images: Path) -> None:
+    """Run a step scan and the twin's own fly scan by Bluesky, and print where the images are.
+
+    A scan beyond the limits is checked first, which must be refused before anything moves.
+
+    Args:
+        host: of the twin.
+        port: of the twin.
+        images: folder for the images of the step scan; made if it is not there.
+    """
     engine = RunEngine({})
     assets = Assets()
     engine.subscribe(assets)
@@ -72,6 +89,9 @@ def main(host: str, port: int, images: Path) -> None:
         print(f"refused: {error}")
 
     def step_scan() -> Iterator[Any]:
+        """Set tube, region and exposure, move to 600 mm and 0 degrees, then take 4 images
+        from 0 to 90 degrees.
+        """
         yield from bps.mv(lab.tube.kV, 90.0, lab.tube.power_W, 20.0, lab.tube.on, True)
         yield from bps.mv(
             lab.camera.roi, "800 620 1199 939", lab.camera.exposure_ms, 100.0

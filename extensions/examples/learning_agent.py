@@ -36,8 +36,12 @@ Policy = Callable[[Array, Array], Array]
 
 
 def features(images: Array) -> Array:
-    """Horizontal variance, darkest pixel, mass and steepest edge of images (k, rows, cols,
-    1)."""
+    """Compute four features of images (k, rows, cols, 1) of 0 to 255: (k, 4).
+
+    They are the horizontal variance of the mass in half widths (times 10), the highest grey
+    value of 1, the mass (over 100), and the steepest step between columns of the column sums
+    (over 5).
+    """
     grey = images[..., 0].astype(np.float64) / 255.0
     columns = np.linspace(-1.0, 1.0, grey.shape[2])
     profile = grey.sum(axis=1) + 1e-9
@@ -51,12 +55,19 @@ def features(images: Array) -> Array:
 
 
 def questions(seen: Array, angles: Array, asked: Array) -> Array:
-    """Return the network's input for every pair of a state and an angle [rad]: (k, asked,
-    inputs).
+    """Make the network's input for every pair of a state and a possible angle.
 
     For each frame so far: its features, alone and times cosines and sines of twice and four
-    times the angle between it and the one in question, because a plate looks the same from both
-    sides.
+    times the angle between it and the one in question, because a plate looks the same from
+    both sides; frames still to come are 0. The number of frames is coded one-hot.
+
+    Args:
+        seen: features of the frames so far, (k, frames, features).
+        angles: of those frames [rad], (k, frames).
+        asked: possible angles [rad], (n,).
+
+    Returns:
+        (k, n, `INPUTS`).
     """
     k, frames = angles.shape
     out = np.zeros((k, len(asked), INPUTS))
@@ -76,6 +87,13 @@ class Network:
     """Two hidden layers of tanh, fitted by Adam to mean squared error."""
 
     def __init__(self, inputs: int, rng: np.random.Generator, width: int = 64) -> None:
+        """Draw normal weights of variance 1 / inputs for two hidden layers; biases are 0.
+
+        Args:
+            inputs: numbers of an input.
+            rng: draws the weights, and later the training pairs.
+            width: of both hidden layers.
+        """
         sizes = [inputs, width, width, 1]
         self.rng = rng
         self.weights = [rng.normal(size=(a, b)) / np.sqrt(a) for a, b in pairwise(sizes)]
@@ -85,6 +103,9 @@ class Network:
         return self._layers(x)[-1][..., 0]
 
     def _layers(self, x: Array) -> list[Array]:
+        """Compute all layers for inputs (n, inputs): the input, two layers of tanh, and the
+        linear output (n, 1).
+        """
         out = [x]
         for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = x @ w + b
@@ -92,7 +113,14 @@ class Network:
         return out
 
     def fit(self, x: Array, y: Array, steps: int, rate: float = 2e-3) -> None:
-        """Minimise the mean squared error to y (n,)."""
+        """Minimise the mean squared error to y (n,) by Adam, in place.
+
+        Args:
+            x: inputs, (n, inputs).
+            y: wanted outputs, (n,).
+            steps: each of 256 pairs, drawn with replacement.
+            rate: first step size; it falls linearly to nearly 0.
+        """
         parameters = [*self.weights, *self.biases]
         first = [np.zeros_like(p) for p in parameters]
         second = [np.zeros_like(p) for p in parameters]
@@ -130,8 +158,16 @@ ANGLES = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
 
 
 def play(envs: ScanVectorEnv, policy: Policy, seeds: list[int]) -> dict[str, Array]:
-    """Run an episode of each environment; return observations, actions and rewards, (k, frames,
-    ...)."""
+    """Run one episode of `FRAMES` frames in each environment.
+
+    Args:
+        envs: k environments, stepped together.
+        policy: chooses sectors from the features and angles so far.
+        seeds: of the k episodes.
+
+    Returns:
+        "seen" (k, frames, features), "sectors" and "rewards" (k, frames).
+    """
     observation, _ = envs.reset(seed=seeds)
     seen = np.zeros((envs.num_envs, 0, FEATURES))
     sectors = np.zeros((envs.num_envs, 0), np.int64)
@@ -151,8 +187,9 @@ def fixed(sectors: list[int]) -> Policy:
 
 
 def greedy_sectors() -> list[int]:
-    """Choose by the package's greedy baseline: most information about upright columns, blind to
-    images."""
+    """Choose `FRAMES` sectors one by one as the package's greedy baseline does: the highest
+    forecast (the first of equals), blind to images.
+    """
     env = ScanEnv(action="discrete", task="plates", frames=FRAMES, time_weight=0.0)
     env.reset(seed=0)
     chosen: list[int] = []
@@ -164,9 +201,20 @@ def greedy_sectors() -> list[int]:
 
 
 def best(network: Ensemble, rng: np.random.Generator, random_part: float) -> Policy:
-    """Choose the angle of the highest value; the first is 0, and some are drawn."""
+    """Make a policy that chooses the sector of the highest predicted value.
+
+    The first frame is always sector 0.
+
+    Args:
+        network: predicts values.
+        rng: draws the exceptions.
+        random_part: probability of a random sector instead.
+    """
 
     def policy(seen: Array, angles: Array) -> Array:
+        """Choose a sector for each of k episodes, from features (k, frames, features) and
+        angles [rad] (k, frames).
+        """
         k, frames = angles.shape
         if frames == 0:
             return np.zeros(k, np.int64)
@@ -185,7 +233,23 @@ def learn(
     steps: int,
     tell: Callable[[str], None],
 ) -> tuple[Ensemble, list[float]]:
-    """Fitted Q iteration; the network and the mean score of the episodes of each round."""
+    """Learn a policy by fitted Q iteration.
+
+    The first round plays at random, later ones by the network with a quarter at random; each
+    round refits the network three times to all episodes so far, with the value of the best
+    next angle added to a frame's reward.
+
+    Args:
+        envs: environments, stepped together.
+        seed: of the network and the objects.
+        rounds: of playing and fitting.
+        episodes: of a round; what is left over by the number of environments is not played.
+        steps: of each fit.
+        tell: called with a line after each round.
+
+    Returns:
+        The network, and the mean score of the episodes of each round.
+    """
     rng = np.random.default_rng(seed)
     network = Ensemble(rng)
     games: list[dict[str, Array]] = []
@@ -230,7 +294,17 @@ def learn(
 
 
 def judge(envs: ScanVectorEnv, policy: Policy, seed: int, judged: int) -> Array:
-    """Scores on objects of their own seeds, (judged,)."""
+    """Score a policy on objects of their own seeds.
+
+    Args:
+        envs: environments, stepped together.
+        policy: to judge.
+        seed: of the first object; the following ones count up.
+        judged: number of objects.
+
+    Returns:
+        (judged,) sum of rewards over `GAIN`: 1 - RMSE / RMS.
+    """
     count = envs.num_envs
     found = [
         play(envs, policy, list(range(seed + at, seed + at + count)))["rewards"].sum(
@@ -242,7 +316,13 @@ def judge(envs: ScanVectorEnv, policy: Policy, seed: int, judged: int) -> Array:
 
 
 def draw(document: dict[str, Any], out: Path) -> None:
-    """Curves of training, and scores of all."""
+    """Draw the curves of training, and bars of all policies' scores with their standard
+    errors, into agent.png and agent.svg.
+
+    Args:
+        document: as written to agent.json.
+        out: folder, which must exist.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -265,6 +345,12 @@ def draw(document: dict[str, Any], out: Path) -> None:
 
 
 def main() -> None:
+    """Train one agent a seed, judge it beside three fixed policies on plates not seen
+    before, and write agent.json, agent.png and agent.svg.
+
+    The agent's score is the mean over the seeds. --pilot judges on the plates that settings
+    were chosen by. Prints the scores and how much the agent is better than the greedy one.
+    """
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=3)

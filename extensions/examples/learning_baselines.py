@@ -21,7 +21,17 @@ COLOURS = {"random": "#5f6c7b", "equidistant": "#1b6ca8", "greedy": "#c8553d"}
 
 
 def run(task: str, frames: int, episodes: int) -> dict[str, dict[str, Any]]:
-    """Mean over episodes of each policy's figures after every frame."""
+    """Play each policy's episodes of one task, at seeds 1 to `episodes`.
+
+    Args:
+        task: "information" or "quality".
+        frames: of an episode.
+        episodes: of each policy.
+
+    Returns:
+        Policy -> the task's figure ("worst_sigma" or "quality") and "clock_s" after each
+        frame, as means over the episodes; mean and standard deviation of the summed reward.
+    """
     key = {"information": "worst_sigma", "quality": "quality"}[task]
     out: dict[str, dict[str, Any]] = {}
     for name, policy in POLICIES.items():
@@ -29,6 +39,7 @@ def run(task: str, frames: int, episodes: int) -> dict[str, dict[str, Any]]:
         played = [play(env, policy, seed) for seed in range(1, episodes + 1)]
 
         def mean(of: Any, played: Any = played) -> list[float]:
+            """Average a figure of an info over the episodes, a value for each frame."""
             return np.mean([[of(i) for i in e.infos] for e in played], axis=0).tolist()
 
         out[name] = {
@@ -41,7 +52,12 @@ def run(task: str, frames: int, episodes: int) -> dict[str, dict[str, Any]]:
 
 
 def draw(found: dict[str, dict[str, dict[str, Any]]], out: Path) -> None:
-    """Two rows: the task's figure over frames and over the scanner's clock."""
+    """Draw a row for each task: its figure over the frames and over the scanner's clock.
+
+    Args:
+        found: task -> what `run` returns. Sigmas get a logarithmic axis.
+        out: folder for baselines.png and baselines.svg, which must exist.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -77,6 +93,9 @@ def draw(found: dict[str, dict[str, dict[str, Any]]], out: Path) -> None:
 
 
 def main() -> None:
+    """Run all policies on both tasks, write baselines.json, .png and .svg into --out (made
+    if it is not there), and print rewards and clock.
+    """
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--episodes", type=int, default=8)
