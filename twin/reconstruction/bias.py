@@ -151,6 +151,8 @@ def bias_of(
     cone_vec: ConeVec,
     shape: tuple[int, int],
     truncation: Truncation | None = None,
+    *,
+    sides_known: bool = False,
 ) -> Bias | None:
     """Find the possible errors of FDK's volume of a scan, from a coarse copy of it.
 
@@ -159,18 +161,20 @@ def bias_of(
         cone_vec: of all views.
         shape: (rows, cols).
         truncation: of `truncation_of`.
+        sides_known: beads have told the direction of rotation and mirrored images.
 
     Returns:
         None where a coarse scan cannot be reconstructed (any GeometryError), as of a
         steep helix or of neither a circle nor a helix.
     """
     try:
-        return _bias_of(CoarseScan.of(image, cone_vec, shape, truncation))
+        scan = CoarseScan.of(image, cone_vec, shape, truncation)
+        return _bias_of(scan, sides_known)
     except GeometryError:
         return None
 
 
-def _bias_of(scan: CoarseScan) -> Bias:
+def _bias_of(scan: CoarseScan, sides_known: bool) -> Bias:
     """Reconstruct a coarse scan and bound its errors, cause by cause.
 
     If images and geometry contradict each other, nothing else is bounded. Bounds are
@@ -181,6 +185,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
 
     Args:
         scan: few views and pixels of the whole scan.
+        sides_known: see `bias_of`.
 
     Returns:
         The bound, with the contradiction if there is one.
@@ -229,7 +234,8 @@ def _bias_of(scan: CoarseScan) -> Bias:
     accuracy = bias.accuracy(bias.found)
     if comparison is None or accuracy is None or accuracy.cut_off:
         return bias
-    return replace(bias, contradiction=comparison.undecided(accuracy.most))
+    undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
+    return replace(bias, contradiction=undecided)
 
 
 def _drift(images: Float32Array) -> Float32Array:

@@ -156,6 +156,8 @@ class NamedCorrection:
         note: its origin (data set, phantom, residual).
         panel: the distortion that was found along with it; None: none. It is undone in
             images, and no state of the twin has it.
+        sides_known: it was found from beads of known places in images of this geometry,
+            which tell the direction of rotation and mirrored images.
     """
 
     name: str
@@ -163,6 +165,7 @@ class NamedCorrection:
     parameters: Offsets = NOMINAL
     note: str = ""
     panel: Panel | None = None
+    sides_known: bool = False
 
     @classmethod
     def from_edge(

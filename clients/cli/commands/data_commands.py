@@ -293,14 +293,21 @@ def scan_of(
         data = with_geometry(data, load_geometry(geometry))
     if report is None:
         return data
-    if (panel := report.document.get("panel")) is not None:
-        from flexdt.twin.geometry.panel import Panel
-        from flexdt.twin.scanner.state import NamedCorrection
+    from flexdt.twin.geometry.panel import Panel
+    from flexdt.twin.scanner.state import NamedCorrection
 
-        found = Panel.from_json(panel)
-        data = data.with_correction(
-            NamedCorrection("report", "", report.parameters, panel=found)
+    panel = data.panel
+    if (found := report.document.get("panel")) is not None:
+        panel = Panel.from_json(found)
+    data = data.with_correction(
+        NamedCorrection(
+            "report",
+            "",
+            report.parameters,
+            panel=panel,
+            sides_known=report.of_beads,
         )
+    )
     return apply_motion(data, report)
 
 
@@ -340,6 +347,13 @@ class Report:
     path: Path
     parameters: Offsets
     document: dict[str, Any]
+
+    @property
+    def of_beads(self) -> bool:
+        """True for a report of `flexdt calibrate` with a phantom whose beads are known."""
+        from flexdt.twin.calibration.unknown_markers import UNKNOWN
+
+        return bool(self.document.get("phantom", UNKNOWN) != UNKNOWN)
 
 
 def read_report(path: Path) -> Report:

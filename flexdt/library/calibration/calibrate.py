@@ -151,6 +151,7 @@ class Outcome(Generic[Images_co]):
             result.fit.parameters,
             f"{self.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
             result.panel,
+            sides_known=self.phantom.name != UNKNOWN,
         )
 
 

@@ -162,6 +162,8 @@ class ScanFrames:
         scatter: of each of the m frames, to subtract, or None.
         doubts: about the images, the trajectory and the corrections.
         kept: store of images that are needed again; None reads them again.
+        sides_known: their geometry is corrected by beads, which have told the direction of
+            rotation and mirrored images.
     """
 
     dataset: ImageSet
@@ -174,6 +176,7 @@ class ScanFrames:
     scatter: ScanScatter | None = None
     doubts: tuple[str, ...] = ()
     kept: KeptImages | None = None
+    sides_known: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -255,7 +258,13 @@ def views_of(
     cone_vec = dataset.corrected(parameters)[np.array(indices)]
     if binning > 1:
         cone_vec = cone_vec.binned(binning, dataset.shape)
-    return ScanFrames(dataset, indices, cone_vec, binning)
+    in_force = dataset.correction
+    sides_known = (
+        in_force is not None
+        and in_force.sides_known
+        and parameters in (None, in_force.parameters)
+    )
+    return ScanFrames(dataset, indices, cone_vec, binning, sides_known=sides_known)
 
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
@@ -476,7 +485,13 @@ def _untold(done: float, total: float) -> None:
 
 
 def _bias(views: ScanFrames) -> Bias | None:
-    return bias_of(views.view, views.cone_vec, views.shape, views.truncation)
+    return bias_of(
+        views.view,
+        views.cone_vec,
+        views.shape,
+        views.truncation,
+        sides_known=views.sides_known,
+    )
 
 
 def _reconstruct_in_process(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
-from flexdt.twin.reconstruction.consistency.suspects import KINDS
+from flexdt.twin.reconstruction.consistency.suspects import KINDS, SIDES
 from flexdt.twin.reconstruction.consistency.trials import (
     MIN_EVIDENCE_SIGMAS,
     Trial,
@@ -200,13 +200,18 @@ class Comparison:
             return Contradiction(trial.excess)
         return None
 
-    def undecided(self, claimed: float) -> Contradiction | None:
+    def undecided(
+        self, claimed: float, *, sides_known: bool = False
+    ) -> Contradiction | None:
         """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`) and would
         change the volume by more than is claimed.
 
         Args:
             claimed: largest relative error that is claimed of nine of ten uniform
                 regions.
+            sides_known: the geometry was found from beads, so that the kinds of `SIDES`
+                need no evidence of these images. A clear contradiction is still found by
+                `contradiction`.
 
         Returns:
             None if the scan is truncated or each such explanation is contradicted by
@@ -219,6 +224,7 @@ class Comparison:
             one
             for one in self._tried
             if one.evidence < MIN_EVIDENCE_SIGMAS
+            and not (sides_known and one.suspect.kind in SIDES)
             and one.change > claimed
             and trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
         ]

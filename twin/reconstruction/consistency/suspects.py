@@ -35,6 +35,9 @@ KINDS: Final = {
 }
 """Kind of error -> its description."""
 
+SIDES: Final = ("direction", "columns", "rows", "turned")
+"""Kinds that mirror the object or its motion, which beads of known places exclude."""
+
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
