@@ -64,8 +64,11 @@ class Room(NamedTuple):
 
 
 def room_of(machine: Machine) -> Room:
-    """Compute the room that a machine needs: its corners [mm], its scale over the drawn one,
-    and the floor's height.
+    """Compute the `Room` of a machine: corners of what its parts reach [mm], its scale
+    over the FleX-ray, and the floor's height [mm].
+
+    The scale is the smaller ratio of horizontal and vertical reach to `DRAWN_FOR_MM`; the
+    floor lies `BELOW_MM` times the scale below the lowest part.
     """
     low, high = reach_of(machine)
     across = (high - low)[:2].max()
@@ -77,7 +80,9 @@ def room_of(machine: Machine) -> Room:
 def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
     """Compute the box of all that the machine's drawn parts reach over their travel.
 
-    A part that turns is taken at any angle about z.
+    A part that turns is taken at any angle about z. Each part is the box of its drawn
+    vertices, moved over all axis limits at once; the box of a turning part holds its
+    circle about z.
 
     Args:
         machine: with axes and components.
@@ -110,7 +115,10 @@ def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
 def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
     """Build the cabinet around all that the machine's parts reach.
 
-    Walls, floor, door and what is on it are seen from within only.
+    Walls, floor, door and what is on it are seen from within only. Walls and floor are
+    the inside of a box, `ROOM_MM` beyond the machine; the ceiling is left out. Door,
+    window, handle and sign are on the wall at lowest x; four steel kerbs surround the
+    floor. All lengths scale with `room.scale`. The lamp itself is not among the pieces.
 
     Args:
         room: of the machine.

@@ -44,6 +44,9 @@ def bevelled(
 ) -> PaintedMesh:
     """Build a box whose edges are cut, so that they catch the light.
 
+    The mesh is the convex hull of 24 points: each corner moved inwards by the bevel along
+    two of three axes. The bevel is at most 0.35 of the smallest half side.
+
     Args:
         size: sides [mm].
         center: [mm].
@@ -71,7 +74,7 @@ def cylinder(
     axis: str = "z",
     sections: int = 48,
 ) -> PaintedMesh:
-    """Build a cylinder.
+    """Build a cylinder about an axis through its centre, as a painted mesh [mm].
 
     Args:
         diameter: [mm].
@@ -90,8 +93,11 @@ def cylinder(
 def lathe(
     profile: Sequence[tuple[float, float]], center: Vector, paint: Paint, axis: str = "z"
 ) -> PaintedMesh:
-    """Build a body of revolution [mm]: (radius, height) from bottom to top, about z
-    (or y)."""
+    """Build a body of revolution of 64 sections as a painted mesh [mm].
+
+    Args: profile: points (radius, height) from bottom to top, relative to `center`; axis:
+    "z", or "y" for a body turned to lie along y.
+    """
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
     return _standing(mesh, center, paint, axis)
 
@@ -99,8 +105,10 @@ def lathe(
 def _standing(
     mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str
 ) -> PaintedMesh:
-    """Paint a mesh that was made about z, turned to y if that is its `axis`, and moved to its
-    centre.
+    """Turn a mesh made about z, move it to its centre and paint it.
+
+    The mesh is changed in place: turned by -90 degrees about x (z becomes y) only if
+    `axis` is "y", then moved by `center` (x, y, z) [mm].
     """
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
@@ -109,8 +117,10 @@ def _standing(
 
 
 def glb(pieces: Iterable[PaintedMesh]) -> bytes:
-    """Write one binary glTF of the pieces, in metres, as bytes; pieces of one paint share
-    a mesh.
+    """Encode pieces as one binary glTF file (bytes), scaled from mm to metres.
+
+    Pieces of equal paint are joined to one mesh, in order of their first use; nodes are
+    named part0, part1, ...; normals are included.
     """
     groups: dict[Paint, list[trimesh.Trimesh]] = {}
     for piece in pieces:
@@ -129,7 +139,8 @@ def glb(pieces: Iterable[PaintedMesh]) -> bytes:
 def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh:
     """Join meshes [mm] of one paint to one mesh [m], smooth but for sharp edges.
 
-    The mesh has the paint as its material, and no metadata.
+    The mesh has the paint as its material, and no metadata. Edges of more than
+    `SMOOTH_RAD` stay sharp. Colours are converted from sRGB to linear; opacity is 1.
 
     Args:
         meshes: of one paint.
@@ -153,7 +164,9 @@ def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh
 
 
 def _linear(channel: int) -> float:
-    """Convert a channel of sRGB (0 to 255) to glTF's: linear, 0 to 1."""
+    """Convert an sRGB channel (integer 0 to 255) to a linear one (0 to 1), by the
+    standard's curve.
+    """
     c = channel / 255.0
     if c <= 0.04045:
         return c / 12.92
@@ -170,7 +183,9 @@ def turn_matrix(axis: Vector, angle: float) -> FloatArray:
 def plain(
     mesh: trimesh.Trimesh,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """Convert a mesh in mm to vertices [m] and faces."""
+    """Convert a mesh [mm] to vertices (v, 3) float32 [m] and faces (f, 3) uint32, numbers
+    of vertices.
+    """
     return (
         (np.asarray(mesh.vertices) * MM).astype(np.float32),
         np.asarray(mesh.faces, dtype=np.uint32),

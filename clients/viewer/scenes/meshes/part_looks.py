@@ -38,6 +38,9 @@ LOOKS: Final[Mapping[str, Any]] = tomllib.loads(_TABLE.read_text(encoding="utf-8
 def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
     """Read the parts' own meshes as GLB files [m].
 
+    A .glb file is passed on unchanged, with its colours; any other mesh [mm] is painted
+    `ALUMINIUM` and encoded as GLB [m]. Parts without a mesh are left out.
+
     Args:
         machine: with the parts.
         folder: of its machine file and the meshes.
@@ -64,6 +67,10 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
 def pieces_of(part: Component) -> list[PaintedMesh]:
     """Build the part's painted meshes, in its own frame [mm]: the convex hull of its
     points if it has any, else the look of its name, role or shape.
+
+    A hull is painted `ALUMINIUM` and not moved; the pieces of a look are sized to the
+    part's box and moved to its centre. The look is that of the part's name, else of its
+    role if `LOOKS` has one, else of its shape.
     """
     if part.points_mm:
         return [
@@ -81,6 +88,10 @@ def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
     """Build one piece of a look, once for each of its turns, about the middle of a box.
 
     Boxes, cylinders and else bodies of revolution; sizes are shares of the box plus mm.
+    Each turn is about z, by an angle of `turned_deg` (one of 0 by default). A cylinder
+    takes its diameter from the first size and its height from the one along its axis.
+    Radii of a body of revolution are in shares of the larger of the x and z sides,
+    heights in shares of the y side.
 
     Args:
         piece: of `data/parts.toml`.
