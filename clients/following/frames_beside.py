@@ -30,6 +30,10 @@ from flexdt.twin.machine.kinematics import motor_poses
 def newest_frame(folder: Path) -> tuple[Path, float] | None:
     """Find the TIFF that was written last; dark and flat images are skipped.
 
+    Only the folder itself is searched, for *.tif*. Names that begin with "di" (dark) or
+    "io" (flat) are skipped, and so are files deleted meanwhile. The time is that of the
+    last change.
+
     Returns:
         Its path and time of writing [s since the epoch]; None if there is none.
     """
@@ -61,7 +65,9 @@ class FramesBeside:
     def write(self, path: Path, mirror: Mirror, age_s: float) -> dict[str, object]:
         """Write one frame with its radiograph, side by side.
 
-        The frame is to the left; beside.png and beside.json are replaced each time.
+        The frame is to the left; beside.png and beside.json are replaced each time. `out`
+        is made if it is missing. Columns and rows of the shift are those of the real
+        image relative to the virtual one [px]. Dense parts are dark in the picture.
 
         Args:
             path: of the frame.
@@ -101,10 +107,12 @@ class FramesBeside:
 
 
 def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, str]:
-    """Convert a frame to line integrals (rows, cols).
+    """Convert a frame to line integrals (rows, cols) of `shape`, with a description of
+    the white level.
 
     Dark and flat images of its folder are used; without them white is a percentile of the
-    frame.
+    frame. The means of the folder's dark and flat images are used if it has both;
+    without, dark is 0 and white is the frame's 99.5 % percentile.
 
     Returns:
         The line integrals, and a description of the white level.
@@ -126,6 +134,9 @@ def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, st
 
 def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
     """Measure the shift of the real image against the virtual one [px], (columns, rows).
+
+    The peak of the phase correlation, to parts of a pixel; positive means that the real
+    image lies at higher columns or rows. Both images have the same shape.
 
     Example:
         >>> image = np.zeros((32, 48), np.float32)

@@ -14,7 +14,12 @@ from flexdt.twin.script.grammar import own_name
 
 
 def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -> Heard:
-    """Read one message.
+    """Decode one message of the scanner to a follower's message (`Heard`), with its typed
+    command or question.
+
+    Bytes before the first "{" are skipped. Bytes that are no event in UTF-8 are tried
+    once more as Latin-1. The component's name is replaced by the axis's own spelling; an
+    event without a reply type becomes "SEND".
 
     Args:
         data: bytes of the message; UTF-8, or one byte for each character where a cluster
@@ -43,6 +48,9 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
 def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
     """Read the typed command, or the name of a question, as (command, ""), (None, name);
     (None, "") for any other or invalid command.
+
+    A command counts only if its type is one of the script's commands; a refused one gives
+    (None, "") and raises nothing.
     """
     try:
         command = read_command(event, axes)

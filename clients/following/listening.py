@@ -38,7 +38,11 @@ _ADDRESS: Final = re.compile(
 
 
 def endpoint(address: str) -> str:
-    """Convert `tcp://HOST[:PORT]` to ZeroMQ's endpoint.
+    """Convert `[tcp://]HOST[:PORT][/]` to ZeroMQ's `tcp://HOST:PORT`; the default port is
+    50000.
+
+    Blanks around it are dropped; an IPv6 address has to be in brackets. The port is from
+    1 to 65535.
 
     Raises:
         ValueError: it is none.
@@ -66,7 +70,11 @@ async def listen(
     link: Callable[[bool, str], None],
     clock: Callable[[], float],
 ) -> None:
-    """Listen until cancelled.
+    """Listen to the scanner's messages in a thread until cancelled, and call the
+    callbacks in the event loop.
+
+    The thread is waited for before the call ends. A lost connection is made again by the
+    socket and only reported by `link`; it raises nothing.
 
     Args:
         address: see `endpoint`.
@@ -88,7 +96,10 @@ async def listen(
         until `ended`.
 
         `passed` is called every `TICK_S` seconds with a time before which all has been
-        read, `link` with up or down, `message` with data, time and delay [s].
+        read, `link` with up or down, `message` with data, time and delay [s]. Waits at
+        most `POLL_S` for a message, so it ends that soon. All messages at hand are read
+        without waiting; of a multipart message only the last part is used. The delay is
+        the time since the socket was last known to be empty, before the wait.
 
         Args:
             socket: of messages.
@@ -116,7 +127,8 @@ async def listen(
         end, and close both.
 
         The socket reconnects by itself, sends heartbeats, and holds at most `MAX_HELD`
-        messages of `MAX_BYTES`.
+        messages of `MAX_BYTES`. IPv6 is allowed only if the address holds "[". Nothing is
+        sent: the socket and monitor are closed without lingering.
         """
         with zmq.Context() as context, context.socket(zmq.SUB) as socket:
             for option, value in (

@@ -53,7 +53,9 @@ def time_of_day(seconds: float, digits: int = 3) -> str:
 
 
 def format_recorded(message: Recorded) -> bytes:
-    """Encode a message with its time, as a recording holds it."""
+    """Encode a message as `[hh:mm:ss.ffffff LATE] DATA` and a line end (bytes), LATE in
+    seconds; the day is lost.
+    """
     head = f"[{time_of_day(message.at_s, 6)} {message.late_s:.6f}] "
     return head.encode() + message.data + b"\n"
 
@@ -62,7 +64,9 @@ def read_recording(data: bytes) -> Iterator[Recorded]:
     """Yield the messages of a recording; times go on after midnight.
 
     They count from the midnight nearest to the first message, and may be below 0. A time
-    in whole seconds is taken as the end of its second, 1 s late.
+    in whole seconds is taken as the end of its second, 1 s late. Bytes before the first
+    stamp are skipped. The last line end of each message is removed. Each time is put on
+    the day nearest to the previous message's, so steps back in time are kept.
 
     Example:
         >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"

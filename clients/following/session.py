@@ -68,8 +68,8 @@ class FollowSession:
     unread_example: str = ""
 
     def __post_init__(self) -> None:
-        """Begin with nothing known of the machine's state, and note the reading of
-        `clock` at the local midnight.
+        """Set the mirror to a machine whose state is unknown, and compute the clock's
+        reading at the last local midnight [s].
         """
         machine = self.follower.machine
         now = datetime.now()
@@ -83,7 +83,10 @@ class FollowSession:
         """Take one message, which came between `late_s` before `at` and `at`: record it, update
         the mirror, report alarms and executed lines.
 
-        Messages that are no events are counted in `unread`.
+        Messages that are no events are counted in `unread`. An executed line is reported
+        by `executed`, alarms by `tell`, a change by `changed`; the recording gets every
+        message, also one that is counted as unread. Only the first unread one is stored
+        as the example, cut to 200 bytes.
 
         Args:
             data: content.
@@ -106,7 +109,11 @@ class FollowSession:
             self.executed(line)
 
     def link(self, connected: bool, why: str) -> None:
-        """Take a change of the connection: `connected`, else `why` it was lost."""
+        """Record that the connection was made or lost, update the mirror and report new
+        alarms.
+
+        Args: connected: whether it was made; why: the reason of a loss, for people.
+        """
         now = self.clock()
         self._keep(UP if connected else LINK + why.encode(), now, 0.0)
         self._take(self.follower.linked(self.mirror, connected, now, why))
@@ -120,8 +127,8 @@ class FollowSession:
         return time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
-        """Write a message with its time since midnight and its delay [s] to the
-        recording, and flush it; nothing without a recording.
+        """Append a message, its time since midnight and its delay [s] to the recording
+        and flush it; do nothing without a recording.
         """
         if self.record is not None:
             self.record.write(
@@ -130,7 +137,9 @@ class FollowSession:
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
-        """Replace the mirror, report each alarm that is new in it, and call `changed`."""
+        """Replace the mirror by the given one, call `tell` for each alarm raised since,
+        oldest first, and then `changed`, always.
+        """
         new = mirror.raised - self.mirror.raised
         self.mirror = mirror
         for alarm in mirror.alarms[len(mirror.alarms) - new :] if new else ():
@@ -138,7 +147,8 @@ class FollowSession:
         self.changed(mirror)
 
     async def run(self, address: str) -> None:
-        """Listen until cancelled.
+        """Listen to the scanner at `address` and check ahead of its script, until
+        cancelled.
 
         Two tasks: listen for messages, and look ahead; an error in one ends both.
 
@@ -156,7 +166,9 @@ class FollowSession:
         """Replay a recording as if it came now; the clock is the recording's.
 
         While something waits or is due, the session ticks every `TICK_S` of the
-        recording's time.
+        recording's time. Without anything waiting or due, time jumps to the next message
+        in one tick. Times of the recording never go back; messages that begin with `LINK`
+        are changes of the connection. Returns after the last message.
 
         Args:
             recording: see `flexdt.clients.following.recording`.
@@ -187,7 +199,9 @@ class FollowSession:
         """Write each new frame of a folder with its radiograph, until cancelled.
 
         Looks every `FRAMES_S` seconds at the newest frame; one that is there at the
-        beginning is left out.
+        beginning is left out. A frame is written once two looks in a row found it
+        unchanged. A frame that could be written clears the alarm "frames"; TwinError and
+        OSError become such a warning and the loop goes on.
 
         Args:
             folder: of the scanner's frames; a frame counts once it is no longer written.
@@ -215,6 +229,9 @@ class FollowSession:
     async def _look_ahead(self) -> None:
         """Check current moves and the rest of the script, again whenever either changes,
         and keep the findings as alarms; until cancelled.
+
+        It looks every `TICK_S`, checks in a thread, and does nothing while neither
+        targets nor the next line have changed.
         """
         while True:
             await asyncio.sleep(TICK_S)
@@ -227,6 +244,9 @@ class FollowSession:
     def _is_new(self) -> bool:
         """Determine whether targets or the next line have changed since the last call;
         False while nothing was heard.
+
+        The state of this call is stored for the next one. True also at the first call
+        with something heard.
         """
         key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
         before = self._looked
@@ -238,8 +258,11 @@ class FollowSession:
 
 
 def executed_script(recording: bytes, machine: Machine) -> bytes:
-    """Return the executed script in a recording of raw messages, as the scanner would
-    write it."""
+    """Replay a recording and return the lines of the executed script, joined (bytes);
+    empty if there are none.
+
+    Nothing is checked ahead. The profile is one without offsets.
+    """
     lines: list[bytes] = []
     follower = Follower(
         machine, Profile(name=ZERO, machine=machine.name, source="no offsets")
