@@ -55,7 +55,7 @@ class Servers:
     def __init__(
         self, options: Mapping[str, object], log: Path, *, viewer: bool = False
     ) -> None:
-        """Prepare the servers; `start` starts them.
+        """Store the servers' options; entering the context starts them.
 
         Ports are free ones unless `options` name them.
 
@@ -123,7 +123,8 @@ class Servers:
     def stop(self) -> int | None:
         """Stop all processes, wait for them and close the log.
 
-        They get SIGTERM, and are killed if they have not ended after `STOP_TIMEOUT_S`.
+        They get SIGTERM, and are killed if they have not ended after `STOP_TIMEOUT_S`. A
+        second call returns None. The log's file stays; a closed pipe is ignored.
 
         Returns:
             The supervisor's exit code; None if it was not running.
@@ -148,6 +149,9 @@ class Servers:
     def log_tail(self, lines: int = 5) -> Sequence[str]:
         """Read the last lines of the processes' standard error; empty if the log cannot
         be read.
+
+        `lines` is how many, at most; without line ends, oldest first, undecodable bytes
+        replaced.
         """
         try:
             text = self._log_path.read_text(encoding="utf-8", errors="replace")
@@ -159,7 +163,7 @@ class Servers:
         """Wait for the supervisor's `ready` line, however long, and return its document.
 
         Other lines are left out. The error's exit code is that of the servers if from 1
-        to 5, else 1.
+        to 5, else 1. The message has the last three lines of the log.
 
         Raises:
             ServersError: the process ended first; with the end of its log.
@@ -259,7 +263,8 @@ class LocalTwin:
         """Start the servers, unless they run already; they run until `stop` or Python's end.
 
         Returns the connected client. A temporary folder holds the log, and the data if no
-        folder was given.
+        folder was given. A second call returns the same client and starts nothing.
+        Arguments are checked first; Python's exit calls `stop`.
 
         Raises:
             ServersError: they did not start; carries the end of their log.
@@ -286,7 +291,8 @@ class LocalTwin:
         return self._running[2]
 
     def _check(self) -> None:
-        """Check machine, profile, sample and data folder.
+        """Check that machine, profile and sample exist and that the data folder can be
+        written, before any process starts.
 
         Raises:
             ServersError: one of them does not hold.
@@ -307,6 +313,8 @@ class LocalTwin:
     def stop(self) -> None:
         """End the client and the servers, and delete a temporary data folder; does
         nothing if they do not run.
+
+        The client is closed before the servers; `start` may be called again.
         """
         running = self._running
         self._running = None

@@ -44,7 +44,8 @@ def write(truth: Mapping[str, float], path: Path) -> None:
 def read(path: Path) -> dict[str, float]:
     """Read a truth file.
 
-    All problems of the file are in one error.
+    All problems of the file are in one error. Integers and floats are numbers, booleans
+    are not. Parameters may be missing. A file that cannot be opened raises OSError.
 
     Args:
         path: of a TOML file, parameter = value.

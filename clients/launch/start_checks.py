@@ -16,6 +16,11 @@ def require_startable(
 ) -> None:
     """Check the words that a twin server is started with.
 
+    Returns nothing. With both None, machine and profile are not checked; the profile is
+    looked up for the machine. "" and the empty stage are allowed samples. Only existence
+    is checked for a sample; a data folder with any content counts as one that may hold
+    uploads.
+
     Args:
         machine: shipped name or file; None for the FleX-ray.
         profile: of zero offsets; None for the machine's.
@@ -45,6 +50,8 @@ def _text(word: str | PathLike[str] | None) -> str | None:
 def _require_folder(folder: Path) -> None:
     """Check that a folder can be written, or made.
 
+    A path that exists but is no folder raises NotADirectoryError.
+
     Raises:
         OSError: it cannot; names the folder.
     """
@@ -63,6 +70,8 @@ def _may_keep_samples(data: Path | None) -> bool:
 
 def _require_sample(name: str) -> None:
     """Check that a sample ships.
+
+    "" and the empty stage are always allowed.
 
     Raises:
         UnknownNameError: it does not; lists those that do.

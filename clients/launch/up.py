@@ -42,7 +42,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     """List the services in starting order: projector, twin and, if chosen, viewer and
     gateway.
 
-    The twin needs the projector's address, viewer and gateway the twin's.
+    The twin needs the projector's address, viewer and gateway the twin's. Limits
+    (NAME=VALUE) that the viewer knows go to the viewer, all others to the twin. The
+    projector always listens on the loopback; nothing is started here.
 
     Args:
         options: of `flexdt up`; each service gets those it knows.
@@ -57,6 +59,8 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     def projector(known: Addresses) -> Sequence[str]:
         """Return module and command-line options of the projector, on this machine's
         loopback address.
+
+        A restarted one keeps the port it had; the memory limit is an option, too.
         """
         given = {
             "host": LOOPBACK,
@@ -69,6 +73,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
         """Return module and options of the twin server, with the projector's address;
         started again, it continues from its stored state, even if it was begun
         `fresh`.
+
+        It gets the options of `flexdt up` that it knows, the limits that are not the
+        viewer's, and the port it had before.
         """
         own = {
             "port": port_of("twin", options.port, known),
@@ -90,6 +97,9 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     def viewer(known: Addresses) -> Sequence[str]:
         """Return module and command-line options of the viewer, on `viewer_port` or a
         free port, connected to the twin's address.
+
+        It gets the options that it knows and its own limits; the port it had before comes
+        first.
         """
         own = {
             "port": port_of("viewer", options.viewer_port, known),
@@ -106,6 +116,8 @@ def services(options: UpSettings) -> tuple[Service, ...]:
     def gateway(known: Addresses) -> Sequence[str]:
         """Return module and command-line options of the gateway, connected to the twin's
         address; without a port given, a free one.
+
+        It listens at its default host; the port it had before comes first.
         """
         own = {
             "port": port_of("gateway", options.gateway_port or 0, known),
@@ -136,7 +148,8 @@ def port_of(name: str, asked: int, known: Addresses) -> int:
 def port_problem(option: str, host: str, port: int) -> str | None:
     """Say why a port cannot be listened on; None if it can.
 
-    The port is bound for a moment and freed again.
+    The port is bound for a moment and freed again. The problem names the address, the
+    system's reason and the option to change.
 
     Args:
         option: that chooses the port.
@@ -154,7 +167,8 @@ def port_problem(option: str, host: str, port: int) -> str | None:
 
 
 def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
-    """Make the supervisor's `ready` line: the twin's address, and every process's by name.
+    """Format the supervisor's `ready` line: the twin's address, and every process's by
+    name (one JSON object, no line end).
 
     The viewer has a URL too, and the gateway its inbound port (one above its port).
 
@@ -181,7 +195,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Check ports and packages, then run the servers until stopped.
 
     INVALID if the gateway's package is missing, REFUSED if a port is taken (both before
-    any start), else the failed server's, or 0.
+    any start), else the failed server's, or 0. Errors are printed on standard error, one
+    line each; only the first port in use is reported. The `ready` line goes to standard
+    output once all servers are up. The gateway's pair of ports is checked unless any free
+    one is allowed.
 
     Args:
         argv: command-line arguments; None for those of the process.
