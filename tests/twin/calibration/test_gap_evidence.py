@@ -45,7 +45,7 @@ def test_steps_are_told_and_what_bends_or_scatters_is_not() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", list(natural_objects.OBJECTS))
-@pytest.mark.campaign(3)
+@pytest.mark.campaign(1)
 def test_natural_objects_have_no_gap(kind: str) -> None:
     for seed in (31, 32):
         told = natural_objects.tried(kind, seed, gap=False)

@@ -112,6 +112,7 @@ threads by estimate, and as much again."""
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(2)
 @pytest.mark.parametrize("name", ["forward", "back", "cgls", "tv"])
 def test_a_signal_is_heard_between_portions(name: str) -> None:
     for moment in np.random.default_rng(5).uniform(0.3, 2.0, 2).tolist():
