@@ -95,7 +95,7 @@ def lathe(
 ) -> PaintedMesh:
     """Build a body of revolution of 64 sections as a painted mesh [mm].
 
-    Args: profile: points (radius, height) from bottom to top, relative to `center`; axis:
+    `profile` holds points (radius, height) from bottom to top, relative to `center`; `axis` is
     "z", or "y" for a body turned to lie along y.
     """
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
