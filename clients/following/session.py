@@ -112,7 +112,7 @@ class FollowSession:
         """Record that the connection was made or lost, update the mirror and report new
         alarms.
 
-        Args: connected: whether it was made; why: the reason of a loss, for people.
+        `connected` is whether it was made, `why` the reason of a loss, for people.
         """
         now = self.clock()
         self._keep(UP if connected else LINK + why.encode(), now, 0.0)
