@@ -39,7 +39,8 @@ _EDGES: Final = tuple(
 def otsu(values: npt.NDArray[np.generic]) -> float:
     """Find the threshold that parts values into two classes with the least variance in each.
 
-    It is an edge of one of OTSU_BINS equal bins.
+    It is an edge of one of OTSU_BINS equal bins. Among equally good thresholds the middle
+    one is taken. Fails on an empty array.
 
     Args:
         values: of any shape, finite.
@@ -67,7 +68,9 @@ def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Face
     """Find the surface of the part above a level.
 
     One vertex for each cell through which the surface passes, at the mean of its
-    crossings.
+    crossings. A value equal to the level counts as below. Vertex order is that of the
+    cells; without a crossing both arrays are empty. The border must be at or below the
+    level.
 
     Args:
         data: on a grid of points, none of those at its border above the level.
@@ -100,7 +103,11 @@ def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Face
 
 
 def _quads(dense: npt.NDArray[np.bool_], number: npt.NDArray[np.int32]) -> Faces:
-    """Make two triangles around each edge that crosses the surface.
+    """Make two triangles for each grid edge that crosses the surface, from the vertices
+    of the four cells around it.
+
+    Their order faces outward, from dense to thin. Every crossing edge needs four cells,
+    so the border has to be outside.
 
     Args:
         dense: (nz, ny, nx) nodes inside.
@@ -129,6 +136,11 @@ def surface(
 ) -> dict[str, Any]:
     """Find the surface of the dense parts, for the scenes.
 
+    The volume is averaged over cubes so that its longest side has at most `cells`, NaN
+    counting as 0; Otsu's threshold of that gives the level. The cubes grow twofold until
+    there are at most `MAX_FACES` faces. Voxels beyond whole cubes are left out; the
+    border is padded with the least value, so the mesh is closed.
+
     Args:
         grown: (y, x, z) [1/mm]; not a number where no data cover.
         voxel_mm, center_mm: of the volume (x, y, z), as `Volume` has them.
@@ -155,7 +167,11 @@ def surface(
 
 
 def _means(grown: Float32Array, shape: list[int], factor: int) -> Float32Array:
-    """Compute means over cubes of voxels."""
+    """Compute means over cubes of voxels.
+
+    A cube has `factor` voxels a side; `shape` is the number of cubes along each axis. NaN
+    in a cube gives NaN; voxels beyond the cubes are left out.
+    """
     cut = grown[tuple(slice(n * factor) for n in shape)]
     blocks = [part for n in shape for part in (n, factor)]
     return np.asarray(cut.reshape(blocks).mean(axis=(1, 3, 5)), dtype=np.float32)

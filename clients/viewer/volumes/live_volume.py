@@ -82,7 +82,10 @@ Tell = Callable[[dict[str, Any]], None]
 def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], bytes]:
     """Encode a volume for a page.
 
-    Code 0 is not a number. Voxels beyond whole cubes are left out.
+    Code 0 is not a number. Voxels beyond whole cubes are left out. The cubes are the
+    smallest with at most `most` means; NaN in a cube makes its mean NaN (code 0). The
+    window is the 1 % to 99.8 % range of every n-th value, its lower end at least
+    -`LOW_SHARE` of the upper.
 
     Args:
         data: (z, y, x) [1/mm]; not a number where no data cover.
@@ -127,7 +130,7 @@ def exact(data: Float32Array, place: tuple[int, int, int]) -> float | None:
     """Read the value of the voxel (x, y, z) [1/mm]; None where no data cover, or
     outside the volume.
 
-    A value that is not finite counts as not covered.
+    A value that is not finite counts as not covered. Also None for a negative index.
     """
     x, y, z = place
     if not all(0 <= at < n for at, n in zip((z, y, x), data.shape, strict=True)):
@@ -153,7 +156,9 @@ class Held:
     request: VolumeRequest | None = None
 
     def say(self, **more: Any) -> None:
-        """Tell all that is known so far, and `more`."""
+        """Print a line (`tell`) with the facts known so far and `more`; `more` is not
+        stored.
+        """
         self.tell({"type": "volume", **self.about, **more})
 
     def keep(self, **more: Any) -> None:
@@ -164,6 +169,9 @@ class Held:
     def hold(self, data: Float32Array, grid: Volume) -> None:
         """Store a volume (nz, ny, nx), from which requests get slices, and its size for their
         answers.
+
+        Other volumes are dropped. Only the largest of the three voxel sides [mm] is told;
+        nothing is printed.
         """
         self.grid = grid
         self.volumes = {"volume": data}
@@ -179,6 +187,9 @@ def grow(
     """Reconstruct a data set while it is taken.
 
     At most `MAX_VIEWS` views are used, binned. The process exits if the viewer has gone.
+    At the end the voxels that no view covers are NaN. Progress is printed at most every
+    `TELL_S` seconds. The correction of the data set is in its geometry; returns once the
+    last image is in.
 
     Args:
         held: gets the volume, which exists before the first image.
@@ -207,7 +218,9 @@ def grow(
         """Yield line integrals (1, rows, cols), binned, each as soon as its file is
         there.
 
-        Dark and flat images are read when the first projection is there.
+        Dark and flat images are read when the first projection is there. Waits for each
+        file; the process exits (SystemExit) if the viewer has gone. Frames are those of
+        `indices`, in order.
         """
         normalise = None
         for index in indices:
@@ -221,6 +234,8 @@ def grow(
     def progress(done: float) -> None:
         """Report the number of images at most every TELL_S seconds, with the surface
         every `SURFACE_INTERVAL_S` and at the end; the end is always reported.
+
+        `done` is the share of images from 0 to 1.
         """
         nonlocal told, drawn
         if done < 1.0 and time.monotonic() < told + TELL_S:
@@ -243,7 +258,10 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     images.
 
     At the end it gets accuracy or doubts, the part of voxels that no view sees, the
-    surface, and then the volumes of errors, if any.
+    surface, and then the volumes of errors, if any. Warnings of the reconstruction become
+    `doubts`, followed by the accuracy if it has no warnings. The surface is printed with
+    `FINISHED_CELLS` cells and not stored. `sigma` and `bias_bound` are stored if they
+    were computed.
 
     Args:
         held: gets the volume and the progress.
@@ -287,7 +305,8 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
 
 
 def _share(held: Held, name: str) -> Callable[[float, float], None]:
-    """Report a share of work under a name, at most every `TELL_S` seconds.
+    """Make a progress callback (done, whole) that prints done / whole under a name, at
+    most every `TELL_S` seconds.
 
     The end is left to what follows, which is told anyway.
     """
@@ -314,7 +333,7 @@ def _facts(data: DataSet) -> dict[str, Any]:
     """Collect a data set's facts for people; unknown ones are empty.
 
     `sample` and `started` are "" without the scan's document, `kV` is None without
-    settings.
+    settings. Times are formatted YYYY-MM-DD HH:MM; kV is the tube's voltage.
 
     Returns:
         `sample`, `started` and `kV`.
@@ -333,7 +352,10 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
     without.
 
     Without a correction to compare with only the volume itself is compared; then the
-    figures of each are kept by name.
+    figures of each are kept by name. The other geometry is the nominal one if the scan
+    has a correction, else that of `now`; without both nothing is reconstructed. It has
+    the same grid as the volume. `difference` (volume minus truth) is stored, too;
+    progress is printed as `comparing` from 0 to 1.
 
     Args:
         held: gets the volumes `truth` and, where there is a correction, `other`; prints
@@ -375,7 +397,10 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:
-    """Wait until a file is there; raises SystemExit(0) once the parent process has ended."""
+    """Wait until a file is there; raises SystemExit(0) once the parent process has ended.
+
+    It looks every `LOOK_S` seconds.
+    """
     while not path.is_file():
         if not alive():
             raise SystemExit(0)
@@ -394,7 +419,12 @@ class Served:
         self._write(json.dumps(document.pop("surface", None)), json.dumps(document))
 
     def answer(self, told: object, content: bytes = b"") -> None:
-        """Write the answer to a request; answers keep the requests' order."""
+        """Write the answer to a request; answers keep the requests' order.
+
+        Codes are limited to `MAX_VOXELS` of a past scan, `MAX_GROWING_VOXELS` of a
+        growing one. Voxel values are None where not covered. A comparison blocks until it
+        ends; its error becomes `not_compared`.
+        """
         self._write("answer", str(len(content)), json.dumps(told), content=content)
 
     def _write(self, *words: str, content: bytes = b"") -> None:
@@ -436,6 +466,9 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
 def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
     """Do work, and report an error of any kind as `problem`, so that the page does not
     wait for ever; unexpected errors with their type. Nothing is raised.
+
+    It is stored with the facts and printed. TwinError, OSError and ValueError are
+    reported by their text alone.
     """
     try:
         work()
@@ -454,7 +487,9 @@ def main() -> None:
 
     The first line names the folder, the volume's side, and whether the data set is past
     (complete: all threads) or grows (one thread, ends with the parent). Returns at once
-    if standard input is closed.
+    if standard input is closed. The priority is lowered by 5 and the kernels are loaded
+    before the first line is read; then each further line is answered until the input
+    ends.
     """
     parent = os.getppid()
     served = Served()
@@ -469,6 +504,9 @@ def main() -> None:
     def work() -> None:
         """Reconstruct a past (complete) data set, or follow one that grows, on one
         thread, until the parent process ends.
+
+        Only a growing one uses one thread and ends with the parent; a past one uses all
+        threads.
         """
         if past:
             reconstruct(held, Path(folder), int(side))
@@ -482,7 +520,9 @@ def main() -> None:
 
 
 def warm() -> None:
-    """Load the compiled kernels, which takes seconds, by a volume of a few voxels."""
+    """Reconstruct a volume from four images of 4 x 4 pixels, so that the kernels are
+    loaded, which takes seconds.
+    """
     scan = ConeVec.circular(sod=100, sdd=200, angles=4, shape=(4, 4), pixel=1)
     like = as_volume(field_of_view(scan, (4, 4)))
     fdk_parts(lambda: [np.zeros((4, 4, 4), np.float32)], scan, (4, 4), like)

@@ -41,8 +41,8 @@ class LiveReconstruction:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        """Begin without a reconstruction; `tell` gets the lines of those to come.
-        Processes are started when needed.
+        """Prepare without a process or a requested volume; `tell` gets each line (str) of
+        later ones.
         """
         self._tell = tell
         self.newest = ""
@@ -54,14 +54,17 @@ class LiveReconstruction:
         self._wanted: deque[asyncio.Future[Answer]] = deque()
 
     def warm(self) -> None:
-        """Start a process in reserve that has loaded its libraries: that takes longer
-        than a slice."""
+        """Start a spare process that loads its libraries ahead of the first request; do
+        nothing if one is spare or running.
+        """
         if self._spare is None and self._task is None:
             self._spare = asyncio.create_task(_started())
 
     def grow(self, folder: Path, side: int, past: bool = False) -> None:
-        """Start to grow the volume of a data set, ending another one; if the same runs
-        already, its newest line is sent again.
+        """Start the volume of a data set and end any other; for the same request only
+        send its newest line again.
+
+        `side` is the number of voxels a side, `past` whether the scan is complete. A repeated request with no line yet does nothing.
         """
         asked = wish(folder, side, past)
         if asked == self._asked:
@@ -75,6 +78,9 @@ class LiveReconstruction:
     def stop(self) -> None:
         """End the running reconstruction, if there is one, and forget what was requested;
         its task is cancelled, not waited for.
+
+        Open requests are cancelled (`ask` returns None), and the newest line is cleared.
+        `close` waits for the end.
         """
         if self._task is not None:
             self._task.cancel()
@@ -87,6 +93,8 @@ class LiveReconstruction:
     async def close(self) -> None:
         """End the running reconstruction and the spare process, and wait until both have
         ended.
+
+        The spare process is killed; nothing is raised if neither exists.
         """
         self.stop()
         if self._ending is not None:
@@ -97,7 +105,7 @@ class LiveReconstruction:
             await process.wait()
 
     def _hang_up(self) -> None:
-        """Cancel all open requests: the process no longer answers."""
+        """Cancel all requests that wait for an answer, and forget the process's input."""
         self._writer = None
         while self._wanted:
             self._wanted.popleft().cancel()
@@ -105,7 +113,8 @@ class LiveReconstruction:
     async def ask(self, asked: Wish, *words: str) -> Answer | None:
         """Send a request to the process and wait for its answer.
 
-        None also if another volume is requested before the answer.
+        None also if another volume is requested before the answer. Answers come in the
+        order of the requests; the words are joined by tabs.
 
         Args:
             asked: the volume that it must have.
@@ -128,7 +137,10 @@ class LiveReconstruction:
         """Run a process for a volume: pass its lines on, and its answers to their
         requests.
 
-        The newest line is kept in `newest`. However this ends, the process is killed.
+        The newest line is kept in `newest`. However this ends, the process is killed. The
+        spare process is used if there is one, else one is started. An answer to a
+        cancelled request is dropped; lines other than answers go to `tell`. After a
+        normal end open requests are cancelled.
 
         Args:
             asked: the words of its first line.
@@ -162,6 +174,9 @@ class LiveReconstruction:
 async def _started() -> asyncio.subprocess.Process:
     """Start a Python process that reconstructs, with one thread a library; input and
     output are pipes, its errors are discarded.
+
+    Its threads are limited by `SINGLE`, except those of numba; the longest line is
+    `LINE_BYTES`.
     """
     return await asyncio.create_subprocess_exec(
         sys.executable,

@@ -39,7 +39,9 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     """Compute the sample's attenuation [1/mm] on the grid of a volume.
 
     Known are the phantoms that ship. Solids are averaged over two half voxels a side; the
-    sample's place on the stage is that of the data set's folder.
+    sample's place on the stage is that of the data set's folder. Values are interpolated
+    linearly, 0 outside the phantom, negative rounding errors clipped to 0. A voxel
+    phantom is used as it is. Without a folder the sample is not shifted or turned.
 
     Args:
         dataset: its sample, and its place on the stage.
@@ -104,7 +106,10 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
 
 
 def _means_of_pairs(data: Float32Array, axis: int) -> Float32Array:
-    """Compute the means of neighbours along an axis, one fewer than there are."""
+    """Compute the means of neighbours along an axis, one fewer than there are.
+
+    The input is not changed; data have at least one entry along `axis`.
+    """
     along = np.moveaxis(data, axis, 0)
     means = along[:-1] + along[1:]
     means *= np.float32(0.5)
@@ -115,7 +120,9 @@ def placement(folder: Path) -> StagePlacement:
     """Read the place of a data set's sample from its job's record; without one: no
     offset.
 
-    An offset is missing also where the record is damaged.
+    An offset is missing also where the record is damaged. The record is `jobs/NAME.json`
+    beside the data set's folder. Any error of reading or content gives no offset; nothing
+    is raised.
     """
     try:
         file = folder.parent / "jobs" / f"{file_stem(folder.name)}.json"
@@ -127,7 +134,10 @@ def placement(folder: Path) -> StagePlacement:
 def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:
     """Measure figures of a volume, and the same of the truth.
 
-    Voxels that no data cover are left out.
+    Voxels that no data cover are left out. Main material: within `ALIKE_SHARE` (10 %) of
+    the main level, without its outermost voxels where any remain. Solid is above half the
+    level, measured and true alike. The rms box is the sample's, 3 voxels wider on each
+    side. `voxel_mm` is the same on all axes; each pair is [measured, true].
 
     Args:
         values: (z, y, x) [1/mm], not a number where no data cover.
@@ -193,6 +203,8 @@ def told(value: float) -> float | None:
 def main_level(truth: Float32Array) -> float:
     """Find the attenuation of most of the sample [1/mm]: the median of the fullest
     logarithmic bin; partly filled voxels all differ. nan for an empty volume.
+
+    Only values above `VACUUM_PER_MM` count, in `LEVELS` bins of the logarithm.
     """
     there = np.log(truth[truth > VACUUM_PER_MM].astype(np.float64))
     if not there.size:
@@ -214,7 +226,9 @@ def extent(
 
     The profile is the median over all lines that meet both faces, so that neither noise
     nor streaks count, and is followed to half of the material's attenuation, between two
-    voxels.
+    voxels. nan where the truth has no solid voxel or the profile never exceeds half of
+    `seen`. Lines within one voxel of the widest extent are used; the result is the
+    profile's width at half of `seen`, interpolated.
 
     Args:
         values: measured, or the truth itself.
