@@ -51,6 +51,8 @@ _R = TypeVar("_R")
 def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
     """Yield pauses between attempts to connect [s], for ever: each twice the one before,
     at most `LONGEST_PAUSE_S`.
+
+    The first is `first_s`, whatever its size; it never ends and waits for nothing itself.
     """
     pause = first_s
     while True:
@@ -104,6 +106,9 @@ class Core:
     async def connected(self) -> Link:
         """Return a live link; connect first if there is none.
 
+        At once if the link is alive; one caller connects at a time and the others wait
+        for it. Attempts go on for `wait_s` the first time and `reconnect_s` later.
+
         Raises:
             ConnectionLost: no server answers, or the client is closed.
             RpcError: the server refuses the client.
@@ -116,7 +121,10 @@ class Core:
     async def call(self, asked: Ask) -> object:
         """Call a method of the server and return its result, not yet decoded.
 
-        A call that only reads is sent up to `ATTEMPTS` times over lost connections.
+        A call that only reads is sent up to `ATTEMPTS` times over lost connections. A
+        call that acts is sent again only if it was not sent; otherwise ConnectionLost
+        says that the outcome is unknown. A time limit of None waits for ever; the limit
+        counts from each attempt's sending.
 
         Args:
             asked: method, params and time limit; a negative limit is the client's own.
@@ -146,6 +154,8 @@ class Core:
     async def subscribe(self, listener: Listener, options: Mapping[str, object]) -> None:
         """Send `listener` its topics' events, also after reconnects.
 
+        Options that are None are left out. After a failure the listener is forgotten.
+
         Raises:
             ValueError: another listener follows one of the topics with other options; the
                 server keeps one set of options for each topic of a connection.
@@ -164,6 +174,9 @@ class Core:
     def follow(self, listener: Listener, params: Mapping[str, object]) -> None:
         """Have `listener` subscribed with these params whenever a connection is made.
 
+        A second call for the same listener replaces its params. Compared are the rate,
+        and for projections kind and binning.
+
         Raises:
             ValueError: as `subscribe`.
 
@@ -179,7 +192,8 @@ class Core:
         """Send it no more events, and unsubscribe at the server from topics without
         another listener.
 
-        Does nothing for an unknown listener; failures of the request are ignored.
+        Does nothing for an unknown listener; failures of the request are ignored. Nothing
+        is sent without a connection.
         """
         self._listeners.pop(listener, None)
         still = {topic for other in self._listeners for topic in other.topics}
@@ -192,7 +206,10 @@ class Core:
                 )
 
     async def close(self) -> None:
-        """End all subscriptions and disconnect; the connection is never opened again."""
+        """End all subscriptions and disconnect; the connection is never opened again.
+
+        Listeners get `end` and are forgotten; a second call does nothing more.
+        """
         self.closed = True
         listeners = list(self._listeners)
         self._listeners.clear()
@@ -203,6 +220,8 @@ class Core:
     async def disconnect(self) -> None:
         """End the connection, if there is one; another may be made, with the same
         subscriptions.
+
+        Waits for the end; `hello` is kept.
         """
         link = self.link
         self.link = None
@@ -225,6 +244,8 @@ class Core:
         """Connect, unless another call has done so meanwhile.
 
         Attempts go on with back-off for `wait_s` the first time, for `reconnect_s` later.
+        Only ConnectionLost is retried; the first attempt is made even if the time is 0.
+        The error is that of the last attempt.
 
         Raises:
             ConnectionLost: no server answers in that time, or the client is closed.
@@ -248,6 +269,9 @@ class Core:
 
     async def _greet(self) -> Link:
         """Open a connection, greet the server and subscribe the listeners again.
+
+        Every listener's stored parameters are sent. If the server said why it ends the
+        connection, that RpcError is raised instead.
 
         Returns:
             The link; `hello` is set to the server's answer.
@@ -276,6 +300,9 @@ class Core:
 
     async def _introduce(self, link: Link) -> HelloResult:
         """Greet the server and check that it is a twin.
+
+        Returns the server's hello; a hello without a machine is that of another program.
+        The error's `sent` is that of the lost request.
 
         Raises:
             ConnectionLost: the server ended the connection.
@@ -309,6 +336,9 @@ def _require_same(
     topic: str, asked: Mapping[str, object], known: Mapping[str, object]
 ) -> None:
     """Check that a topic is followed as before: its rate, and a projection's kind and binning.
+
+    The rate is compared for every topic, kind and binning only for "projection"; None
+    counts as a value.
 
     Args:
         topic: that is subscribed to again.
@@ -346,7 +376,9 @@ class ClientMethod(Generic[_P, _R]):
         """Make the blocking and the asynchronous method of a function, with its
         signature.
 
-        Awaited in a coroutine, a call shows no progress bar unless asked to.
+        Awaited in a coroutine, a call shows no progress bar unless asked to. Only a
+        parameter named `progress` whose annotation is in `SHOWN` makes a bar; `help()`
+        shows the signature with self and without Flow.
 
         Args:
             make: returns the flow of a call; see `twin_methods`.
@@ -486,6 +518,8 @@ class AsyncTwinClient(SharedMethods):
     ) -> None:
         """Prepare a client for `transport`, or for TCP to host and port if None; nothing
         is sent before `connect`. Arguments: see the class.
+
+        With a transport, host, port and ssl are ignored.
         """
         link: Transport
         if transport is None:
@@ -540,6 +574,9 @@ class AsyncTwinClient(SharedMethods):
         """Return a subscription to `topics` (default: state), for `async with` and `async
         for`.
 
+        Nothing is sent before it is entered or the first event is awaited; the error is
+        raised then. Options that are None are the server's.
+
         Args:
             topics: state, projection, job, log.
             max_rate_hz: most events per second for each topic.
@@ -568,6 +605,9 @@ class AsyncTwinClient(SharedMethods):
 def _loop() -> asyncio.AbstractEventLoop:
     """Start the event loop of all synchronous clients in a thread of its own; it ends with the
     process.
+
+    Cached: all calls return the same loop. At Python's exit `_end_links` runs; a forked
+    process starts its own.
     """
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="flexdt-clients", daemon=True).start()
@@ -578,6 +618,8 @@ def _loop() -> asyncio.AbstractEventLoop:
 def _end_links() -> None:
     """End the connections of clients that were not closed, by cancelling all tasks of the
     clients' loop; called as Python exits.
+
+    It waits until they have ended.
     """
 
     async def cancel() -> None:
@@ -599,6 +641,9 @@ if hasattr(os, "register_at_fork"):  # a forked process has no thread that runs 
 def _result(work: Coroutine[Any, Any, _R]) -> _R:
     """Run `work` on the clients' loop, in its thread, and return its result or raise its
     error; an interrupt here cancels it.
+
+    It blocks the calling thread without a time limit; never call it from the loop's own
+    thread.
     """
     doing = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
@@ -649,6 +694,8 @@ class TwinClient(SharedMethods):
     ) -> None:
         """Connect to the twin, blocking until the handshake is done; arguments and
         errors: see the class.
+
+        Options are those of `AsyncTwinClient`, which runs on the clients' shared loop.
         """
         self._client = AsyncTwinClient(
             host,
@@ -696,6 +743,8 @@ class TwinClient(SharedMethods):
         """Subscribe to `topics` (default: state) and return an iterator over their
         events.
 
+        It subscribes at once, and blocks until the server has answered.
+
         Args:
             topics: state, projection, job, log.
             max_rate_hz: most events per second for each topic.
@@ -716,8 +765,10 @@ class TwinClient(SharedMethods):
         return Subscription(events, self._wait)
 
     def _perform(self, effect: Effect) -> object:
-        """Carry out an effect of a flow: calls of functions in this thread, where they may call
-        the client, all else in the loop's.
+        """Perform one effect and return its result: a `Tell` by calling its function in
+        this thread, all others on the clients' loop.
+
+        Blocks until it is done; the result of a Tell is the function's own.
         """
         if isinstance(
             effect, Tell

@@ -56,7 +56,8 @@ class Projection:
     def from_wire(cls, value: WireProjection) -> Projection:
         """Convert the wire's model.
 
-        Image and marks (None without any) become arrays.
+        Image and marks (None without any) become arrays. Pixels are read-only arrays of
+        the wire's data type and shape.
 
         Raises:
             RpcError: shape and data do not match.
@@ -84,7 +85,9 @@ class Projection:
         return self.image
 
     def __repr__(self) -> str:
-        """Format columns x rows, data type and kind; the time [s] unless it is None."""
+        """Return `<Projection COLUMNS x ROWS DTYPE, KIND, t = TIME s>`; without the time
+        if it is None.
+        """
         rows, cols = self.image.shape
         if self.time is None:
             at = ""
@@ -122,7 +125,9 @@ class Event:
     def from_wire(cls, params: Mapping[str, object]) -> Event:
         """Validate the params of an event and build it.
 
-        The data become a `Projection`, state, job status or log entry, by the topic.
+        The data become a `Projection`, state, job status or log entry, by the topic. A
+        boolean passes as a number; the sequence number is an integer. The error's code is
+        -32603.
 
         Args:
             params: topic, seq, time and data, as decoded from the wire.
@@ -167,7 +172,8 @@ class AsyncSubscription:
         keep_alive: Callable[[], Awaitable[object]],
         cancel: Callable[[AsyncSubscription], Awaitable[object]],
     ) -> None:
-        """Prepare a subscription, which begins with `async with` or the first event.
+        """Store the subscription's parameters; nothing is sent before it is entered or
+        awaited.
 
         Args:
             topics: names of the topics.
@@ -212,7 +218,9 @@ class AsyncSubscription:
         """Wait for the next event and return it; reconnect after a lost connection.
 
         Subscribes first, unless that has happened. The time limit is for each wait, and
-        not for reconnecting.
+        not for reconnecting. Events at hand come first, also after `close`. Only the wait
+        for an event is limited; the flag of a lost connection is cleared before
+        reconnecting.
 
         Args:
             timeout_s: time limit [s]; None waits for ever.
@@ -257,8 +265,8 @@ class AsyncSubscription:
                 await self._cancel(self)
 
     def put(self, params: Mapping[str, object]) -> None:
-        """Append an event and wake who waits for it; if the queue is full, the oldest
-        event is dropped and counted.
+        """Append an event and wake the waiting `next`; drop and count the oldest event if
+        `max_queue` are waiting.
         """
         if len(self._events) >= self._max_queue:
             self._events.popleft()
@@ -312,6 +320,9 @@ class Subscription:
 
     def next(self, timeout_s: float | None = None) -> Event:
         """Wait for the next event and return it.
+
+        Blocks the calling thread; `timeout_s` is the limit [s], None waits for ever.
+        Subscribes first if necessary.
 
         Raises:
             TimeoutError: none came in time.

@@ -67,6 +67,9 @@ def ask(
 ) -> Flow[_M]:
     """Call `method` and validate its result; params that are None are not sent.
 
+    Returns the method's result model. With "seconds" in the method's limits `patience_s`
+    is ignored and there is no time limit.
+
     Args:
         method: of the wire.
         patience_s: see `Ask`; a method whose time the server limits is waited for in any case.
@@ -86,7 +89,9 @@ def sample_shape() -> Flow[scanner.SampleMeshResult]:
     """Fetch the mesh of the sample on the stage, in parts; returns the first part with the
     bytes of all in `data`.
 
-    Starts again when another sample is put on the stage meanwhile.
+    Starts again when another sample is put on the stage meanwhile. Parts are fetched
+    until `total` bytes are there; name, revision and total of each are compared with the
+    first's.
     """
     while True:
         content = b""
@@ -108,7 +113,8 @@ def sample_shape() -> Flow[scanner.SampleMeshResult]:
 def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:
     """Run a flow to its end by blocking calls of `perform`; returns the flow's result.
 
-    An exception of `perform` is thrown into the flow, which may handle it.
+    An exception of `perform` is thrown into the flow, which may handle it. Each effect is
+    performed before the next one is requested.
     """
     try:
         effect = next(flow)
@@ -149,7 +155,8 @@ async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> o
 async def adrive(flow: Flow[_R], call: Callable[[Ask], Awaitable[object]]) -> _R:
     """Run a flow to its end, and return its result.
 
-    Errors of an effect are thrown into the flow, which may handle them.
+    Errors of an effect are thrown into the flow, which may handle them. Cancellation is
+    thrown into the flow, too. Each effect is awaited before the next one is requested.
 
     Args:
         flow: yields effects, and gets their results or errors.

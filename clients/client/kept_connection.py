@@ -77,10 +77,11 @@ class KeptConnection:
         on_change: Callable[[], None] = lambda: None,
         subscription: Mapping[str, object] | None = None,
     ) -> None:
-        """Prepare the connection; `run` opens it.
+        """Prepare a client for the address, not yet connected; `run` connects.
 
         No attempt to reconnect is made by the client itself. `problem` says why there is
-        no connection.
+        no connection. A request waits up to `HELLO_S` for the hello only. A
+        subscription's topics are stored in `topics`; without one it is empty.
 
         Args:
             address: of the twin.
@@ -125,7 +126,11 @@ class KeptConnection:
         """Keep the connection until cancelled: connect again after each loss, with growing
         pauses; may be called again after that.
 
-        `problem` is the reason why there is none, and `on_change` is called when that changes.
+        `problem` is the reason why there is none, and `on_change` is called when that
+        changes. OSError and RpcError of a connection attempt become `problem`; pauses
+        start at `FIRST_PAUSE_S`, double up to a limit, and start again after a success.
+        `on_change` is called after each attempt and each loss. The connection is closed
+        at the end.
         """
         core = self._client.core
         pauses = back_off(FIRST_PAUSE_S)
@@ -153,6 +158,9 @@ class KeptConnection:
     ) -> object:
         """Send a request over the present connection and wait for its result, however long.
 
+        It never waits for a connection and is never repeated; parameters are {} if None.
+        The result is not validated.
+
         Raises:
             RpcError: the twin's answer is an error; `Unsendable`: the parameters cannot be
                 sent.
@@ -167,8 +175,8 @@ class KeptConnection:
             raise Unsendable(method, error) from None
 
     def put(self, params: Mapping[str, object]) -> None:
-        """Pass an event and its topic to the handler; an exception is logged and does not
-        end the connection.
+        """Call the event handler with topic and params; log its exception without raising
+        it.
         """
         try:
             self._on_event(str(params.get("topic")), params)

@@ -47,6 +47,8 @@ class ConnectionLost(ConnectionError):
     def of(cls, calls: Correlation[Any], *, sent: bool) -> ConnectionLost:
         """Build (not raise) the error of a request whose connection has ended, with a
         violation of the protocol or the server's reason if one is known.
+
+        A violation comes before the server's reason; `sent` is passed on.
         """
         if calls.violation is not None:
             return cls(f"the server broke the protocol: {calls.violation}", sent=sent)
@@ -113,7 +115,7 @@ class TcpTransport:
         timeout_s: float = 5.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        """Prepare a connection.
+        """Store where and how to connect; `open` connects.
 
         Args:
             host: name or address.
@@ -149,7 +151,9 @@ class TcpTransport:
         """Connect to the server; an earlier connection is closed.
 
         Also raised after `timeout_s`; the message names the cause, and `flexdt up` if the
-        connection was refused.
+        connection was refused. With TLS the certificate is checked for `host`. The new
+        connection starts with an empty message buffer; OSError and a time-out become
+        ConnectionLost.
 
         Raises:
             ConnectionLost: no server answers at the address.
@@ -190,6 +194,9 @@ class TcpTransport:
         """Send one message; all its bytes are queued at once, so a cancelled call breaks
         nothing.
 
+        A message that cannot be encoded raises the codec's error before anything is sent.
+        Waits until the stream's buffer has room.
+
         Raises:
             ConnectionLost: there is no connection, or it has ended.
 
@@ -212,7 +219,8 @@ class TcpTransport:
     async def receive(self) -> list[Message]:
         """Wait for messages and return them; an empty list at the end of the connection.
 
-        A lost connection ends it as well, without an error.
+        A lost connection ends it as well, without an error. At least one message
+        otherwise. An empty list also without a connection, or after `close`.
 
         Raises:
             ProtocolError: the server ended the connection inside a message.
@@ -238,6 +246,8 @@ class TcpTransport:
     def close(self) -> None:
         """Close the connection, if there is one; does nothing if its event loop has
         ended.
+
+        `receive` wakes up and returns an empty list. It does not wait for the end.
         """
         streams = self._streams
         self._streams = None
@@ -266,7 +276,8 @@ class Link:
         on_event: Callable[[Mapping[str, object]], None],
         on_end: Callable[[], None],
     ) -> None:
-        """Read messages from an open transport from now on, in a task.
+        """Start a task in the running event loop that reads messages from an open
+        transport.
 
         Args:
             transport: open.
@@ -284,6 +295,9 @@ class Link:
         self, method: str, params: Mapping[str, object], timeout_s: float | None
     ) -> object:
         """Send a request and wait for its result.
+
+        The id is freed if the call is cancelled or timed out, and a late answer is
+        ignored. The result is as the codec decoded it, not validated.
 
         Args:
             method: name of the method.
@@ -334,7 +348,7 @@ class Link:
         ConnectionLost.
 
         A violation of the protocol is recorded and closes the connection; it is not
-        raised.
+        raised. In every case `alive` becomes False and `on_end` is called once.
         """
         try:
             while messages := await self._transport.receive():
@@ -353,6 +367,8 @@ class Link:
     def _take(self, message: Message) -> None:
         """Give a message's answers to the requests that wait for them (cancelled ones are
         skipped), and its events to `on_event`; the rest is ignored.
+
+        Only notifications named "event" with an object as params count as events.
         """
         for item in self.calls.receive(message):
             match item:
