@@ -425,9 +425,8 @@ def test_a_component_of_somebody_else_takes_part_in_a_scripted_scan(
 ) -> None:
     heater = Program(*ports)
     lines = ("heater\tset temp\t20\t\tACK\t\t", "tube\txrayoff\t\t\tACK\t\t")
-    plain.call(
-        "script.submit", text="".join(f"{line}\r\n" for line in lines), name="heated"
-    )
+    text = "".join(f"{line}\r\n" for line in lines)
+    job = plain.call("script.submit", text=text, name="heated")["job"]
     plain.call("session.control", action="release")
     asked = all_until(heater, lambda e: e["component"] == "heater")[-1]
     assert (asked["reply type"], asked["command"], asked["arg1"]) == (
@@ -440,6 +439,8 @@ def test_a_component_of_somebody_else_takes_part_in_a_scripted_scan(
     told = program.events(asked["UUID"])
     assert [(e["reply type"], e["reply"]) for e in told] == [("RCV", ""), ("ACK", "20 C")]
     heater.close()
+    while plain.call("job.status", job=job)["state"] != "done":
+        time.sleep(0.02)
 
 
 def test_who_follows_the_gateway_sees_where_its_machine_differs(
