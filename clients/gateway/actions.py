@@ -71,6 +71,8 @@ async def write_settings(
 ) -> str:
     """Write the present motor positions into the recording's settings texts; returns "".
     Raises Refusal if that fails.
+
+    They are stored, too, if no image was saved yet.
     """
     try:
         twin.record().write_settings(await twin.state())
@@ -84,6 +86,9 @@ def setting(
 ) -> Action:
     """Make the action of a command that only sets a value.
 
+    Returns the action; it sends the request, waits for the answer and returns the reply.
+    Errors of the twin are raised as Refusal.
+
     Args:
         method: of the twin.
         params: its parameters, from the command.
@@ -93,6 +98,7 @@ def setting(
     async def send(
         twin: ConnectedTwin, command: c.Command, progress: CommandProgress
     ) -> str:
+        """Raises Refusal if the twin rejects it; moves under way keep their own rate."""
         await twin.ask(method, params(command))
         return reply(command)
 
@@ -105,7 +111,7 @@ async def wait_ready(
     """Wait until X-rays are ready: the script's polling loop as one command.
 
     READY_S counts in the twin's time, and also in real time where the twin runs as fast
-    as it can.
+    as it can. It looks every `POLL_S` seconds (real time); FDB is "FALSE" meanwhile.
 
     Returns:
         "TRUE".
@@ -134,7 +140,9 @@ async def take_image(
     """Take an image at the present pose and settings, keep it in the camera and wait for
     its exposure on the twin's clock.
 
-    Returns "columns x rows, mean" of its counts. Nothing is saved.
+    Returns "columns x rows, mean" of its counts. Nothing is saved. Counts are those of
+    the present state; uint16 (rows, cols). The exposure [s] is exposure times averages;
+    the image before it is replaced.
     """
     state = await twin.state()
     counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
@@ -149,6 +157,9 @@ async def save_image(
     twin: ConnectedTwin, command: c.SaveImage, progress: CommandProgress
 ) -> str:
     """Save the last image under the bare name of the command's path, in the recording's folder.
+
+    Without an output path the folder takes the name of the path's folder. Writing is in a
+    thread; the image stays in the camera.
 
     Returns:
         The file's path.
@@ -208,6 +219,9 @@ async def _go(
 ) -> str:
     """Move an axis, report its position while it moves, and check that it arrived.
 
+    It looks every `POLL_S` seconds. The request's errors are Refusals, too. Arrived is
+    within 1e-9 of the target and not sent elsewhere.
+
     Args:
         twin: state and requests.
         axis: name of the motor or virtual axis.
@@ -243,7 +257,8 @@ async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> flo
     """Clamp a target beyond a limit to the limit, where the machine does so.
 
     Unchanged also where the machine does not have the axis, the target is within the
-    limits, or the machine refuses instead of clamping.
+    limits, or the machine refuses instead of clamping. A virtual axis gets its reading
+    when its motors are at the clamped targets.
 
     Args:
         twin: connection and machine.
@@ -302,6 +317,8 @@ def rate_setting(what: Rate, digits: int) -> Action:
 def _why(state: State) -> str:
     """Return the reason of the safety state in brackets, with a leading blank; empty if all is
     well.
+
+    The message of the safety state, or its name if there is none.
     """
     safety = state.safety
     if safety.state != "ok":
@@ -314,7 +331,8 @@ async def question(
 ) -> str:
     """Answer with a part of the twin's state as text.
 
-    The path must end at a bool or a number.
+    The path must end at a bool or a number. A path without such a value raises an error
+    of formatting, which the gateway logs. Booleans are asked before numbers.
 
     Returns:
         "TRUE" or "FALSE", or a number with 10 decimals for positions and 6 for all else.
@@ -335,8 +353,10 @@ async def sequence(
 ) -> str:
     """Take an image sequence as a job of the twin, at rest or during the armed move.
 
-    The twin decides by its own clock when each image is taken, so the frames are where the
-    scanner's rule puts them, however slow the network is.
+    The twin decides by its own clock when each image is taken, so the frames are where
+    the scanner's rule puts them, however slow the network is. The armed move is taken
+    over and forgotten. The images are added to the recording; the data set is named after
+    it and the prefix. The reply is that of `_adopt`.
 
     Returns:
         Text of ACK. The armed move ends with the job: with its reply, or with its error.
@@ -379,7 +399,9 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
     """Write the script of a sequence: every setting of the twin's state, the move, the
     sequence.
 
-    With a move armed it ends with the same move again, which waits for its end.
+    With a move armed it ends with the same move again, which waits for its end. Lines are
+    tab-separated, ended by CR LF, seven columns; the prefix is reduced to its bare name.
+    A rate that is None is left out.
 
     Args:
         state: of the twin; its camera, tube and rates are written as settings.
@@ -418,6 +440,8 @@ async def abort_script(
 ) -> str:
     """Abort the job that this gateway started; returns its name.
 
+    Errors of the twin are raised as Refusal.
+
     Raises:
         Refusal: none is running.
 
@@ -434,7 +458,9 @@ async def _run(
 ) -> str:
     """Submit a script and wait for the end of its job.
 
-    A status without data set returns "".
+    A status without data set returns "". At most 999 names are tried; the status is
+    requested every `JOB_POLL_S` seconds. `twin.job` is None again afterwards, whatever
+    happens.
 
     Args:
         twin: connection; its `job` is the running one meanwhile.

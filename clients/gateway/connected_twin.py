@@ -77,9 +77,11 @@ class ConnectedTwin:
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
-        """Take the connection and what commands of clients change.
+        """Store the connection, the folder of saved images and the machine; the twin's
+        state is not known yet.
 
-        Nothing is recorded or known of the twin yet.
+        Nothing is recorded or known of the twin yet. Machine and profile that are None
+        are those that the twin names, as far as they ship.
 
         Args:
             link: to the twin.
@@ -110,7 +112,8 @@ class ConnectedTwin:
         """Take an event of the twin: keep the status of a job, and wake `news`, whatever
         the topic.
 
-        The end of a job that was not kept before is not kept.
+        The end of a job that was not kept before is not kept. `topic` is "state" or
+        "job", `params` those of the event with `data`. Other topics only wake.
         """
         if topic == "job":
             status = JobStatus.model_validate(params["data"])
@@ -121,6 +124,9 @@ class ConnectedTwin:
     def told_jobs(self, state: State) -> list[JobStatus]:
         """Return the newest status of each job whose progress is to be sent; drop ended
         ones.
+
+        Jobs that have ended are returned this once; in no particular order but that of
+        their first status.
 
         Args:
             state: of the twin; its job is added.
@@ -136,7 +142,8 @@ class ConnectedTwin:
         """Wait until something may have changed: an event has come, or some time has passed
         while something moves.
 
-        At the end it waits another POLL_S, so that several changes are met at once.
+        At the end it waits another POLL_S, so that several changes are met at once. The
+        time is `LIVELY_S`, only while `lively`; else only an event ends the wait.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LIVELY_S if self.lively else None):
@@ -147,6 +154,8 @@ class ConnectedTwin:
     def script_of(self, job: JobStatus) -> bytes | None:
         """Read the script of a job from its data set; None where it is missing or too
         long, or is a client's own sequence.
+
+        Too long is more than `MAX_SCRIPT` bytes. A job without a data set has none.
         """
         path = Path(job.dataset or "") / SCRIPT
         if not path.is_file() or path.stat().st_size > MAX_SCRIPT:
@@ -185,6 +194,10 @@ class ConnectedTwin:
     async def until(self, seconds: float, progress: CommandProgress, what: str) -> None:
         """Wait for `seconds` of the twin's clock, reporting the time left; at speed-up
         "max" returns at once.
+
+        The sleep between two requests is at most 0.2 s; `progress.text` is "WHAT: N s
+        left". A change of the speed-up takes effect within that time. Raises Refusal as
+        `ask`.
         """
         state = await self.state()
         end = state.time + seconds
@@ -195,8 +208,8 @@ class ConnectedTwin:
             state = await self.state()
 
     def record(self) -> Recording:
-        """Return the recording that images go to now; the first use creates it, with the
-        machine and profile known then.
+        """Return the current recording; create it at the first use, for the present
+        output path, machine and profile.
         """
         if self.recording is None:
             machine, profile = self._scanner()
@@ -214,7 +227,8 @@ class ConnectedTwin:
         """Close the recording and save later images in another folder, `path`.
 
         The new transcript begins with the last command, which leaves the old one; or, if
-        no image was saved yet, with all commands.
+        no image was saved yet, with all commands. Nothing is written now; the folder is
+        made with the first image.
         """
         old = self.record()
         fresh = old.folder is None
@@ -232,8 +246,9 @@ class ConnectedTwin:
     def motor_text(self, axis: str, at: AxisState) -> str:
         """Format the reply to a completed move: a motor's cluster, one character a byte.
 
-        A virtual axis, which has no motor, and a motor of a machine that the gateway does not
-        know reply with their position.
+        A virtual axis, which has no motor, and a motor of a machine that the gateway does
+        not know reply with their position. Positions have 10 decimals. Also without speed
+        or acceleration only the position is replied. Characters are Latin-1.
         """
         machine = self.machine
         if machine is None:
@@ -262,7 +277,8 @@ class ConnectedTwin:
         """Return machine and profile: those given, else those that the twin names.
 
         (None, None) without any machine; (machine or None, None) if this package lacks
-        the one named or its profile.
+        the one named or its profile. A given machine or profile comes before the twin's.
+        Without a connection and a given machine both are None.
         """
         hello = self.link.hello
         machine = self._machine
@@ -281,6 +297,9 @@ class ConnectedTwin:
 def _one_line(error: RpcError) -> str:
     """Format an error of the twin as one line: its message, then the first five errors
     (not warnings) of a script with their lines.
+
+    Joined by "; ". Problems are the data's list, or its `problems`; entries without a
+    message are skipped.
     """
     data = error.data
     if isinstance(data, Mapping):

@@ -34,6 +34,9 @@ class ScriptLine:
 def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
     """Read the commands of a script, one for each step of its plan.
 
+    Commands of the grammar only; other rows are left out. `waits` is False for a line
+    whose reply is not ACK.
+
     Example:
         >>> script_lines(b"tube\\txrayon\\t\\t\\tACK\\t\\t")
         (ScriptLine(words=('tube', 'xrayon', '', ''), waits=True),)
@@ -50,6 +53,9 @@ def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
 def _texts(row: CodeLine) -> tuple[str, ...]:
     """Split a row into component, command and two arguments, also in the space-padded
     form; missing ones are "", further ones are dropped.
+
+    The result has four strings. A row without tabs is split by the grammar's command with
+    the most words, else by its words.
     """
     texts = [f.text for f in (row.columns if row.columns is not None else row.words())]
     if row.columns is not None:
@@ -92,6 +98,9 @@ class Echoes:
 
         Nothing is yielded at the first call, and no changes while a script of a job is
         echoed. A move ends when its axis rests; a new target makes the former one fail.
+        Components in `own` get no events. X-rays are told as command xrayon or xrayoff
+        without argument. All other changes end at once with their value; a move gives
+        feedback when it is due. The state is stored as known in any case.
 
         Args:
             state: of the twin.
@@ -135,7 +144,10 @@ class Echoes:
 
         Yields nothing while the job is queued or its text is not there. Each line's event
         begins when the job reaches its step; the one before then ends. A job that ends
-        otherwise than "done" makes its line fail.
+        otherwise than "done" makes its line fail. Each line ends with its reply, or at
+        once if it does not wait ("command sent"); lines of components elsewhere only get
+        their command sent. Feedback, when due, is the axis's position or the job's text.
+        A finished job is forgotten.
 
         Args:
             status: of the job.
@@ -194,6 +206,9 @@ class Echoes:
     ) -> tuple[Exchange, AcquilaEvent, AcquilaEvent]:
         """Make the exchange of a command that somebody else gave.
 
+        An unknown component has the kind "other". The command gets a random number and
+        the time [ms] modulo 2^32.
+
         Args:
             words: component, command and two arguments.
             state: of the twin, which names its axes.
@@ -217,7 +232,8 @@ class Echoes:
         is under way.
 
         Without a `reply`: the axis's position after a move, "TRUE" after REPEAT UNTIL,
-        the argument after "set ..." (except on the scanner), else "".
+        the argument after "set ..." (except on the scanner), else "". The line is
+        forgotten in any case.
         """
         line = self._line
         self._line = None
@@ -245,7 +261,8 @@ def told(state: State) -> Mapping[Key, str]:
     """Return all values that commands can set, in the scanner's words and decimals.
 
     Axes have their target as a move, and speed and acceleration where these are known;
-    virtual axes are left out.
+    virtual axes are left out. Decimals: 6, for speed, target and position 10. The
+    camera's values are mode, exposure [ms], averages, frames and region.
 
     Returns:
         (component, command) -> argument; `xrays` has the command itself.

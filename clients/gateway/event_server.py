@@ -79,7 +79,9 @@ class Gateway:
     ) -> None:
         """Bind both sockets.
 
-        Raises too if `host` is not an address of this machine alone. `run` serves.
+        Raises too if `host` is not an address of this machine alone. `run` serves. The
+        neighbouring port is used if `inbound` is None. After an error nothing stays open.
+        It needs a running event loop only in `run`.
 
         Args:
             twin: connection and state.
@@ -114,7 +116,9 @@ class Gateway:
         """Serve until cancelled: receive events, and echo what others do; then cancel
         tasks, close recording and sockets.
 
-        An event that fails is logged, and serving goes on after `PAUSE_S`.
+        An event that fails is logged, and serving goes on after `PAUSE_S`. Cancelled
+        tasks answer their commands with ERR; closing waits at most `LINGER_MS` for events
+        to be sent.
         """
         echoes = asyncio.get_running_loop().create_task(self._echo())
         self._tasks.add(echoes)
@@ -138,6 +142,8 @@ class Gateway:
     def _receive(self, frames: list[bytes]) -> None:
         """Read an event from a message and begin its command; malformed messages are
         rejected with an event, a failure is logged and answered with ERR.
+
+        A message has one frame.
         """
         try:
             if len(frames) != 1:
@@ -157,7 +163,9 @@ class Gateway:
 
         A command gets a number if it is anonymous; an echo of a running one is dropped,
         and one too many is answered by ERR. Subscribers see the command as well as its
-        replies.
+        replies. The most are `MAX_RUNNING`, twice as many for stop and abort. A command
+        for a component elsewhere waits for its answer; all others are run in a task.
+        Returns at once.
 
         Args:
             event: from a client.
@@ -189,7 +197,9 @@ class Gateway:
         script. Runs until cancelled, also after errors.
 
         After a refusal or an error it waits `PAUSE_S`. Notes in `twin.lively` whether
-        anything moves or a job is known.
+        anything moves or a job is known. Components with running commands of clients are
+        not echoed. Events are sent in the order: lines of scripts, then changes of the
+        state.
         """
         clock = asyncio.get_running_loop().time
         while True:
@@ -218,6 +228,8 @@ class Gateway:
     ) -> None:
         """Await the work of a command; an exception is logged and answered with ERR, not
         raised.
+
+        The reply does not name the exception. Cancellation is passed on.
         """
         try:
             await work
@@ -231,7 +243,9 @@ class Gateway:
 
         Refusals and errors are answered with ERR, not raised; the control of the twin is
         released before the last reply. If cancelled, the command is cancelled and
-        answered with ERR.
+        answered with ERR. The state after the command is stored, so that it is not
+        echoed. FDB is sent when the exchange says so, with the progress text; the task is
+        waited for between.
 
         Args:
             event: the command.
@@ -268,6 +282,9 @@ class Gateway:
     async def _carry_out(self, event: AcquilaEvent, progress: CommandProgress) -> str:
         """Carry out a command and return its reply; it waits for earlier commands of its
         component unless it is one of `AT_ONCE`.
+
+        Axes are asked for first if they are unknown. Raises Refusal for an unknown
+        command, before any wait.
         """
         if not self.twin.axes:
             await self.twin.state()
@@ -284,6 +301,8 @@ class Gateway:
     ) -> str:
         """Run a command's action and return its reply; its line is in the recording's
         transcript meanwhile, and stays unless it fails (or is cancelled).
+
+        A command that is not of scripts has no line.
         """
         line = transcript_line(event, command)
         lines = self.twin.record().transcript
@@ -299,7 +318,8 @@ class Gateway:
     async def _await_other_answer(self, event: AcquilaEvent) -> None:
         """Wait for another subscriber to answer a command that is not for the scanner.
 
-        Commands with one key share their wait.
+        Commands with one key share their wait. Nothing is sent if an answer comes:
+        `_forward` has done so. The wait is forgotten afterwards.
 
         Args:
             event: the command; ERR is sent where no answer comes within `FOREIGN_S`.
@@ -322,6 +342,8 @@ class Gateway:
     def _forward(self, event: AcquilaEvent) -> None:
         """Send on the reply of a component elsewhere, and wake the command that waits for
         it; an echo of one of our own events is dropped.
+
+        Recognised are the last 256 events sent.
         """
         text = format_event(event)
         if hash(text) in self._recent:
@@ -335,7 +357,8 @@ class Gateway:
         """Store the state after a client's command, so that it is not echoed, and count
         one command less in the component's busy mark.
 
-        A refusal is ignored, a failure logged.
+        A refusal is ignored, a failure logged. Nothing is stored while the twin is not
+        connected; the mark is always taken off.
         """
         try:
             if self.twin.link.connected:
@@ -351,6 +374,8 @@ class Gateway:
     async def _release(self) -> None:
         """Release control of the twin if no other command of this gateway runs and the
         twin is connected; a refusal is ignored, a failure logged.
+
+        The present command counts as one of the running ones.
         """
         if len(self._running) <= 1 and self.twin.link.connected:
             try:
@@ -361,8 +386,11 @@ class Gateway:
                 self._log_failure("session.control")
 
     def _send(self, event: AcquilaEvent) -> None:
-        """Publish an event, and remember it so that its echo is recognised; dropped for a
-        subscriber that is too slow.
+        """Format an event, remember its hash (of the last 256) to recognise its echo, and
+        publish it without waiting.
+
+        A subscriber that is too slow does not get it; characters outside UTF-8 are
+        replaced.
         """
         text = format_event(event)
         self._recent.append(hash(text))
@@ -372,6 +400,8 @@ class Gateway:
     def _reject(self, why: str) -> None:
         """Count a malformed event, log the first `MAX_LOGGED` ones, and answer with ERR
         and the fields of an event.
+
+        Later ones are answered, too. The reply goes to all subscribers.
         """
         self._rejected += 1
         if self._rejected <= MAX_LOGGED:
@@ -389,8 +419,8 @@ class Gateway:
             log("gateway command failed", logging.ERROR, error=True, command=command)
 
     def _start(self, work: Coroutine[Any, Any, None], key: tuple[object, int]) -> None:
-        """Run work in a task that is kept until it ends; then `key` no longer marks its
-        event as running.
+        """Run work in a task; when it has ended, drop the task and take `key` from the
+        running commands.
         """
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
@@ -406,7 +436,9 @@ class Gateway:
     ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
         """Bind PUB and SUB; if any free port will do, find two neighbouring ones.
 
-        Raises zmq.ZMQError if a port is in use, or after `PAIR_TRIES` pairs.
+        Raises zmq.ZMQError if a port is in use, or after `PAIR_TRIES` pairs. Other socket
+        errors are raised at once. `inbound` has a limit of `MAX_BYTES` a message and
+        `MAX_HELD` messages a sender.
 
         Args:
             port: of PUB; 0 is any free port.
@@ -451,6 +483,8 @@ class Gateway:
 def check_loopback(host: str) -> None:
     """Check that `host` is a loopback address.
 
+    Returns nothing.
+
     Raises:
         AccessError: it is not; lists the allowed ones.
     """
@@ -465,6 +499,8 @@ def check_loopback(host: str) -> None:
 def bind_endpoint(host: str, port: int) -> str:
     """Format an address as ZeroMQ's endpoint: IPv6 in brackets, localhost as 127.0.0.1;
     port 0 is any free port.
+
+    Other names are used as they are.
     """
     if ":" in host:
         place = f"[{host}]"
@@ -485,7 +521,8 @@ def transcript_line(event: AcquilaEvent, command: c.Command) -> str | None:
     not one of scripts.
 
     Waits for the position (POS) only after a triggered absolute move, else for the
-    acknowledgement.
+    acknowledgement. Seven columns, of which the last two are empty; blanks in a word are
+    joined to one.
     """
     if type(command).__module__ != c.__name__:
         return None

@@ -36,7 +36,10 @@ EVENTS_HZ = 20.0
 async def run(options: GatewaySettings) -> int:
     """Serve until SIGTERM or SIGINT.
 
-    Announces the ports, once open, in a line on standard output.
+    Announces the ports, once open, in a line on standard output. It subscribes to state
+    and jobs at `EVENTS_HZ`. Machine and profile are read from files where the options
+    name them. The first task that ends (with its error, if any) ends all. Returns OK; a
+    ZMQError of a port becomes the OSError.
 
     Args:
         options: addresses, token, certificate, folders and files of the process.
@@ -98,7 +101,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the gateway with the options of `argv` (default: the command line) until it is ended;
     returns the exit code.
 
-    Where pyzmq is not installed it says so and returns the code of an invalid call.
+    Where pyzmq is not installed it says so and returns the code of an invalid call. A
+    missing package is reported on standard error before anything is opened.
     """
     options = parse(GatewaySettings, argv)
     set_up()

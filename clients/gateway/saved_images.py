@@ -70,7 +70,10 @@ class Recording:
         started: datetime,
         version: str = "",
     ) -> None:
-        """Begin a recording; its folder is made with the first image.
+        """Store the folder's name and texts' facts; nothing is written before the first
+        image.
+
+        Without a usable last part of the path the name is "gateway".
 
         Args:
             root: folder of recordings.
@@ -104,14 +107,21 @@ class Recording:
         return self._folder.path
 
     def suggest(self, path: str) -> None:
-        """Name the folder after the folder in a file's path, where no output path is
-        set."""
+        """Name the folder after the last folder in a file's path, while no output path
+        was set and no image saved.
+
+        A path without a usable folder changes nothing; slashes and backslashes separate.
+        """
         parts = [part for part in re.split(r"[\\/]", path)[:-1] if bare_name(part)]
         if self._folder is None and self.name == UNNAMED and parts:
             self.name = bare_name(parts[-1])
 
     def save(self, file: str, image: Image) -> Path:
-        """Write an image under a plain name.
+        """Write an image as TIFF under a plain file name, add it to the record and
+        rewrite the texts.
+
+        Returns the file's path. Its kind comes from the name; its time counts from the
+        first image [s].
 
         Raises:
             DatasetError: the name is not plain or is taken, the file cannot be written, or
@@ -137,6 +147,11 @@ class Recording:
     def adopt(self, folder: Path, state: State) -> int:
         """Add the projections of a data set that the twin made.
 
+        Files are linked or copied under their own names; frames missing in the folder are
+        copied from the data set's other storage. Blocks begin at the time of `state`
+        minus the set's duration; the texts are rewritten. A document without frames adds
+        none.
+
         Args:
             folder: of the data set.
             state: of the twin, after the data set was made.
@@ -159,8 +174,8 @@ class Recording:
         return len(document.frames)
 
     def write_settings(self, state: State) -> None:
-        """Keep these motor positions for the settings texts, and write these now if the
-        folder has images (`write settings file`).
+        """Store a state whose motor positions the settings texts show from now on;
+        rewrite the texts if the folder has images.
         """
         with self._turn:
             self._settings = state
@@ -170,6 +185,9 @@ class Recording:
     def close(self) -> None:
         """Close the folder, once a saving in progress has ended; nothing is saved into it
         any more.
+
+        Waits for a saving in progress; a second call does nothing. A later saving raises
+        DatasetError.
         """
         with self._turn:
             self._closed = True
@@ -181,7 +199,9 @@ class Recording:
         """Open the recording's folder, made at the first use, and check that names are
         free.
 
-        The name is made free in the data directory at the first use.
+        The name is made free in the data directory at the first use. Returns the open
+        folder. If the name of the folder is taken, a number is added. Only the first
+        taken file is named in the error.
 
         Args:
             names: of files to be written.
@@ -224,7 +244,8 @@ class Recording:
         """Write the transcript, and the settings texts if machine and profile are known, into
         the folder.
 
-        Needs a folder (asserts it).
+        Needs a folder (asserts it). Lines end with CR LF; existing texts are replaced.
+        Nothing but the transcript is written for an unknown machine.
         """
         assert self._folder is not None
         text = "\r\n".join([*self.transcript, ""])
@@ -236,7 +257,9 @@ class Recording:
     def _record(self) -> ScanRecord | None:
         """Build the record of the images so far: blocks, settings, times and correction.
 
-        Without a projection the record is incomplete, with that reason.
+        Without a projection the record is incomplete, with that reason. Positions, speeds
+        and tube are those of `write_settings`, else of the last image. `smooth` is
+        whether any motor moved within a block of projections; an unknown speed is 0.
 
         Returns:
             The record; None where machine or profile is unknown.
@@ -295,8 +318,10 @@ def kind_of_file(file: str) -> FrameKind:
 
 
 def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:
-    """Copy an image, which never changes, from one folder into another: as a link if the disk
-    has links. Nothing happens where it cannot be copied.
+    """Link an image file into another folder, or copy its bytes where links are not
+    possible.
+
+    A link is tried only if `linked`. Errors of the copy are raised.
 
     Args:
         name: of the file.
@@ -318,6 +343,8 @@ def _positions(state: State) -> Mapping[str, float]:
 def _correction(state: State) -> NamedCorrection | None:
     """Return the twin's correction as offsets with name, date and comment; None without
     one.
+
+    Parameters are converted from the wire's units to offsets.
     """
     c = state.correction
     if c is None:
@@ -328,6 +355,9 @@ def _correction(state: State) -> NamedCorrection | None:
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
     """Split a document's frames into runs of equal kind, camera setting and X-rays; times
     count from `start` [s].
+
+    The order is kept; frames are only joined to neighbours. A change of mode, region,
+    exposure or averages, too, begins a new block.
     """
 
     def settings(f: FrameEntry) -> tuple[object, ...]:
@@ -336,6 +366,8 @@ def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
     def block(run: Sequence[FrameEntry]) -> FrameBlock:
         """Make the block of a run of frames with one kind and camera setting, taken from
         the first; times are `start` plus the frames' own [s].
+
+        Motors are those of the first frame.
         """
         first = run[0]
         camera = CameraSettings(

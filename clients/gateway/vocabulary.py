@@ -91,7 +91,9 @@ def known_commands(component: str) -> tuple[str, ...]:
 def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
     """Read the command of an event.
 
-    Also raised for an unknown component, arguments in excess and wrong ones.
+    Also raised for an unknown component, arguments in excess and wrong ones. The axis
+    name is read in any letter case. Arguments beyond those of the command have to be
+    empty. Commands of the interface alone, such as stop, are read too.
 
     Args:
         event: from a client.
@@ -126,6 +128,8 @@ def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
 
 def _extra(event: AcquilaEvent, name: str) -> c.Command:
     """Read a command that the grammar of scripts does not have.
+
+    Letter case and repeated blanks do not matter.
 
     Raises:
         Refusal: the component does not know it; the message lists what it knows.
