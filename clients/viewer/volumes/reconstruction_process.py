@@ -64,7 +64,8 @@ class LiveReconstruction:
         """Start the volume of a data set and end any other; for the same request only
         send its newest line again.
 
-        `side` is the number of voxels a side, `past` whether the scan is complete. A repeated request with no line yet does nothing.
+        `side` is the number of voxels a side, `past` whether the scan is complete. A
+        repeated request with no line yet does nothing. Returns nothing.
         """
         asked = wish(folder, side, past)
         if asked == self._asked:
