@@ -95,8 +95,8 @@ def lathe(
 ) -> PaintedMesh:
     """Build a body of revolution of 64 sections as a painted mesh [mm].
 
-    `profile` holds points (radius, height) from bottom to top, relative to `center`; `axis` is
-    "z", or "y" for a body turned to lie along y.
+    `profile` holds points (radius, height) from bottom to top, relative to `center`;
+    `axis` is "z", or "y" for a body turned to lie along y.
     """
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
     return _standing(mesh, center, paint, axis)
