@@ -49,10 +49,12 @@ class BeamPlane:
 def fans(
     world: World, lines: npt.NDArray[np.generic], radius_mm: float
 ) -> list[BeamPlane]:
-    """Planes of the middle column before and behind the sample, and of the middle row.
+    """Compute four planes of the beam: of the image's middle column and middle row, each
+    before and behind the sample.
 
     Four planes: for each direction one before the sample, with all light, and one behind
-    it, with the light that passes.
+    it, with the light that passes. The transmission is exp(-line integral). The order is
+    column before, column behind, row before, row behind.
 
     Args:
         world: of the image's moment.
@@ -77,7 +79,10 @@ def _fan(
 ) -> BeamPlane:
     """Draw the rays to a line of pixels through the image's middle.
 
-    Pixels are as opaque as transmission says, transparent where no ray passes.
+    Pixels are as opaque as transmission says, transparent where no ray passes. The
+    opacity is at most `MOST` of 255, times the transmission of the pixel where the ray
+    ends. Before the sample the plane begins at the focal spot; behind it, it ends at the
+    panel.
 
     Args:
         world: geometry.
@@ -120,9 +125,7 @@ class BeamShade:
     """The planes in a scene."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        """Add the four images of the beam's shade to the scene, hidden and blank until
-        drawn.
-        """
+        """Add the four images of the beam's planes to the scene, hidden and blank."""
         plain: Any = {"visible": False, "cast_shadow": False, "receive_shadow": False}
         self._planes: list[Any] = [
             scene.add_image(
@@ -147,6 +150,8 @@ class BeamShade:
     def light(self, on: bool) -> None:
         """Show the shaded beam, drawn with the newest image, or hide it; nothing if that
         is so already.
+
+        `on` is whether X-rays are on.
         """
         if on != self._lit:
             self._lit = on
@@ -157,6 +162,8 @@ class BeamShade:
     def _draw(self) -> None:
         """Draw the newest image as planes along the beam; nothing while X-rays are off or
         no image is there.
+
+        Also nothing is sent for hidden planes; sizes are converted to [m].
         """
         if not self._lit or self._newest is None:
             return

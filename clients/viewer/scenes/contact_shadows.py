@@ -36,7 +36,8 @@ def standing(parts: Sequence[Component], bodies: Mapping[str, Body]) -> dict[str
     """List the parts that rest on another one, with the height of its top.
 
     Only parts that touch within `TOUCHING_MM` and do not rise against each other; the
-    highest counts.
+    highest counts. Parts are boxes at their home places; they have to overlap in x and y.
+    Parts on nothing are left out.
 
     Args:
         parts: of a machine.
@@ -70,7 +71,8 @@ def shadow(part: Component, top_mm: float) -> bytes:
     """Make the shadow of a part as a GLB file [m], in the part's own frame.
 
     A transparent rectangle with soft edges, slightly larger than the part, just above the
-    surface.
+    surface. The rectangle is larger by `SPREAD_SHARE` of the part's size on each side,
+    and `ABOVE_MM` above the surface.
 
     Args:
         part: that casts it.
@@ -104,6 +106,9 @@ def shadow(part: Component, top_mm: float) -> bytes:
 def _soft() -> Image.Image:
     """Draw the shadow's texture: a black square whose edges fade to transparent, RGBA
     (SIDE_PX, SIDE_PX).
+
+    The opacity is `MAX_OPACITY` under the part itself and falls smoothly to 0 at the
+    border.
     """
     at = np.abs((np.arange(SIDE_PX) + 0.5) / SIDE_PX * 2.0 - 1.0)
     inner = 1.0 / (1.0 + 2.0 * SPREAD_SHARE)

@@ -49,6 +49,9 @@ class Gizmos:
     def __init__(self, server: viser.ViserServer, machine: Machine, drag: Drag) -> None:
         """Add a handle for each stage (source, object, detector); `drag` gets the axes'
         targets when one is dragged.
+
+        The targets are of motors [mm, deg], with viser's client id. Handles are at the
+        origin until the first `update`.
         """
         self._machine = machine
         self._drag = drag
@@ -57,8 +60,8 @@ class Gizmos:
         self._handles = [self._add(server, stage) for stage in STAGES]
 
     def update(self, state: State, world: World) -> None:
-        """Note the motors' positions and move the handles to their stages, except the one
-        being dragged.
+        """Store the motors' positions and put each handle at its stage's point, except
+        one that is being dragged.
         """
         self._positions = motors(self._machine, state)
         at = {"source": world.source, "object": world.axis, "detector": world.detector}
@@ -69,6 +72,8 @@ class Gizmos:
     def _rest(self, handle: _Handle) -> None:
         """Put a handle back to its stage's place, that of the object also to no rotation;
         nothing while it is dragged or the place is unknown.
+
+        The position is sent only if it differs.
         """
         at = self._at.get(handle.stage)
         if handle.dragging or at is None:
@@ -105,6 +110,8 @@ class Gizmos:
         async def follow(event: Any) -> None:
             """Follow the phases of a drag: begin, move and end; afterwards the handle is
             put back unless dragged.
+
+            `event` has the phase "start", "end", or any other for a move.
             """
             match event.phase:
                 case "start":
@@ -129,7 +136,8 @@ class Gizmos:
         """Convert the handle's shift and turn to motor targets and pass them on.
 
         Ignored before the drag has begun; only motors that the stage has get targets. The
-        turn takes the shorter way.
+        turn takes the shorter way. The shift is converted to [mm], the turn about z to
+        degrees from -180 to 180; no targets, no call.
 
         Args:
             handle: being dragged.
@@ -155,6 +163,9 @@ class Gizmos:
         self, targets: dict[str, float], handle: _Handle, quantity: str, change: float
     ) -> None:
         """Set the target of the motor that changes a quantity, within its limits.
+
+        Nothing is set if the quantity depends on none or several motors, or if the change
+        is below 0.001.
 
         Args:
             targets: motor -> target, added to.

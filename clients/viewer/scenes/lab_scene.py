@@ -88,7 +88,9 @@ class LabScene:
     ) -> None:
         """Build all nodes, each shown or hidden as in `Shown()`; see the class.
 
-        `looks` holds glTF bytes that replace a component's own look, by its name.
+        `looks` holds glTF bytes that replace a component's own look, by its name. Nothing
+        is placed before the first `update`. `drag` is called with viser's client and the
+        targets when a handle is dragged.
         """
         self._server = server
         self.machine = machine
@@ -124,7 +126,8 @@ class LabScene:
         """Build lights, floor, machine, cabinet, beam, panel and lines, before any state.
 
         Fills the frames and solids by component; positions [mm] of the machine become
-        [m].
+        [m]. The parts that rest on another get a contact shadow. Sample, image, beam,
+        axis, cross and ranges are placeholders until the first state.
         """
         scene = self._server.scene
         scene.set_up_direction("+z")
@@ -229,6 +232,8 @@ class LabScene:
     def _build_bodies(self) -> None:
         """Add the hull of each collision body, and one grown by the safety margin if the
         machine has one.
+
+        Hulls are red, margins amber, both translucent and in the parts' frames.
         """
         margin = self.machine.safety_margin_mm
         for name, body in self._bodies.items():
@@ -241,7 +246,10 @@ class LabScene:
                 )
 
     def _build_labels(self) -> None:
-        """Build the world's axes and a scale on the floor, in [m]."""
+        """Build the world's axes and a scale on the floor, in [m].
+
+        The scale is `SCALE_MM` long, the axes `AXES_MM`.
+        """
         scene = self._server.scene
         (x, y, z) = _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
@@ -257,7 +265,8 @@ class LabScene:
         """List the names shown now, with their places [m].
 
         With "labels": the scale, three axes and the parts; without them, the image's
-        names if "names" is shown, else none.
+        names if "names" is shown, else none. The names of the axes are at 1.1 times their
+        length; the parts are those of `names_of_parts`.
         """
         if "labels" not in shown:
             if "names" in shown:
@@ -277,6 +286,8 @@ class LabScene:
     ) -> Any:
         """Add a translucent, two-sided mesh without shadows to the scene; returns its
         handle.
+
+        Vertices are converted to [m].
         """
         vertices, faces = plain(mesh)
         return self._server.scene.add_mesh_simple(
@@ -295,7 +306,9 @@ class LabScene:
     def update(self, state: State, world: World) -> None:
         """Move everything to a state.
 
-        Changes parts, sample, beam, panel and drag handles in one message.
+        Changes parts, sample, beam, panel and drag handles in one message. The tube is
+        shifted with the source, the panel with the detector and turned as the image;
+        other parts follow their motors.
 
         Args:
             state: of the twin; its motors and X-rays.
@@ -322,6 +335,8 @@ class LabScene:
     def _place(self, name: str, turn: FloatArray, at: FloatArray) -> None:
         """Pose a node's frame in the viewer and keep the pose sent; `at` is in [mm], sent
         in [m].
+
+        `turn` is a rotation (3, 3).
         """
         pose = (*quaternion(turn), *(at * MM).tolist())
         self._sent[name] = pose
@@ -333,7 +348,8 @@ class LabScene:
         """Move edges, spot, lamp, cross and axis to a state, and colour them by X-rays on
         or off.
 
-        Positions become [m]; the spot is hidden while X-rays are off.
+        Positions become [m]; the spot is hidden while X-rays are off. Edges are the eight
+        lines of the pyramid of focal spot and image corners.
 
         Args:
             state: of the twin.
@@ -356,7 +372,10 @@ class LabScene:
         self._axis.wxyz = quaternion(world.stage.turn)
 
     def _show_panel(self, world: World) -> None:
-        """Place the live image in front of the panel, as large as it and turned like it."""
+        """Place the live image in front of the panel, as large as it and turned like it.
+
+        It is `GAP_MM` in front, towards the source; sizes are converted to [m].
+        """
         rows, cols = world.shape
         at = (world.detector - GAP_MM * world.normal) * MM
         width = float(np.linalg.norm(world.u)) * cols * MM
@@ -372,7 +391,9 @@ class LabScene:
         """Collect the drawn shapes for a picture that needs no browser; any thread may
         call.
 
-        An opaque sample is drawn where it is near and has no dense part.
+        An opaque sample is drawn where it is near and has no dense part. "near" also
+        leaves out panel and beam. The order is parts, sample, panel, beam; the cone is
+        drawn only while X-rays are on. Shapes are in the world's frame [m].
 
         Args:
             world: of the state that was drawn last.
@@ -405,6 +426,9 @@ class LabScene:
     ) -> None:
         """Draw an image (rows, cols, 3) on the panel, and its line integrals as the
         shaded beam.
+
+        The ball around the sample is left out of the beam; `rgb` is uint8, `lines` (rows,
+        cols).
         """
         self._image.image = rgb
         with self._server.atomic():
@@ -418,7 +442,7 @@ class LabScene:
         """Show the volume's surface that a scan has reconstructed so far, on the stage;
         None removes it.
 
-        No faces remove it, too.
+        No faces remove it, too. A surface that is there already is replaced.
 
         The sample itself fades meanwhile, so that its volume is seen within it.
 
@@ -452,7 +476,7 @@ class LabScene:
         """Put a sample on the stage.
 
         Nothing is done if the look is there already. A look that is not exact is drawn as
-        wires.
+        wires. The rod below it is drawn anew, and `plain` updated.
 
         Args:
             look: its meshes; the former ones are removed.
@@ -483,7 +507,8 @@ class LabScene:
         """Draw a thin rod from the mount to the sample; X-rays do not see it.
 
         A former rod is removed; none is drawn if the machine has no mount or the sample
-        touches it.
+        touches it. The rod is 5 mm thick and reaches from the mount's top to the lowest
+        vertex, about the object's z axis.
 
         Args:
             look: the sample; without meshes there is no rod.
@@ -511,7 +536,8 @@ class LabScene:
         """Collect the nodes of all layers, for frames of a page that shows `shown`.
 
         Returns node -> its properties: `visible` for each node, and the opacity for the
-        sample's surfaces, at most FADED_OPACITY within a drawn volume.
+        sample's surfaces, at most FADED_OPACITY within a drawn volume. Dense skins stay
+        opaque unless the sample fades.
 
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
@@ -532,7 +558,9 @@ class LabScene:
         return {**out, **clear}
 
     def _visible(self, shown: Shown, near: Collection[str] = ()) -> dict[str, bool]:
-        """Say whether each node of the scene is visible; margins of 0 have none."""
+        """Determine for each node that exists whether it is visible; a margin of 0 has no
+        node.
+        """
         there = self._server.scene.get_handle_by_name
         wanted = shown.visible(self._bodies, near)
         return {node: on for node, on in wanted.items() if there(node) is not None}
@@ -541,7 +569,9 @@ class LabScene:
         """Draw the remaining travel of each stage as a line through its position.
 
         Only linear axes that carry a part are drawn, with marks at their limits; without
-        any, the former lines stay.
+        any, the former lines stay. Each axis has a line between its limits, through the
+        part's centre, and a mark of 50 mm at each end. Correction shifts are not
+        included.
 
         Args:
             state: of the twin.
@@ -569,15 +599,20 @@ class LabScene:
 
 def _clear(opacity: float, dense: bool) -> dict[str, Any]:
     """Choose opacity and sides of a skin: dense ones stay opaque, others show their
-    rear, too."""
+    rear, too.
+
+    None as opacity is opaque; an opaque skin shows its front only, a dense one of a
+    translucent sample both sides.
+    """
     opaque = opacity >= 1.0
     side = "front" if opaque else "double"
     return {"opacity": None if dense or opaque else opacity, "side": side}
 
 
 def _scale_mm(machine: Machine) -> FloatArray:
-    """Compute the place of the scale: next to the lowest part, at the height of its
-    top."""
+    """Compute the scale's first end (3,) [mm]: near a corner of the part that carries the
+    others, 2 mm above its top.
+    """
     ground = ground_of(machine)
     (x, y, z) = ground.size_mm
     middle = np.array(ground.center_mm)
@@ -599,6 +634,8 @@ def _axis_points() -> npt.NDArray[np.float32]:
 def _cross_points() -> npt.NDArray[np.float32]:
     """Return four lines, (4, 2, 3) [m], of an upright cross in the xz plane with an open
     centre.
+
+    Each line is from 1.5 to 7 mm from the centre.
     """
     r = 7.0 * MM
     g = 1.5 * MM

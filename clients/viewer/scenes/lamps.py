@@ -22,6 +22,8 @@ FILL_AT: Final = (-2.6, 1.4, 1.2)
 def light_plainly(scene: viser.SceneApi) -> None:
     """Replace the scene's lamps by sky, key and fill light without shadows, for all
     clients.
+
+    An environment map is removed.
     """
     scene.configure_environment_map(None)
     scene.add_light_hemisphere(
@@ -34,6 +36,9 @@ def light_plainly(scene: viser.SceneApi) -> None:
 def light_finely(scene: viser.SceneApi) -> None:
     """Set a room that shines in metal and lights from all around, and a lamp that casts
     shadows.
+
+    The environment map is "studio"; sky and key lamp replace the plain ones, the plain
+    fill light stays.
 
     Args:
         scene: of one client; its lamps replace those of all clients.

@@ -36,6 +36,8 @@ class Layer:
     def nodes_of(self, parts: Collection[str]) -> Iterator[tuple[str, str | None]]:
         """Name its nodes, each with its component or None.
 
+        Nodes keep the layer's order; `{part}` gives one node a part.
+
         >>> list(Layer("margin", "safety margin", False, ("/{part}/margin",)).nodes_of(["tube"]))
         [('/tube/margin', 'tube')]
         """
@@ -87,6 +89,9 @@ class Shown:
     def changed(self, opacity: float | None = None, **layers: bool | None) -> Shown:
         """Replace the opacity and some layers in a copy.
 
+        Layers that are None stay, and so does an opacity of None. Unknown names are added
+        as they are.
+
         >>> sorted(Shown(frozenset(["beam", "axis"])).changed(axis=False, names=True).layers)
         ['beam', 'names']
         """
@@ -100,7 +105,7 @@ class Shown:
 
     @property
     def told(self) -> dict[str, object]:
-        """What the page gets: "shown" (layer -> bool, of all layers) and
+        """Return what the page gets: "shown" (layer -> bool, of all layers) and
         "opacity".
         """
         return {
@@ -111,7 +116,10 @@ class Shown:
     def visible(
         self, parts: Collection[str], near: Collection[str] = ()
     ) -> dict[str, bool]:
-        """Say whether each node of all layers is visible.
+        """Determine whether each node of all layers is visible.
+
+        A part's node is also visible if the part is in `near` and the layer has `near`.
+        Returns node -> bool.
 
         Args:
             parts: names of the machine's components.

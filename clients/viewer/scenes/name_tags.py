@@ -43,7 +43,9 @@ def laid_out(
     """Place the names' boxes.
 
     From top to bottom, each at the place that covers fewest points; then names are
-    exchanged so that leaders do not cross.
+    exchanged so that leaders do not cross. Places are on rings around a point
+    (`RINGS_PX`, `WAYS` directions), inside the area and `GAP_PX` from other boxes; nearer
+    and higher ones are preferred. All boxes are treated as large as the largest.
 
     Args:
         anchors: (n, 2) named points [px]; NaN or outside the picture: no name.
@@ -97,6 +99,9 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
 def names_of_image(world: World) -> list[Name]:
     """List the names X-ray source, sample and detector with their places [m]; "detector"
     is beside the panel's centre.
+
+    The sample's place is its origin; "detector" is a quarter of the image's width to the
+    side.
     """
     image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
     named = (
@@ -112,6 +117,8 @@ def names_of_parts(
 ) -> list[Name]:
     """List parts that move or have a role, with the place [m] of a corner; from their
     poses (w, x, y, z, place [m]), those without one left out.
+
+    The corner is the upper one towards +x; underscores of names become blanks.
     """
     out = []
     for part in machine.components:
@@ -137,7 +144,8 @@ class NameTags:
         moved.
 
         No names are drawn in a picture narrower than `LEAST_PX`; names behind the camera
-        are left out.
+        are left out. Names that no longer have room are removed. A leader joins each name
+        to its point; at most 64 former names are looked for.
 
         Args:
             client: with its camera.

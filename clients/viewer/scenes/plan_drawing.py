@@ -49,6 +49,8 @@ class PlanDrawing:
         """Show some clients the moving parts at other motor positions.
 
         Made at the first call, moved later; bodies that no axis moves are left out.
+        Positions of axes that are not given are 0. The meshes are the bare collision
+        bodies, blue and translucent.
 
         Args:
             clients: that get the ghost.
@@ -91,6 +93,8 @@ class PlanDrawing:
     ) -> None:
         """Show some clients the focal spot's path as the sample sees it; None: no longer.
 
+        A former path is replaced; fewer than two points show none.
+
         Args:
             clients: that see it.
             points: (n, 3) [mm], object frame.
@@ -115,6 +119,8 @@ def _draw_lines(
 ) -> None:
     """Replace the lines (n, 2, 3) [mm] that clients had under this name, `px` thick; None
     or no lines remove them.
+
+    `color` is (r, g, b); coordinates are converted to [m].
     """
     _remove(clients, name)
     if lines is not None and len(lines):

@@ -100,6 +100,8 @@ class SampleLook:
     def _reach(self, axes: int) -> float | None:
         """Compute the greatest distance of the skins from the origin along the first
         `axes` axes [mm]; None without skins.
+
+        With 3 axes it is the distance from the origin, with 2 that from the z axis.
         """
         far = [
             np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins
@@ -110,6 +112,8 @@ class SampleLook:
 def _hull(vertices_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Find the corners of the convex hull of vertices (k, 3); all of them where they lie in a
     plane.
+
+    Also all of them where there are too few; in no particular order otherwise.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -138,7 +142,10 @@ class MeshCache:
         return sample.revision is not None and _key(sample) not in self._made
 
     def add(self, sample: SampleState, stl: bytes) -> None:
-        """Store the shape of an upload.
+        """Store the look of an upload from its STL (bytes, mm), kept at its own place.
+
+        Without a material it is `DEFAULT_MATERIAL`. At most `MAX_LOOKS` looks are kept,
+        the oldest goes first.
 
         Raises:
             TwinError: it is no mesh.
@@ -148,8 +155,8 @@ class MeshCache:
         self._keep(sample, made)
 
     def look(self, sample: SampleState) -> SampleLook:
-        """Return the look of `sample`, an upload whose mesh is lacking as a box; it
-        may take a second.
+        """Return the look of a sample: its own meshes if known, a box of its size if not,
+        `NOTHING` for an empty stage.
 
         No sample has the empty look. A named phantom is loaded and kept at its first use;
         what cannot be loaded is a box, too.
@@ -171,7 +178,10 @@ def _skins(phantom: Phantom) -> SampleLook:
     """Make a phantom's look: one skin for each material, smooth up to a number of
     triangles.
 
-    Holes are turned inside out; steel among other materials is marked as dense.
+    Holes are turned inside out; steel among other materials is marked as dense. Meshes of
+    more than `MAX_FACES` triangles are not smoothed. Skins are in order of their
+    materials' first part; unknown materials have `OTHER_COLOR`. Names have _ in place of
+    other characters than letters and digits.
 
     Args:
         phantom: with parts and beads.
@@ -200,6 +210,8 @@ def _skins(phantom: Phantom) -> SampleLook:
 def _box(sample: SampleState) -> SampleLook:
     """Show a sample of which only the size is known as a box, marked as not exact;
     nothing without a size.
+
+    The box is centred on the sample's origin and has no beads.
     """
     if sample.size_mm is None:
         return NOTHING
@@ -211,6 +223,9 @@ def _box(sample: SampleState) -> SampleLook:
 async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
     """Get the STL of the sample on the stage; None if the sample has changed or is too
     large.
+
+    `ask` sends a request to the twin. None too if there is no mesh, and for every error
+    of the twin. Raises nothing else.
 
     Raises:
         ConnectionLost: the twin has gone.

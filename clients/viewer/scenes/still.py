@@ -60,8 +60,11 @@ class Shape:
 
 
 def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
-    """Split meshes [mm] into shapes [m], in meshes over `LARGE_MM` triangles are divided:
-    a large one may reach behind the eye.
+    """Convert painted meshes [mm] to shapes [m]; triangles of a large mesh are first
+    divided, as they may reach behind the eye.
+
+    A mesh is large if a side of its box exceeds `LARGE_MM`, which is then the longest
+    edge. Shapes are opaque and lit, in the meshes' order.
     """
     out = []
     for piece in pieces:
@@ -87,7 +90,8 @@ def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
 def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
     """Make the shape of the panel's image, in front of the panel.
 
-    Reduced to the number of cells, two triangles each; not lit.
+    Reduced to the number of cells, two triangles each; not lit. It is 1 mm in front of
+    the panel, towards the source.
 
     Args:
         rgb: (rows, cols, 3); drawn as IMAGE_CELLS.
@@ -113,6 +117,8 @@ def image_on(rgb: npt.NDArray[np.uint8], world: World) -> Shape:
 def cone(world: World, color: tuple[int, int, int], opacity: float) -> Shape:
     """Make the translucent shape of the beam's sides, from the focal spot to the image's
     corners [m], not lit.
+
+    Four triangles; `color` is (r, g, b) from 0 to 255, `opacity` from 0 to 1.
     """
     corners = world.corners * MM
     spot = np.broadcast_to(world.source * MM, corners.shape)
@@ -126,7 +132,9 @@ def drawn(
     """Draw the picture (height, width, 3), RGB.
 
     Small pictures are drawn finer and averaged; the background is shaded from top to
-    bottom.
+    bottom. Opaque shapes hide by depth; a translucent one is blended where nothing opaque
+    is nearer, its own nearest triangle alone. Up to `SMALL_PX` pixels are computed
+    `SMOOTH` times finer a side.
 
     Args:
         shapes: visible ones; the translucent ones are drawn over the others in their
@@ -170,6 +178,8 @@ def drawn(
 def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
     """Encode as a JPEG of the best of four qualities that fits into `most` bytes; the
     worst, if none does.
+
+    `picture` is RGB (height, width, 3); qualities are 85, 75, 60 and 40.
     """
     import cv2
 
@@ -183,8 +193,11 @@ def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
 
 
 def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
-    """Compute the colours of a shape's triangles in the scene's light, (n, 3); its own
-    colour if it is not lit.
+    """Compute the colours (n, 3) float32 of a shape's triangles: its colour times the
+    light on each triangle's normal; unchanged if it is not lit.
+
+    Values may exceed 255. A part `SKY` of the light comes from above, the rest from
+    `KEY`.
     """
     color = np.broadcast_to(shape.color, (len(shape.corners), 3)).astype(np.float32)
     if not shape.lit:
@@ -202,6 +215,9 @@ def _projected(
     corners: FloatArray, camera: Standpoint, width: int, height: int
 ) -> FloatArray:
     """Project the corners of triangles onto a picture.
+
+    Rows grow downwards. Too near is less than `NEAR_M` ahead; the opening is the camera's
+    vertical one.
 
     Args:
         corners: (n, 3, 3) [m].
@@ -230,7 +246,9 @@ def _filled(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
     """Fill the pixels with the nearest triangles.
 
-    Triangles seen from behind, and with points that are not finite, are left out.
+    Triangles seen from behind, and with points that are not finite, are left out. Of
+    equally near triangles the last filled one wins. At most `PLACES_AT_ONCE` pixels are
+    tested at a time.
 
     Args:
         corners: (n, 3, 3) column, row [px] and inverse depth [1/m].

@@ -33,6 +33,8 @@ class Stills:
         """Return a JPEG of at most MOST_BYTES, computed at its first use.
 
         At most MAX_PICTURES are kept, the oldest goes first; one is computed at a time.
+        Sizes are limited to `LEAST_PX` to `MOST_PX`; missing ones are the least. If the
+        lowest quality is larger than MOST_BYTES it is sent all the same.
 
         Args:
             camera: of the view.

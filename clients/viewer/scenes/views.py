@@ -51,7 +51,8 @@ FOV_RAD: Final = {
 
 
 def _way(yaw_deg: float, pitch_deg: float) -> Vector:
-    """Look along the beam, turned to its side (positive: from the right) and down.
+    """Compute the unit direction (x, y, z) of a look along the beam, turned to the side
+    (positive: from the right) and down.
 
     >>> _way(0.0, 0.0)
     (-0.0, 1.0, -0.0)
@@ -109,6 +110,8 @@ class Fitted:
         """Choose the camera for a pane: of those that hold all points, the one nearest to
         the middle.
 
+        The aspect is limited to `MIN_ASPECT` to `MAX_ASPECT`.
+
         Args:
             aspect: the pane's width over its height.
         """
@@ -122,7 +125,8 @@ class Fitted:
     def fits(self, camera: Standpoint, aspect: float) -> bool:
         """Check that a camera holds all points and wastes no room.
 
-        False as well if a point is behind it.
+        False as well if a point is behind it. Wasted is a largest extent below
+        `LEAST_REACH` of the picture.
 
         Args:
             camera: its present place.
@@ -154,10 +158,12 @@ def bounded(aspect: float) -> float:
 def presets(
     world: World, radius_mm: float, rim_mm: FloatArray | None = None
 ) -> dict[str, Fitted]:
-    """View -> the camera that it opens with, for all but the beam's eye.
+    """Compute the fitted views that the scene opens with: view -> `Fitted`, for all but
+    the beam's eye.
 
     "iso", "side" and "free" show tube, ball and panel whole; "sample" shows the cylinder
-    (or the ball).
+    (or the ball). The ball has at least 5 mm radius; the cylinder is that of `rim`.
+    Points are converted to [m].
 
     Args:
         world: the machine's pose.
@@ -185,7 +191,9 @@ def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArr
     """Compute points (n, 3) [mm] around the cylinder in which the sample turns; None
     without a sample.
 
-    At its lower and upper end, a polygon outside the circle.
+    At its lower and upper end, a polygon outside the circle. The cylinder is upright
+    through the rotation axis, from the lowest to the highest vertex; None for meshes
+    without vertices, too. The lower end's points come first.
 
     Args:
         world: pose of the sample.
@@ -215,6 +223,9 @@ def fitted(
     points: FloatArray, way: Vector, fov: float, around: FloatArray, aspect: float = WIDE
 ) -> Standpoint:
     """Find the nearest camera that looks along `way` and holds all points; up is +z.
+
+    The points fill at most `ROOM` of the picture; the camera looks at the point of its
+    line nearest to `around`.
 
     Args:
         points: (n, 3) [m].
@@ -246,7 +257,8 @@ def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
     """Compute the beam's eye of a geometry, and how a page crops it to the image alone.
 
     The eye is at the focal spot and looks at the foot of the perpendicular, unless that
-    needs too large a picture.
+    needs too large a picture. Too large is more than `MAX_SIZE_RATIO` times the image in
+    width or height. Up is the image's -v; distances of the camera are in [m].
 
     Args:
         world: geometry.

@@ -91,7 +91,11 @@ class World:
         return self.view.piercing_points().reshape(2)
 
     def pixel(self, column: float, row: float) -> FloatArray:
-        """Compute the centre of a pixel (column, row), in the world's frame, (3,) [mm]."""
+        """Compute the centre of a pixel (column, row), in the world's frame, (3,) [mm].
+
+        The first pixel is (0, 0), at the top left; parts of pixels and places outside the
+        image are allowed.
+        """
         rows, cols = self.shape
         across = column - (cols - 1) / 2
         down = row - (rows - 1) / 2
@@ -106,6 +110,8 @@ class World:
 def camera_of(machine: Machine, camera: CameraState) -> CameraSettings:
     """Convert the wire's camera settings to the twin's, with the detector modes of the
     machine.
+
+    Exposure is in ms; averages and frames are numbers of images.
     """
     return CameraSettings(
         camera.mode,
@@ -157,7 +163,9 @@ def placed(
     """Compute the geometry for motor positions.
 
     Returns view, source, panel, axis, stage and sample in the world's frame [mm], and how
-    far source and panel are shifted by the correction.
+    far source and panel are shifted by the correction. The nominal geometry comes from
+    `motor_poses`; the correction moves the axis by dO and tau, tilts and turns the stage,
+    and shifts source and panel. The sample's pose is the stage's times its offset.
 
     Args:
         machine, profile: the twin's.
@@ -194,6 +202,9 @@ def beads_on(
     cone_vec: Sequence[float], beads: FloatArray, world: World, shape: tuple[int, ...]
 ) -> list[list[float]]:
     """Project bead centres into an image of geometry `cone_vec` (object's frame).
+
+    Bead order is kept; beads outside the image, by more than half a pixel, are left out.
+    Pixel centres are whole numbers.
 
     Args:
         cone_vec: twelve numbers, with the correction in force.
