@@ -47,7 +47,8 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
 
     Usage errors exit with USAGE, limits and collisions with LIMIT, refusals and lost
     connections with REFUSED, the rest with INVALID; errors of the twin's wire as
-    `wire_code` has it.
+    `wire_code` has it. Connections that fail, time-outs and addresses in use count as
+    lost. A file's temporary name is replaced by the named one.
 
     Args:
         error: of any kind; one that is not expected is called a defect of flexdt.
@@ -101,7 +102,8 @@ def _usage(error: Exception) -> tuple[str, ...]:
     """Return the lines on a wrong use of the command line: the error, and where help is;
     the help page itself if no command was given.
 
-    For an unknown option that may be set elsewhere, this place is added.
+    For an unknown option that may be set elsewhere, this place is added. Two lines: the
+    command with the message, and "Try ... --help".
     """
     message = str(error.format_message())  # type: ignore[attr-defined]
     if message.startswith("Usage:"):  # no command was given: the message is the help page
@@ -123,6 +125,8 @@ def _usage(error: Exception) -> tuple[str, ...]:
 def _wire_error(error: RpcError) -> tuple[str, ...]:
     """Return the lines of a server's error reply: its message, the problems after the
     first (which the message states), and their positions in a script.
+
+    Lines begin with "flexdt: ", but for the positions.
     """
     lines = [error.message]
     if isinstance(
@@ -136,6 +140,9 @@ def _wire_error(error: RpcError) -> tuple[str, ...]:
 def wire_code(error: RpcError) -> int:
     """Determine the exit code of an error reply: of a rejected script that of its
     problems (errors only), else that of the error's kind; INVALID for an unknown one.
+
+    A rejected script is error -32005 with a list; without errors in it the code is
+    INVALID.
     """
     if error.code == -32005 and isinstance(error.data, Sequence):
         wrong = [p for p in error.data if p.get("severity", "error") == "error"]
@@ -147,7 +154,7 @@ def verdict(errors: Iterable[str]) -> int:
     """Determine the exit code of a script with errors of these codes: invalid wins
     over collision and limit.
 
-    No errors give 0.
+    No errors give 0. Collision and limit alone give LIMIT.
     """
     codes = set(errors)
     if codes - set(LIMIT_CODES):
@@ -164,6 +171,9 @@ def _named_file(file: object) -> str:
 def positions(data: object, file: str = "") -> list[str]:
     """List `file:line:column: severity: message` for the problems in an error's data;
     empty without any. Without a file it is "script".
+
+    Line 0 and column 0 are left out; problems without a line are skipped. `data` is a
+    list, or a mapping with `problems` or `errors`.
     """
     if isinstance(data, Mapping):
         data = data.get("problems", data.get("errors"))
@@ -183,7 +193,10 @@ def positions(data: object, file: str = "") -> list[str]:
 
 
 def _first_line(error: Exception) -> str:
-    """Return the first line of an error's message; its type's name if it has none."""
+    """Return the first line of an error's message; its type's name if it has none.
+
+    Blank lines before it are skipped.
+    """
     text = str(error).strip()
     if text:
         return text.splitlines()[0]

@@ -162,7 +162,8 @@ def own_first(
 ) -> tuple[list[str], list[str]]:
     """Split words of the command line into options of `flexdt` itself and the others.
 
-    A flag may have its value in the same word (`--name=value`) or in the next one.
+    A flag may have its value in the same word (`--name=value`) or in the next one. A
+    missing value of the last flag is not noticed here. Order is kept in both lists.
 
     Args:
         words: in order; after `--` none is an option.
@@ -192,8 +193,9 @@ class InSections(TyperGroup):
         """Parse the command line, with the options of `flexdt` itself that a command heeds put
         before its name.
 
-        Fails with a usage error for an option that the command does not heed, or one without a
-        value.
+        Fails with a usage error for an option that the command does not heed, or one
+        without a value. Unknown commands are left to typer. Returns the words that
+        remain.
         """
         command: Any = self
         for word in own_first(args, COMMON)[1]:
@@ -214,7 +216,8 @@ class InSections(TyperGroup):
         come last.
 
         Commands that no section names are the extensions'; names that are absent and
-        empty sections are left out.
+        empty sections are left out. A command in several sections is shown in each. The
+        text is cut to the formatter's width.
         """
         found = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
         named = {name for names in SECTIONS.values() for name in names}
@@ -234,7 +237,8 @@ class InSections(TyperGroup):
 def build(words: Sequence[str] | None = None) -> typer.Typer:
     """Build the command line with all its commands.
 
-    Returns an app of typer, not run yet.
+    Returns an app of typer, not run yet. Processes' commands pass unknown options on;
+    their own help is switched off where the process prints it.
 
     Args:
         words: of the command line, after the program's name. Of other distributions'
@@ -288,8 +292,12 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
 
 
 def found(name: str) -> Callable[..., Any] | None:
-    """Load the function of a command, a word or two, that an installed distribution
-    offers."""
+    """Load the function of a command that an installed distribution offers; None if none
+    does.
+
+    `name` is a word or two, e.g. "job watch". An extension that cannot be imported raises
+    its error.
+    """
     from flexdt.library.extras import offered
 
     function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
@@ -299,6 +307,8 @@ def found(name: str) -> Callable[..., Any] | None:
 def listed(name: str) -> Callable[..., None]:
     """Make the placeholder of a command whose extension is not installed: it takes any
     words, and raises the error that names the package to install.
+
+    The name must be in `KNOWN`, whose line is the placeholder's help.
     """
 
     def command(words: list[str] | None = argument(None, "...")) -> None:
@@ -315,7 +325,8 @@ def _add_others(
 ) -> None:
     """Add other distributions' commands, which take no name of ours.
 
-    One that is known but not installed gets a placeholder that tells how to install it.
+    One that is known but not installed gets a placeholder that tells how to install it. A
+    command that nobody knows is not added. All known ones are on the help page.
 
     Args:
         app: the command line.
@@ -352,6 +363,8 @@ def _add(
 ) -> None:
     """Add a command to `app`; its help page ends with the options of `flexdt` itself that
     it heeds, if any.
+
+    The function gets the list of these options as `heeds`.
     """
     complete, heeds = completed(command)
     complete.heeds = heeds  # type: ignore[attr-defined]
@@ -377,7 +390,8 @@ REMOVED_COMMANDS = ("backup", "restore")
 def run(argv: Sequence[str]) -> int:
     """Run one command line.
 
-    Ctrl-C, or an aborted prompt, gives INTERRUPTED.
+    Ctrl-C, or an aborted prompt, gives INTERRUPTED. Other errors are printed and give
+    their exit code, as `_run` has it.
 
     Args:
         argv: words after the program's name.
@@ -396,7 +410,9 @@ def _run(argv: Sequence[str]) -> int:
     """Run one command line as `run`; Ctrl-C is not handled here.
 
     Errors are printed by `describe`, with a traceback first if FLEXDT_TRACEBACK is set.
-    Removed commands give USAGE. A reader of our output that has gone is no error.
+    Removed commands give USAGE. A reader of our output that has gone is no error. A
+    request for completions, by the environment, prints these. Only typer's Abort and
+    KeyboardInterrupt are raised.
 
     Args:
         argv: words after the program's name.
@@ -441,7 +457,10 @@ def _run(argv: Sequence[str]) -> int:
 
 def _spread(argv: Sequence[str]) -> list[str]:
     """Split `--roi 'L T R B'` (or with commas) into the four words that `--roi L T R
-    B` has."""
+    B` has.
+
+    Only the word after --roi is split; all others stay.
+    """
     out: list[str] = []
     for word in argv:
         whole = out[-1:] == ["--roi"]

@@ -33,6 +33,9 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
     """Wrap a command for typer: fill its arguments from `flexdt`'s options, print its
     answers.
 
+    A command that takes `context` and is no generator is returned unchanged, with no
+    options. Options without help get that of the docstring.
+
     Args:
         command: function with `Args:` as help; a generator yields texts and a document.
 
@@ -56,6 +59,9 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
         """Run the command with the arguments that it takes from `flexdt` itself: check the keys
         of the settings file and that its output files can be written, and print its answers, as
         lines or (--json) as documents.
+
+        A generator's texts are printed without --json, its other values only with it.
+        `given` are the command's own options.
         """
         configuration()
         root = context.find_root().params
@@ -94,6 +100,8 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:
     """Return the parameter with the allowed words of its option (and None, if that is its
     default) as its type; unchanged if its option has no such list.
+
+    The list is made now, as the command line is built.
     """
     among = getattr(parameter.default, "among", None)
     if among is None:

@@ -39,7 +39,7 @@ def speak(quiet: bool, verbose: bool) -> None:
     """Set the amount of output on standard error in addition to warnings and errors.
 
     Neither changes nothing but the state of a former call; with both, `quiet` silences
-    slow steps.
+    slow steps. Only `verbose` makes libraries log, at the level INFO.
 
     Args:
         quiet: no progress.
@@ -59,7 +59,10 @@ def speak(quiet: bool, verbose: bool) -> None:
 
 def printable() -> None:
     """Set the terminal's streams to write unknown characters as escapes, without an
-    error."""
+    error.
+
+    Only streams of the text kind are changed, standard output and standard error.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -85,7 +88,8 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
     """Show on a terminal that a command works, until it prints something.
 
     Without a terminal on stderr, without words, or while the shell completes words
-    nothing is shown.
+    nothing is shown. The display is taken off by the first output, or at the end; the
+    help option is told by a leading minus.
 
     Args:
         words: of the command line; nothing is shown of help, completion, servers and
@@ -107,6 +111,8 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
 def say(text: str = "", end: str = "\n") -> None:
     """Print text (and `end`) to standard output at once; a closed pipe silences all later
     output.
+
+    It also ends the display of a silent command. Other errors of writing are raised.
     """
     _end_silence()
     try:
@@ -118,6 +124,8 @@ def say(text: str = "", end: str = "\n") -> None:
 def note(text: str) -> None:
     """Write a line of progress or a warning to standard error at once; a closed pipe
     silences all later lines.
+
+    It also ends the display of a silent command.
     """
     _end_silence()
     try:
@@ -127,7 +135,10 @@ def note(text: str) -> None:
 
 
 def warn(texts: Iterable[str], about: object = None) -> None:
-    """Write warnings to standard error, each after its subject."""
+    """Write warnings to standard error, each after its subject.
+
+    `about` is the subject, e.g. a file; None leaves it out. No texts, no output.
+    """
     for text in texts:
         note(f"warning: {text}" if about is None else f"{about}: warning: {text}")
 
@@ -140,6 +151,8 @@ def emit(document: object) -> None:
 def as_json(document: object) -> str:
     """Convert a document to indented JSON; numbers that are not finite become null,
     arrays lists, and unknown objects text.
+
+    Keys are field names, not aliases; the text has no final line end.
     """
     from pydantic_core import to_jsonable_python
 
@@ -158,7 +171,9 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
     """Format rows and their header as text columns, padded to the widest cell; numbers
     are formatted by the caller.
 
-    Empty rows are skipped; returns "" without any row.
+    Empty rows are skipped; returns "" without any row. Columns are two blanks apart,
+    left-aligned, without blanks at line ends; all rows must have as many cells as the
+    first. Cells are converted by str.
     """
     every = [[str(cell) for cell in row] for row in (header, *rows) if row]
     if not every:
@@ -176,6 +191,9 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:
 def duration(seconds: float) -> str:
     """Format a time span [s] for people: 3.2 s, 4 min 05 s, 2 h 03 min; "unknown" if not
     finite.
+
+    From 60 s on in whole seconds, from an hour on in whole minutes. Negative times are
+    formatted as seconds.
     """
     if not math.isfinite(seconds):
         return "unknown"
@@ -189,7 +207,10 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Format a number of bytes for people, in units of 1000 up to TB: 12 B, 1.2 GB."""
+    """Format a number of bytes for people, in units of 1000 up to TB: 12 B, 1.2 GB.
+
+    Bytes are whole, other units have one decimal; larger sizes stay in TB.
+    """
     for unit in ("B", "kB", "MB", "GB"):
         if abs(count) < 1000:
             if unit == "B":
@@ -222,7 +243,8 @@ class ProgressBar:
     ) -> None:
         """Prepare a bar, which nothing draws yet.
 
-        None for `terminal` finds that out.
+        None for `terminal` finds that out. Entering draws it; elapsed time counts from
+        now on.
 
         Args:
             title: of the work.
@@ -272,6 +294,8 @@ class ProgressBar:
         PLAIN_INTERVAL_S.
 
         As a line: never in quiet mode, and not if neither `done` nor `total` has changed.
+        In the bar `done` and `total` replace the former ones. A total that is None or 0
+        gives neither share nor time left.
 
         Args:
             done: units.
@@ -297,7 +321,8 @@ class ProgressBar:
         time left.
 
         Without a total only what is done; amounts that are not whole are left out; no
-        estimate at the beginning and end.
+        estimate at the beginning and end. `elapsed` is the time so far [s]; the time left
+        assumes a constant rate.
         """
         if not total:
             return f"{text}: {done:g} {self._unit}"

@@ -51,7 +51,8 @@ def leave(*_: object) -> None:
     """End the process at once with a line on standard error and the exit code of an interrupt;
     printed lines stay.
 
-    Arguments (of a signal handler) are ignored.
+    Arguments (of a signal handler) are ignored. It does not return; exit functions are
+    not called.
     """
     try:
         os.write(2, LINE)
@@ -62,6 +63,8 @@ def leave(*_: object) -> None:
 def _interrupt(number: int, frame: object) -> None:
     """Handle SIGINT in the main thread: count it, and raise KeyboardInterrupt; end the process
     during an import, which must not be interrupted.
+
+    An import is in progress if any frame of the stack is of `IMPORT_FILE`.
     """
     global _heard
     _heard += 1
@@ -73,8 +76,10 @@ def _interrupt(number: int, frame: object) -> None:
 
 
 def _watch() -> None:
-    """Start a daemon thread that ends the process where the main thread does not react to
-    a signal; changes the process's wake-up descriptor.
+    """Start a daemon thread that ends the process if the main thread does not react to
+    SIGINT.
+
+    Signals reach it through a pipe that is set as the process's wake-up descriptor.
     """
     import threading
 
@@ -91,7 +96,8 @@ def _end_if_stuck(arrivals: int) -> None:
     it has.
 
     Never returns. After SIGINT the main thread has STUCK_S to react; the thread that
-    watches for silence is started once.
+    watches for silence is started once. A handled signal within that time ends nothing;
+    other signals are ignored.
 
     Args:
         arrivals: descriptor that gives the number of each signal, 0 for the beginning of
@@ -117,6 +123,8 @@ def _end_if_silent() -> None:
     """End the process once it has used almost no processor time for `SILENCE_S` seconds.
 
     With FLEXDT_TRACEBACK in the environment, dumps the stacks of all threads first.
+    Almost none is less than `MIN_WORKING_SHARE` of the time, measured every `CHECK_S`
+    seconds. It ends by `leave`, with exit code 130.
     """
     import time
 
@@ -142,7 +150,9 @@ def _wanted_s() -> float:
     processor, or have waited for one or for a disk [s]; without /proc only those of this
     process, and only while they had one.
 
-    Waiting counts as work: a busy machine gives a process less, and never ends it.
+    Waiting counts as work: a busy machine gives a process less, and never ends it. The
+    figure grows from call to call only as a difference; a thread waiting for a disk adds
+    the present time.
     """
     import time
 
@@ -159,7 +169,11 @@ def _wanted_s() -> float:
 
 
 def _family() -> list[str]:
-    """List the process ids of this process and all its descendants, read from /proc."""
+    """List the process ids of this process and all its descendants, read from /proc.
+
+    This process is first; processes that end meanwhile may be missing. Raises
+    FileNotFoundError without /proc.
+    """
     parents = {}
     for entry in _entries("/proc"):
         pid = entry.rpartition("/")[2]
@@ -175,6 +189,8 @@ def _family() -> list[str]:
 def _entries(folder: str) -> list[str]:
     """List the paths in a folder; empty if it is missing, as of a process that has ended,
     except for /proc itself (raises).
+
+    Paths are complete, in no order.
     """
     try:
         return [f"{folder}/{name}" for name in os.listdir(folder)]
@@ -185,7 +201,10 @@ def _entries(folder: str) -> list[str]:
 
 
 def _text(file: str) -> str:
-    """Read a small text file; "" if it is missing or its process has ended."""
+    """Read a small text file; "" if it is missing or its process has ended.
+
+    Other errors of reading are raised; other characters than ASCII are replaced.
+    """
     try:
         with open(file, encoding="ascii", errors="replace") as opened:
             return opened.read()
@@ -194,7 +213,10 @@ def _text(file: str) -> str:
 
 
 def _not_lost(unraisable: object) -> None:
-    """End the process at a KeyboardInterrupt that no code gets, as in a finaliser."""
+    """End the process at a KeyboardInterrupt that no code gets, as in a finaliser.
+
+    Other exceptions are reported by Python's own hook.
+    """
     if unraisable.exc_type is KeyboardInterrupt:  # type: ignore[attr-defined]
         leave()
     sys.__unraisablehook__(unraisable)  # type: ignore[arg-type]
@@ -204,7 +226,9 @@ def main() -> None:
     """Run the command line of this process; an interrupt ends it without a traceback,
     even while it is stuck.
 
-    Where interrupts are ignored (as after a shell's `&`), they stay ignored.
+    Where interrupts are ignored (as after a shell's `&`), they stay ignored. Never
+    returns after an interrupt: exit code 130, after a line on standard error. During its
+    last part a further signal ends the process at once.
     """
     if (
         signal.getsignal(signal.SIGINT) != signal.default_int_handler
@@ -237,6 +261,7 @@ def _end_without_teardown() -> None:
     objects.
 
     An interruption in the compiler leaves objects half made, and freeing them can crash.
+    Output is flushed; it does not return.
     """
     import atexit
 

@@ -19,6 +19,8 @@ from flexdt.library.failure import CommandError
 def number(word: str, what: str) -> float:
     """Read a finite number, negative ones and exponents included.
 
+    `what` names the value in the error.
+
     Raises:
         typer.BadParameter: not a finite number.
     """
@@ -34,7 +36,8 @@ def number(word: str, what: str) -> float:
 def assignments(words: Iterable[str]) -> dict[str, float]:
     """Read AXIS=VALUE words as axis -> value, in order.
 
-    Values are numbers, of any unit.
+    Values are numbers, of any unit. Blanks around the axis are dropped. No words give {}.
+    Also raised for a value that is no finite number.
 
     Raises:
         typer.BadParameter: a word of another form, or an axis given twice.
@@ -56,6 +59,9 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
 def span(word: str, what: str) -> tuple[float, float]:
     """Read LOWER:UPPER, or one number for both.
 
+    `what` names the value in the error. Returns (lower, upper), equal ones for one
+    number.
+
     Raises:
         typer.BadParameter: neither, or the lower is above the upper.
 
@@ -73,6 +79,9 @@ def numbers(
     word: str, what: str, form: str, *counts: int, by: str = ",", whole: bool = False
 ) -> list[float]:
     """Read a list of finite numbers.
+
+    Blanks around parts are dropped, and letters are read in any case. Returns the list,
+    also of whole numbers as float.
 
     Args:
         word: from the command line.
@@ -102,6 +111,8 @@ def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
 def position(word: str) -> tuple[float, float]:
     """Read SOD[:LATERAL] as (SOD, lateral) [mm]; lateral is 0 if left out.
 
+    Also raised for numbers that are not finite.
+
     Raises:
         typer.BadParameter: not numbers.
     """
@@ -120,6 +131,8 @@ def names(word: str) -> tuple[str, ...]:
 def require_ending(file: Path, *allowed: str) -> None:
     """Check a file's ending.
 
+    `allowed` are endings with their dot, lower case; the file's may be of any case.
+
     Raises:
         typer.BadParameter: another one.
     """
@@ -131,6 +144,9 @@ def require_ending(file: Path, *allowed: str) -> None:
 
 def require_folder(*files: Path | None) -> None:
     """Check that files can be written where they are to be.
+
+    Only the parent folder is looked at; files that are None are skipped. The first
+    failing file raises.
 
     Raises:
         CommandError: a folder does not exist.

@@ -111,8 +111,7 @@ def option(
     written: bool = False,
     **details: Any,
 ) -> Any:
-    """Make the default of a command's parameter that the command line offers as an
-    option.
+    """Make the default of a command's parameter that is an option of the command line.
 
     Args:
         default: where the option is left out; `...` for one that must be given.
@@ -125,6 +124,10 @@ def option(
         proposes: gives the values that a shell completes, see `value_completion`.
         written: it is a path that the command writes to; it is tried before the command begins.
         details: of `typer.Option`, such as metavar, min and max.
+
+    Returns:
+        typer's option, with `among` and `written` as attributes; nothing is called or
+        checked now.
     """
     flags = [word for word in words if word.startswith("-")]
     help = next((word for word in words if not word.startswith("-")), None)
@@ -144,6 +147,9 @@ def argument(
         metavar: the word in the help.
         help: one line; default: that of the command's docstring.
         proposes: gives the values that a shell completes, see `value_completion`.
+
+    Returns:
+        typer's argument; an empty help becomes None.
     """
     return typer.Argument(
         default, metavar=metavar, help=help or None, autocompletion=proposes

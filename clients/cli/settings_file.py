@@ -98,6 +98,8 @@ KEYS: Final = {
 def config_file(environ: Mapping[str, str]) -> Path:
     """Return the path of the configuration file, which need not exist: that named in the
     environment, else flexdt/config.toml in XDG_CONFIG_HOME or ~/.config.
+
+    FLEXDT_CONFIG names it; ~ is expanded. An empty variable counts as not set.
     """
     named = environ.get(f"{PREFIX}CONFIG")
     if named:
@@ -114,7 +116,9 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
     """Read the defaults in force.
 
     The environment's values replace the file's; token and token file replace each other,
-    but both together in one place are an error. Empty values count as not given.
+    but both together in one place are an error. Empty values count as not given. A
+    missing file counts as empty unless FLEXDT_CONFIG names it. Values that are paths have
+    ~ expanded; the tables stay unread but for their keys.
 
     Args:
         environ: the environment; this process's if left out.
@@ -149,7 +153,8 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
 def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     """Read the configuration file and check its keys and plain values.
 
-    A table without a dictionary as its value counts as a plain key.
+    A table without a dictionary as its value counts as a plain key. The values of tables
+    are not checked here.
 
     Args:
         path: of the TOML file.
@@ -193,7 +198,7 @@ def _require_known(
 ) -> None:
     """Check the keys of a table, or those outside all tables.
 
-    The first unknown key raises.
+    The first unknown key raises. The error also suggests a similar key.
 
     Args:
         where: beginning of the message.
@@ -216,6 +221,8 @@ def _require_known(
 def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
     """Read a table of the file as settings; None if `more` requests the help, which is
     shown.
+
+    The words come last. The data directory is that of the file only for `up` and `twin`.
 
     Args:
         kind: of a process or command.
@@ -252,7 +259,10 @@ def _problem(error: Any) -> str:
 
 def chosen(kind: type[S]) -> S:
     """Read the settings of a command from its table of the file; errors as
-    `settings_of`."""
+    `settings_of`.
+
+    Never None.
+    """
     found = settings_of(kind)
     assert found is not None
     return found
@@ -262,7 +272,9 @@ def home_of(command: str, flag: str) -> str | None:
     """Return the place in the file of a former option `flag`; None if the file has no
     such key.
 
-    The words are "`key` in [table] of FILE"; the table is that of the command.
+    The words are "`key` in [table] of FILE"; the table is that of the command. `command`
+    is the whole path, e.g. "flexdt twin"; `flag` may begin with dashes. The file need not
+    exist.
     """
     name = "_".join(command.split()[1:])
     table = SHARED_TABLES.get(name, name)

@@ -19,7 +19,9 @@ DEFAULT_SERVER: Final = str(Address(LOOPBACK, TWIN_PORT))
 def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
     """Connect to a twin and return the client, to be used as a context manager.
 
-    Arguments that are None come from the user's configuration, see `configuration`.
+    Arguments that are None come from the user's configuration, see `configuration`. A
+    token file given here or configured comes before a token. With certificates configured
+    it connects by TLS. It blocks until the twin has answered.
 
     Args:
         server: HOST:PORT, see `server_address`; 127.0.0.1:55000 if nothing is configured.
@@ -51,6 +53,8 @@ def connect(server: str | None = None, token_file: str | None = None) -> TwinCli
 def server_address(word: str) -> tuple[str, int]:
     """Read HOST:PORT, HOST, :PORT or [IPV6]:PORT as (host, port); the default port is
     55000.
+
+    HOST is 127.0.0.1 if left out; an IPv6 address without a port needs no brackets.
 
     Raises:
         typer.BadParameter: no such form, or a port outside 1 to 65535.
