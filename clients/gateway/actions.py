@@ -98,7 +98,11 @@ def setting(
     async def send(
         twin: ConnectedTwin, command: c.Command, progress: CommandProgress
     ) -> str:
-        """Raises Refusal if the twin rejects it; moves under way keep their own rate."""
+        """Send the command to the twin; moves under way keep their own rate.
+
+        Raises:
+            Refusal: the twin rejects it.
+        """
         await twin.ask(method, params(command))
         return reply(command)
 
