@@ -174,7 +174,7 @@ class Core:
     def follow(self, listener: Listener, params: Mapping[str, object]) -> None:
         """Have `listener` subscribed with these params whenever a connection is made.
 
-        A second call for the same listener replaces its params. Compared are the rate,
+        The listener's own earlier parameters count as such, too. Compared are the rate,
         and for projections kind and binning.
 
         Raises:
