@@ -98,10 +98,8 @@ def setting(
     async def send(
         twin: ConnectedTwin, command: c.Command, progress: CommandProgress
     ) -> str:
-        """Send the command to the twin; moves under way keep their own rate.
-
-        Raises:
-            Refusal: the twin rejects it.
+        """Send the command's parameters to the twin and return the reply; raises Refusal
+        if the twin rejects them.
         """
         await twin.ask(method, params(command))
         return reply(command)
@@ -301,6 +299,7 @@ def rate_setting(what: Rate, digits: int) -> Action:
 
         A value that the machine would clamp is lowered first to the slowest motor's share
         of it. Without a machine, or on an axis it lacks, the value is sent as it is.
+        Raises Refusal if the twin rejects it; moves under way keep their own rate.
         """
         axis = command.component
         machine = twin.machine

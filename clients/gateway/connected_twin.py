@@ -125,8 +125,7 @@ class ConnectedTwin:
         """Return the newest status of each job whose progress is to be sent; drop ended
         ones.
 
-        Jobs that have ended are returned this once; in no particular order but that of
-        their first status.
+        Jobs that have ended are returned this once; the order is that of their first status.
 
         Args:
             state: of the twin; its job is added.

@@ -81,7 +81,7 @@ class Gateway:
 
         Raises too if `host` is not an address of this machine alone. `run` serves. The
         neighbouring port is used if `inbound` is None. After an error nothing stays open.
-        It needs a running event loop only in `run`.
+
 
         Args:
             twin: connection and state.

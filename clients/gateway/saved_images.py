@@ -147,8 +147,7 @@ class Recording:
     def adopt(self, folder: Path, state: State) -> int:
         """Add the projections of a data set that the twin made.
 
-        Files are linked or copied under their own names; frames missing in the folder are
-        copied from the data set's other storage. Blocks begin at the time of `state`
+        Files are linked or copied under their own names; frames that are no file of the folder are copied. Blocks begin at the time of `state`
         minus the set's duration; the texts are rewritten. A document without frames adds
         none.
 
