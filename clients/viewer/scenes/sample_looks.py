@@ -225,7 +225,7 @@ async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
     large.
 
     `ask` sends a request to the twin. None too if there is no mesh, and for every error
-    of the twin. Raises nothing else.
+    of the twin.
 
     Raises:
         ConnectionLost: the twin has gone.
