@@ -82,6 +82,11 @@ def calibrate(
         scale: Set the distance of two unknown markers.
         radius: Look for bead spots of this radius.
         start: Begin at these offsets (mm, deg).
+
+    Yields:
+        The report as document of --json, then its lines (`show`); problems go to standard
+        error. Raises CommandError with NOT_IDENTIFIABLE, and usage errors before images
+        are read. With --push the twin has to answer before the work begins.
     """
     if report is not None:
         option_values.require_ending(report, ".html", ".json")
@@ -149,7 +154,10 @@ def _read_assignments(given: list[str] | None) -> dict[str, float]:
 
 
 def _require_phantom(phantom: str | None) -> str:
-    """Return the named phantom; none is a usage error that lists those that ship."""
+    """Return the named phantom; none is a usage error that lists those that ship.
+
+    Whether it exists is not checked here.
+    """
     if phantom is None:
         from flexdt.phantoms import phantom_names
 
@@ -168,6 +176,9 @@ def _load_inputs(
 ) -> list[DataSet]:
     """Load the data sets, any scanner's frames, or the geometry of markers without
     images.
+
+    Frames come before markers if both are given. Markers alone give one data set without
+    images, named by their file.
 
     Args:
         folders: data sets; none needs `frames` or `markers`.
@@ -207,7 +218,8 @@ def _load_inputs(
 def _load_data_sets(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
     """Load the data sets, each with its own geometry or the one of a file.
 
-    No geometries (None or an empty list): each data set keeps its own.
+    No geometries (None or an empty list): each data set keeps its own. Order is that of
+    the folders.
 
     Args:
         folders: of the data sets.
@@ -248,6 +260,11 @@ def align(
     Args:
         out: Write the report, for flexdt reconstruct --correction.
         per_frame: Find shifts of single frames (jitter) too.
+
+    Yields:
+        The report as document of --json, then tables and lines; warnings go to standard
+        error. Raises CommandError with NOT_IDENTIFIABLE if the axis column cannot be
+        told; --out has to end with .json.
     """
     if out is not None:
         option_values.require_ending(out, ".json")
@@ -295,6 +312,10 @@ def compare(
         phantom: Compare with this phantom, the one that was scanned.
         tolerance: Exit with 1 where the beads' rms is above this.
         out: Write a report and difference images to this folder.
+
+    Yields:
+        The document of --json, then a table of residuals before and after. Raises
+        CommandError above the tolerance, after the files are written.
     """
     from flexdt.library.comparison import compare_folder, rows_of, write_comparison
     from flexdt.library.figures import require_plots
@@ -329,6 +350,8 @@ def _push(
 ) -> None:
     """Put a correction in force on the twin, with a note on standard error.
 
+    A motion is not put in force, and warned of.
+
     Args:
         twin: connects to it.
         correction: name and offsets.
@@ -344,6 +367,8 @@ def _push(
 
 def push_correction(client: TwinClient, correction: NamedCorrection, source: str) -> None:
     """Put a correction in force on the twin: the parameters that differ from the nominal ones.
+
+    Values are in the wire's units [mm, deg]; nominal offsets give an empty correction.
 
     Args:
         client: of the twin.
@@ -365,7 +390,7 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield a calibration's document as text: its use first, then images and offsets.
 
     Without a fit only the verdict, next steps and what was seen are shown; without a
-    scale no markers.
+    scale no markers. Offsets are shown only if identifiable.
 
     Args:
         document: of a calibration report.
@@ -424,8 +449,8 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def motions(document: Mapping[str, Any]) -> Iterator[str]:
-    """Return the phantom's name or file; None is a usage error that lists the phantoms
-    that ship.
+    """Yield a line for each parameter that may have moved in each scan of a report: its
+    range, unit and mean sigma, or that no motion was found; nothing without a motion.
     """
     for moved in document.get("motion", ()):
         for name, told in moved.items():
@@ -443,7 +468,10 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
 
 def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Make rows of text of the parameters: name, value, sigma, its part from the
-    images, unit. Parameters estimated by their prior alone come last, in brackets."""
+    images, unit. Parameters estimated by their prior alone come last, in brackets.
+
+    Otherwise they are in the report's order; numbers have the digits that sigma leaves.
+    """
     return [
         (
             name if p["asked"] else f"({name})",

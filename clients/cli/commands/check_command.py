@@ -44,6 +44,11 @@ def check(
         sample: Check truncation, collisions and exposure of this sample.
         html: Write the report to this file as one page.
         against: Compare with the log of this script, line by line.
+
+    Yields:
+        The report as document of --json, then its tables as lines; problems go to
+        standard error, without --json only. With --against, those of `compare`. Ends by
+        typer.Exit.
     """
     if against is not None:
         yield from compare(script, against, machine, html)
@@ -79,6 +84,9 @@ def check(
 def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> Answer:
     """Compare each line of an executed script with its prediction, the greatest errors
     first.
+
+    Problems of the log are written to standard error. A script that is a log itself is
+    not compared line by line. `against` replaces plan and check.
 
     Args:
         script: file of the script, or the log itself.
@@ -120,7 +128,8 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
 def show(report: CheckReport, file: str) -> Answer:
     """Yield the plan and the figures of a check.
 
-    Yields the table of steps, if any, the summary, and "ok" or "not ok".
+    Yields the table of steps, if any, the summary, and "ok" or "not ok". Times are in
+    [s]; a cell without an assumed time is empty.
 
     Args:
         report: of the check.

@@ -80,6 +80,12 @@ def reconstruct(
         png: Write three slices beside the volume.
         preview: Make a quick, coarse FDK volume, and PNG slices.
         slurm: Submit workers to SLURM as this file says.
+
+    Yields:
+        The document of --json (shape, voxel, frames, accuracy, warnings, seconds), then
+        lines: file and size, accuracy if known, files of slices. Warnings and missing
+        frames are written to standard error. Raises typer.BadParameter for options that
+        exclude each other.
     """
     own = {
         "algorithm": None if algorithm == DEFAULT else algorithm,
@@ -187,7 +193,8 @@ def _check_together(
 
     Checked: preview, the ending of `out`, kV, options that the algorithm lacks, SLURM
     with a scheduler, workers for FDK only, and correction with a geometry. The first
-    wrong one is raised.
+    wrong one is raised. Returns nothing; `out` names the wrong ending, all others their
+    option.
 
     Args:
         given: options by name.
@@ -246,7 +253,8 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
     """Read the chosen correction, and the report that it comes from.
 
     None as `named` gives (None, None); "none", or a twin without a calibration in force,
-    gives zero offsets without report; a file gives its offsets and its report.
+    gives zero offsets without report; a file gives its offsets and its report. The twin
+    is asked only for "twin", and gives no report.
 
     Args:
         named: a report's file, "twin" or "none"; None for the scan's own.
@@ -277,6 +285,9 @@ def scan_of(
 ) -> DataSet:
     """Load the data set, with the motion and the panel of a report, or the geometry of a
     file.
+
+    A report's panel becomes the data set's correction, its motion is applied if it is of
+    this data set. A geometry replaces the data set's own first.
 
     Args:
         folder: of the data set.
@@ -315,6 +326,8 @@ def _workers(
     scheduler: str | None, slurm: Path | None
 ) -> AbstractContextManager[Executor] | None:
     """Make the workers for --scheduler or --slurm; None without either.
+
+    `scheduler` is an address, `slurm` a file; with both the scheduler counts.
 
     Raises:
         TwinError: flexdt-extensions is not installed.
@@ -359,7 +372,9 @@ class Report:
 def read_report(path: Path) -> Report:
     """Read a report of `flexdt calibrate`, or a plain object of parameters.
 
-    A report's correction is its "correction". An empty one counts as none.
+    A report's correction is its "correction". An empty one counts as none. Values are
+    converted from the wire's units. Unknown parameter names raise TwinError. True and
+    false count as no numbers.
 
     Args:
         path: of a JSON file.
@@ -391,7 +406,9 @@ def apply_motion(data: DataSet, report: Report) -> DataSet:
     """Apply the motion that a report of `flexdt calibrate --per-frame` has for the data
     set.
 
-    Returned as it is without a motion, and if nothing moves.
+    Returned as it is without a motion, and if nothing moves. A report lists one motion
+    for each of its data sets, told apart by their folders; exactly one must be of this
+    one.
 
     Args:
         data: the data set; a motion of another one is left out with a warning.
@@ -454,6 +471,10 @@ def export(
         correction: Apply the correction of this calibration report instead.
         unknown: State, for CTSimU, what reconstruction does not know (TOML).
         rows: Count rows down or up; up: for images turned upside down.
+
+    Yields:
+        The document of --json (format, file, views, shape, corrected, rows), then one
+        line. Warnings go to standard error; --correction with --nominal is a usage error.
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
@@ -522,6 +543,10 @@ def import_(
         views: Set the number of projections (flexDATA).
         rows: Count rows down or up; up: v is negated.
         real: Take, of a CTSimU file, what is so, or what reconstruction knows.
+
+    Yields:
+        The document of --json (format, file, out, views, shape, pixel_mm, notes), then
+        one line; notes go to standard error.
     """
     given = geometry_options(like, shape, pixel, views)
     from dataclasses import replace
@@ -556,6 +581,9 @@ def geometry_options(
     like: Path | None, shape: str | None, pixel: str | None, views: int | None = None
 ) -> Given:
     """Read the options that complete a geometry's file.
+
+    Values that no option gives are the data set's, else None. One pitch is both of
+    columns and rows.
 
     Args:
         like: data set to take values from; the other options override it.

@@ -72,10 +72,17 @@ def demo(
         out: Write everything to this folder.
         no_viewer: Exit when the work is done, without a viewer.
         truth: Hide this misalignment, not a random one.
+
+    Yields:
+        The document of `demo.json`, once all is done; lines of progress are printed, with
+        --json to standard error.
     """
 
     def stay(url: str) -> None:
-        """Print the lab's address, and wait until Ctrl-C; returns then."""
+        """Print the lab's address, and wait until Ctrl-C; returns then.
+
+        It never returns otherwise.
+        """
         note(f"the lab is at {url}; Ctrl-C ends the demonstration")
         try:
             while True:
@@ -95,7 +102,8 @@ def run_demo(
     """Run all stages.
 
     The servers run meanwhile; kernels compile at the same time. `demo.json` and the
-    calibration are written into `out`.
+    calibration are written into `out`. A drawn misalignment is kept outside `out` and
+    deleted at the end. `out/data` holds the scan; servers end in any case.
 
     Args:
         out: folder for all files, made if need be.
@@ -142,6 +150,8 @@ def run_demo(
 def _drawn_truth() -> Iterator[Path]:
     """Write a random hidden misalignment to a temporary file outside the folder of the
     results; deleted at the end.
+
+    Yields the path of the TOML file.
     """
     with tempfile.TemporaryDirectory(prefix="flexdt-truth-") as secret:
         path = Path(secret) / "truth.toml"
@@ -154,6 +164,9 @@ def _running_servers(
     options: Mapping[str, object], out: Path, tell: Tell, *, viewer: bool
 ) -> Iterator[Servers]:
     """Start servers on free ports and print their addresses; end them on leaving.
+
+    Yields them, running. A failed start raises ServersError. The log is `servers.log` in
+    `out`.
 
     Args:
         options: of the servers.
@@ -183,6 +196,9 @@ def _main_job(
     tell: Tell,
 ) -> dict[str, Any]:
     """Scan, calibrate, put the correction in force and preview.
+
+    Only the hidden truth is compared, after the correction is in force. Preview and
+    picture are written into `out`.
 
     Args:
         client: connected to the twin.
@@ -221,7 +237,9 @@ def _scan(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
     """Run the example script on the twin and read the data set back with the ordinary
     reader.
 
-    Its name has the date and time; the twin's clock runs as fast as possible.
+    Its name has the date and time; the twin's clock runs as fast as possible. It puts the
+    example's sample on the stage first. Warnings are printed; a pause by an error ends
+    the wait.
 
     Args:
         client: connected to the twin.
@@ -268,6 +286,7 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     """Calibrate from the data set alone.
 
     The phantom is the example's; the progress line has the time, beads seen and rms.
+    Returns the outcome, identifiable; its problems are in the error.
 
     Args:
         dataset: of the example scan.
@@ -314,8 +333,9 @@ def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
     """Draw the first radiograph and the middle layer of a volume side by side, equally
     high, each with a title and a scale.
 
-    The radiograph is dark where the sample is dense, as one of `flexdt snap`; the layer is
-    bright there.
+    The radiograph is dark where the sample is dense, as one of `flexdt snap`; the layer
+    is bright there. Both are `PICTURE_ROWS` rows high, by nearest pixels, with a white
+    gap of `PICTURE_GAP` columns.
 
     Args:
         dataset: of the radiograph.
@@ -357,7 +377,7 @@ def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
 
 
 def _scaled_to(image: npt.NDArray[Any], rows: int = PICTURE_ROWS) -> npt.NDArray[Any]:
-    """Return an image at `rows` rows, by its nearest pixels."""
+    """Resize an image (rows, cols) to `rows` rows in proportion, by its nearest pixels."""
     import numpy as np
 
     places = (np.arange(rows) * image.shape[0]) // rows
@@ -369,7 +389,8 @@ def _scaled_to(image: npt.NDArray[Any], rows: int = PICTURE_ROWS) -> npt.NDArray
 def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
     """Print the verdict, the files and the next commands.
 
-    The next commands are to reconstruct and to open the lab; all paths are quoted.
+    The next commands are to reconstruct and to open the lab; all paths are quoted. The
+    program's name is `PROGRAM` if it is on the path, else that of this process.
 
     Args:
         document: of the demonstration.
@@ -402,7 +423,8 @@ def _compare_with_truth(
     """Compare the calibration with the hidden truth; a miss is called a miss.
 
     A table is printed, then one line that says inside or miss. A parameter that the truth
-    lacks counts as 0 (angle_scale as 1).
+    lacks counts as 0 (angle_scale as 1). Only the calibration's parameters are in the
+    table.
 
     Args:
         outcome: of the calibration.

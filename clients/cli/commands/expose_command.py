@@ -55,6 +55,11 @@ def expose(
         sod: Set the distance from source to axis; default: as `flexdt script new` sets it.
         sdd: Set the distance from source to panel; default: likewise.
         detail: See this detail; void:MM for less of the sample.
+
+    Yields:
+        The forecast (or, of a data set, the measured exposure) as document of --json,
+        then its lines. Assumptions and warnings go to standard error. With a data set all
+        other options are ignored.
     """
     from flexdt.library import expose as of
     from flexdt.library.reading.folders import load_dataset
@@ -91,6 +96,8 @@ def expose(
 def _transmission_lines(found: Forecast | Measured) -> Answer:
     """Yield two lines: transmission (least and percentiles), and saturated ("unknown" if
     None) and starved pixels [%].
+
+    Transmission is a share from 0 to 1.
     """
     seen: Transmission = found.transmission
     yield (
@@ -107,7 +114,9 @@ def _transmission_lines(found: Forecast | Measured) -> Answer:
 def _forecast_lines(forecast: Forecast) -> Answer:
     """Yield the forecast as text: counts, contrast, dose and the best settings.
 
-    Shows the first `SHOWN_SETTINGS` of the best settings.
+    Shows the first `SHOWN_SETTINGS` of the best settings. A detail without contrast is
+    "not seen": its pixels are saturated. Settings are in the forecast's order; kerma is
+    in mGy.
 
     Args:
         forecast: of the exposure.

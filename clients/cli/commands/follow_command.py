@@ -53,6 +53,11 @@ def follow(
         frames: Compare images that appear here.
         out: Write beside.png and beside.json of --frames here.
         seconds: End after this time.
+
+    Yields:
+        The state of the mirror at the end as document of --json. Alarms are printed as
+        they come, without --json; counts of alarms and unread messages at the end go to
+        standard error. Exactly one of address and --replay, else a usage error.
     """
     from flexdt.clients.following.frames_beside import FramesBeside
     from flexdt.clients.following.recording import STAMP
@@ -126,6 +131,8 @@ def _follower(
 ) -> Follower:
     """Build the follower of a machine, with its profile, script and sample.
 
+    Sizes and collisions are those of the sample's phantom, or of an empty stage.
+
     Args:
         machine: name or file; None for the default.
         profile: name or file of the zero offsets; None for the machine's own.
@@ -159,6 +166,9 @@ async def _run(
 ) -> None:
     """Follow the scanner for some seconds (None: without end), or until it ends, with a
     status line and images from `beside`; raises the session's error, if it has one.
+
+    After the time all tasks are cancelled, without an error. Errors of the status line
+    and of images are dropped.
     """
     work = asyncio.create_task(session.run(address))
     more = [asyncio.create_task(_status(session))]
@@ -175,6 +185,8 @@ async def _run(
 async def _status(session: FollowSession) -> None:
     """Print every `STATUS_S` seconds, until cancelled: connection, age of the last
     message, commands under way, number of alarms, and what is unread.
+
+    It goes to standard error.
     """
     while True:
         await asyncio.sleep(STATUS_S)

@@ -51,6 +51,11 @@ def run(
         sample: Put this sample on the stage first.
         speed_up: Let the twin's time run X times as fast as yours.
         detach: Return once the script is submitted.
+
+    Yields:
+        With --detach the submitted job as document and line; else the job's last status,
+        both ways. Raises CommandError for a refused script (its places are printed first)
+        and for a job that did not end as done.
     """
     from flexdt.protocol.rpc_errors import RpcError
 
@@ -94,7 +99,8 @@ def failure_code(status: JobStatus) -> int:
 def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     """Show a job's progress until it ends.
 
-    A paused job of another client is waited for, and the reason printed.
+    A paused job of another client is waited for, and the reason printed. Progress is a
+    bar on standard error. Only an own job raises for a pause.
 
     Returns:
         Its last status.
@@ -113,7 +119,8 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     def show(status: JobStatus) -> None:
         """Update the progress bar, and report why a job is paused.
 
-        A reason is shown once; only an own job raises.
+        A reason is shown once; only an own job raises. In any state but running the bar's
+        text names it.
 
         Raises:
             CommandError: the job is paused, and nobody else can resume it.
@@ -147,7 +154,11 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
 
 
 def list_jobs(twin: Twin) -> Answer:
-    """List all jobs, oldest first."""
+    """List all jobs, oldest first.
+
+    Yields:
+        The jobs as document of --json, then a table, or "no jobs yet".
+    """
     with twin() as client:
         found = client.jobs()
     yield found
@@ -161,6 +172,8 @@ def list_jobs(twin: Twin) -> Answer:
 def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., Answer]:
     """Make a command that acts on one job and shows its new status.
 
+    A job that is left out is the current one; with `steers` that has to exist.
+
     Args:
         does: help of the command.
         method: of the client, called with the job.
@@ -170,6 +183,9 @@ def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., 
     def command(twin: Twin, job: Job = None) -> Answer:
         """Call the method for a job (None: the current one) of the twin; print its
         warnings, and yield its status as a document and as a line.
+
+        Errors of the twin are raised; with `steers` a missing current job raises
+        CommandError.
         """
         with twin() as client:
             if job is None and steers is not None:
@@ -185,6 +201,8 @@ def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., 
 
 def _require_current(client: TwinClient, verb: str) -> None:
     """Check that there is a current job: of a command that names none.
+
+    Returns nothing; the exit code is REFUSED.
 
     Args:
         client: connected to the twin.
@@ -207,7 +225,12 @@ def forget(
         metavar="JOB", help="As in `job list`; `all` that have ended."
     ),
 ) -> Answer:
-    """Forget an ended job; its data set stays."""
+    """Forget an ended job; its data set stays.
+
+    Yields:
+        The forgotten jobs as document of --json, then a line with their names. "all"
+        forgets all that have ended; the twin refuses one that runs.
+    """
     with twin() as client:
         if job == ALL:
             gone = client.forget_job(days=0.0)
@@ -221,7 +244,8 @@ def describe(status: JobStatus) -> str:
     """Format a job as one line: name, state, frames done of all.
 
     Then, where known: script line, what runs, time left on the twin's clock (only while
-    queued, running or paused), the error's message, and the data set.
+    queued, running or paused), the error's message, and the data set. An error without
+    message is shown whole.
     """
     text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
     if status.line is not None:

@@ -82,6 +82,10 @@ def fit(
         logs: Logs, or recordings of follow; oldest first.
         out: Write the machine to this file.
         base: Take what the logs do not tell from this machine.
+
+    Yields:
+        The fit as document of --json, then tables of axes and times, and lines. Commands
+        unlike the base machine are noted on standard error.
     """
     from flexdt.twin.machine.description import builtin_machine_text
     from flexdt.twin.machine.fitted_machine import fitted_text
@@ -124,6 +128,8 @@ def fit(
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
     """Make the table of axes: limits, maximum speed and acceleration, unit, and the
     figures' source.
+
+    `axes` is name -> (axis, source); the table has a row for each, in that order.
     """
     rows = [
         (
@@ -140,6 +146,8 @@ def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
 def _places(machine: Machine) -> str:
     """Make the table of distances along the beam without zero offsets: their sum, ends
     and value at home [mm].
+
+    Without places the table is empty.
     """
     from flexdt.twin.machine.kinematics import places
 
@@ -153,6 +161,9 @@ def _places(machine: Machine) -> str:
 def _bodies(machine: Machine) -> str:
     """Make the table of bodies: name, role, axes that move it ("nothing" without any),
     size [mm], mesh and source.
+
+    Sizes are "x by y by z"; a body without mesh and source has the file's comments as
+    source.
     """
     rows = [
         (

@@ -51,6 +51,11 @@ def new(
         power: Set the largest power.
         limit: Set an axis's travel so.
         without: Leave out this axis.
+
+    Yields:
+        The document of --json (file and text), then one line. Nothing is written if the
+        machine, or its standing at home, does not hold. A voltage given alone is the
+        largest.
     """
     from flexdt.twin.collision.home_check import check_home
     from flexdt.twin.machine.description import (
@@ -125,7 +130,8 @@ def _ask_or_default(question: str, given: str | None, usual: str) -> str | None:
     """Return the given value, else the answer of a person at a terminal; None for the
     usual one.
 
-    Without a terminal on stdin, what is given is returned, None too.
+    Without a terminal on stdin, what is given is returned, None too. The question is on
+    standard error; an answer equal to `usual` gives None.
     """
     if given is not None or not sys.stdin.isatty():
         return given

@@ -60,6 +60,11 @@ def make(
         mesh: Fill this mesh: STL, OBJ, PLY, GLB or OFF.
         unit: Read the mesh in this unit; default: mm, for GLB m.
         stl: Write its surfaces, too, to print it.
+
+    Yields:
+        The summary as document of --json, then a line; what is assumed goes to standard
+        error. Exactly one of --like, --size and --mesh, else a usage error; an existing
+        file is replaced.
     """
     if sum(given is not None for given in (like, size, mesh)) != 1:
         raise typer.BadParameter("give one of --like NAME, --size W,B,H or --mesh FILE")
@@ -92,6 +97,8 @@ def _size(text: str) -> tuple[float, float, float]:
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:
     """Describe a phantom for `--json`: name, size [mm], number of beads, their radii
     [mm], description, and what is assumed of it.
+
+    Radii are a list, empty without beads.
     """
     return {
         "name": name,

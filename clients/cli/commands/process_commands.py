@@ -59,7 +59,9 @@ def up(context: typer.Context, only: str | None, **given: object) -> None:
 
 
 def _declared(settings: type[Settings]) -> list[inspect.Parameter]:
-    """List the options of a process, with the values that a shell completes."""
+    """List the options of a process as parameters, each with the function that proposes
+    its values to a shell, if any.
+    """
     own = [*parameters(settings).values()]
     for p in own:
         [declared] = p.annotation.__metadata__
@@ -69,7 +71,10 @@ def _declared(settings: type[Settings]) -> list[inspect.Parameter]:
 
 def _public() -> list[inspect.Parameter]:
     """List the options that `up` shows; one left out is None, so that the settings
-    file can set it."""
+    file can set it.
+
+    Switches keep False.
+    """
     public = {f.name for f in fields(UpSettings) if f.metadata["public"]}
     own = [p for p in _declared(UpSettings) if p.name in public]
     return [p if p.default is False else p.replace(default=None) for p in own]
@@ -94,6 +99,7 @@ def alone(name: str, about: str) -> Callable[..., None]:
     its help.
 
     The process reads them itself; its options are declared here for shells that complete.
+    Options are declared only while a shell completes words.
     """
 
     def command(context: typer.Context, **_: object) -> None:
@@ -121,6 +127,8 @@ def start(name: str, more: Sequence[str]) -> None:
     those of `more`.
 
     It ends by typer.Exit; if `more` requests the help, that is shown and nothing runs.
+    Raises typer.BadParameter and TwinError for options that do not hold, before the
+    process begins.
     """
     settings = settings_of(TABLES[name], more)
     if settings is not None:
@@ -131,6 +139,9 @@ def start(name: str, more: Sequence[str]) -> None:
 
 def _check(given: Mapping[str, Any], named: Sequence[str]) -> None:
     """Check options against each other, and names and folders by themselves.
+
+    Returns nothing. TLS needs certificate and key together; a projector's address and
+    port exclude each other.
 
     Args:
         given: option -> value.

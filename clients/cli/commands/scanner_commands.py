@@ -53,6 +53,8 @@ def state(twin: Twin) -> Answer:
 def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
     """Return the cells of an axis: name, position, target, velocity, limits, unit, and
     "moving", "virtual" or "".
+
+    Positions have 4 decimals, the velocity 3; limits are "[lower, upper]".
     """
     lower, upper = axis.limits
     if axis.moving:
@@ -76,6 +78,8 @@ def _facts(state: State) -> list[tuple[str, str]]:
     """List the facts of a state for its table: geometry, view, tube, camera, sample,
     safety, clock, correction and controller; then image (saturated, starved, cut off)
     and job, if there are any.
+
+    Lengths are in [mm], voxels in [um]; nothing is printed.
 
     Returns: (label, text) of each.
     """
@@ -135,6 +139,9 @@ def tube(
         kV: Set the tube's voltage.
         power_W: Set the tube's power.
         on: Switch X-rays on or off.
+
+    Yields:
+        The tube as document of --json, then one line. Without options nothing is set.
     """
     with twin() as client:
         if kV is None and power_W is None and on is None:
@@ -165,6 +172,9 @@ def camera(
         exposure_ms: Set the exposure time.
         mode: Set the mode: HWaSWbHigh or HWaSWbLow.
         averages: Average so many read-outs in an image.
+
+    Yields:
+        The camera as document of --json, then one line. Without options nothing is set.
     """
     with twin() as client:
         if exposure_ms is None and mode is None and roi is None and averages is None:
@@ -217,6 +227,11 @@ def move(
         plan: Plan a path around obstacles.
         shortest: Turn rot_obj by the shortest way.
         no_wait: Return without waiting for the arrival.
+
+    Yields:
+        The result as document of --json, then one line with the time. Ctrl-C leaves the
+        axes moving, with a note; raises CommandError (exit code REFUSED) if an axis did
+        not arrive. Targets are read by `assignments`.
     """
     wanted = option_values.assignments(targets)
     with twin() as client:
@@ -251,6 +266,9 @@ def jog(
     Args:
         velocity: mm/s or deg/s, signed.
         seconds: Stop after so many seconds of the twin's clock.
+
+    Yields:
+        The axis at the end as document of --json, then one line. The axis is braked after the time and after Ctrl-C; numbers that are not finite, and a time of 0 or less, are usage errors.
     """
     speed = option_values.number(velocity, "the velocity")
     if seconds is None:
@@ -275,7 +293,9 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
     """Jog for so many seconds of the twin's clock, lease after lease, at any speed of the
     clock.
 
-    Returns at the end of the travel; warnings are printed once.
+    Returns at the end of the travel; warnings are printed once. A lease lasts
+    `JOG_LEASE_S` of real time, at most `LONGEST_LEASE_S` of the twin's, and is renewed
+    before its end. At the fastest clock, and the last one, it runs out by itself.
 
     Args:
         client: connected to the twin.
@@ -309,11 +329,12 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
 
 
 def _outwait(client: TwinClient, axis: str, duration_s: float) -> State:
-    """Wait until a lease has ended by itself, and return the state then.
+    """Wait until a jog's lease has ended or the axis rests, and return the state then.
 
     The last lease runs out by itself, to the moment. At the fastest clock every lease
     does: a renewal could come before or after its end, and the time of motion would be
-    unknown.
+    unknown. `duration_s` counts on the twin's clock; the state is requested every
+    `JOG_POLL_S` seconds.
     """
     now = client.state()
     end = now.time + duration_s  # counted from after its start, not from before
@@ -342,6 +363,8 @@ def estop(twin: Twin) -> Answer:
 def _rest(state: Stopped) -> str:
     """Describe in words after which time and distance each axis rests, and which bodies
     would collide on the way; "nothing moves" without any.
+
+    Also "nothing moves" where the stop has no record.
     """
     stopping = state.stopping
     if stopping is None or not stopping.distances:
@@ -357,7 +380,12 @@ def _rest(state: Stopped) -> str:
 
 
 def reset(twin: Twin) -> Answer:
-    """Leave the emergency stop."""
+    """Leave the emergency stop.
+
+    Yields:
+        The state as document of --json, then a line on its safety. Only the stop that was
+        seen is released.
+    """
     with twin() as client:
         seen = (
             client.state().safety
@@ -385,6 +413,12 @@ def sample(
         name: A mesh, phantom or scene file is sent first. Lists what there is if left out.
         unit: Read a mesh in this unit; default: mm, for GLB m.
         material: Fill a mesh with this material; default: abs.
+
+    Yields:
+        The samples, or the result, as document of --json, then lines. A file is uploaded
+        if its ending is that of a mesh, phantom or scene and it exists; any other word is
+        a name. --unit and --material without a mesh file are a usage error; warnings go
+        to standard error.
     """
     from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
 
@@ -421,6 +455,8 @@ def sample(
 
 def _named_sample(client: TwinClient, name: str) -> SampleResult:
     """Put a sample on the stage by its name.
+
+    A refused name is looked up as a file only to explain the error.
 
     Args:
         client: connected to the twin.
@@ -495,6 +531,11 @@ def snap(
         kind: Write this kind; default: counts in a TIFF, integrals in a PNG.
         binning: Average so many pixels a side.
         marks: Colour saturated, starved and cut-off pixels of a PNG.
+
+    Yields:
+        The document of --json (file, dtype, shape, cone_vec, kind, flags), then a line,
+        and the legend of marks. A dark image, and bad exposure, are warned of on standard
+        error; another ending, or a missing folder, is an error before anything is taken.
     """
     option_values.require_ending(file, ".tiff", ".tif", ".png")
     option_values.require_folder(file)
@@ -540,6 +581,8 @@ def snap(
 def warn_of_exposure(flags: ImageFlags) -> None:
     """Warn on standard error of the share [%] of saturated and of starved pixels, each
     from `WARNING_SHARE` on.
+
+    Nothing is written below that share.
     """
     from flexdt.twin.physics.exposure import WARNING_SHARE
 
@@ -556,6 +599,9 @@ def save(
     marks: npt.NDArray[Any] | None = None,
 ) -> None:
     """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in colour.
+
+    An existing file is replaced. A TIFF holds the image unchanged. Raises CommandError
+    for an image that cannot be drawn as PNG.
 
     Args:
         file: its ending selects the format.

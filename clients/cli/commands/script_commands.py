@@ -57,6 +57,12 @@ def new(
         kv: Set the tube's voltage.
         power: Set the tube's power.
         mode: Set the camera's mode.
+
+    Yields:
+        The document of --json (file, text, frames, bytes, duration_s), then a line, or
+        without a file the script itself. Problems go to standard error; raises
+        CommandError if the script is invalid, and a usage error for options of another
+        kind of scan.
     """
     from flexdt.library.scripts import collisions
     from flexdt.twin.machine.camera import Roi
@@ -108,7 +114,8 @@ def new(
 def _kind_members(kind: Kind, **given: Any) -> dict[str, Any]:
     """Collect members of a request that belong to one kind of scan.
 
-    A position becomes a placement, `rise` the member `rise_mm`.
+    A position becomes a placement, `rise` the member `rise_mm`. The first option of
+    another kind raises.
 
     Args:
         kind: of the scan.

@@ -28,7 +28,8 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
     its problems to standard error.
 
     Recordings are told by their first time stamp. Warnings are printed and do not stop
-    the reading.
+    the reading. The executed script of a recording is worked out by replaying it. Any
+    problem that is an error raises, after all are printed.
 
     Args:
         log: file.
