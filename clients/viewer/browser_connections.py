@@ -51,6 +51,8 @@ class BrowserConnection(ServerConnection):
     def __init__(self, admission: Admission, *given: Any, **more: Any) -> None:
         """Prepare a connection that counts against the limits of `admission`; nothing is
         held yet.
+
+        Further arguments are those of websockets.
         """
         super().__init__(*given, **more)
         self._admission = admission
@@ -61,6 +63,9 @@ class BrowserConnection(ServerConnection):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Count the new connection among those that have sent no request, and note its
         network address.
+
+        Socket options are set as for all servers; with too many such connections one
+        gives way.
         """
         super().connection_made(transport)
         peer = transport.get_extra_info("peername") or ("?", 0)
@@ -84,6 +89,8 @@ class BrowserConnection(ServerConnection):
     def data_received(self, data: bytes) -> None:
         """Take received bytes; aborts the connection if all connections together hold
         more than `MAX_HELD` and this one more than `FAIR_BYTES`.
+
+        The data that exceed the limit are dropped.
         """
         self._hold(self._held + len(data))
         if self._admission.held > MAX_HELD and self._held > FAIR_BYTES:
@@ -95,6 +102,8 @@ class BrowserConnection(ServerConnection):
     async def send_context(self, *, expected_state: State = OPEN) -> AsyncIterator[None]:
         """Write to the connection as the library does, but for an answer to a browser that
         has left meanwhile: that is no error of the library's.
+
+        Other exceptions are passed on.
 
         Raises:
             ConcurrencyError: the browser has left before it was answered.
@@ -118,6 +127,8 @@ class BrowserConnection(ServerConnection):
     def connection_lost(self, exc: Exception | None) -> None:
         """Free the place of an ended connection among those that are counted, and the
         bytes it held.
+
+        Called once, by asyncio.
         """
         self._hold(0)
         self._admission.strangers.leave(self)

@@ -41,6 +41,9 @@ DARK = (16, 19, 25)
 def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
     """Render a client's view as PNG, on the page's background.
 
+    `client` is one open view. The answer is awaited for 30 s; translucent pixels are
+    blended with `LIGHT` or `DARK`.
+
     Args:
         client: renders it.
         width: [px].
@@ -70,8 +73,11 @@ def scene_file(
     form: Form,
     dark: bool,
 ) -> bytes:
-    """Export the live scene to a file: as the page shows it, with `beside` over it
-    (HTML)."""
+    """Export the live scene as the page shows it to a file: an HTML page with `beside`
+    over it, or viser's own format.
+
+    See `_file`; `camera` is the first view, `nodes` are those shown.
+    """
     serializer = server.get_scene_serializer()
     look_from(serializer, camera, nodes)
     return _file(serializer, form, dark, title, beside)
@@ -89,6 +95,9 @@ def replay_file(
     dark: bool,
 ) -> bytes:
     """Export a plan, or a recorded scan, to a file that plays it.
+
+    It is drawn at `FRAMES` moments of the plan, played in `REPLAY_S` seconds, in a server
+    of its own that is stopped at the end.
 
     Args:
         machine, profile: of the scene.
@@ -120,7 +129,8 @@ def replay_file(
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
     """Return the content of an exported scene.
 
-    Only html has colours, title and `beside`.
+    Only html has colours, title and `beside`. Returns bytes; title and text of the page
+    are escaped, `beside` is not.
 
     Args:
         serializer: viser's, of the scene.
@@ -150,7 +160,8 @@ def title_of(state: State | None, what: str) -> str:
 def beside(state: State | None, image: ShownImage | None) -> str:
     """Format a radiograph and its values as HTML over a scene.
 
-    Values are distances [mm], magnification, voxel [um], beam and correction.
+    Values are distances [mm], magnification, voxel [um], beam and correction. Without an
+    image the picture is empty. Names are escaped.
 
     Args:
         state: of the twin; None gives "".
@@ -182,7 +193,11 @@ def beside(state: State | None, image: ShownImage | None) -> str:
 
 
 def at_positions(state: State, positions: dict[str, float]) -> State:
-    """Copy the state with its motors at `positions` (others stay) and X-rays on."""
+    """Copy the state with its motors at `positions` (others stay) and X-rays on.
+
+    Velocities and targets stay; an unknown axis is ignored. The given state is not
+    changed.
+    """
     axes = {
         name: axis.model_copy(update={"position": positions.get(name, axis.position)})
         for name, axis in state.axes.items()
@@ -194,6 +209,8 @@ def at_positions(state: State, positions: dict[str, float]) -> State:
 def standpoint(client: viser.ClientHandle) -> Standpoint:
     """Return the present camera of a client: position, the point it looks at, up
     direction, and field of view [rad].
+
+    Lengths are in [m].
     """
     c = client.camera
     position, look_at, up = (

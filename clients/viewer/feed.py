@@ -45,6 +45,8 @@ class ImageFeed:
     ) -> None:
         """Prepare a feed; `start` subscribes.
 
+        No image is there yet; `newest` is None.
+
         Args:
             address: of the twin.
             kind: of the images.
@@ -66,6 +68,8 @@ class ImageFeed:
     def start(self) -> None:
         """Subscribe to images of this kind, at most `IMAGE_HZ`, and start the tasks that
         take them; does nothing if they run.
+
+        A failing task is logged and calls `died`.
         """
         if not self._tasks:
             wish = {
@@ -84,6 +88,8 @@ class ImageFeed:
     def stop(self) -> asyncio.Future[Any]:
         """Cancel the feed's tasks at once; the returned future is done once they have
         ended.
+
+        `newest` stays; `start` may follow at once.
         """
         tasks = self._tasks
         self._tasks = []
@@ -104,6 +110,8 @@ class ImageFeed:
     def _arrived(self, topic: str, params: Mapping[str, object]) -> None:
         """Keep the newest image with the twin instance it is from ("" if unknown), and
         wake the task that takes it; other topics are ignored.
+
+        An older image that has not been taken is dropped.
         """
         if topic == "projection":
             if self._link is None:
@@ -122,6 +130,8 @@ class ImageFeed:
         within `SETTLE_S` seconds.
 
         Runs until cancelled; an image that cannot be shown is logged, once until one can.
+        `take` runs in a thread, one image at a time; images that come meanwhile are
+        skipped but for the newest.
         """
         shown_coarse = False
         sound = True
@@ -157,6 +167,7 @@ def radiograph(params: Mapping[str, object], twin: str = "") -> ShownImage:
     """Read the image of a `projection` event, made by that run of the twin.
 
     Time is the event's where the image has none; flags and origin are None where unknown.
+    `params` are as decoded from the wire.
 
     Args:
         params: of the event.

@@ -112,6 +112,9 @@ class Front:
     ) -> None:
         """Prepare the page of the scenes and the checks; `start` listens.
 
+        viser's program is split from its page and served under a name of its own; scripts
+        of ours are put into that page. Nothing listens yet.
+
         Args:
             page: serves a page's connection.
             connect: opens a connection to viser.
@@ -162,6 +165,9 @@ class Front:
         """Start to listen; port 0 is any free one.
 
         Connections come one at a time, uncompressed; the token is that of the front.
+        Without a token only loopback addresses are allowed. Messages have at most
+        `MAX_FROM_PAGE` bytes; a browser that does not answer a ping for `SILENT_S` is cut
+        off.
 
         Args:
             host, port: to listen on.
@@ -195,7 +201,10 @@ class Front:
         one_at_a_time(self._server.server)
 
     async def close(self) -> None:
-        """Stop listening, end every connection and wait for that."""
+        """Stop listening, end every connection and wait for that.
+
+        A second call does nothing more.
+        """
         self._closing.set()
         if self._server is not None:
             self._server.close()
@@ -209,7 +218,8 @@ class Front:
         """Answer a request; None to go on with a WebSocket.
 
         A request that cannot be read has status 400; a still picture that is not there in
-        time has 204 (no content). Other content comes from `_content`.
+        time has 204 (no content). Other content comes from `_content`. The time limit of
+        a picture is `STILL_S`. Nothing is raised for a bad request.
 
         Requests of other sites and without the token are rejected; a still picture is
         waited for.
@@ -244,7 +254,8 @@ class Front:
         """Answer an admitted request with a page, a file of the page, a download or an
         error.
 
-        A download can be fetched once. Unknown paths give 404.
+        A download can be fetched once. Unknown paths give 404. Files are those of the
+        page's folder with the ending html, css, js or svg; "/" is the page.
 
         Args:
             request: of the browser.
@@ -293,7 +304,7 @@ class Front:
         or None.
 
         On the loopback address the Host must be a local one; an Origin must equal the
-        Host.
+        Host. Elsewhere the Host is not checked; a request without Origin passes.
         """
         host = request.headers.get("Host", "")
         if self._loopback and is_rebound(host):
@@ -311,7 +322,9 @@ class Front:
         """Check the token or the cookie of a request.
 
         Without a token of the viewer all are admitted. At the path / the response is a
-        form.
+        form. The answer to a wrong token waits `GUESS_S`, one after the other, and not
+        while closing. A valid one is answered with 302 to the path without it; all others
+        with 401.
 
         A valid token sets the cookie; a wrong one is logged and answered slowly.
 
@@ -363,6 +376,9 @@ class Front:
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve a WebSocket: a page, or a view (closed with 1013 if the largest number of
         views is open); returns when it ends.
+
+        A page in excess has no place here, and is closed by the page handler. The path
+        has been checked.
         """
         assert connection.request is not None
         path = urlsplit(connection.request.path).path
@@ -389,6 +405,8 @@ class Front:
     async def _relay(self, browser: ServerConnection, path: str) -> None:
         """Pass messages between a browser and viser until either ends; `MessageFilter`
         filters those to viser. Lost connections are not raised.
+
+        Both directions are ended together; viser's connection is closed.
         """
         with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
             async with self._connect(path, browser.subprotocol) as viser:
@@ -404,6 +422,8 @@ class Front:
     async def _up(self, browser: ServerConnection, viser: ClientConnection) -> None:
         """Relay messages from a browser to viser, without those that the message filter holds
         back.
+
+        At most `RELAYED_HZ` messages a second; runs until the browser closes.
         """
         async for message in browser:
             if (admitted := self.doorkeeper.admit(message)) is not None:
@@ -422,6 +442,7 @@ def _quiet() -> logging.Logger:
     nothing.
 
     Such are pages' connections to us, and ours to viser when a page leaves at once.
+    Returns the logger; only the message "opening handshake failed" is dropped.
     """
     front = logging.getLogger("websockets.front")
     for logger in (front, logging.getLogger("websockets.server")):
@@ -448,7 +469,10 @@ def _same(given: str | None, wanted: str) -> bool:
 
 
 def _cookie(request: Request) -> str | None:
-    """Return the value of our cookie in a request; None without it."""
+    """Return the value of our cookie in a request; None without it.
+
+    The first one counts.
+    """
     for header in request.headers.get_all("Cookie"):
         for part in header.split(";"):
             name, _, value = part.strip().partition("=")
@@ -463,7 +487,7 @@ def _kept(
     """Make a response that a browser may keep: sent again only where it has changed, and
     packed.
 
-    Packed with gzip if the browser accepts it.
+    Packed with gzip if the browser accepts it. The tag is a hash of the content.
 
     Args:
         request: with the tag that the browser has.
@@ -504,7 +528,7 @@ def _response(
 ) -> Response:
     """Make a response with the headers of all content: length, type, policy, no cache.
 
-    It also says that the connection closes.
+    It also says that the connection closes. Further headers are those of `more`.
 
     Args:
         body: content.

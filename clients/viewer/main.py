@@ -47,6 +47,8 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     """Serve until SIGTERM or SIGINT, or until an essential part has failed.
 
     `FAILED` if such a part has failed, else `OK`; the viewer is stopped in any case.
+    Token, certificates and files are read first, and raise their errors; the parts' own
+    meshes are used only for a machine from a file.
 
     Args:
         options: addresses, token, certificates, limits and files of the process.
@@ -110,7 +112,10 @@ def viewer_pages(viewer: Viewer) -> Pages:
     """
 
     def health() -> dict[str, object]:
-        """Return name and version of this server, and whether the twin is connected."""
+        """Return name and version of this server, and whether the twin is connected.
+
+        Raises nothing.
+        """
         return {
             "server": f"flexdt viewer {version('flexdt')}",
             "twin": "connected" if viewer.link.connected else "not connected",
@@ -120,6 +125,8 @@ def viewer_pages(viewer: Viewer) -> Pages:
         """List the metrics: open pages and views, pages ever opened, dropped messages,
         drawn states, connection to the twin, wrong tokens; 0 for what the front counts
         while there is none.
+
+        Counters only grow.
         """
         front = viewer.front
         return [
@@ -151,7 +158,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the viewer with the options of `argv` (default: the command line) until it is ended;
     returns the exit code.
 
-    What viser prints is suppressed.
+    What viser prints is suppressed. Only standard output is suppressed; the ready line is
+    printed there all the same.
     """
     options = parse(ViewerSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)

@@ -84,7 +84,8 @@ class Page:
     ) -> None:
         """Prepare the page's state and its connection to the twin; `run` serves.
 
-        It shows line integrals live, with the default layers.
+        It shows line integrals live, with the default layers. `local` methods come before
+        the twin's.
 
         Args:
             id: of the page.
@@ -126,7 +127,8 @@ class Page:
         """Run until the browser leaves or no longer reads, then cancel the page's tasks.
 
         With more than `MAX_NOTES` notices unsent, logs a warning and closes the
-        connection with TRY_AGAIN.
+        connection with TRY_AGAIN. It ends also if the connection to the twin, sending or
+        reading fails.
         """
         for work in (self.link.run(), self._send(), self._read()):
             self._start(work, "a page's connection", self._over.set)
@@ -153,6 +155,8 @@ class Page:
     ) -> asyncio.Task[None]:
         """Run work in a task that is cancelled when the page closes.
 
+        Returns the task; a failure is logged, not raised.
+
         Args:
             work: to run.
             what: word for the log if it fails.
@@ -167,6 +171,8 @@ class Page:
         """Read the page's messages until it closes: acknowledgements free their slots,
         requests are each answered in a task; bytes are ignored. At the end the page is
         over.
+
+        Requests are not waited for, so their answers may come in another order.
         """
         with contextlib.suppress(ConnectionClosed):
             async for message in self._connection:
@@ -182,7 +188,8 @@ class Page:
         """Send something that must arrive, in order; a page that has not taken 1000 is
         closed.
 
-        `kind` is the message's type, `content` its fields.
+        `kind` is the message's type, `content` its fields. The page is closed at more
+        than `MAX_NOTES`; the content is converted to JSON now.
         """
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:
@@ -204,6 +211,9 @@ class Page:
     async def _follow(self) -> None:
         """Send the axes' newest dragged targets to the twin, one request at a time with a
         pause, until none is left; a refusal is shown to the page and goes on.
+
+        The pause is `DRAG_S`; targets given meanwhile replace each other. Refusals and
+        lost connections become a note.
         """
         while (targets := self._dragged) is not None:
             self._dragged = None
@@ -218,6 +228,8 @@ class Page:
     async def _send(self) -> None:
         """Send what waits for the page, in order of its slots, whenever there is
         something; returns when the connection closes.
+
+        What is still unsent then is dropped.
         """
         with contextlib.suppress(ConnectionClosed):
             while True:
@@ -230,7 +242,9 @@ class Page:
         """Select the next message: answers and notes, then the newest content of a slot,
         then a part of an image (first byte 1: its last).
 
-        None if nothing waits or too much is on the way.
+        None if nothing waits or too much is on the way. The other slots go in the order
+        in which they were shown first. A part is `_part` bytes long; first byte 0 says
+        that more parts follow.
         """
         if self._notes:
             return self._notes.popleft()
@@ -248,6 +262,8 @@ class Page:
     def _may_send(self, slot: str) -> bool:
         """Check that fewer messages of a slot are on the way than allowed, and if so
         count one more; slots without a limit may always send.
+
+        The limit is that of `ON_THE_WAY`; the time of sending is stored.
         """
         if (sent := self._sent_at.get(slot)) is None:
             return True
@@ -260,6 +276,8 @@ class Page:
         """Note that the page has taken a message of a slot, and wake the sender; quick
         pages get larger parts of images, slow ones small parts. Ignored if none was
         sent.
+
+        Quick is less than `QUICK_S`.
         """
         if not (sent := self._sent_at[slot]):
             return
@@ -275,7 +293,9 @@ class Page:
         """Answer a request of the page with its result or an error.
 
         Errors of any kind are sent to the page; too many requests at a time are rejected,
-        except urgent ones.
+        except urgent ones. A message that is no request is answered with INVALID_REQUEST.
+        Too many is `MAX_ASKED`; each request gets a trace id, and the answer the time.
+        Nothing is raised.
 
         Args:
             text: JSON with id, method and params.
@@ -324,6 +344,9 @@ class Page:
         """Call a method for the page: one of the viewer, or of the twin if pages may call it;
         returns the result.
 
+        Bytes in the twin's result become null. Hidden and unknown methods are
+        METHOD_NOT_FOUND; a lost connection raises ConnectionLost.
+
         Raises:
             RpcError: no such method, parameters that do not fit, or the twin refuses.
         """
@@ -341,7 +364,10 @@ class Page:
             raise
 
     def _fail(self, id: object, error: RpcError) -> None:
-        """Answer the request `id` with an error's code, message and data without bytes."""
+        """Answer the request `id` with an error's code, message and data without bytes.
+
+        Returns nothing; the message is for people (`_words`).
+        """
         data = without_bytes(error.data)
         self.say(
             "answer",
@@ -359,7 +385,7 @@ def _words(error: RpcError | ConnectionLost) -> str:
     wire's method.
 
     Only the refusal because another is the controller is reworded; others keep their
-    text.
+    text. A lost connection gives its own text.
     """
     if not isinstance(error, RpcError):
         return str(error)
@@ -398,7 +424,8 @@ def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
 def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Read method and parameters of a message.
 
-    Without params these are {}.
+    Without params these are {}. Params that are null or empty are {}. Also raised if
+    params are a list.
 
     Raises:
         ValueError: it has none.
@@ -413,6 +440,8 @@ def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 def without_bytes(value: Any) -> Any:
     """Convert to plain data for JSON: mappings with text keys, lists; bytes become null,
     as a page gets images another way.
+
+    Tuples become lists; all other values stay as they are.
     """
     if isinstance(value, Mapping):
         return {str(k): without_bytes(v) for k, v in value.items()}

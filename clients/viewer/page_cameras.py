@@ -49,7 +49,7 @@ class SceneClients:
     def __init__(self, scenes: Scenes) -> None:
         """Register for viser's clients as they connect and leave.
 
-        No client, camera or theme is known yet.
+        No client, camera or theme is known yet. viser calls back in threads of its own.
 
         Args:
             scenes: viser's server.
@@ -74,7 +74,10 @@ class SceneClients:
         self._server.on_client_disconnect(self._gone)
 
     def of(self, page: str, view: str | None = None) -> list[viser.ClientHandle]:
-        """List the connected clients that show `view` (any, if None) of `page`."""
+        """List the connected clients that show `view` (any, if None) of `page`.
+
+        Those that have just left are left out.
+        """
         with self._lock:
             ids = [
                 i
@@ -95,7 +98,9 @@ class SceneClients:
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
         """Set the nodes of a page's frames, from one thread only.
 
-        Only nodes that differ from what the frame shows are sent.
+        Only nodes that differ from what the frame shows are sent. `built` is also
+        compared with the number at the last call: nodes built since are compared with
+        `plain` as well.
 
         Args:
             page: its frames; a frame that has not received all nodes yet is left for
@@ -135,7 +140,8 @@ class SceneClients:
         it.
 
         Views whose pane has no known size yet are left out. Otherwise a camera moves only
-        if the points no longer fit its view.
+        if the points no longer fit its view. `anew` also moves those that a person has
+        moved.
 
         Args:
             anew: put all cameras to their presets, moved or not.
@@ -152,6 +158,8 @@ class SceneClients:
     def reset(self, page: str, view: str) -> None:
         """Set a page's view back to its preset for the client's aspect ratio; nothing
         without a preset.
+
+        Also moves a camera that a person has moved, and nothing if it is there already.
         """
         preset = self.cameras.get(view)
         for client in self.of(page, view):
@@ -161,7 +169,9 @@ class SceneClients:
     def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
         """Turn a page's view towards a ball, from where it looks.
 
-        The preset's direction is kept. Raises KeyError for a view without a preset.
+        The preset's direction is kept. Raises KeyError for a view without a preset. The
+        distance is `FAR_RATIO` times that at which the ball fills the view, more in a
+        narrow pane. The camera then counts as moved by a person.
 
         Args:
             page: its id.
@@ -198,7 +208,10 @@ class SceneClients:
         self._theme.pop(page, None)
 
     def _looking(self, view: str) -> list[viser.ClientHandle]:
-        """List the connected clients that show a view, of any page."""
+        """List the connected clients that show a view, of any page.
+
+        In no particular order.
+        """
         with self._lock:
             ids = [i for i, w in self._who.items() if w.view == view]
         clients = self._server.get_clients()
@@ -207,6 +220,8 @@ class SceneClients:
     def _put(self, client: viser.ClientHandle, camera: Standpoint) -> None:
         """Set a client's camera, unless it was put there last and has not been moved
         since.
+
+        The camera is stored as put, so that a person's move can be told.
         """
         if self._sent.get(client.client_id) == camera and self._untouched(client):
             return
@@ -216,6 +231,8 @@ class SceneClients:
     def _untouched(self, client: viser.ClientHandle) -> bool:
         """Check that a client's camera is still where it was put, within a share of its
         distance; False if it never was.
+
+        The share is `MOVED_SHARE`; only the place is compared, not the direction.
         """
         put = self._sent.get(client.client_id)
         if put is None:
@@ -227,7 +244,9 @@ class SceneClients:
     def _connected(self, client: viser.ClientHandle) -> None:
         """Register a new client: its page and view, camera and theme.
 
-        Ignored if its path names none. Then `joined` is called.
+        Ignored if its path names none. Then `joined` is called. Called in a thread of
+        viser's. A view without preset keeps viser's camera; a page without theme is light
+        and plain.
 
         Args:
             client: of viser; its path names page and view.
@@ -250,7 +269,10 @@ class SceneClients:
         self.joined(client, who.page)
 
     def _gone(self, client: viser.ClientHandle) -> None:
-        """Forget page, camera and layers of a client that has closed."""
+        """Forget page, camera and layers of a client that has closed.
+
+        The page's theme stays until `forget`.
+        """
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
@@ -260,6 +282,8 @@ class SceneClients:
 def _now(client: viser.ClientHandle) -> Standpoint:
     """Return the present camera of a client: position, the point it looks at, up
     direction, and field of view [rad].
+
+    Lengths are in [m].
     """
     c = client.camera
     position, look_at, up = (
@@ -272,6 +296,8 @@ def _now(client: viser.ClientHandle) -> Standpoint:
 def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
     """Set up direction, place, target and field of view [rad] of a client's camera in one
     message.
+
+    It does not wait for the browser.
     """
     with client.atomic():
         client.camera.up_direction = camera.up

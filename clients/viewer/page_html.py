@@ -21,6 +21,9 @@ BOXES: Final = "<!-- a box for each layer -->"
 def page_file(name: str) -> bytes:
     """Read a file of the page as browsers get it.
 
+    Also raises for other files of the package that are missing; names are not checked
+    here. Returns bytes.
+
     Raises:
         FileNotFoundError: there is none of this name.
 
@@ -35,7 +38,8 @@ def page_file(name: str) -> bytes:
 def token_form(wrong: bool) -> bytes:
     """Make the page with the form for the viewer's token.
 
-    Returns HTML as bytes; it says so if a wrong one was given.
+    Returns HTML as bytes; it says so if a wrong one was given. Otherwise the mark stays,
+    a comment.
 
     Args:
         wrong: whether a wrong one was given.
@@ -48,7 +52,10 @@ def token_form(wrong: bool) -> bytes:
 
 
 def boxes(layers: tuple[Layer, ...]) -> str:
-    """Make (HTML) a labelled checkbox for each layer, a line each, named "layer-NAME"."""
+    """Make (HTML) a labelled checkbox for each layer, a line each, named "layer-NAME".
+
+    Titles are escaped.
+    """
     return "\n        ".join(
         f'<div><label><input type="checkbox" id="layer-{layer.name}" data-layer="{layer.name}">'
         f"{html.escape(layer.title)}</label></div>"

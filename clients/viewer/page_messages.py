@@ -89,7 +89,9 @@ class Unwanted(ValueError):
 def admitted(raw: str | bytes) -> bytes:
     """Validate a page's message and encode it again for viser.
 
-    Only the kinds in `ALLOWED` pass; pictures must be small PNGs.
+    Only the kinds in `ALLOWED` pass; pictures must be small PNGs. A text message is
+    unwanted; messages but pictures have at most `MAX_SMALL` bytes. Unknown fields are
+    wrong ones.
 
     Args:
         raw: as received.
@@ -122,6 +124,8 @@ def admitted(raw: str | bytes) -> bytes:
 def _small_picture(data: bytes) -> bool:
     """Check that a PNG's header states sides of at most `LARGEST_SIDE` pixels; empty
     bytes report a failure and pass. The content is not decoded.
+
+    Sides of 0 fail.
     """
     if not data:
         return True
@@ -151,6 +155,7 @@ class MessageFilter:
         """Validate a browser's message for viser and return it; None drops it.
 
         Counts the dropped; each different problem is logged once, at most `MAX_LOGGED`.
+        The result is encoded again, not the bytes received.
         """
         try:
             return admitted(raw)

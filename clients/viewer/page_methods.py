@@ -145,6 +145,8 @@ class Window(Params):
     def _both(self) -> Window:
         """Check that both ends or none are given, the lower first.
 
+        Returns the window itself; equal ends are wrong, too.
+
         Raises:
             ValueError: they are not.
         """
@@ -249,6 +251,9 @@ class Export(Params):
 async def layers(viewer: Viewer, page: Page, params: Params) -> object:
     """Show or hide the layers named in `params` on this page alone, and report them to
     it; returns {}.
+
+    The ranges are drawn now if they are shown. Layers that are None stay, and an opacity
+    of None.
     """
     page.shown = page.shown.changed(**params.model_dump())
     if viewer.lab is not None and viewer.state is not None and "ranges" in page.shown:
@@ -269,6 +274,8 @@ async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
 async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
     """Set a view of this page back to its preset, or, with `sample`, have it look at the
     sample (preset while no state is known); returns {}.
+
+    Only clients of this view of this page are moved; without one nothing happens.
     """
     if params.sample and viewer.world is not None:
         viewer.clients.look(
@@ -283,7 +290,7 @@ async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
     """Return the first camera of a view in a pane of this page; empty where it is not
     known.
 
-    The fields are those of `Standpoint`.
+    The fields are those of `Standpoint`. The beam's eye and unknown views have none.
     """
     fitted = viewer.clients.cameras.get(params.view)
     if fitted is None:
@@ -301,6 +308,8 @@ async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
 async def window(viewer: Viewer, page: Page, params: Window) -> object:
     """Set the window [low, high] of the panel for all pages and draw the newest image
     again; either None chooses it automatically. Returns {}.
+
+    Pages' own windows are not changed.
     """
     low = params.low
     high = params.high
@@ -316,7 +325,8 @@ async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
     """Show this page the ray of a pixel; returns the twin's path lengths through
     materials and the ray's length [mm].
 
-    Without a pixel or a known state hides the ray and returns {}.
+    Without a pixel or a known state hides the ray and returns {}. The pixel is (column,
+    row). Raises RpcError as the twin does, and while the scene is not there.
     """
     lab = _lab(viewer)
     world = viewer.world
@@ -334,7 +344,8 @@ async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
     """Compute the tube's spectrum behind the machine's filters at a voltage.
 
     The photons are relative, behind the filters; limits are voltage [kV], power [W],
-    exposure [ms].
+    exposure [ms]. The voltage is in kV, energies in keV. Lists have one entry for each
+    energy; raises RpcError before the twin has been seen.
 
     Returns:
         `energy_keV`, `photons`, `mean_keV`, `filters`, and `limits` of tube and camera.
@@ -365,6 +376,9 @@ async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
     """Plan a script to scrub through; None removes the plan and its drawing from this
     page.
 
+    The plan starts from the twin's present positions. Removing returns {}; the path is
+    kept if no state is known.
+
     Returns:
         The time line, see `scrubbed_plan.document`.
 
@@ -394,6 +408,8 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
     again.
 
     The plan of the page is replaced by the data set's positions if it is of this machine.
+    The path is that of the projections alone. Raises RpcError for an unknown data set;
+    else plan and path of the page are removed first.
 
     Returns:
         The result of `dataset.get`; empty for None.
@@ -424,7 +440,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     moment.
 
     Without a usable virtual image `problem` states why, and the recorded one is shown
-    alone.
+    alone. A virtual image is made only of projections with known positions; one of other
+    size is a problem. The ghost is moved only if the page has a plan.
 
     Returns:
         The image's entries, `geometry`, `tube` and `problem` of the virtual image.
@@ -480,7 +497,8 @@ def _readout(
     """Compute distances and sizes of a recorded image's nominal geometry; None: it is
     not known.
 
-    None as well where no distances can be computed from it.
+    None as well where no distances can be computed from it. The sample's place is taken
+    as the origin.
     """
     if not cone:
         return None
@@ -495,6 +513,7 @@ async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
     origin as well.
 
     Tube and camera settings that are None are left out, so the present ones count.
+    Returns (pixels, origin or None). Raises RpcError as the twin does.
     """
     asked = {name: told[name] for name in ("kind", "positions")}
     for what in ("tube", "camera"):  # unknown settings are the present ones
@@ -507,7 +526,9 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
     """Start to grow a volume of a data set from its images so far, for all pages that
     want one; without a name, end that for this page. Returns {}.
 
-    Raises INVALID_PARAMS if there is no such data set (links do not count).
+    Raises INVALID_PARAMS if there is no such data set (links do not count). With a
+    running process for the same volume its newest line is sent again. `past` requests the
+    complete one. Raises RpcError without --data.
     """
     page.live = params.name is not None
     if params.name is None:
@@ -524,7 +545,8 @@ async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, by
     """Send a request to the volume's process; returns nothing where it has another
     volume by now.
 
-    Returns a head and bytes; nothing is ({}, b"").
+    Returns a head and bytes; nothing is ({}, b""). Raises RpcError without --data or for
+    a name that is not plain.
     """
     folder = _data(viewer) / plain_name(params.name or "", "data set")
     return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or (
@@ -535,7 +557,11 @@ async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, by
 
 async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
     """Offer a reconstructed volume to a page: a head, and codes to fetch; empty while
-    there is none."""
+    there is none.
+
+    The former block of the page is dropped if it was not fetched. Codes are offered as a
+    download, its url and size in the result.
+    """
     head, codes = await _of_volume(viewer, params, "block", params.what)
     if not codes:
         return {}
@@ -554,6 +580,8 @@ async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
 async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
     """Start comparing the volume with the truth of its sample, with the correction in
     use; the volume's document brings the figures later.
+
+    Without a correction only the volume itself is compared. Returns {}.
     """
     if viewer.state is None:
         correction = None
@@ -571,6 +599,8 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
 
     Distances are those of the motors alone: a script moves motors, and the correction in
     force, in which SOD and SDD are a little different, may not lead beyond their travel.
+    Axes in `keep` stay where they are and are not in `moved`. Raises RpcError for a scan
+    that cannot be made; without a state `moved` is empty.
 
     Returns:
         `text`, and `moved`: axis -> its present position and the script's.
@@ -593,7 +623,8 @@ def scan_request(
 ) -> ScanRequest:
     """Make the request of a scan: as wished, and for the rest as the twin stands.
 
-    Distances [mm] are rounded; a wished voxel [um] sets the SOD.
+    Distances [mm] are rounded; a wished voxel [um] sets the SOD. A voltage or power that
+    is None is the present one; mode and region are the present ones.
 
     Args:
         params: the wish.
@@ -624,6 +655,9 @@ def scan_request(
 def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, float]]:
     """Compare a script's poses with the present ones.
 
+    Same is within `MIN_DIFFERENCE` [mm, deg]; a script without projections moves none.
+    Blocks: called in a thread.
+
     Returns:
         Axis -> (present position, that of the script's projections), for axes that are
         neither
@@ -644,6 +678,8 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
 async def datasets(viewer: Viewer, page: Page, params: Datasets) -> object:
     """List data sets, newest first, from `start` on and matching `search`, with
     thumbnails in base64; the twin's answer.
+
+    A thumbnail is at most 96 pixels a side; None stays None.
     """
     asked = {"search": params.search, "start": params.start, "thumbnail": 96}
     told: Any = await page.link.request("dataset.list", asked)
@@ -658,7 +694,8 @@ async def estimate(
 ) -> object:
     """Fit a geometry to data sets; nothing is applied.
 
-    Over a connection of its own: other requests of the page do not wait for this one.
+    Over a connection of its own: other requests of the page do not wait for this one. It
+    has no time limit. Raises RpcError as the twin does; bytes in the result become null.
     """
     at = viewer.twin_address
     if isinstance(params, CalibrationFit):
@@ -684,7 +721,7 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
     `time_s`; returns its positions.
 
     None removes the ghost and returns None for the positions. Raises INVALID_PARAMS while
-    the page has no plan.
+    the page has no plan. Times beyond the plan's ends give its first or last positions.
     """
     lab = _lab(viewer)
     time_s = params.time_s
@@ -703,7 +740,8 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
 async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
     """Take a picture of one of this page's views; returns the offer of a PNG to download.
 
-    Raises INVALID_PARAMS if that view is not open.
+    Raises INVALID_PARAMS if that view is not open. The first client of the view draws it.
+    Raises RpcError BUSY with `MAX_SHARED` pictures or exports under way.
     """
     clients = viewer.clients.of(page.id, params.view)
     if not clients:
@@ -718,7 +756,8 @@ async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
 async def export(viewer: Viewer, page: Page, params: Export) -> object:
     """Export the scene, or a replay of this page's plan, as one file: html or viser.
 
-    Without an open view of this page the scene is seen from the preset.
+    Without an open view of this page the scene is seen from the preset. It is made in a
+    thread; the file's name has the time.
 
     Returns:
         The download's `url` and name.
@@ -769,6 +808,8 @@ async def export(viewer: Viewer, page: Page, params: Export) -> object:
 def _room(viewer: Viewer) -> Iterator[None]:
     """Count an export while it is made.
 
+    At most `MAX_SHARED` at a time; the count is taken back in any case.
+
     Raises:
         RpcError: too many are being made.
     """
@@ -798,6 +839,8 @@ def _data(viewer: Viewer) -> Path:
 def _offer(viewer: Viewer, name: str, content: bytes) -> dict[str, object]:
     """Keep a file in memory for download, at most 16 of them (the oldest is dropped);
     returns its url, name and bytes.
+
+    The url has a random key; it is not written to a disk.
     """
     key = secrets.token_hex(16)
     while len(viewer.downloads) >= 16:
@@ -844,6 +887,8 @@ async def serve(
     name: str, viewer: Viewer, page: Page, given: Mapping[str, Any]
 ) -> object:
     """Answer one request of a page: check its parameters and call the method.
+
+    The result is the method's own.
 
     Args:
         name: of METHODS.

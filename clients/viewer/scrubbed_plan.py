@@ -50,6 +50,9 @@ class RecordedPositions:
         """Build from a result of `dataset.get`, ordered by time; None where poses are not
         known. Images without times are a second apart; those without a position are
         left out.
+
+        Times are the data set's [s], or its indices. Left out are images where the first
+        motor's position is unknown.
         """
         motors = {
             n: np.array(values, dtype=float) for n, values in told["positions"].items()
@@ -96,6 +99,9 @@ async def make(
 ) -> Made:
     """Plan a script, in a process of its own where that may take long.
 
+    Short scripts are planned in a thread. Returns plan, path (None without a state) and
+    document.
+
     Args:
         workers: these processes.
         text: of the script.
@@ -122,7 +128,8 @@ def work(parts: Sequence[bytes]) -> list[bytes]:
 def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
     """Plan a script, and compute the source's path and the time line.
 
-    Without a state there is no path.
+    Without a state there is no path. Too many is more than `MAX_IMAGES`. Also raises
+    ScriptError.
 
     Raises:
         RpcError: it takes too many images.
@@ -142,6 +149,8 @@ def plan_text(
 ) -> ScanPlan:
     """Plan a script from the twin's positions on, or from the machine's start without a state.
 
+    Only positions are taken from the state, not rates or settings.
+
     Raises:
         ScriptError: it does not parse.
     """
@@ -155,6 +164,8 @@ def document(plan: ScanPlan) -> dict[str, Any]:
     """Make the data of a page's time line.
 
     Images are thinned to at most `MAX_STEPS`; of steps the first `MAX_STEPS` are there.
+    Times are in [s]; curves have `CURVE_POINTS` points, axes that move less than 1e-9
+    none. Of n images every k-th is kept.
 
     Args:
         plan: of the script.
@@ -196,7 +207,10 @@ def document(plan: ScanPlan) -> dict[str, Any]:
 
 
 def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
-    """Return axis -> (n,) positions at the projections of a plan."""
+    """Return axis -> (n,) positions at the projections of a plan.
+
+    Order is that of the images; dark and flat images are left out.
+    """
     kinds = [group.kind for group in plan.groups for _ in range(len(group))]
     taken = np.array(kinds, dtype=str) == "projection"
     return {name: values[taken] for name, values in plan.image_positions.items()}
@@ -206,6 +220,9 @@ def source_path(
     at: Mapping[str, FloatArray], machine: Machine, profile: Profile, state: State
 ) -> FloatArray:
     """Compute the focal spot's path in the sample's frame.
+
+    Empty (0, 3) without positions. Every k-th is taken, so up to twice as many may
+    remain.
 
     Args:
         at: axis -> positions (n,) [mm, deg].

@@ -60,7 +60,8 @@ def window_of(image: ShownImage) -> tuple[float, float]:
 
     Only every fourth row and column is looked at. For line integrals the lower value is
     at most 0 and matter is what exceeds AIR; other images use the percentiles 0.2 and
-    99.8. Without pixels: (0, 1); where all are equal, high is low + 1.
+    99.8. Without pixels: (0, 1); where all are equal, high is low + 1. Percentiles are of
+    the looked-at pixels; NaN is not expected.
 
     Returns:
         (low, high), high the greater one.
@@ -82,7 +83,8 @@ def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8
     """Convert to 8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter
     bright on black.
 
-    `window` is the values of black and white; NaN is black.
+    `window` is the values of black and white; NaN is black. Values beyond the window are
+    cut; equal ends divide by zero.
     """
     low, high = window
     scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))
@@ -102,7 +104,9 @@ def packed(
     Pixels are uint16 with a scale. Exact ones are the differences from column to column
     (mod 2^16), first the low bytes of all, then the high ones, deflated (zlib). Coarse
     ones are a grey JPEG of their high bytes. The rows of a virtual image follow those of
-    an exact one.
+    an exact one. Line integrals and coarse images are scaled between their least and
+    greatest values; exact counts keep scale 1. The window is chosen from the image, with
+    its virtual one below.
 
     Args:
         image: to send.
@@ -149,7 +153,7 @@ def packed(
 def _jpeg(raw: npt.NDArray[np.uint16]) -> bytes:
     """Encode a grey image (rows, cols) as JPEG.
 
-    Sixteen bits are reduced to eight.
+    Sixteen bits are reduced to eight. The quality is `JPEG_QUALITY`.
 
     Raises:
         ValueError: OpenCV cannot encode it.

@@ -77,6 +77,8 @@ PageMethod = Callable[["Viewer", Page, Mapping[str, Any]], Awaitable[object]]
 def nearest(safety: SafetyState) -> dict[str, Any]:
     """Return the nearest parts that may not touch, for pages: their distance "mm" (None:
     unknown), "pair", and "close" if a warning is due.
+
+    Due is below `CLOSE_MM`; `pair` is [] if unknown.
     """
     mm = safety.clearance_mm
     return {
@@ -117,7 +119,7 @@ class Viewer:
         """Prepare link, feeds, viser's server and the pages' state; see the class.
 
         viser's server runs from now on, on a private socket; `start` connects to the twin
-        and listens.
+        and listens. No page is open yet.
         """
         self.twin_address = address
         self._token = token
@@ -175,7 +177,8 @@ class Viewer:
     async def start(self, host: str, port: int, ssl: Any = None) -> None:
         """Start to listen and to work.
 
-        A part that fails sets `failed`.
+        A part that fails sets `failed`. The twin need not be there: the link goes on
+        trying.
 
         Args:
             host, port: to listen on.
@@ -208,6 +211,8 @@ class Viewer:
     async def stop(self) -> None:
         """End all tasks, feeds, pages, reconstructions and planners, and viser's server,
         in this order, waiting for each but the planners.
+
+        Raises nothing for tasks that failed.
         """
         for task in self._tasks:
             task.cancel()
@@ -227,7 +232,8 @@ class Viewer:
         all pages.
 
         Repeated log entries, and those on jobs (which come under their own topic), are
-        not passed on.
+        not passed on. Events without an object as data are ignored. States go to drawing,
+        not to the pages here.
 
         Args:
             topic: of the event.
@@ -257,6 +263,7 @@ class Viewer:
         """Keep a state of the twin, and wake the task that draws it.
 
         A time earlier than the last one means another twin: it is then reported anew.
+        Only the log's numbering starts again then.
         """
         if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
             self._told = -1
@@ -269,7 +276,7 @@ class Viewer:
         rest, or it hangs.
 
         Skipped while disconnected; a failed request is tried again, a state older than
-        the newest is dropped.
+        the newest is dropped. An answer counts as heard.
         """
         while True:
             await asyncio.sleep(max(0.05, self._heard_at + QUIET_S - time.monotonic()))
@@ -286,6 +293,8 @@ class Viewer:
     async def _beat(self) -> None:
         """Send all pages, every `BEAT_S` for ever, how long the twin has been silent [s]:
         a hanging twin does not report it.
+
+        Older beats that were not sent are replaced.
         """
         while True:
             now = time.monotonic()
@@ -301,7 +310,8 @@ class Viewer:
         without an event.
 
         Once the machine is at rest it is in each picture, too, unless a person has chosen
-        another one.
+        another one. It looks every `NAMES_S` seconds, for ever; at rest means the same
+        geometry as before. Layers are set again, too.
         """
         before: World | None = None
         while True:
@@ -324,7 +334,7 @@ class Viewer:
         """Set the nodes that each page shows in its frames, as soon as they have
         received all nodes.
 
-        Nothing without the scene of the lab.
+        Nothing without the scene of the lab. A frame gets only the differences.
         """
         if (lab := self.lab) is None:
             return
@@ -345,6 +355,8 @@ class Viewer:
     def _tell_link(self, page: Page) -> None:
         """Send a page the state of the connection to the twin: connected, problem,
         address, its hello, and whether any page shows a scene.
+
+        `hello` is None without a connection.
         """
         hello = self.link.hello
         page.say(
@@ -362,7 +374,8 @@ class Viewer:
         """Draw the newest state at most `DRAW_HZ` times a second (`PLAIN_DRAW_HZ` where no
         page has a graphics processor), for ever; older ones are skipped.
 
-        A failure is logged once, until a state is drawn again.
+        A failure is logged once, until a state is drawn again. The time of drawing counts
+        towards the interval.
         """
         loop = asyncio.get_running_loop()
         sound = True
@@ -388,7 +401,9 @@ class Viewer:
         """Draw a state: sample, cameras, scene and pages.
 
         Then the pages get it with framing, nearest parts and time. Travel ranges are
-        drawn only if a page shows them.
+        drawn only if a page shows them. Cameras get new presets each time; they move for
+        a new machine only, and the beam's eye always follows. Raises for a state that is
+        not valid.
 
         A new machine or sample is built first; the first state starts the images.
 
@@ -448,6 +463,8 @@ class Viewer:
         "flexray" while no twin is known).
 
         It is built anew in a thread if they have changed; pages then get the layers.
+        Raises TwinError for an unknown machine or profile. The former scene's nodes are
+        replaced.
         """
         hello = self.link.hello
         machine = self._machine or builtin_machine(
@@ -471,6 +488,8 @@ class Viewer:
     async def _dress(self, lab: LabScene, state: State) -> None:
         """Show the look of the sample on the stage, and begin to fetch its shape if that
         is missing.
+
+        Building the look is in a thread.
         """
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.wear(self.look)
@@ -482,7 +501,8 @@ class Viewer:
         """Fetch the mesh of an upload, and show it if the sample is still on the stage; a
         box is drawn until then.
 
-        Nothing is shown if the twin has none; a failure is logged.
+        Nothing is shown if the twin has none; a failure is logged. Errors are
+        ConnectionLost, TwinError and ValueError; all others are logged by the task.
         """
         try:
             stl = await sample_looks.fetch(self.link.request, sample)
@@ -505,7 +525,8 @@ class Viewer:
         worker thread.
 
         Only line integrals are shown on the panel; nothing before the scene is there. If
-        no page is open the feeds end.
+        no page is open the feeds end. The window is that of all pages, else chosen from
+        the image. Coarse images are drawn from every second pixel.
 
         Args:
             image: to show.
@@ -543,6 +564,9 @@ class Viewer:
     async def still(self, asked: Mapping[str, str]) -> bytes | None:
         """Draw the present scene as a JPEG (see `Stills`), once it has been placed or
         `STILL_S` has passed; None if nothing is placed or the view is not known.
+
+        `asked` is the page's query: view, page, and those of `Stills`. The view "sample"
+        shows only what turns with it.
         """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._placed.wait(), STILL_S)
@@ -561,6 +585,8 @@ class Viewer:
     def _grown(self, line: str) -> None:
         """Show a line of the reconstruction process: the surface in the scene, the slices in
         pages that follow it.
+
+        Removing is not done here.
         """
         surface, slices = line.split("\t")
         if (told := json.loads(surface)) is not None and self.lab is not None:
@@ -583,7 +609,8 @@ class Viewer:
 
         A page in excess is logged and closed with TRY_AGAIN. A page's name is cut at 40
         characters ("a visitor" without one). At its end the cameras are forgotten, and
-        volume and feeds stopped if no page wants them.
+        volume and feeds stopped if no page wants them. Two connections with one id: the
+        newer one counts.
 
         Args:
             id: of the page.
@@ -627,6 +654,8 @@ class Viewer:
     def refresh_feeds(self) -> None:
         """Subscribe to the images that pages show, and to line integrals for the panel if
         there is any page; stop other feeds.
+
+        Running feeds send their newest image again.
         """
         wanted = {page.kind for page in self.pages.values()}
         if self.pages:
@@ -641,6 +670,8 @@ class Viewer:
     def _joined(self, client: viser.ClientHandle, id: str) -> None:
         """Draw a page's plan path in its new view; nothing without a path. Called in one
         of viser's threads.
+
+        An unknown page is ignored.
         """
         page = self.pages.get(id)
         lab = self.lab

@@ -68,7 +68,8 @@ class Scenes:
         the outside.
 
         Sockets of viewers that were killed are removed first; on a failure the folder is
-        removed.
+        removed. The folder for temporary files is /tmp if the usual one's path exceeds
+        `LONGEST_TMP` bytes. What viser prints is dropped.
 
         Args:
             label: of the server.
@@ -103,6 +104,9 @@ class Scenes:
     ) -> AsyncIterator[ClientConnection]:
         """Connect a browser's frame to viser's socket, uncompressed; `path` identifies
         the frame. Closes the connection at the end.
+
+        A message has at most `MAX_OF_VISER` bytes. Yields the connection; errors of
+        connecting are raised.
         """
         async with unix_connect(
             str(self.path),
@@ -116,6 +120,8 @@ class Scenes:
     def path_of(self, client_id: int) -> str | None:
         """Return the path of a client's connection without its query; None when it has
         closed.
+
+        None for an unknown client, too.
         """
         connection = self.server._websock_server._live_connections.get(client_id)
         if connection is None:
@@ -134,7 +140,8 @@ class Scenes:
     def heard(self, client_id: int, said: int) -> bool:
         """Check that a client has been sent the first `said` messages to all clients.
 
-        Messages to it alone have a queue of their own, and could overtake those.
+        Messages to it alone have a queue of their own, and could overtake those. An
+        unknown client has been sent nothing.
         """
         at = self.server._websock_server._broadcast_buffer.generator_cursors.get(
             client_id, -1
@@ -151,6 +158,8 @@ class Scenes:
 def clear_left_behind(folder: Path) -> None:
     """Remove the sockets of viewers that were killed: those older than `YOUNG_S` on which
     no process listens; others stay, errors are ignored.
+
+    `folder` is searched for `PREFIX` names only; a removed folder goes with all it holds.
     """
     for left in folder.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
@@ -163,7 +172,10 @@ def clear_left_behind(folder: Path) -> None:
 
 
 def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
-    """Give nodes that all clients have other properties in the frame of one."""
+    """Give nodes that all clients have other properties in the frame of one.
+
+    `nodes` is node -> properties; the nodes themselves are not checked.
+    """
     with client.atomic():
         for message in _changes(nodes):
             client._websock_connection.queue_message(message)
@@ -172,6 +184,8 @@ def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
 def _changes(nodes: Nodes) -> Iterator[Message]:
     """Yield viser's messages that set the nodes' properties: visibility apart, the others
     together.
+
+    A visibility of None is left out; nodes without properties give nothing.
     """
     for name, properties in nodes.items():
         if (rest := dict(properties)).pop("visible", None) is not None:
@@ -184,6 +198,7 @@ def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
     """Set the first camera of a recorded scene, and its shown nodes.
 
     `server.initial_camera` would do so too, but also override the cameras of later pages.
+    Up direction and opening are not set.
     """
     serializer._insert_message(SetCameraPositionMessage(camera.position, initial=True))
     serializer._insert_message(SetCameraLookAtMessage(camera.look_at, initial=True))
@@ -194,8 +209,9 @@ def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
 def parted(html: bytes) -> tuple[bytes, bytes]:
     """Split viser's page into the page with MARK and its program as a script of its own.
 
-    The program is nearly all of the page, and the same for every view: as a file under one name
-    a browser fetches it once.
+    The program is nearly all of the page, and the same for every view: as a file under
+    one name a browser fetches it once. The data of the script's tag are set by the script
+    itself.
 
     Returns:
         Page and script; the whole page and nothing if it is built otherwise.
@@ -216,7 +232,8 @@ def parted(html: bytes) -> tuple[bytes, bytes]:
 def _listening_at(path: Path) -> Iterator[None]:
     """Make a server that viser starts meanwhile listen at a path and nowhere else.
 
-    Only one at a time. After an error the socket is closed.
+    Only one at a time. After an error the socket is closed. The library's own function is
+    put back in any case. The socket is left to viser.
 
     Args:
         path: of the Unix socket.

@@ -19,7 +19,8 @@ def watched(
 ) -> asyncio.Task[None]:
     """Run `work` as a task.
 
-    An error is logged, not raised; `died` is not called if the task is cancelled.
+    An error is logged, not raised; `died` is not called if the task is cancelled. Returns
+    the task, which ends without an exception. It is not started again.
 
     Args:
         work: the coroutine.
@@ -28,7 +29,10 @@ def watched(
     """
 
     async def run() -> None:
-        """Await the work; an exception is logged and `died` called, not raised."""
+        """Await the work; an exception is logged and `died` called, not raised.
+
+        Cancellation is passed on.
+        """
         try:
             await work
         except Exception:
