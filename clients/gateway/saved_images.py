@@ -147,7 +147,8 @@ class Recording:
     def adopt(self, folder: Path, state: State) -> int:
         """Add the projections of a data set that the twin made.
 
-        Files are linked or copied under their own names; frames that are no file of the folder are copied. Blocks begin at the time of `state`
+        Files are linked or copied under their own names; frames that are no file of the
+        folder are copied. Blocks begin at the time of `state`
         minus the set's duration; the texts are rewritten. A document without frames adds
         none.
 

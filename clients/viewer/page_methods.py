@@ -497,8 +497,8 @@ def _readout(
     """Compute distances and sizes of a recorded image's nominal geometry; None: it is
     not known.
 
-    None as well where no distances can be computed from it. The sample's place is taken
-    as the origin.
+    None as well where no distances can be computed from it. The axis is taken through the
+    object frame's origin.
     """
     if not cone:
         return None

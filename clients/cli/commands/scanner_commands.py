@@ -268,7 +268,9 @@ def jog(
         seconds: Stop after so many seconds of the twin's clock.
 
     Yields:
-        The axis at the end as document of --json, then one line. The axis is braked after the time and after Ctrl-C; numbers that are not finite, and a time of 0 or less, are usage errors.
+        The axis at the end as document of --json, then one line. The axis is braked after
+        the time and after Ctrl-C; numbers that are not finite, and a time of 0 or less,
+        are usage errors.
     """
     speed = option_values.number(velocity, "the velocity")
     if seconds is None:
