@@ -83,8 +83,13 @@ def _is_read(declared: Field[Any]) -> bool:
 
 
 def described(thing: object) -> tuple[str, dict[str, str]]:
-    """Split a docstring into its text and its arguments or attributes by name."""
-    text, *lists = re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(thing) or "")
+    """Split a docstring into its text and its arguments or attributes by name.
+
+    Sections of results and errors belong to neither.
+    """
+    whole = inspect.getdoc(thing) or ""
+    whole = re.sub(r"\n\n(?:Yields|Returns|Raises):\n(?: +\S.*\n?)+", "", whole)
+    text, *lists = re.split(r"\n\n(?:Args|Attributes):\n", whole)
     items = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", "\n".join(lists), re.MULTILINE)
     return text, {name: " ".join(about.split()) for name, about in items}
 
