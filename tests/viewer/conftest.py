@@ -237,8 +237,15 @@ def no_errors_on_the_console(request: pytest.FixtureRequest) -> Iterator[None]:
 def open_page(
     chromium: Any, lab: Lab, console: list[str]
 ) -> Iterator[Callable[..., Any]]:
-    """Opens the viewer's page; whatever it says on the console as an error fails the test."""
+    """Opens the viewer's page; whatever it says on the console as an error fails the test.
+
+    Nobody is in control when a module's own fixtures begin: a page of the module before may
+    have left just now.
+    """
     made: list[Any] = []
+    with lab.client() as client:
+        client.control("force")
+        client.control("release")
 
     def new(
         view: str = "none",
