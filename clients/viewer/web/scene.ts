@@ -10,8 +10,8 @@
   const LATE_MS = 5000;
   const HEARTBEAT_MS = 1000;
   const REST_MS = 8000;
-  const PAUSES = 6;
-  const LONGEST_PAUSE_MS = 1500;
+  const PAUSES = 1;
+  const LONGEST_PAUSE_MS = 500;
   const TOUCHED_MS = 2000;
   const LOOK_MS = 25;
   const ask = window.requestAnimationFrame.bind(window);
