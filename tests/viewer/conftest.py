@@ -351,8 +351,9 @@ def as_at_first(lab: Lab, client: TwinClient) -> None:
     A module's tests pass or fail whichever module ran before them on the same servers.
     """
     assert lab.first is not None
-    client.set_camera(**USUAL)
-    tube = lab.first.tube
+    camera, tube = lab.first.camera, lab.first.tube
+    exposed = {"exposure_ms": camera.exposure_ms, "averages": camera.averages}
+    client.set_camera(**USUAL, **exposed, frames=camera.frames)
     client.set_tube(kV=tube.kV, power_W=tube.power_W, on=False)
     client.set_sample(lab.first.sample.name)
     motors = {n: a for n, a in lab.first.axes.items() if not a.virtual}

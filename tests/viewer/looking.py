@@ -21,6 +21,9 @@ if (!localStorage.getItem('flexdt-motors')) localStorage.setItem('flexdt-motors'
 """
 """A browser that has been here before: motors open."""
 
+SAID_HIDDEN = "#warnings, #notes { visibility: hidden }"
+"""What the page says to people lies over its views, and comes and goes by itself."""
+
 USUAL = {"mode": "HW2SW1High", "roi": (32, 8, 1943, 1527)}
 """The camera that most tests expect."""
 
@@ -76,7 +79,8 @@ def begun(page: Any, twin: TwinClient) -> str:
 
 
 def picture(target: Any) -> Picture:
-    raw = target.screenshot(timeout=180_000)
+    """A picture of a view, (rows, cols, 3), without the notes and warnings over it."""
+    raw = target.screenshot(timeout=180_000, style=SAID_HIDDEN)
     return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=np.float32)
 
 
