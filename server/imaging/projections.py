@@ -94,15 +94,21 @@ class TrueGeometry:
 def load_truth(path: Path, data: Path) -> TrueGeometry:
     """Read the hidden misalignment from a truth file: TOML, parameter = value [mm, deg].
 
-    The path is resolved, so a link into the data directory is refused, too; text values
-    and those not below `MAX_TRUTH_VALUE` are errors.
+    Parameters that the file leaves out are zero. The path is resolved, so a link into
+    the data directory is refused, too. Refused are unknown names, values that are not
+    numbers (text, true, false), and values whose magnitude is not below
+    `MAX_TRUTH_VALUE` (nan included).
 
     Args:
         path: the file.
         data: the data directory, which must not contain it.
 
+    Returns:
+        The true geometry.
+
     Raises:
-        MachineFileError: file, key, and allowed values; no value of the file is repeated.
+        MachineFileError: file, key, and allowed values; no value of the file is
+            repeated. Also for a file that cannot be read or is not TOML.
     """
     file = path.resolve()
     if file.is_relative_to(data.resolve()):
@@ -214,20 +220,24 @@ class Imaging:
     ) -> Float32Array:
         """Compute line integrals of `sample` at n nominal poses, in the true geometry.
 
-        Solids, meshes and voxels are added up with their factors.
-
-        The sample is sent to the projector where it is new there.
+        The parts (solids, meshes, voxels) are projected one after the other and added
+        up with their factors. The sample is sent to the projector where it is new
+        there. An empty stage is answered without the projector, and its geometry is not
+        checked.
 
         Args:
             sample, poses, camera: as `Radiography.take` has them.
-            truth: instead of the hidden one.
+            truth: instead of the hidden one; None for the hidden one.
 
         Returns:
-            float32 (n, rows, cols), dimensionless; zeros for an empty stage.
+            float32 (n, rows, cols), dimensionless; zeros for an empty stage. The
+                projector's own read-only array if the sample is a single part of factor
+                1.
 
         Raises:
             ProjectorUnavailable: the projector does not answer.
             GeometryError: a geometry no scanner can have.
+            RpcError: the projector refuses the sample.
         """
         if not sample.name:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
@@ -255,20 +265,21 @@ class Imaging:
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
         """Compute paths through each material of `sample` at n nominal poses.
 
-        An empty stage has m = 0 materials. The geometry is checked; `truth` None is the
-        hidden one.
+        The geometry is checked before the focal spot is divided, for an empty stage
+        too.
 
         Args:
             sample, poses, camera, truth: as for `line_integrals`.
             spot: size of the focal spot [mm] and number of its points from which rays
-                start: so many views of each pose, one after another.
+                start. With more than one point n is the number of poses times that of
+                points: the views of a pose follow one another.
 
         Returns:
-            The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n,
-            12), which must not leave the server.
+            The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry
+                (n, 12), which must not leave the server. An empty stage has m = 0.
 
         Raises:
-            ProjectorUnavailable, GeometryError: as `line_integrals`.
+            ProjectorUnavailable, GeometryError, RpcError: as `line_integrals`.
         """
         cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
@@ -289,8 +300,19 @@ class Imaging:
             return divided.found, out, cone.rows
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
-        """Compute material -> path [mm] to the one pixel of `cone`, n = 1, in
-        the object's frame."""
+        """Compute the path of one ray through each material.
+
+        Args:
+            sample: on the stage, or that a scan is to show.
+            cone: one view (n = 1) of a one-pixel detector, in the object's frame; its
+                shape is replaced by (1, 1).
+
+        Returns:
+            Name of the material -> path [mm], zeros included; empty for an empty stage.
+
+        Raises:
+            ProjectorUnavailable, RpcError: as `nominal_paths`.
+        """
         found, paths = await self.nominal_paths(sample, cone.with_shape((1, 1)))
         lengths = paths.sum(axis=(1, 2, 3)).tolist()
         return {part.material.name: x for part, x in zip(found, lengths, strict=True)}
@@ -319,10 +341,18 @@ class Imaging:
             return divided.found, out
 
     async def nominal_integrals(self, sample: Sample, cone: ConeVec) -> Float32Array:
-        """Compute line integrals without the hidden truth, float32 (n, rows, cols); see
-        `nominal_paths`.
+        """Compute line integrals along rays that nothing hidden moves.
 
-        Zeros for an empty stage.
+        Each part is projected by itself, then all are added up with their factors.
+
+        Args:
+            sample, cone: as for `nominal_paths`.
+
+        Returns:
+            float32 (n, rows, cols), dimensionless; zeros for an empty stage.
+
+        Raises:
+            ProjectorUnavailable, RpcError: as `nominal_paths`.
         """
         views, *grid = cone.shape
         if not sample.name:
@@ -333,8 +363,14 @@ class Imaging:
             return np.asarray(np.tensordot(factors, parts, axes=1), dtype=np.float32)
 
     async def _along(self, divided: _DividedSample, cone: ConeVec) -> Float32Array:
-        """Project each piece of a sample along `cone`, one after the other: (pieces, n,
-        rows, cols).
+        """Project each piece of a divided sample along `cone`, one after the other.
+
+        Args:
+            divided: the sample, on the projector.
+            cone: n views in the sample's frame, with the detector's shape.
+
+        Returns:
+            float32 (pieces, n, rows, cols), without the pieces' factors.
         """
         views, *grid = cone.shape
         out = np.empty((len(divided.names), views, *grid), dtype=np.float32)
@@ -343,10 +379,19 @@ class Imaging:
         return out
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
-        """Sample the materials of `sample` on a grid of about `voxels` cubes; the last
-        grid is kept.
+        """Sample the materials of `sample` on a grid for scatter, or return the grid kept
+        last.
 
-        It is kept for one phantom, whatever the number of voxels asked later.
+        The grid of one phantom is kept: while the phantom is the same, later calls
+        return it whatever `voxels` is. The sample is sent to the projector like for
+        images. The grid is computed in a thread.
+
+        Args:
+            sample: on the stage; not empty.
+            voxels: approximate number of cubes of a new grid.
+
+        Returns:
+            The grid of materials.
         """
         async with self._on_projector(sample, "material") as divided:
             phantom = divided.phantom
@@ -420,14 +465,14 @@ class Imaging:
         """Divide a sample, send it to the projector where it is new, and keep it there
         within the context.
 
-        A sample that cannot be sent raises before the context begins.
-
-        Old samples beyond the limits are dropped, here and there.
+        One sample is divided and sent at a time. Old samples beyond the limits are
+        dropped, here and there (`_forget_old`); one in use is not. A sample that cannot
+        be sent raises before the context begins.
 
         Args:
-            sample: on the stage.
-            pieces: "part" for what attenuates, (body, factor) each; "material" for
-                channels.
+            sample: on the stage; not empty.
+            pieces: "part" for bodies that attenuate, (body, factor) each; "material"
+                for channels.
 
         Yields:
             The pieces, with their names on the projector.
@@ -451,11 +496,15 @@ class Imaging:
         """Divide the sample as it is now, in a thread, or reuse its pieces; with
         `_sending` held.
 
-        It becomes the most recently used; a new phantom under the name is divided anew.
+        The sample becomes the most recently used. A new phantom under the same name is
+        divided anew, and its names on the projector are then empty.
 
         Args:
             sample: on the stage, or of a scan.
             pieces: "part" or "material", as in `_on_projector`.
+
+        Returns:
+            The divided sample, kept in `_divided`.
         """
         key = (_name(sample), pieces)
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
@@ -492,11 +541,11 @@ class Imaging:
         return {key for key in self._divided if key[0] in names}
 
     async def _forget_old(self) -> None:
-        """Drop the least recently used samples beyond the limits, here and on the
-        projector; with `_sending` held.
+        """Drop the least recently used samples beyond the limits; with `_sending` held.
 
-        The newest, those that must stay, and those in use are kept, even beyond the
-        limits.
+        Limits are `memory_limit` bytes (None: no limit) and `MAX_SAMPLES` samples. The
+        newest, those that are pinned, and those in use are kept, even beyond the
+        limits. All versions of a dropped sample are removed on the projector, too.
         """
         stays = self._pinned_keys()
         if self.memory_limit is None:
@@ -520,18 +569,22 @@ class Imaging:
         """Ensure that the projector has the present version of a body; old versions are
         removed.
 
-        At most `MAX_VERSIONS` of it stay; where there is no room old versions of all
-        bodies are removed first.
+        At most `MAX_VERSIONS` of a body stay, the present one included. A version that
+        was sent before is not sent again and counts as the newest. If the projector has
+        no room, all bodies' versions but the newest are removed, and the body is sent
+        once more.
 
         Args:
             name: of the body here.
             body: scene, mesh or volume.
 
         Returns:
-            Its name on the projector, which contains a hash of its content.
+            Its name on the projector, "NAME #HASH" with a hash of its content.
 
         Raises:
-            RpcError: -32008, the projector has no room even without old versions.
+            RpcError: -32008, the projector has no room even without old versions; or
+                the projector refuses the body.
+            ProjectorUnavailable: the projector does not answer.
         """
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])
@@ -551,10 +604,10 @@ class Imaging:
         return named
 
     async def _remove(self, name: str, left: int) -> None:
-        """Remove all but the `left` newest versions of a body, here and on the projector;
-        its errors are ignored.
+        """Remove all but the `left` newest versions of a body, the oldest first.
 
-        The oldest first.
+        They are removed on the projector and from the list here; errors of the
+        projector are ignored.
         """
         versions = self._versions[name]
         while len(versions) > left:
@@ -576,10 +629,11 @@ def digest_of(body: Body) -> str:
     """Hash everything of a body that images depend on: equal for equal contents, in every
     process.
 
-    Volumes with shape, voxel size, centre and float32 values; names count only in scenes.
+    A scene is hashed as its dictionary, names included. A mesh: corners as float64,
+    triangles as int64. A volume: shape, voxel size, centre, and float32 values.
 
     Returns:
-        16 hexadecimal digits.
+        The first 16 hexadecimal digits of the SHA-256.
     """
     if isinstance(body, Scene):
         sha = hashlib.sha256(

@@ -71,7 +71,11 @@ class ProjectorClient:
             self._channel.close()
 
     async def give(self, name: str, body: Body) -> None:
-        """Ensure that the server has `body` under `name`.
+        """Ensure that the server has `body` under `name`; sent only if it is not there
+        already.
+
+        A body counts as there if this very object was sent to this run of the server.
+        Bodies are sent one at a time.
 
         Raises:
             RpcError: -32008, above the server's memory limit; -32602, a mesh that does
@@ -82,7 +86,10 @@ class ProjectorClient:
             await self._ask("volume.put", lambda channel: self._give(channel, name, body))
 
     async def _give(self, channel: ProjectorLink, name: str, body: Body) -> None:
-        """Send a body unless the server has this very one."""
+        """Send a body unless this very object was sent under that name, and remember it.
+
+        It may be evicted if the server evicts volumes.
+        """
         if self._sent.get(name) is not body:
             await _send(channel, name, body, {"evictable": True} if self._evicts else {})
             self._sent[name] = body
@@ -97,10 +104,11 @@ class ProjectorClient:
     ) -> npt.NDArray[np.float32]:
         """Compute line integrals; send the body again if the server has dropped it.
 
-        At most `MAX_TRIES` times; without `body` an unknown volume is an error at once.
+        A volume that the server does not know is sent and requested again, at most
+        `MAX_TRIES` requests in all; without `body` it is an error at once.
 
         Args:
-            name, body: the body to project; None if it is there already.
+            name, body: the body to project; body None if it is there already.
             cone_vec: n views, object frame.
             shape: detector (rows, cols).
 
@@ -178,13 +186,18 @@ class ProjectorClient:
             ) from None
 
     async def _connect(self) -> ProjectorLink:
-        """Connect and introduce the client; forget what was sent to a server that has
-        restarted.
+        """Connect, say hello, and forget the bodies that were sent to another run of the
+        server.
 
-        Also notes whether that server drops volumes when memory is needed.
+        Notes whether the server evicts volumes when memory is needed. A connection
+        whose hello fails is closed.
+
+        Returns:
+            The connection.
 
         Raises:
-            ProjectorUnavailable: the client is closed, or no projector answers.
+            ProjectorUnavailable: the client is closed, no projector answers, or the
+                connection ends during the hello.
             RpcError: the projector refuses the client.
         """
         if self._closed:
@@ -216,10 +229,11 @@ class ProjectorClient:
 async def _send(
     channel: ProjectorLink, name: str, value: Body, how: Mapping[str, object]
 ) -> None:
-    """Send a volume or mesh in chunks, or a scene as one message; each chunk waits for
-    its answer.
+    """Send a volume or mesh in chunks, or a scene as one message, each awaiting its
+    answer.
 
-    Values go as little-endian float32, corners as float64, faces as int32.
+    A chunk has at most `CHUNK_BYTES`. Values go as little-endian float32; of a mesh all
+    corners (float64) come before all triangles (int32).
 
     Args:
         channel: connection to the projector.
@@ -229,6 +243,7 @@ async def _send(
 
     Raises:
         RpcError: the projector refuses it.
+        LinkLost: the connection has ended.
     """
     if isinstance(value, Scene):
         await channel.ask(

@@ -92,26 +92,38 @@ class ProjectorPool:
         return {f"{m.client.host}:{m.client.port}": m.views for m in self._members}
 
     async def close(self) -> None:
-        """Cancel the open requests and close every client's connection."""
+        """Cancel the open requests, then close every client's connection for good, one by
+        one.
+        """
         for task in self._open:
             task.cancel()
         for member in self._members:
             await member.client.close()
 
     async def room(self) -> int | None:
-        """Return the memory that the largest projector can have for one sample [bytes];
-        None if not known."""
+        """Return the memory that the largest projector can have for one sample [bytes].
+
+        All are asked at once, each for at most `LATE_S`. None if no projector's is
+        known (`_room_of`).
+        """
         found = await asyncio.gather(*map(_room_of, self._members))
         return max((room for room in found if room is not None), default=None)
 
     async def put(self, name: str, body: Body) -> None:
-        """Store a body, and send it to one projector, which shows that it fits;
-        errors as the client's."""
+        """Keep a body under a name, and send it to one projector, which shows that it
+        fits.
+
+        Others get it with their first request for it. It stays kept if sending fails.
+        Raises as `_request`.
+        """
         self._values[name] = body
         await self._request(name, None, (0, 0))
 
     async def remove(self, name: str) -> None:
-        """Have all projectors remove it; those that do not answer lose it when they restart."""
+        """Forget a body and have all projectors remove it; their failures are ignored.
+
+        Those that do not answer lose it when they restart.
+        """
         self._values.pop(name, None)
         removals = (member.client.remove(name) for member in self._members)
         await asyncio.gather(*removals, return_exceptions=True)
@@ -119,8 +131,19 @@ class ProjectorPool:
     async def project(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
     ) -> Float32Array:
-        """Compute line integrals, float32 (n, rows, cols);
-        errors as `ProjectorClient.project`."""
+        """Compute line integrals on one of the projectors.
+
+        Args:
+            name: of a body that `put` has kept.
+            cone_vec: n views, object frame.
+            shape: detector (rows, cols).
+
+        Returns:
+            float32 (n, rows, cols).
+
+        Raises:
+            ProjectorUnavailable, RpcError: as `_request`.
+        """
         images = await self._request(name, cone_vec, shape)
         assert images is not None
         return images
@@ -131,10 +154,11 @@ class ProjectorPool:
         """Request images of a free projector, and of another one if it is late; take the
         first answer.
 
-        Invalid parameters are raised at once, other errors once every projector has
-        refused. While all are busy or rest it waits.
-
-        A projector that fails rests for a while, and the request goes to the next.
+        A request is late after `LATE_S` and `LATE_FACTOR` times the time that its views
+        usually take. A projector that fails rests (`_ask`), and the request goes to the
+        next. Waits without a limit while all are busy; failures count only once none of
+        its requests runs. Requests that lose are cancelled only if this one ends with
+        an error; else they keep their place until answered.
 
         Args:
             name: of the body.
@@ -145,8 +169,10 @@ class ProjectorPool:
             Images (n, rows, cols), or None without views.
 
         Raises:
-            ProjectorUnavailable: none has answered within the patience.
-            RpcError: an error that another projector would answer, too.
+            ProjectorUnavailable: a projector has failed after `patience_s`, with none
+                left running.
+            RpcError: invalid parameters, at once; another error once every projector
+                has refused.
         """
         loop = asyncio.get_running_loop()
         value = self._values.get(name)
@@ -221,11 +247,12 @@ class ProjectorPool:
         """Start a request in a task that counts as open until it ends, and then wakes a
         waiting request.
 
-        The task is returned at once.
-
         Args:
-            member: the projector.
+            member: the projector, whose open requests are counted.
             asking: the request.
+
+        Returns:
+            The task, at once.
         """
 
         def ended(task: asyncio.Task[Float32Array | None]) -> None:
@@ -254,18 +281,20 @@ class ProjectorPool:
         views: ConeVec | None,
         shape: tuple[int, int],
     ) -> Float32Array | None:
-        """Send a request to one projector; measure its pace, or let it rest for `REST_S`
-        after a failure.
+        """Send a request to one projector; measure its pace, or let it rest after a
+        failure.
 
-        After an error of the wire it rests only if there are others; its kind is then
-        asked again. Its pace is a running mean [s a view].
-
-        A new member's version and backend are asked first and compared with the others'.
+        A member whose version and backend are unknown is asked for them first, and they
+        are compared with the others' (`_compare`). A member that does not answer rests
+        for `REST_S`, is logged, and is asked for its version again later; so it is
+        after an error answer, unless it is the only member. Its pace is a running mean,
+        a quarter of it the latest request [s a view]; its views are counted.
 
         Args:
             member: the projector.
             name: of the body.
-            value: the body; None for a request that sends none.
+            value: the body, sent unless it is there; None for a request that sends
+                none.
             views: to project; None for none.
             shape: (rows, cols) of the images.
 
@@ -316,10 +345,11 @@ class ProjectorPool:
 
 
 async def _room_of(member: _Member) -> int | None:
-    """Return the memory that a projector can have for a sample [bytes]; None if it
-    does not answer.
+    """Return the memory that a projector can have for a sample [bytes]: free or
+    evictable.
 
-    None also for one that does not evict volumes; within `LATE_S`.
+    None if it does not answer within `LATE_S`, answers with an error, or evicts no
+    volumes.
     """
     try:
         health = await asyncio.wait_for(member.client.health(), LATE_S)

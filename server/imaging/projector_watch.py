@@ -63,7 +63,11 @@ class ProjectorWatch:
                 group.create_task(self._watch(client))
 
     async def _watch(self, client: Watched) -> None:
-        """Check one projector every `every_s`, for ever; skipped while nobody asks."""
+        """Check one projector, wait `every_s`, and so on until cancelled; skipped while
+        nobody asks.
+
+        The wait begins when the projector has answered or failed.
+        """
         while True:
             if self.asks():
                 await self._check(client)
@@ -98,11 +102,13 @@ class ProjectorWatch:
             answer.cancel()
 
     def _report(self, client: Watched, problem: str | None) -> None:
-        """Record the problem of one projector; set `problem` and call `changed` if all
-        have one, or no longer.
+        """Record the problem of one projector, and announce a change of the pool's
+        problem.
 
-        A projector that has not been asked yet counts as without a problem; `problem` is
-        the first one's.
+        The pool has a problem only if all its projectors have one: then `problem` is
+        that of the first projector, else None. One that has not been checked yet counts
+        as without. `changed` is called if `problem` differs from before, its text
+        included.
 
         Args:
             client: of the projector.

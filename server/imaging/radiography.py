@@ -187,12 +187,15 @@ class Radiography:
     ) -> list[Radiograph]:
         """Compute radiographs of `sample`, without noise, one for each of `exposures`.
 
-        With an extended focal spot images are made one by one. An empty stage has no
-        scatter.
+        "ideal" gives line integrals, and settings do not matter; "mono" and "poly"
+        give expected counts. With an extended focal spot images are made one by one,
+        and its size is that of each exposure's power. Scatter is simulated at each
+        image's middle pose; an empty stage has none.
 
         Args:
             sample: on the stage.
-            poses: n nominal poses: as many for each image, spread over its exposure.
+            poses: n nominal poses: as many for each image, spread over its exposure; n
+                is a multiple of the number of exposures.
             camera: of all of them.
             exposures: tube and time of each image; taken as if X-rays were on.
             truth: instead of the hidden one.
@@ -251,16 +254,19 @@ class Radiography:
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
     ) -> list[Scattered]:
-        """Simulate the scatter of each image by its own view alone.
+        """Simulate the scatter of each image by its own view alone, one after the other.
 
-        So a scan that is resumed has the same bytes.
+        So a scan that is resumed has the same bytes. One beam is made for each voltage.
 
         Args:
             thing: the sample's voxels.
             chain: tube, materials, panel.
             views: (n, 12) cone_vec rows [mm].
             camera: of all images.
-            exposures: of each image.
+            exposures: of each image, n.
+
+        Returns:
+            The scatter of each image, n.
         """
         beams = {
             kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}
@@ -273,11 +279,14 @@ class Radiography:
     async def predicted_shares(self, sample: Sample, probe: SampleProbe) -> CountShares:
         """Predict the saturated and starved parts of a setting's pixels behind a sample.
 
-        Without scatter.
+        Without noise and scatter.
 
         Args:
             sample: that the scan is to show; nominal geometry, nothing hidden.
             probe: setting, and the rays that are looked at.
+
+        Returns:
+            The parts of the rays' counts that are saturated and starved.
 
         Raises:
             ProjectorUnavailable: the projector does not answer.
@@ -329,11 +338,14 @@ class Radiography:
     def signal(
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
-        """Compute the expected counts above dark as if X-rays were on, not
-        clipped, (rows, cols).
+        """Compute the expected counts above dark as if X-rays were on.
 
-        Shape (rows, cols), without noise and dark; X-rays count as on whatever `exposure`
-        has.
+        Without noise and dark counts, and not clipped at full scale; whether X-rays are
+        on in `exposure` is not used. Of physics other than "ideal" the exposure is in
+        the radiograph already.
+
+        Returns:
+            float32 (rows, cols).
         """
         if radiograph.expected is not None:
             return expected_counts(self.panel, camera, radiograph.expected.mean_e)
@@ -351,15 +363,17 @@ class Radiography:
     ) -> ideal.Counts:
         """Compute the counts that the camera saves of a radiograph.
 
-        For ideal physics `before` and `trapped` are not used.
+        For ideal physics `before` and `trapped` are not used. Earlier frames without
+        expected counts are skipped.
 
         Args:
             radiograph: without noise.
             camera: mode and region.
-            exposure: tube and time; X-rays off give a dark image.
+            exposure: tube and time; X-rays off give a dark image, whatever the
+                radiograph.
             rng: generator of the frame's noise; None for the expectation.
             before: earlier frames, each with the time since its end [s].
-            trapped: electrons in traps, (rows, cols).
+            trapped: electrons in traps, (rows, cols); None for none.
 
         Returns:
             uint16 (rows, cols).
@@ -387,15 +401,17 @@ def marks_of(
 ) -> npt.NDArray[np.uint8]:
     """Mark every pixel with the sum of SATURATED, STARVED and CUT_OFF.
 
-    Without noise; CUT_OFF only on the image's edge. Rows and columns that do not fill a
-    binned pixel mark the last one.
+    Judged without noise. STARVED: fewer than `FEW_COUNTS` above dark. CUT_OFF: on the
+    image's edge, with a line integral above `CUT_OFF_INTEGRAL`. Rows and columns that
+    do not fill a binned pixel mark the last one.
 
     Args:
         radiography, radiograph, camera, exposure: as in `flags_of`.
-        binning: pixels a side; a mark of any of them is a mark of their mean.
+        binning: pixels a side; a mark of any of them is a mark of their mean. At most
+            rows and cols.
 
     Returns:
-        uint8 (rows, cols), binned.
+        uint8 (rows // binning, cols // binning).
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)
@@ -424,18 +440,22 @@ def flags_of(
     exposure: ExposureSettings,
     time: float | None = None,
 ) -> ImageFlags:
-    """Compute the saturated and starved parts of an image, their bounds, and the edges
-    that cut the sample off.
+    """Compute the saturated and starved parts of an image, and the edges that cut the
+    sample off.
 
-    Every `JUDGED_STEP_PX`-th pixel without noise is judged; an edge is cut where any of
-    its pixels is above `CUT_OFF_INTEGRAL`. `good_counts` and `good_lines` are the ranges
-    of counts and of line integrals that are neither starved nor saturated.
+    Judged without noise at every `JUDGED_STEP_PX`-th pixel; parts are 0 to 1. An edge
+    ("left", "right", "top", "bottom") is cut where any of its pixels is above
+    `CUT_OFF_INTEGRAL`. `good_counts` and `good_lines` are the ranges of counts and of
+    line integrals (rounded to 0.01) that are neither starved nor saturated.
 
     Args:
         radiography: how images are made.
         radiograph: the image.
-        camera, exposure: its settings.
+        camera, exposure: its settings; taken as if X-rays were on.
         time: of its pose [s]; None leaves it out.
+
+    Returns:
+        The flags, as they go to clients.
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)[
@@ -481,8 +501,9 @@ def predict(
 ) -> list[bytes]:
     """Answer `exposure.predict`, in the worker.
 
-    At most `MAX_PROPOSALS` settings of the best; the infinite last edge of the histogram
-    is left out.
+    The forecast's `images` are sent as `frames`, with the sample's name added. At most
+    `MAX_PROPOSALS` settings of the best; the infinite last edge of the histogram is
+    left out.
 
     Args:
         phantom: the sample.
@@ -491,7 +512,7 @@ def predict(
         codec: of the answer.
 
     Returns:
-        The encoded answer.
+        The encoded answer, in pieces.
 
     Raises:
         RpcError: an argument that the machine does not allow.
