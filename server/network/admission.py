@@ -33,12 +33,13 @@ class TokenCheck:
         self._wrong = 0
 
     async def check(self, given: str | None, client: str) -> None:
-        """Compare a token with the server's; delay the answer to each wrong one
-        more than the last.
+        """Compare a token with the server's; a wrong one is answered late, and too many
+        close.
 
-        Each wrong token delays by 0.2 s more.
-
-        The connection is closed after `MAX_WRONG_TOKENS` wrong ones.
+        Nothing is checked if the server has no token. Each wrong token is logged and
+        delays its answer by 0.2 s more than the last one. The connection is closed at
+        the `MAX_WRONG_TOKENS`-th wrong one and at each later one; right ones do not
+        reset the count.
 
         Args:
             given: by the client; None for none.

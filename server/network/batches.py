@@ -30,8 +30,13 @@ class Batch:
     """
 
     def __init__(self, items: Sequence[Item], lane: Lane, most: int) -> None:
-        """Queue a batch's items by lane, in their order within a lane; answers may have
-        `most` bytes.
+        """Queue a batch's items by lane, the most urgent lane first, in their order
+        within a lane.
+
+        Args:
+            items: of the batch, in the order of their answers.
+            lane: gives the lane of an item.
+            most: size that all answers together may have [bytes].
         """
         by_lane = sorted(enumerate(items), key=lambda each: lane(each[1]))
         self._left = deque(by_lane)
@@ -52,7 +57,9 @@ class Batch:
     def next_item(self, *, urgent_alone: bool = False) -> Item | None:
         """Take out the next item, urgent ones first, and remember its place in the batch.
 
-        None if none is left, or, with `urgent_alone`, if the next is not urgent.
+        Returns:
+            The item; None if none is left, or, with `urgent_alone`, if the next is
+                ordinary (it stays then).
         """
         if not self._left:
             return None
@@ -68,11 +75,15 @@ class Batch:
         answer: m.Response | m.Failure | None,
         encode: Callable[[m.Response | m.Failure], list[bytes]],
     ) -> None:
-        """Keep the answer to the item that was taken out last; a notification has none.
+        """Keep the answer to the item that was taken out last; nothing for None (a
+        notification).
 
-        The error counts with the size of the answer that it replaces.
+        An answer that would make the batch too large is replaced by an error, which
+        counts with the size of that answer: so the batch is full from then on.
 
-        An answer that would make the batch too large is replaced by an error.
+        Args:
+            answer: to the item.
+            encode: gives the pieces of an answer.
         """
         if answer is None:
             return

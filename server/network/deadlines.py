@@ -19,8 +19,10 @@ class Deadlines:
         self._timers: dict[str, asyncio.TimerHandle] = {}
 
     def start(self, name: str, seconds: float | None) -> None:
-        """Start a timeout unless one of that name runs; after it `on_timeout` is called.
-        None seconds starts none.
+        """Start a timeout, after which `on_timeout` is called once with name and seconds.
+
+        Nothing if `seconds` is None, or if a timeout of that name has been started and
+        not stopped, even one that has passed.
         """
         if seconds is not None and name not in self._timers:
             self._timers[name] = asyncio.get_running_loop().call_later(

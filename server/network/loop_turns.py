@@ -23,10 +23,15 @@ class LoopTurns:
         self._due = False
 
     async def take(self, who: object, lane: int) -> None:
-        """Wait for a turn of connection `who` in a lane; lower lanes go first,
-        connections one after another.
+        """Wait for a turn of connection `who` in a lane; within a lane connections
+        alternate.
 
-        One turn is given in each round of the loop.
+        One turn is given in each round of the loop: to the lowest lane in which anybody
+        waits.
+
+        Args:
+            who: the connection, hashable.
+            lane: FIRST, URGENT or ORDINARY.
         """
         loop = asyncio.get_running_loop()
         turn = loop.create_future()
@@ -37,11 +42,10 @@ class LoopTurns:
         await turn
 
     def _give_turn(self) -> None:
-        """Give the first waiting connection of the most urgent lane its turn; reschedule
-        if others wait.
+        """Give the first waiting connection of the most urgent lane its turn.
 
-        A connection has one turn and then is last of its lane; cancelled waits are
-        skipped.
+        Its further waits come last in the lane. Cancelled waits are skipped. Scheduled
+        for the next round of the loop again if others wait; nothing if nobody does.
         """
         self._due = False
         for lane in self._lanes:

@@ -68,7 +68,8 @@ class Outbox:
     def send(self, body: Sequence[bytes]) -> None:
         """Send or queue the body from `encode`, or several of them as a batch.
 
-        A batch that is too large is replaced by one error without an id.
+        A batch that is too large is replaced by one error without an id. Dropped if the
+        connection has ended or is closing.
         """
         wire = self.link.wire
         try:
@@ -80,8 +81,11 @@ class Outbox:
     def encode(self, message: m.Response | m.Failure) -> list[bytes]:
         """Encode an answer; if that is impossible, encode an error with its id instead.
 
-        Too large: that error. Values that are not finite, or of a wrong type: an internal
-        error, and a log line that names the place.
+        Too large for a message: that error. Values that are not finite, or of a wrong
+        type: an internal error, and a log line that names the place.
+
+        Returns:
+            The pieces of the body; nothing is sent.
         """
         wire = self.link.wire
         try:
@@ -99,9 +103,9 @@ class Outbox:
         """Send an event now, or keep it while the transport is full: newest of its slot,
         or in order.
 
-        Nothing if the connection has ended. An event that cannot be encoded is logged.
-
-        A connection with more than `max_events` unread is aborted.
+        Nothing if the connection has ended or is closing. An event that cannot be
+        encoded is logged and dropped. A connection whose queue has `max_events` writes
+        or more is aborted at an event that would be sent.
 
         Args:
             message: notification, or its bytes.
@@ -126,7 +130,10 @@ class Outbox:
             self.link.log("event not sent", logging.ERROR, error=True)
 
     def _put_all(self, pieces: Sequence[bytes]) -> None:
-        """Send or queue pieces: joined in one write if small, else in writes of `WRITE_BYTES`."""
+        """Send or queue pieces: one write if they have at most `WRITE_BYTES` together.
+
+        Else each piece in writes of its own of at most `WRITE_BYTES`.
+        """
         if sum(map(len, pieces)) <= WRITE_BYTES:
             self._put(b"".join(pieces))
             return
@@ -152,10 +159,11 @@ class Outbox:
         self.ready.clear()
 
     def resume(self) -> None:
-        """Mark the transport as ready; write the queue, then the newest value of each
-        slot, until it is full.
+        """Mark the transport as ready; write the queue, then the events of slots,
+        until it is full.
 
-        The queue is dropped if the transport is closing.
+        Slots are written in the order in which they were filled. The queue is
+        dropped if the transport is closing.
         """
         self.ready.set()
         while self.queue and self.ready.is_set():
@@ -168,13 +176,15 @@ class Outbox:
             self._put_event(self.slots.pop(slot))
 
     async def room(self) -> None:
-        """Wait until the client has taken enough of its replies."""
+        """Wait until at most `max_unsent` bytes are queued, or the connection has ended."""
         while self.unsent > self.link.limits.max_unsent and not self.over:
             await self.ready.wait()
 
     async def flushed(self) -> None:
         """Wait until queue and slots have been handed to the transport, or the connection
         has ended.
+
+        It does not wait until the transport has sent them.
         """
         while (self.queue or self.slots) and not self.over:
             await self.ready.wait()
@@ -190,14 +200,15 @@ class Outbox:
 def _not_finite(value: object, path: str = "$") -> str | None:
     """Find the path of the first number that JSON cannot represent, for the log.
 
-    Depth first, in order; None for other types.
+    Depth first, in the order of keys and items.
 
     Args:
-        value: of a message.
+        value: of a message: model, mapping, list, tuple or number; others count as
+            finite.
         path: to the value.
 
     Returns:
-        Path and number; None if all are finite.
+        "PATH: NUMBER", for example "$.result.x: nan"; None if all are finite.
     """
     match value:
         case float():

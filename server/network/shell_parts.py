@@ -35,7 +35,8 @@ async def answered(
     """Await the answer to a request, count it with its time, and log it at the level
     `debug`.
 
-    An exception of `work` is raised uncounted.
+    An exception of `work` is raised, neither counted nor logged. Log lines of `work`
+    carry the trace, and a method's name is cut to 100 characters.
 
     Args:
         work: makes the answer.

@@ -103,10 +103,11 @@ class TcpServer(ListeningServer):
         return _Link(self)
 
     def look_soon(self, link: _Link) -> None:
-        """Schedule a search for urgent requests of a connection, in turns that no
-        flood can fill.
+        """Schedule a search for urgent requests of a connection, in turns that no flood
+        can fill.
 
-        A connection is in the list once.
+        A connection is in the list once, in the order of first calls. The search is
+        made in the loop's next round, by `_start_urgent`.
         """
         self._unexamined[link] = None
         if not self._examination_due:
@@ -114,10 +115,10 @@ class TcpServer(ListeningServer):
             asyncio.get_running_loop().call_soon(self._start_urgent)
 
     def _start_urgent(self) -> None:
-        """Let waiting connections start their urgent requests, for up to `LOOK_S`;
-        reschedule the rest.
+        """Let listed connections start their urgent requests, for up to `LOOK_S`.
 
-        At least one connection is examined at each call.
+        At least one connection is examined at each call. The rest is scheduled for the
+        loop's next round, also if one raises.
         """
         until = time.perf_counter() + LOOK_S
         try:
@@ -133,7 +134,11 @@ class TcpServer(ListeningServer):
                 asyncio.get_running_loop().call_soon(self._start_urgent)
 
     async def close(self) -> None:
-        """Stop listening, end every connection (waiting ones too), wait until all are gone."""
+        """Stop listening, abort every connection (waiting ones too), and wait until all
+        are gone.
+
+        Messages that are not sent are lost.
+        """
         if self.server is not None:
             self.server.close()
         links = {*self.links, *self.waiting.guests, *self.reserved.guests}
@@ -158,14 +163,14 @@ async def serve(
 
     Args:
         open: begins a session of the application with a connection.
-        host, port: where.
-        limits: of connections.
-        token: that clients must bring.
-        ssl: for TLS.
-        methods: there are.
+        host, port: address to listen on.
+        limits: of connections; None for the defaults.
+        token: that clients must bring; None for none.
+        ssl: for TLS; None for plain TCP.
+        methods: there are, by name.
         observe: called for every answer.
-        read: reads large messages; None: they are read in the loop, which then waits for
-            it.
+        read: reads large messages; None: they are read in the loop, which then waits
+            for it.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
@@ -228,10 +233,11 @@ class _Link(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Register a new connection in the waiting room and start serving it.
 
-        The worker's failure aborts the connection.
-
-        Without a token on the server, the application's session is opened at once; else a
-        deadline for the client's hello starts.
+        The connection is numbered and named "HOST:PORT#NUMBER"; its socket is tuned,
+        and its write buffer counts as full above 64 KiB. Without a token on the server,
+        the application's session is opened at once; else a deadline (`hello_timeout_s`)
+        for the client's hello starts. The waiting room may end an older connection. A
+        failure of the serving task aborts the connection.
 
         Args:
             transport: of the connection.
@@ -257,7 +263,9 @@ class _Link(asyncio.BufferedProtocol):
         """Give the connection a place if one is free, else a reserved one, for urgent
         requests alone.
 
-        It leaves the waiting room in any case.
+        There are `max_clients` places and `RESERVED_PLACES` reserved ones, where a new
+        connection may displace an older one. It leaves the waiting room in any case.
+        Nothing changes if it has a place.
 
         Returns:
             Whether it has a place of its own.
@@ -290,10 +298,10 @@ class _Link(asyncio.BufferedProtocol):
         """Divide received bytes into messages; start E-stops at once, other urgent
         requests soon.
 
-        While reading pauses, the deadline is stopped.
-
-        Starts and stops the deadline of an incomplete message, and pauses reading while
-        too many messages wait.
+        The deadline `message_timeout_s` runs while a message is incomplete, and stops
+        while reading pauses. Reading pauses while too many messages or bytes wait
+        (`_full`). The serving task is woken for whole messages, and for an incomplete
+        one, which may be too long already.
 
         Args:
             data: any part of the stream.
@@ -317,22 +325,25 @@ class _Link(asyncio.BufferedProtocol):
             self.deadlines.stop("message")  # the rest comes when we read again
 
     def overtake(self) -> None:
-        """Start the urgent requests among the received messages, wherever in the
-        queue they are.
+        """Start the urgent requests among the received messages, wherever in the queue
+        they are.
 
-        Nothing before admission or after the end. If not all was examined it goes on: at
-        the loop's next turn for an emergency stop, else in the server's order.
+        Nothing before admission or after the end, or if all has been examined. If not
+        all was examined now it goes on: at the loop's next turn if an E-stop may be
+        among it, else in the server's order.
         """
         if self.gone.is_set() or not self.let_in:
             return
         found: list[Coroutine[object, object, None]] = []
 
         def wanted(raw: bytes) -> bool:
-            """Decode a message and start it if it is urgent; return whether to take it out.
+            """Decode a message and start it if it is urgent; return whether to take it
+            out of the queue.
 
-            Large messages, ordinary ones, and those beyond the number in service wait for
-            their turn. Of a batch with other items the urgent ones are started; it stays
-            in the queue.
+            Messages above `MAX_INLINE_BYTES`, ordinary ones, and those beyond
+            `MAX_URGENT_IN_SERVICE` in service (four times as many for E-stops) wait
+            for their turn. Of a batch with other items the urgent ones are started;
+            it stays in the queue, for the others.
 
             Args:
                 raw: the message as received.
@@ -366,7 +377,9 @@ class _Link(asyncio.BufferedProtocol):
                 self.server.look_soon(self)
 
     def eof_received(self) -> bool:
-        """Note the client's end of stream; replies may take `end_timeout_s`.
+        """Note the client's end of stream; what was received is still answered.
+
+        Replies may take `end_timeout_s`. The deadline of an incomplete message ends.
 
         Returns:
             Whether the transport stays open for them: not under TLS.
@@ -381,7 +394,8 @@ class _Link(asyncio.BufferedProtocol):
         """Cancel the work of an ended connection, give back its place and close its
         session.
 
-        An error of the session's close is logged.
+        Queued messages are dropped, deadlines end, and who waits for the end (`gone`)
+        is woken. An error of the session's close is logged.
 
         Args:
             exc: the reason, not used.
@@ -436,9 +450,11 @@ class _Link(asyncio.BufferedProtocol):
         self.transport.abort()
 
     def displace(self) -> None:
-        """End the connection for a newer one; an admitted client is sent the reason, others not.
+        """End the connection for a newer one; an admitted client is sent the reason,
+        others are not.
 
-        The reason is not waited for if the client does not read what was sent before.
+        The connection is aborted, so that the reason may be lost, if the client is not
+        admitted or does not read what was sent.
         """
         if self.let_in:
             self.out.reply(m.Failure(None, self._no_place()))
@@ -474,9 +490,11 @@ class _Link(asyncio.BufferedProtocol):
     # -- requests ----------------------------------------------------------------------------
 
     def _admit(self) -> None:
-        """Admit the connection and open the application's session; abort it if that fails.
+        """Admit the connection and open the application's session; abort it if that
+        fails.
 
-        The time limit for hello ends, and messages that came before are examined.
+        The time limit for hello ends, reading is resumed if little waits, and
+        messages that came before are examined for urgent ones.
         """
         self.let_in = True
         self.loop.call_soon(self.overtake)  # earlier messages were not examined
@@ -522,10 +540,11 @@ class _Link(asyncio.BufferedProtocol):
         """Serve the connection's messages in order, one in each turn; close after its
         stream has ended.
 
-        Before admission its turns are urgent. Urgent items of a batch are awaited before
-        the batch is answered. At the stream's end all answers are sent before it closes.
-
-        A fatal error in the stream is answered and ends the connection at once.
+        Before admission its turns are urgent. A malformed message is answered with its
+        error; one that leaves the stream unreadable also ends the connection at once. A
+        batch whose urgent items have been started is answered after them. At the
+        stream's end all answers, those of urgent requests too, are sent before it
+        closes.
         """
         while True:
             while self.wire.whole:
@@ -557,7 +576,11 @@ class _Link(asyncio.BufferedProtocol):
             await self.arrived.wait()
 
     def _answer_the_end(self) -> None:
-        """Send a parse error if the client has ended its stream inside a message."""
+        """Send a parse error without id if the client has ended its stream inside a
+        message.
+
+        Nothing if it ended between messages.
+        """
         try:
             self.wire.receive_end()
         except ProtocolError as error:
@@ -597,14 +620,15 @@ class _Link(asyncio.BufferedProtocol):
         *,
         urgent: bool = False,
     ) -> None:
-        """Answer one message or batch and send the answer; an urgent one waits for a turn
-        first.
+        """Answer one message or batch and send the answer; waits while the client reads
+        too slowly.
 
         A notification has no answer.
 
         Args:
             message: decoded, or read in another process (a tuple is a batch).
-            urgent: whether it was taken out of the queue before its turn.
+            urgent: whether it was taken out of the queue before its turn; then it waits
+                for a turn of its own lane, as do the items of a batch.
         """
         match message:
             case m.Batch(items):
@@ -619,13 +643,14 @@ class _Link(asyncio.BufferedProtocol):
                     await self._send(self.out.encode(answer))
 
     def _batch(self, items: Sequence[m.Single | parts.Frozen]) -> batches.Batch:
-        """Make a batch with this connection's lanes and size limit."""
+        """Make a batch with this connection's lanes and the size limit of its codec."""
         return batches.Batch(items, self._lane, MAX_ANSWER[self.codec])
 
     async def _begin(self, split: batches.Split) -> None:
-        """Serve a batch's urgent items, then set `urgent_done`, even after an error.
+        """Serve a batch's urgent items, each in a turn of its own.
 
-        The others follow when the batch's turn comes.
+        `urgent_done` is set at the end, even after an error. The others follow when the
+        batch's turn comes.
         """
         try:
             await self._serve_items(split.batch, waits=True, urgent_alone=True)
@@ -633,7 +658,14 @@ class _Link(asyncio.BufferedProtocol):
             split.urgent_done.set()
 
     async def _answer_batch(self, batch: batches.Batch, *, waits: bool) -> None:
-        """Serve the items of a batch and send the answers together."""
+        """Serve the remaining items of a batch and send all its answers together.
+
+        Nothing is sent for a batch of notifications.
+
+        Args:
+            batch: whose items are served.
+            waits: whether the first item waits for a turn, too.
+        """
         await self._serve_items(batch, waits=waits)
         if bodies := batch.bodies():
             await self._send(self.wire.batch(bodies))
@@ -674,16 +706,19 @@ class _Link(asyncio.BufferedProtocol):
     async def _answer(
         self, message: m.Message | parts.Frozen, refused: RpcError | None = None
     ) -> m.Response | m.Failure | None:
-        """Answer one message and count it; a violation of the protocol ends the connection.
+        """Answer one message and count it; a violation of the protocol ends the
+        connection.
 
-        A malformed message is answered with its error and counted as broken.
+        A violation (such as an id that is in use) is answered with an error without id.
+        A malformed message is answered with its error and counted as broken. Answers of
+        the client have no effect.
 
         Args:
             message: decoded, or read in another process.
             refused: error to answer with instead of serving it.
 
         Returns:
-            The answer; None for a notification.
+            The answer; None for a notification or an answer of the client.
         """
         item = message.thawed() if isinstance(message, parts.Frozen) else message
         try:
@@ -707,11 +742,11 @@ class _Link(asyncio.BufferedProtocol):
         return None
 
     def _count(self, *, broken: bool) -> None:
-        """Count broken messages in a row; without the token every message counts. Close
-        after too many.
+        """Count broken messages in a row, and close the connection after too many.
 
-        A good message of an admitted client resets the count; the limit is `malformed`,
-        or `MAX_STRANGE_MESSAGES` before the token.
+        A good message of an admitted client resets the count; of a client that is not
+        admitted every message counts. The limit is `malformed` for an admitted client,
+        `MAX_STRANGE_MESSAGES` for another.
         """
         if broken or not self.let_in:
             self.broken = self.broken + 1
@@ -747,12 +782,13 @@ class _Link(asyncio.BufferedProtocol):
     async def _handle(
         self, id: m.Id, name: str, given: Given, trace: str
     ) -> m.Response | m.Failure:
-        """Check token, rate, place and parameters of a call, and have the session handle
-        it.
+        """Check admission, rate, place and parameters of a call, and have the session
+        handle it.
 
-        Urgent calls need neither rate nor place; hello needs no place.
-
-        `Hello` with the right token opens the session. Unexpected errors are logged.
+        In that order. Before admission only hello is allowed. Urgent calls need neither
+        rate nor place; hello needs no place. A hello with the right token opens the
+        session, and then reaches it as well. Unexpected errors are logged; the answer
+        has the trace.
 
         Args:
             id: of the request; None for a notification.
@@ -805,9 +841,11 @@ class _Link(asyncio.BufferedProtocol):
             self._take_place()
 
     def _check_rate(self) -> None:
-        """Count a request against the client's rate `requests_per_s`, if it has one.
+        """Count a request against the client's rate `requests_per_s`; nothing if that is
+        None.
 
-        The allowance is at most one second's requests; a refused one does not count.
+        The allowance grows with time, up to one second's requests; a refused one does
+        not count.
 
         Raises:
             RpcError: -32003, more requests than that.
@@ -833,8 +871,9 @@ class _Link(asyncio.BufferedProtocol):
     def _full(self) -> bool:
         """Whether so much waits that reading pauses: messages, or bytes received ahead.
 
-        An incomplete message of an admitted client may be completed. Others have a lower
-        limit.
+        `max_waiting` messages; more than `READ_AHEAD_BYTES` (`MAX_INLINE_BYTES` before
+        admission). Of an admitted client bytes count only beside a whole message, so
+        that an incomplete one may be completed.
         """
         ahead = 0
         if self.wire.whole or not self.let_in:
@@ -845,7 +884,11 @@ class _Link(asyncio.BufferedProtocol):
         return self._load >= self.limits.max_waiting or ahead > limit_bytes
 
     def _relax(self) -> None:
-        """Resume reading once messages and bytes that wait are at most half of their limits."""
+        """Resume reading once messages and bytes that wait are at most half of their
+        limits.
+
+        Bytes count only beside a whole message.
+        """
         ahead = 0
         if self.wire.whole:
             ahead = self.wire.pending
@@ -853,14 +896,22 @@ class _Link(asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        """Remove an ended task, report its error if it crashed, and resume reading if possible."""
+        """Remove an ended task, report its error if it crashed, and resume reading if
+        possible.
+
+        Reading is left alone once the connection is gone.
+        """
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():
             self._relax()
 
     def _crashed(self, task: asyncio.Task[None]) -> None:
-        """Log the failure of a task and abort; handlers' failures are answered before that."""
+        """Log the failure of a task and abort the connection; nothing if it succeeded or
+        was cancelled.
+
+        Handlers' failures are answered before that.
+        """
         if not task.cancelled() and (error := task.exception()) is not None:
             self.log("connection failed", logging.ERROR, error_type=repr(error))
             self.transport.abort()
