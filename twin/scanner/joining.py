@@ -214,14 +214,20 @@ class Lookahead:
     # ------------------------------------------------------------------------------------
 
     def joined(self, new: Trajectories) -> Joined:
-        """Find the first certified programme of these three, or none; nothing moves yet.
+        """Find the first certified programme for a requested motion; nothing moves yet.
 
-        A halt that gets no motor any farther does not count.
+        A request without contact is taken as it is. Else it is the first of these that is
+        free and either takes some motor `MIN_STEP` farther or halts one that is under
+        way:
 
-        1. The new motors follow the request, the others carry on.
-        2. The new motors halt before the contact, the others carry on.
-        3. All halt along the new path, where the new motors are under way already and
-        have nothing else that is free.
+        1. No other motor is under way: a single new motor goes to its last free position,
+        and otherwise the new motors halt along their path before the contact.
+        2. Others are under way: the new motors halt before the contact, the others carry
+        on.
+        3. Others and at least one of the new motors are under way: all halt along the new
+        path.
+
+        None of them is tried where the last free moment is not after now.
 
         Args:
             new: motor -> requested trajectory.
@@ -258,16 +264,18 @@ class Lookahead:
     def _halt_alone(
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
-        """Shorten the motion of a single motor to its last free position.
+        """Shorten the motion of a single motor to its last free position before the
+        contact.
 
-        It goes there as fast as it was planned to go.
+        It goes there with the planned top speed and acceleration (at least
+        `profiles.MIN_RATE`); the shorter motion is swept.
 
         Args:
             new: motor -> requested trajectory.
             contact: ahead on it.
 
         Returns:
-            Motor -> trajectory; None for several motors, or if that is not free.
+            Motor -> trajectory; None for several motors, or if the sweep finds a contact.
         """
         if len(new) != 1:
             return None
@@ -285,16 +293,17 @@ class Lookahead:
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
         """Slow `new` along its path as late as possible before the contact; the path is
-        free up to there.
+        free up to there, so nothing is swept.
 
-        Braking is with the hardest accelerations allowed.
+        Braking is with the hardest accelerations allowed. The moment is found by
+        `HALVINGS` bisection steps.
 
         Args:
             new: motor -> requested trajectory.
             contact: ahead on it.
 
         Returns:
-            Motor -> trajectory that rests in time; None if none does.
+            Motor -> trajectory that rests by the last free moment; None if none does.
         """
         moving = {name: self.drives[name].following(t) for name, t in new.items()}
 
@@ -378,13 +387,17 @@ class Lookahead:
     # -----------------------------------------------------------------------------------
 
     def stopped(self, most: Most = None) -> StopMotion:
-        """Stop everything: along the path, or quicker where a sweep shows that free.
+        """Compute how everything stops: along the path, or quicker where a sweep shows
+        that free.
 
-        An error of the sweep gives the stop along the path.
+        An error of the sweep gives the stop along the path. Nothing moves yet.
 
         Args:
             most: motor -> greatest acceleration; None: those that the motion was planned
                 with.
+
+        Returns:
+            The stop, its path "apart" where it is the quicker one, else "along".
         """
         along = braked_along(self.drives, self.now, most)
         try:
@@ -398,11 +411,12 @@ class Lookahead:
     def _quicker_stop(
         self, along: Trajectories, most: Most
     ) -> dict[str, Trajectory] | None:
-        """Find a quicker stop: along the path for a while, then each motor by
-        itself, if free.
+        """Find a quicker stop: along the path for a while, then each motor by itself, if
+        free.
 
-        Tried at `QUICKER_STOP_SHARES` of its duration, as long as at least `MIN_GAIN_S`
-        is gained; it must stay within travel.
+        It is tried after each of `QUICKER_STOP_SHARES` of the stop's duration, and given
+        up at the first that gains less than `MIN_GAIN_S`. Each is swept, but for a single
+        motor under way that brakes at once; every motor must rest within its travel.
 
         Args:
             along: motor -> trajectory of the stop along the path.
@@ -410,7 +424,8 @@ class Lookahead:
                 with.
 
         Returns:
-            Motor -> trajectory; None where nothing is quicker and free.
+            Motor -> trajectory, of all motors of `along` too; None where nothing is
+            quicker and free.
         """
         duration = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
@@ -453,13 +468,17 @@ class Lookahead:
         return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
 
     def halted_at_once(self, contact: Contact) -> Trajectories | None:
-        """Slow what is under way along its path from now on.
+        """Slow what is under way along its path from now on, with the hardest
+        accelerations.
+
+        Nothing is swept: the path is free up to the contact.
 
         Args:
             contact: ahead on it.
 
         Returns:
-            Motor -> trajectory; None if it does not rest before the contact.
+            Motor -> trajectory; None if it rests later than the contact's last free
+            moment.
         """
         if (
             programme_time_at_rest(self.drives, self.now, self.hardest)
@@ -469,11 +488,13 @@ class Lookahead:
         return braked_along(self.drives, self.now, self.hardest)
 
     def halted(self, under_way: Trajectories, contact: Contact) -> Trajectories | None:
-        """Halt what is under way before a contact that a new stage has put ahead of it.
+        """Find a halt of what is under way before a contact that a new stage has put
+        ahead of it.
 
-        As late as can be along the path, which is free up to the contact; where the
-        contact is too near for that, at once and as hard as the machine can, if a sweep
-        shows that free.
+        The first of these that is free: a single motor goes to its last free position;
+        all brake as late as possible along the path, which is free up to the contact; all
+        brake at once along the path; each motor brakes at once by itself. The last two
+        brake as hard as the machine can, are swept, and must rest within travel.
 
         Args:
             under_way: motor -> present trajectory.
@@ -496,11 +517,13 @@ class Lookahead:
         return None
 
     def _within_travel(self, trajectories: Trajectories) -> bool:
-        """Return whether motors that brake by themselves rest within their travel.
+        """Return whether all motors rest within their travel, to `POSITION_ROUNDING`.
 
-        To `POSITION_ROUNDING`.
+        A motor that stops in step with a weaker one goes farther than its own programme
+        did.
 
-        One that stops in step with a weaker one goes farther than its own programme did.
+        Args:
+            trajectories: motor -> trajectory; only its target is checked.
         """
         axes = self.machine.axes
         return all(
@@ -609,19 +632,25 @@ class StageChange:
 
     def renewed(self, before: StageChange) -> Joined:
         """Judge the change at the takeover, reusing the verdict found `before` where
-        nothing has changed.
+        possible.
 
-        Judged anew only if at most `MAX_SWEPT_LEGS` legs are under way.
+        1. Stage, stops and programmes are the same, nothing is to be moved, and the
+        motion was free: it still is.
+        2. At most `MAX_SWEPT_LEGS` trajectories are under way: the change is judged anew.
+        3. A longer programme is the same as before and must halt: it halts at once, if it
+        rests before the contact that was found.
 
         Args:
             before: the same change, as it was prepared and swept.
 
         Returns:
-            The halting motion and its contact, both empty where motion carries on.
+            The halting motion and its contact; no trajectories and None where motion
+            carries on.
 
         Raises:
             CollisionError: as `verdict`.
-            SafetyError: a long programme has begun meanwhile; nothing changes.
+            SafetyError: none of the three applies (a long programme has begun or gone on
+                meanwhile); nothing changes.
         """
         still = before.version == self.version and not self.moves
         found = before.found
@@ -637,17 +666,21 @@ class StageChange:
         raise SafetyError(what, {"allowed": "asking again"})
 
     def verdict(self) -> Joined:
-        """Judge whether what is under way may carry on with the new stage, or how it is
-        halted.
+        """Judge whether what is under way may carry on with the new stage, or how it
+        halts.
 
-        Moves of a scene need that what is under way is free.
+        In this order: clearances now, the motion under way to its end, then the moves of
+        the change together with it. Moves of the change need motion under way that is
+        free.
 
         Returns:
-            The halting motion and its contact, both empty where motion carries on.
+            The halting motion and its contact; no trajectories and None where motion
+            carries on.
 
         Raises:
-            CollisionError: a pair is too near, a move of the change would collide, or no
-                halt is free.
+            CollisionError: a pair is too near, a move of the change would collide, or
+                motion under way is not free and either no halt is, or the change has
+                moves.
         """
         changed = self.ahead.on(self.guard)
         now = self.ahead.now
@@ -669,14 +702,19 @@ class StageChange:
         return Joined(halted, contact)
 
     def _require_no_nearer(self, changed: Lookahead) -> None:
-        """Check that pairs within the margin stay above their floor on the new stage.
+        """Check that the new stage brings no pair within the safety margin that was not,
+        and no near pair below its floor.
 
         A sample on a stage of the turntable is as large as the region that the stage can
         bring it to. Pairs that are near already are therefore measured at their present
         positions as well: else that region would excuse a sample that really overlaps.
+        Without a pair within the margin that second measurement is left out.
+
+        Args:
+            changed: all motors now, with the guard of the new stage.
 
         Raises:
-            CollisionError: a pair is nearer than its floor.
+            CollisionError: names the first such pair.
         """
         margin = self.ahead.machine.safety_margin_mm
         for standing in (False, True):

@@ -101,17 +101,18 @@ class Guard(Protocol):
 
 
 def require_ready(safety: Safety, what: str) -> None:
-    """Check that motion is allowed; a contact alone does not forbid motion that brings
-    parts apart.
+    """Check that the safety state allows motion.
 
-    A ready state passes, and so does a block by a contact that lasts.
+    It does while ready, and while blocked by a contact that lasts: the guard then allows
+    only motion that brings no touching pair nearer.
 
     Args:
         safety: state in force.
         what: command, for the message.
 
     Raises:
-        SafetyError: E-stop in force, or blocked; the message includes the way out.
+        SafetyError: E-stopped, or blocked without a contact; the message says that a
+            reset is needed.
     """
     if safety.state == "estopped" or (
         safety.state == "blocked" and safety.contact is None
@@ -128,9 +129,11 @@ def require_ready(safety: Safety, what: str) -> None:
 
 
 def after_contact(safety: Safety, contact: Contact) -> Safety:
-    """Count a blocked attempt; at the maximum the state becomes blocked. An E-stop stays.
+    """Count a blocked attempt; at the maximum the state becomes blocked.
 
-    Blocked once more it also counts as a stop, and has a reason with the two parts.
+    Becoming blocked counts as a stop, and has a reason with the two parts. With an E-stop
+    in force nothing changes. While parts are in contact attempts are counted, and nothing
+    else changes.
 
     Args:
         safety: state before the attempt.
@@ -175,9 +178,10 @@ def estopped(safety: Safety, by: str) -> Safety:
 
 
 def released(safety: Safety, stop: int | None) -> Safety:
-    """Release an E-stop or a block; a contact remains one, and is the next stop.
+    """Release an E-stop or a block; blocked attempts count from 0 again.
 
-    Blocked attempts count from 0 again.
+    With parts in contact the state is blocked again at once, as the next stop. A reset of
+    a ready state is allowed.
 
     Args:
         safety: before it.
@@ -212,13 +216,16 @@ def released(safety: Safety, stop: int | None) -> Safety:
 def with_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
     """Record that `pair` is in contact, or (None) that nothing is any more.
 
-    A new contact of a ready scanner counts as a stop.
-
-    Parts that have come apart leave the state blocked until a reset. An E-stop stays one.
+    A contact blocks; one of a ready scanner counts as a stop. Parts that have come apart
+    leave the state blocked until a reset, with that as its reason. An E-stop stays one,
+    with its own reason; only the pair is recorded.
 
     Args:
         safety: present state.
-        pair: two parts, or None.
+        pair: two parts; None for no contact, which changes nothing if there was none.
+
+    Returns:
+        The state after it.
     """
     if pair is None:
         if safety.contact is None:

@@ -268,15 +268,18 @@ class ScannerTwin:
     ) -> dict[str, float]:
         """Send axes to targets; all start together, nothing moves if any target is bad.
 
+        A free move clears the count of blocked attempts. A contact ahead counts as one;
+        at the machine's maximum all motors stop and the state is blocked.
+
         Args:
             targets: motor or virtual axis -> position [mm, deg], script's sign.
             now: time of the command [s].
             relative: targets are displacements from where the motors are bound for.
             shortest: rotations go the shorter way round; otherwise angles are
-                accumulated.
+                accumulated. Ignored for relative targets.
 
         Returns:
-            Motor -> seconds until it rests.
+            Motor -> seconds until it rests, of the motors that are sent.
 
         Raises:
             UnknownNameError, LimitError: nothing moves.
@@ -309,11 +312,13 @@ class ScannerTwin:
     ) -> dict[str, float]:
         """Compute the motor targets that a move would have; nothing moves.
 
+        Neither the safety state nor contacts are checked.
+
         Args:
             targets, now, relative, shortest: as for `move`.
 
         Returns:
-            Motor -> target [mm, deg].
+            Motor -> target [mm, deg], of the motors that would be sent.
 
         Raises:
             UnknownNameError, LimitError: as `move`.
@@ -329,7 +334,8 @@ class ScannerTwin:
         """List messages about targets beyond a limit that would arrive at the limit;
         nothing moves.
 
-        All end with "set to the limit", also where the machine refuses such targets.
+        All end with "set to the limit", also where the machine refuses such targets. The
+        list is empty if all targets are within travel.
 
         Args:
             targets: axis -> position [mm, deg].
@@ -355,14 +361,16 @@ class ScannerTwin:
     def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
         """Run `axis` at `velocity` until the lease ends or a limit nears, then brake.
 
-        A jog that a contact cuts short runs as far as it is free, and returns the
-        contact. One that cannot go at all is a blocked attempt and changes nothing: the
-        lease that it was to renew runs out.
+        A jog that a contact cuts short runs as far as it is free, returns the contact,
+        and leaves the count of blocked attempts. One that cannot go at all is a blocked
+        attempt and changes nothing, unless it is once too often (then all motors stop):
+        the lease that it was to renew runs out. A free jog of at least `MIN_STEP` clears
+        the count.
 
         Args:
             axis: motor or virtual axis.
-            velocity: [mm/s, deg/s], of either sign.
-            lease_s: time until it brakes unless renewed [s].
+            velocity: [mm/s, deg/s], of either sign; 0 brakes.
+            lease_s: time until it brakes unless renewed, above 0 [s].
             now: twin time [s].
 
         Returns:
@@ -370,7 +378,10 @@ class ScannerTwin:
             come to rest.
 
         Raises:
-            UnknownNameError, LimitError, SafetyError, CollisionError: as `move`.
+            UnknownNameError: no such axis.
+            LimitError: a velocity or lease out of range.
+            SafetyError: E-stopped or blocked; nothing changes.
+            CollisionError: a contact, and no free motion before it.
         """
         self._require_ready("motion", now)
         new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
@@ -442,10 +453,17 @@ class ScannerTwin:
         self.safety = rules.released(self._safety_at(now), stop)
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
-        """Set motors to their known positions, at rest: a start, not a motion.
+        """Set motors to known positions at rest, at once: a start, not a motion.
+
+        The others rest at once where their present motion would have ended. Nothing is
+        swept; parts that touch then block the scanner, which is no error here.
+
+        Args:
+            positions: motor or virtual axis -> position [mm, deg]; others as above.
+            now: twin time [s].
 
         Raises:
-            UnknownNameError, LimitError: no such motor, or outside its travel; nothing is
+            UnknownNameError, LimitError: no such axis, or outside its travel; nothing is
                 changed.
         """
         wanted = resolve_targets(self.machine, positions, self.positions(now))
@@ -462,8 +480,8 @@ class ScannerTwin:
         now: float,
         start: Mapping[str, float] | None = None,
     ) -> UnsweptProgramme:
-        """Prepare a programme for its sweep; `certified` on the result may run
-        in another thread.
+        """Prepare a programme for its sweep; nothing moves, and `certified` on the result
+        may run in another thread.
 
         Args:
             programme: motor -> trajectories in the order of their starts, on a clock that
@@ -471,6 +489,10 @@ class ScannerTwin:
             now: time of the command [s].
             start: positions of motors then, at rest; those left out where their
                 programme ends [mm, deg].
+
+        Returns:
+            The programme with its start, the guard, and the numbers of the stage and of
+            the stops, to which its certificate is bound.
 
         Raises:
             UnknownNameError: no such motor.
@@ -492,17 +514,20 @@ class ScannerTwin:
         return certificate.prepared.version == (self._stage, self._stops)
 
     def follow(self, certificate: CertifiedProgramme, now: float) -> None:
-        """Start a programme that was swept: all motors follow it from `now` on.
+        """Start a programme that was swept: its motors follow it from `now` on, the
+        others rest.
+
+        It counts as a new programme, and leaves the count of blocked attempts.
 
         Args:
             certificate: the programme with the verdict of its sweep.
             now: twin time [s], the zero of the programme's clock.
 
         Raises:
-            CollisionError: a contact anywhere along it; nothing moves, the attempt
-                counts.
-            SafetyError: E-stopped or blocked; the motors are not at rest at its start, or
-                stage or motion have been changed since it was prepared (prepare it
+            CollisionError: a contact anywhere along it, on the stage that it was prepared
+                for; the attempt counts, and nothing moves.
+            SafetyError: E-stopped or blocked; the motors are not at rest exactly at its
+                start, or stage or stops have changed since it was prepared (prepare it
                 again).
         """
         self._require_ready("a programme", now)
@@ -533,7 +558,7 @@ class ScannerTwin:
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
-        """Prepare another sample or correction for its sweep; nothing is changed yet.
+        """Prepare another sample or correction for its sweep; the stage stays as it is.
 
         Targets that the motors are bound for already are left out; the safety state must
         allow the others.
@@ -546,11 +571,18 @@ class ScannerTwin:
             guard: finds contacts with both of them.
             now: time of the command [s].
             targets: where motors are sent together with the change; None sends none.
-            paces: motor -> (speed, acceleration) that are set before [mm/s, mm/s2, ...].
+            paces: motor or virtual axis -> (speed, acceleration) that the moves have and
+                the change sets [mm/s, mm/s2, ...]; None sets none.
+
+        Returns:
+            The change without a verdict, bound to stage, stops and programmes as they are
+            now.
 
         Raises:
             GeometryError: a correction that no scanner can have.
             UnknownNameError, LimitError: `targets` or `paces`.
+            SafetyError: motors coast, or a target is asked for while E-stopped or
+                blocked.
         """
         self.require_applicable(correction)
         self._require_power("a change of the stage", now)
@@ -584,24 +616,24 @@ class ScannerTwin:
         """Put a certified change of the stage in force: sample, correction, guard,
         paces and moves.
 
-        A halt also counts as a stop.
-
-        What is under way is judged anew where it has changed meanwhile. Motion that is
-        not free of the new stage is halted, if halting is free. Moves of the change
-        begin.
+        The change is prepared and judged again for `now` (see `StageChange.renewed`).
+        Motion that is not free of the new stage is halted, if halting is free; such a
+        halt counts as a stop and as a blocked attempt. The moves of the change begin.
 
         Args:
             change: with its verdict.
             now: twin time [s].
 
         Returns:
-            The contact that halted the motion under way, as an error, or None; it counts
-            as a blocked attempt.
+            The contact that halted the motion under way, as an error; None where nothing
+            was halted.
 
         Raises:
             CollisionError: not even halting is free of the new stage; nothing changes.
-            SafetyError: the stage was changed meanwhile, motion was stopped, or a long
-                programme has begun.
+            SafetyError: the stage was changed meanwhile; motion was stopped meanwhile and
+                the change has targets; motors coast; or a long programme has begun.
+                Nothing changes.
+            GeometryError, UnknownNameError, LimitError: as `stage_change`.
         """
         if change.version[0] != self._stage:
             raise SafetyError(
@@ -650,6 +682,8 @@ class ScannerTwin:
     ) -> list[str]:
         """Begin with this stage, whatever it touches, as after a restart.
 
+        Nothing is swept and no motor stops; certificates of before are void.
+
         Args:
             sample: on the stage.
             correction: in force; None for none.
@@ -657,7 +691,8 @@ class ScannerTwin:
             now: time [s].
 
         Returns:
-            Messages about touching parts; the state is blocked then.
+            One message that names the nearest pair within the safety margin, and the
+            state is blocked (or stays E-stopped); [] without such a pair.
 
         Raises:
             GeometryError: a correction that no scanner can have.
@@ -705,16 +740,16 @@ class ScannerTwin:
         """Change the tube's settings; those left out stay.
 
         Args:
-            kV, power_W: settings.
+            kV, power_W: voltage [kV] and power [W].
             on: X-rays on or off.
             now: time of the switch [s]; None is long ago, so that X-rays are ready at
-                once.
+                once. Used with `on` only.
             warm: leave out the warm-up after a long rest (scripts are planned without
                 one).
 
         Raises:
-            LimitError: outside the tube's range.
-            SafetyError: X-rays on while the E-stop is in force.
+            LimitError: outside the tube's range; nothing is changed.
+            SafetyError: X-rays on while the E-stop is in force; nothing is changed.
         """
         if on and self.safety.state == "estopped":
             raise SafetyError(
@@ -786,16 +821,16 @@ class ScannerTwin:
             )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
-        """Find the nearest pair within the safety margin now; the result is kept for a
-        scanner at rest.
+        """Find the nearest pair in contact, or closer than the safety margin by more than
+        rounding (2 `ROUNDING_MM`).
 
-        Closer than the margin by more than rounding, or in contact; None without a guard.
+        The result is kept as long as positions and stage stay the same.
 
         Args:
             now: twin time [s].
 
         Returns:
-            The two names; None if all pairs keep the margin.
+            The two names; None if all pairs keep the margin, or without a guard.
         """
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self._stage)
@@ -824,8 +859,10 @@ class ScannerTwin:
     def _blocked(
         self, joined: Joined, now: float, what: str, zero: float = 0.0
     ) -> CollisionError:
-        """Count a blocked attempt and halt before the contact, or stop everything after
-        too many.
+        """Count a blocked attempt, and let the motors follow the motion that is left.
+
+        If that was the attempt too many (the state is blocked, and not by a contact that
+        lasts), all motors stop instead.
 
         Args:
             joined: the motion that is left, and the contact that cut it short.
@@ -834,7 +871,7 @@ class ScannerTwin:
             zero: time at which the clock of the contact shows 0 [s].
 
         Returns:
-            The error to raise.
+            The error to raise, with where the motors come to rest.
         """
         contact = joined.contact
         assert contact is not None

@@ -325,11 +325,15 @@ def switched(
 ) -> TubeSettings:
     """Switch the tube on or off.
 
+    X-rays are ready after the times of switching on and of stabilising, and after the
+    warm-up too if the tube rested longer than the machine's `cold_after_s`.
+
     Args:
-        machine: has the times of the high voltage, and of a warm-up after a long rest.
+        machine: has these times.
         tube: before; switching to its present state changes nothing.
         on: on or off.
-        now: time of the command [s]; None: the X-rays are ready already.
+        now: time of the command [s]; None: the X-rays are ready already, and the time of
+            the last switch stays.
         warm: no warm-up, however long the rest was.
 
     Returns:
@@ -376,15 +380,17 @@ def changed_camera(
     """Change settings of a camera; those left out stay.
 
     Args:
-        spec: the detector, with its ranges.
+        spec: the detector, with its modes, pixels and range of exposures [ms].
         camera: settings before.
-        change: the new values; None and what is left out stay.
+        change: the new values; None and what is left out stay. Averages are 1 to 10 000,
+            frames 1 to 1 000 000.
 
     Returns:
         The new settings.
 
     Raises:
-        LimitError: outside the detector's range; the message names the setting.
+        LimitError: an unknown mode, a region outside the panel, or a number outside its
+            range; the message names the setting.
     """
     stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
     new = replace(camera, **stated)
@@ -419,7 +425,9 @@ def require_applicable(
     """Check that a correction leaves a geometry that a scanner can have, anywhere in the
     travel.
 
-    Anywhere is judged at the motor positions nearest to the source.
+    Three checks: each offset is plausible beside the machine's longest linear travel; the
+    geometry is one of a scanner, and the axis in front of the source, both at the motor
+    positions nearest to the source.
 
     Args:
         machine: with the travel of its motors.
@@ -451,7 +459,11 @@ def require_applicable(
 def _nearest(machine: Machine) -> dict[str, float]:
     """Compute the motor positions that bring sample and detector nearest to the source.
 
-    Motors that move neither along the beam stay at home; returns every axis.
+    A motor goes to the end of its travel by the sign of its two factors along the beam,
+    added; where they add up to 0 it stays at home.
+
+    Returns:
+        Motor -> position [mm, deg], of every motor.
     """
     along = {
         name: machine.geometry.get("object_y", {}).get(name, 0.0)
