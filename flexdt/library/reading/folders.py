@@ -83,21 +83,29 @@ def load_dataset(
 ) -> DataSet:
     """Open a data set.
 
+    A folder is read by the first of these that it has: the only file of a supported
+    format of another program (in a folder without a document, geometry or projections of
+    flexdt's names), flexdt.json, the geometry that `DataSet.save` wrote, a scanner's
+    settings texts.
+
     Args:
-        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
-            .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a folder with one
-            of these.
+        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts;
+            Nikon's .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a
+            folder with one of these.
         machine: the scanner, for texts that do not name one that ships with the package.
-        profile: zero offsets to use; default: those of the file, or the profile that reproduces
-            the printed figures.
+            Ignored, like `profile`, for files of other programs.
+        profile: zero offsets to use; default: those of the file, or the profile that
+            reproduces the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
         geometry: one view for each projection, in place of a file's, or where an NXtomo
-            or .txrm file has none.
+            or .txrm file has none. Ignored for folders of flexdt's or a scanner's own.
         distances: source to axis and source to panel [mm], of an NXtomo file that has
-            angles and pixels only.
+            angles and pixels only. Ignored where `geometry` is given, and for folders of
+            flexdt's or a scanner's own.
 
     Raises:
-        DatasetError: the data set is invalid; names the path.
+        DatasetError: the data set is invalid, or its folder was not saved to the end;
+            names the path.
 
     Example:
         >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
@@ -254,16 +262,18 @@ def _from_document(
 ) -> DataSet:
     """Read a data set by its flexdt.json.
 
-    Warns if its geometry does not follow from its motor positions, and of doubts
-    predicted at submission. The stored geometry is used unless machine or profile is
-    given.
+    The stored geometry is used unless machine or profile is given; then it is computed
+    from the motor positions. Warns if the stored geometry does not follow from these
+    within `AGREE_MM`, and of doubts predicted at submission. A scan that did not finish
+    is an incomplete data set, with the reason.
 
     Args:
         content: the folder.
         machine, profile: in place of the document's, or None.
 
     Raises:
-        DatasetError: the document is invalid, or frames do not fit it.
+        DatasetError: the document is invalid or lists no projections, or frames do not
+            fit it.
     """
     path = content.path / DOCUMENT
     doc = parse_document(read_text(path), str(path))
@@ -312,10 +322,12 @@ def _from_document(
 
 
 def _foreign_file(content: Folder) -> Path | None:
-    """Return the only file with a scan of another program, in a folder without one of ours.
+    """Find the only file with a scan of another program, by its ending, whatever its
+    case.
 
     Returns:
-        None where the folder has images of ours, or no such file, or several.
+        Its path; None where there is no such file, or several, or the folder has
+        projections, a document or a geometry of flexdt.
     """
     if (
         content.projections
@@ -359,7 +371,13 @@ def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
 
 def _from_geometry(content: Folder) -> DataSet:
     """Read the data set that `DataSet.save` wrote for a scan without a machine: images
-    and geometry; the stored notes become warnings, except that on missing dark images.
+    and geometry.
+
+    The stored notes become warnings, except that on missing dark images. Without stored
+    names the images have flexdt's.
+
+    Raises:
+        DatasetError: two images have one number, or the geometry is invalid.
     """
     _require_one_each(content)
     path = content.path / GEOMETRY
@@ -384,15 +402,16 @@ def _from_texts(
 ) -> DataSet:
     """Read a data set by the scanner's settings texts.
 
-    Also raised if neither text gives the geometry. Projections that the texts do not
-    count are read with a warning; a cancelled script makes the data set incomplete.
+    Projections beyond the number in the text are read with a warning; fewer are missing
+    frames. A cancelled script makes the data set incomplete.
 
     Args:
         content: the folder.
         machine, profile: in place of those that the texts name, or None.
 
     Raises:
-        DatasetError: no projections, no usable text, or a scan of several sections.
+        DatasetError: no projections, two with one number, no usable text, a scan of
+            several sections, or texts that do not give the geometry.
     """
     if not content.projections:
         raise DatasetMissingError(
@@ -457,20 +476,21 @@ def _from_texts(
 
 
 def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
-    """Read the settings of the scanner's text, or of its second text if the first is unusable.
+    """Read the settings of the scanner's text, or of its second text if the first is
+    unusable.
 
     Where no text is usable but the folder has its document, it is None, and the errors
     are warnings.
 
     Args:
         content: the folder.
-        warnings: get the errors of the text that is not used.
+        warnings: extended by the errors of texts that are not used.
 
     Returns:
-        None where there is no text.
+        None where there is no text, or none usable beside a document.
 
     Raises:
-        DatasetError: no text is usable.
+        DatasetError: no text is usable, and there is no document; the first text's error.
     """
     readers: Sequence[tuple[str | None, Callable[[str, str], ScanSettings]]] = (
         (content.scan_settings, parse_scan_settings),
@@ -507,10 +527,11 @@ def _require_one_each(content: Folder) -> None:
 def _require_one_circle(content: Folder) -> None:
     """Check that the scan has one circular section; others need flexdt.json.
 
-    Nothing is checked if the texts are missing or cannot be read.
+    Only the scanner's second text states sections: nothing is checked if it is missing or
+    cannot be parsed.
 
     Raises:
-        DatasetFormatError: the texts state more than one section.
+        DatasetFormatError: that text states several sections.
     """
     if content.xre_settings is None:
         return

@@ -49,17 +49,17 @@ SCAN_FORMATS: Final = (
 def open_file(
     path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
 ) -> DataSet:
-    """Open the data set in a file; a geometry that is given replaces the file's.
-
-    Distances are allowed only for formats that lack them.
+    """Open the data set in a file, by its ending, whatever its case.
 
     Args:
         path: of the file.
-        geometry: one view for each projection.
-        distances: source to axis and to panel [mm].
+        geometry: one view for each projection, in place of the file's; None for the
+            file's.
+        distances: source to axis and to panel [mm]; only for formats that lack them.
 
     Raises:
-        DatasetError: another kind of file, or one that lacks data; names them.
+        DatasetError: another kind of file, one that is damaged or lacks data, or
+            distances with another format; names the formats that are allowed.
     """
     ending = path.suffix.lower()
     for form in SCAN_FORMATS:

@@ -21,14 +21,15 @@ MAX_REPEATED_CHARACTERS: Final = 200
 def parsing(path: Path, form: str) -> Iterator[None]:
     """Run the body of a `with`, and turn any error of a parser into the file's error.
 
-    A TwinError passes as it is; lack of memory has its own message.
+    A TwinError passes as it is; lack of memory has its own message. At most
+    `MAX_REPEATED_CHARACTERS` of the parser's words are repeated.
 
     Args:
         path: the file.
         form: whose format it should have.
 
     Raises:
-        DatasetFormatError: anything was raised but a TwinError.
+        DatasetFormatError: the body raised any Exception but a TwinError.
     """
     try:
         yield
@@ -50,8 +51,10 @@ def parsing(path: Path, form: str) -> Iterator[None]:
 def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
     """Read a text that describes a scan, as UTF-8 with or without a byte order mark.
 
+    Bytes that are no UTF-8 become replacement characters.
+
     Raises:
-        DatasetFormatError: it has more than `most` bytes.
+        DatasetFormatError: it has more than `most` bytes; nothing is read.
         OSError: it cannot be read.
     """
     size = path.stat().st_size
@@ -64,10 +67,11 @@ def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
 
 
 def require_memory(path: Path, what: str, size: int) -> None:
-    """Check that `what`, to be read in one piece, fits into memory.
+    """Check that `what`, to be read in one piece of `size` bytes, fits into the machine's
+    memory.
 
     Raises:
-        DatasetFormatError: it does not fit.
+        DatasetFormatError: it does not; the message has both sizes [GiB].
     """
     most = memory_bytes()
     if size > most:

@@ -29,14 +29,16 @@ def in_order(
 ) -> tuple[list[str], list[str]]:
     """Sort images by the numbers in their names.
 
+    Names of another form than the rest stay, with a doubt; they are left out where the
+    others are exactly as many as the views.
+
     Args:
         content: where they are.
         names: of the images.
-        views: that the geometry has.
+        views: number of views of the geometry.
 
     Returns:
-        The names, and doubts about them. Names of another form than the rest are left out
-        where the others are as many as the views.
+        The names in order, and doubts about them as sentences.
 
     Raises:
         DatasetFormatError: two have one number.
@@ -55,12 +57,11 @@ def in_order(
 
 
 def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> list[str]:
-    """List doubts about the geometry of images.
+    """List doubts about a geometry for images of a shape (rows, cols), as sentences that
+    name the folder; [] without doubts.
 
     Raises:
         DatasetFormatError: no scanner has such a geometry.
-
-    They are the warnings' texts; errors raise.
     """
     found = examine(Operation.OPEN, geometry, shape)
     if found:
@@ -83,20 +84,25 @@ def listed(
 ) -> DataSet:
     """Make the data set of images named one by one.
 
+    Images that are missing or zero everywhere become missing frames and make it
+    incomplete. Doubts about the geometry, saturated images (unless a warning names them
+    already) and a lack of dark images become warnings.
+
     Args:
         content: where they are.
         geometry: one view for each projection.
         names, darks, flats: of the images.
         name: of the data set; default: the folder's.
-        shapes: (rows, cols) of each projection; default: all as the first that is there.
+        shapes: (rows, cols) of each projection; default: all as the first that is there,
+            which the geometry must then fit.
         reasons: why it is not complete.
         warnings: doubts about it.
         full_scale: largest count of the panel, to find saturated images; None: unknown.
         known: further members of `DataSet`.
 
     Raises:
-        DatasetError: no image is there, or the geometry has another number of views or
-            another shape.
+        DatasetError: no scanner has the geometry; or, without `shapes`, no image is
+            there, or the geometry has another number of views or another shape.
     """
     if not shapes:
         there = [n for n in names if n in content.names]
@@ -143,8 +149,12 @@ def listed(
 def _first_look(
     frames: Sequence[Frame], flats: Sequence[Path], full_scale: int | None
 ) -> list[str]:
-    """Check whether the first flat image or the middle present projection is saturated at
-    `full_scale`; returns the warnings.
+    """Check whether the first flat image or a projection is saturated at `full_scale`.
+
+    The projection is the middle one of those that are there.
+
+    Returns:
+        Warnings; [] without images or doubts.
     """
     taken = [frame.path for frame in frames if frame.present and frame.path is not None]
     kinds = {FLAT_IMAGE: [*flats], RADIOGRAPHS: taken[len(taken) // 2 :]}
@@ -170,10 +180,10 @@ def nothing_in(blank: Sequence[str]) -> str:
 def markers_alone(geometry: ConeVec, name: str) -> DataSet:
     """Make a data set without images: geometry for markers.
 
-    Its frames are named views and marked as missing.
+    Each view has a frame, named "view 0" and so on, that is marked as missing.
 
     Raises:
-        TwinError: the geometry does not state the detector's size.
+        TwinError: the geometry does not state the detector's rows and columns.
     """
     if geometry.shape is None:
         raise TwinError(

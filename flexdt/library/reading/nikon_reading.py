@@ -38,17 +38,21 @@ DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
-    """Read a scan of Nikon's.
+    """Read a scan of Nikon's; its images stay in their files.
 
-    The white level of the file serves as flat image, the dark one is zero; offsets that
-    are not applied become warnings. Distances are checked unless `geometry` is given.
+    They are in `InputFolderName`, beside the file by default. The white level of the file
+    serves as flat image, the dark one is zero; detector offsets are not applied and
+    become warnings.
 
     Args:
         path: the .xtekct file.
-        geometry: one view for each projection, in place of the file's.
+        geometry: one view for each projection, in place of the file's; the file must
+            state its numbers all the same, but impossible distances are no error then.
 
     Raises:
-        DatasetError: the file lacks data, or images are missing or of another shape.
+        DatasetError: the file lacks a number, has impossible distances or not 1 to
+            `MOST_VIEWS` projections; or images are missing or of another shape than it
+            states.
     """
     said = dict(LINE.findall(head_text(path)))
     views = int(_number(path, said, "Projections"))
@@ -108,8 +112,10 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
 def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     """List the names of the projections by their numbers, missing ones included.
 
-    Names of missing numbers are made like the others, if the file states more views; else
-    those found are returned. Names of another form are left out with a doubt.
+    Fewer names than views are completed by names like that of the lowest number, from 1,
+    0 or that number on: the first start from which the numbers that are there are in the
+    range. Without such a start, or where a name does not end in a number of its own, they
+    are returned as found. Names of another form are left out with a doubt.
 
     Args:
         folder: of the images.
@@ -156,10 +162,10 @@ def _number(
         path: for the message.
         said: keys and values of the file.
         key: of the number.
-        default: where the key is missing; None makes that an error.
+        default: where the key is missing or its value is empty; None makes that an error.
 
     Raises:
-        DatasetFormatError: no finite number.
+        DatasetFormatError: the value is no finite number.
     """
     text = said.get(key, "")
     try:
@@ -179,8 +185,13 @@ def _number(
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:
-    """Return the matrix that takes row vectors into the frame whose z is the axis: rolled about
-    y, tilted about x."""
+    """Compute the matrix (3, 3) that takes row vectors into the frame whose z is the
+    axis.
+
+    Args:
+        roll: turn about y [rad], applied second.
+        tilt: turn about x [rad], applied first.
+    """
     c = np.cos([roll, tilt])
     s = np.sin([roll, tilt])
     rolled = np.array([[c[0], 0.0, s[0]], [0.0, 1.0, 0.0], [-s[0], 0.0, c[0]]])

@@ -31,16 +31,19 @@ SMALL_BYTES: Final = 1 << 30
 def read_nxtomo(
     path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
 ) -> DataSet:
-    """Read an NXtomo file into memory.
+    """Read an NXtomo file into memory; the file is closed again.
 
     Args:
         path: the file.
         geometry: one view for each projection; None: the rows of cone_vec in the file, or
             its angles, pixels and distances.
-        distances: source to axis and to panel [mm], in place of the file's.
+        distances: source to axis and to panel [mm], in place of the file's; ignored where
+            `geometry` or the file's cone_vec is used.
 
     Raises:
-        DatasetFormatError: no HDF5, no NXtomo, missing images, or no geometry.
+        DatasetFormatError: no HDF5, no NXtomo, missing images, no geometry, or one that
+            the file's own figures contradict.
+        TwinError: the package h5py is not installed.
     """
     h5py = package("h5py", "NXtomo")
     try:
@@ -57,8 +60,7 @@ def _read(
 ) -> DataSet:
     """Read the images of an open file, and their geometry.
 
-    Invalid images and those with unknown keys are left out, with a doubt. Raises
-    DatasetFormatError if no image is a projection.
+    Invalid images and those with unknown keys are left out, with a doubt.
 
     Args:
         file: open.
@@ -67,6 +69,10 @@ def _read(
 
     Returns:
         The data set in memory, with its doubts as warnings.
+
+    Raises:
+        DatasetFormatError: no image is a projection, the geometry is missing, or the
+            file's angles or pixel contradict it.
     """
     name, doubts = _entry(file, path)
     group = file[name]
@@ -104,9 +110,9 @@ def _read(
 
 
 def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
-    """Find the group that holds images and their keys.
+    """Find the first group of a file that holds images and their keys.
 
-    The first group is taken; other scans in the file are a doubt.
+    Further scans in the file are a doubt that names up to five.
 
     Returns:
         Its name, and doubts about it.
@@ -151,15 +157,17 @@ def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
 def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     """Return the images as an unread dataset of HDF5, and their keys (n,).
 
-    Files with the images of a virtual or external dataset must be there.
+    Files with the images of a virtual or external dataset must be there. The others must
+    not unfold to more than `MOST_DEFLATED` times the bytes that are stored, unless they
+    are at most `SMALL_BYTES`.
 
     Args:
         group: with `data` and `image_key`.
         path: of the file, for messages.
 
     Raises:
-        DatasetFormatError: they do not fit each other, are missing, exceed the memory, or claim
-            more than the file holds.
+        DatasetFormatError: images and keys do not fit each other, or images are missing,
+            exceed the memory, or are more than what is stored can hold.
     """
     data = group["data"]
     keys = np.asarray(group["image_key"])
@@ -214,9 +222,13 @@ def _geometry(
     shape: tuple[int, int],
     distances: tuple[float, float] | None,
 ) -> tuple[ConeVec, list[str]]:
-    """Take the geometry from the file's cone_vec, or from its angles, pixel and distances.
+    """Take the geometry from the file's cone_vec, or from its angles, pixel and
+    distances.
 
-    A cone_vec of the file is taken without assumptions.
+    A cone_vec, at the file's root or in the entry's `flexdt`, is taken without
+    assumptions or checks. The other way assumes an upright panel with the axis in its
+    middle column, and square pixels without `y_pixel_size`; signs of the distances do not
+    matter.
 
     Args:
         file: with the entry.
@@ -227,7 +239,7 @@ def _geometry(
         distances: source to axis and to panel [mm], in place of the file's.
 
     Returns:
-        The geometry, and the assumptions made.
+        The geometry, and a sentence on the assumptions made; none with cone_vec.
 
     Raises:
         DatasetFormatError: the file states too little; lists the missing quantities.
@@ -299,8 +311,11 @@ NEEDED_LENGTHS: Final = ("x_pixel_size", "source distance", "detector distance")
 def _angles(
     file: Any, name: str, projections: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float64] | None:
-    """Read angles of the projections from the first place of the file that has one for each
-    image.
+    """Read angles of the projections from the first place of the file that has one for
+    each image.
+
+    Places are the group with the images, the entry, and the entry's groups, in this
+    order. Angles are in degrees unless their unit begins with "rad".
 
     Args:
         file: open HDF5.
@@ -326,10 +341,10 @@ def _angles(
 
 
 def _length(file: Any, name: str, *members: str) -> float | None:
-    """Read a length from the first of some places that has it.
+    """Read a length from the first of some places that has one number in a known unit.
 
-    The entry comes before the group; a place with an unknown unit, or more than one
-    number, is passed over. A length without unit is in metres.
+    All names are looked up in the entry, then in the group. A length without unit is in
+    metres; its sign is kept.
 
     Args:
         file: open HDF5.
@@ -337,7 +352,7 @@ def _length(file: Any, name: str, *members: str) -> float | None:
         members: names in the entry, or in the group.
 
     Returns:
-        [mm]; None without any, or with an unknown unit.
+        Length [mm]; None without such a place.
     """
     entry = file[name.split("/")[0]]
     near = file[name]

@@ -37,14 +37,16 @@ GEOMETRY_HINT: Final = ", or give it: geometry=ConeVec"
 def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
     """Read a scan of Zeiss's into memory.
 
-    Raises too if the package olefile is missing.
+    Any error of the parser is the file's error.
 
     Args:
         path: the .txrm file.
-        geometry: one view for each projection, in place of the file's.
+        geometry: one view for each projection, in place of the file's; None for the
+            file's.
 
     Raises:
-        DatasetFormatError: it is damaged, or lacks data.
+        DatasetFormatError: it is no OLE2 file, is damaged, or lacks data.
+        TwinError: the package olefile is not installed.
     """
     olefile = package("olefile", "Zeiss's .txrm")
     try:
@@ -135,10 +137,12 @@ class _Streams:
         return out
 
     def lengths(self, name: str, count: int) -> FloatArray:
-        """Read lengths (count,) of a stream of `ImageInfo`, without their signs.
+        """Read lengths (count,) of a stream of `ImageInfo`, without their signs, in its
+        unit.
 
         Raises:
-            DatasetFormatError: one of them is 0 or not finite.
+            DatasetFormatError: the stream is missing or too short, or one of them is 0 or
+                not finite.
         """
         found = abs(
             self.values(f"ImageInfo/{name}", "<f4", count, hint=GEOMETRY_HINT).astype(
@@ -153,10 +157,11 @@ class _Streams:
 
 
 def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
-    """Read the images, reference and geometry of an open file into a data set.
+    """Read the images, reference and geometry of an open file into a data set in memory.
 
-    Images of floats are divided by the reference and given as line integrals. Fewer
-    images than planned make it incomplete; a missing reference is a warning.
+    Images of floats are divided by the mean reference and given as line integrals; other
+    images stay counts, with the reference as flat images. Dark is zero. Fewer images than
+    planned make it incomplete; counts without a reference are a warning.
 
     Args:
         file: its streams.
@@ -164,8 +169,8 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
         name: of the data set.
 
     Raises:
-        DatasetFormatError: the file claims more images than it holds, or floats without
-            reference.
+        DatasetFormatError: no images were taken, more are claimed than the file can hold,
+            floats have no reference, or the geometry is not supported (see `_geometry`).
     """
     sizes = "ImageHeight", "ImageWidth", "NoOfImages", "DataType"
     rows, cols, planned, code = (file.whole(f"ImageInfo/{n}") for n in sizes)
@@ -208,7 +213,8 @@ def _reference(
 ) -> npt.NDArray[Any] | None:
     """Read the images of the open beam.
 
-    The first folder of REFERENCES that has images counts.
+    The first folder of REFERENCES that has images counts; they are `Image` and `Image1`
+    to `Image999`.
 
     Args:
         file: its streams.
@@ -219,7 +225,7 @@ def _reference(
         (k, rows, cols); None without any.
 
     Raises:
-        DatasetFormatError: pixels that are not finite.
+        DatasetFormatError: pixels that are not finite, an unknown type, or another size.
     """
     for folder in REFERENCES:
         names = [
@@ -236,15 +242,21 @@ def _reference(
 def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]]:
     """Read the geometry, and list doubts about it.
 
-    Doubts: values that are not applied, and a CenterShift that is.
+    The panel's pixel is the one at the axis times the first view's magnification; image
+    shifts and CenterShift move the panel. Doubts: values that are not applied
+    (`NOT_APPLIED`), and a CenterShift that is.
 
     Args:
         file: its streams.
-        views: that were taken.
+        views: number of images taken.
         rows: of an image.
 
+    Returns:
+        The geometry, without a shape, and the doubts as sentences.
+
     Raises:
-        DatasetFormatError: a parallel beam, or a stage that rises.
+        DatasetFormatError: a parallel beam, or a stage that rises by more than a quarter
+            of the image's height at the axis.
     """
     if file.whole("ImageInfo/XrayGeometry", 1) != 1:
         raise DatasetFormatError(
