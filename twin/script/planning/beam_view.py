@@ -86,8 +86,12 @@ def views(plan: ScanPlan) -> Iterator[View]:
     """Group the saved images of `plan` by camera setting and kind; yield a view of each
     group.
 
+    Exposure, frames and averages make no other group. Images without a file, or with an
+    empty region, are left out.
+
     Args:
-        plan: of a script; of long moving sequences `_SAMPLED_IMAGES` are taken.
+        plan: of a script; of a moving sequence at most `_SAMPLED_IMAGES` images are
+            taken, evenly spread, of another one image.
     """
     batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
     first = 0
@@ -108,9 +112,14 @@ def views(plan: ScanPlan) -> Iterator[View]:
 
 
 def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
-    """Warn of projections with the sample wholly outside the image, and of flats that show it.
+    """Warn of projections with the sample wholly outside the image, and of flats that
+    show it.
 
-    At most one warning of each kind for a view; the line is the first one's.
+    At most one warning of each kind for a view; the line is the first one's. Dark and
+    preview images are not checked.
+
+    Returns:
+        Warnings `sample_out_of_beam` and `sample_in_flat`, in the order of the views.
     """
     found: list[ScriptProblem] = []
     for view in views(plan):
@@ -127,7 +136,13 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
 def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
     """Make one warning for all `bad` images of a view, at the first of their lines.
 
-    The text ends with the number of further lines.
+    The text ends with the number of further lines, if there are any.
+
+    Args:
+        view: with the line of each image.
+        bad: (n,) which images; at least one.
+        code: of the warning.
+        text: of the warning.
     """
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = ""
@@ -140,7 +155,8 @@ def _outside_text(view: View) -> str:
     """Describe, for a warning, on which side the first image without the sample has lost
     it.
 
-    Left, right, or above or below.
+    Left or right, of the image's columns; else above or below its rows. The column of the
+    rotation axis is in the text too.
     """
     i = int(np.argmax(view.outside))
     rows, cols = view.camera.shape
@@ -160,7 +176,9 @@ def _outside_text(view: View) -> str:
 
 
 def _inside_text(view: View) -> str:
-    """Describe where the first flat image that shows the sample has its shadow [columns]."""
+    """Describe, for a warning, which columns the sample's shadow has in the first flat
+    image that shows it; for a sample without width the axis's column.
+    """
     i = int(np.argmin(view.outside))
     if view.left[i] == view.right[i]:
         where = f"the shadow of its axis lies at column {view.axis[i]:.0f}"
@@ -178,12 +196,18 @@ def _view(
 ) -> View:
     """Project the sample's outline into the images of one camera setting.
 
+    A sample of unknown size is as wide as the axis; without a height its top and bottom
+    are NaN.
+
     Args:
         plan: with machine, profile and the sample's size.
         camera: the setting.
         kind: of the images.
         lines: of the script, that take them.
         positions: axis -> positions (n,) [mm, deg].
+
+    Returns:
+        The view: edges of the shadow, and the axis's column, (n,) each [pixels].
     """
     p = motor_poses(plan.machine, plan.profile, camera, positions)
     shape = camera.shape
@@ -206,6 +230,8 @@ def _view(
 def _tangents(p: Poses, radius: float) -> list[FloatArray]:
     """Compute the points where rays touch the sample's cylinder, at the source's height.
 
+    A cylinder that contains the source is touched beside it: the sine is at most 1.
+
     Args:
         p: n poses.
         radius: of the cylinder about the rotation axis [mm].
@@ -225,8 +251,16 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
 
 
 def _rims(p: Poses, rims_mm: Sequence[tuple[float, float]]) -> list[FloatArray]:
-    """Compute the nearest and farthest points of circles about the axis, two of (n, 3)
-    for each [mm]."""
+    """Compute the points of circles about the rotation axis nearest to and farthest from
+    the source.
+
+    Args:
+        p: n poses.
+        rims_mm: (radius, height) of each circle, height above the axis's origin [mm].
+
+    Returns:
+        For each circle the nearest and the farthest point, (n, 3) [mm].
+    """
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     return [

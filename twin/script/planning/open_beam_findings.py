@@ -32,7 +32,10 @@ Setting = tuple[ExposureSettings, CameraSettings]
 def open_beam_problems(
     plan: ScanPlan, physics: Physics = "poly"
 ) -> tuple[ScriptProblem, ...]:
-    """Warn once for each setting of tube and camera whose open beam is saturated or starved.
+    """Warn once for each setting of tube and camera whose open beam is saturated or
+    starved.
+
+    Settings whose beam the physics cannot predict, or with X-rays off, get no warning.
 
     Args:
         plan: with the saved images, their settings and positions.
@@ -40,7 +43,7 @@ def open_beam_problems(
 
     Returns:
         Warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that
-        would do.
+        would do, at the first line that uses the setting.
     """
     problems: list[ScriptProblem] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():
@@ -59,12 +62,15 @@ def lit_settings(
 ) -> dict[Setting, tuple[int, list[int]]]:
     """List the settings of tube and camera of a plan's saved images with X-rays on.
 
+    Frames and averages make no other setting. Images with an empty region are left out.
+
     Args:
         plan: with its groups of images.
         kinds: of the images that are listed; default: all.
 
     Returns:
-        For each setting the line that first uses it, and the indices of its images.
+        (exposure, camera) -> the line that first uses it, and the indices of its images
+        among all of the plan; in the order of first use.
     """
     found: dict[Setting, tuple[int, list[int]]] = {}
     first = 0
@@ -88,11 +94,13 @@ def brightest_beam(
 ) -> OpenBeam | None:
     """Predict the brightest open beam of some images of a setting.
 
+    It is the one with the most counts among at most `SAMPLED_IMAGES` of them.
+
     Args:
         plan: with the positions.
         exposure: of the setting.
         camera: of the setting.
-        indices: of the images.
+        indices: of the images, at least one.
         physics: how counts are predicted.
 
     Returns:

@@ -202,13 +202,15 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         """Compute positions spread over each image's exposure.
 
         The samples are symmetric about the nominal pose (assumed: the trigger's place
-        within the exposure is not published), so their mean has no bias against it.
+        within the exposure is not published), so their mean has no bias against it at
+        constant speed. An exposure covers all averages; images of a group that stands
+        have equal samples.
 
         Args:
             samples: number of moments in an exposure.
 
         Returns:
-            Axis -> (n, samples) positions [mm, deg].
+            Axis -> (n, samples) positions [mm, deg] of all images, saved or not.
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         of_group = [
@@ -260,7 +262,13 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
 
 def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, FloatArray]]]:
-    """Yield each group that saves images, with its motors' positions, axis -> (n,) [mm, deg]."""
+    """Yield each group that saves images, with its motors' positions.
+
+    Groups without files are skipped.
+
+    Yields:
+        The group, and axis -> (n,) positions of its images [mm, deg].
+    """
     first = 0
     for group in plan.groups:
         rows = slice(first, first + len(group))
@@ -327,8 +335,10 @@ class CheckReport(WithProblems):
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `flexdt check --json`; times in s, lengths in mm.
 
-        Without a collision check, `collisions_checked` is false and the clearance is
-        empty.
+        It has problems, steps, durations and their ranges, numbers of images and bytes,
+        collisions, clearance, optics, dose, start and sample. Without a collision check
+        `collisions_checked` is false and the clearance is empty; without a sample
+        `sample` is None, and an unknown height is None.
         """
         plan = self.plan
         clearance = self.clearance

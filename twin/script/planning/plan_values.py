@@ -195,8 +195,16 @@ class SampleSize:
         source: str = "given",
         offset: StagePlacement | None = None,
     ) -> SampleSize:
-        """Make the cylinder that contains a box of `size_mm` (x, y, z) at `offset`,
-        at every angle."""
+        """Make the cylinder about the rotation axis that contains a box on the stage, at
+        every angle.
+
+        A box that is tilted about x or y counts as its enclosing sphere.
+
+        Args:
+            size_mm: of the box, x, y, z [mm].
+            source: of the size, for people.
+            offset: placement of the box; None: upright in the middle of the stage.
+        """
         if offset is None:
             at = StagePlacement()
         else:
@@ -212,9 +220,11 @@ class SampleSize:
     def of_points(cls, points_mm: FloatArray, source: str = "given") -> SampleSize:
         """Make the cylinder, and the rims, that contain points at every angle.
 
+        The cylinder is as high above the stage's origin as below it.
+
         Args:
-            points_mm: (k, 3) in the object frame, k > 0: corners of the sample's shape, as
-                it stands on the stage.
+            points_mm: (k, 3) in the object frame, k > 0: corners of the sample's shape,
+                as it stands on the stage.
             source: of the size, for people.
         """
         radius = np.hypot(points_mm[:, 0], points_mm[:, 1])
@@ -238,11 +248,13 @@ def _outer_rims(
 ) -> tuple[tuple[float, float], ...]:
     """Find the circles on the convex hull of a body of revolution, from the lowest up.
 
+    Of circles at one height only the widest counts.
+
     Args:
         radius, height: of its circles, (k,) each [mm].
 
     Returns:
-        (radius, height) of those that no others contain.
+        (radius, height) of those that the others' hull does not contain.
     """
     order = np.lexsort((-radius, height))
     _, first = np.unique(height[order], return_index=True)

@@ -82,7 +82,9 @@ def infer(
         averages: stated number of averages, or None.
 
     Returns:
-        The inferred values, or None if speed and run-up do not determine them.
+        The inferred values, with a note on each one that was not stated. None if averages
+        do not follow (`_averages`), or the scan has less than half a step or
+        `MAX_INFERRED_STEPS` steps or more.
     """
     length = _length(trigger)
     rotation = trigger.unit == "deg"
@@ -107,8 +109,20 @@ def infer(
 
 
 def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
-    """Compute (increment, mismatch over the scan) of `frames` images with
-    `step` of motion between."""
+    """Compute the increment between the images of a scan, and its mismatch.
+
+    A rotation within half a step of whole turns (one or more) is divided into frames - 1
+    equal increments; the mismatch is by how much the steps exceed the turns. Else the
+    increment is `step`, and the mismatch 0.
+
+    Args:
+        step: motion from image to image [mm, deg].
+        frames: number of images.
+        rotation: whether the axis turns.
+
+    Returns:
+        (increment, mismatch over the scan) [mm, deg].
+    """
     scan = step * (frames - 1)
     turns = round(scan / FULL_TURN_DEG)
     if rotation and turns >= 1 and abs(scan - turns * FULL_TURN_DEG) < 0.5 * step:
@@ -119,7 +133,8 @@ def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
 def _length(trigger: planned.Trigger) -> float:
     """Compute the length of a triggered scan without its run-ups [mm, deg].
 
-    An angle within 1 deg of whole turns (one or more) is rounded to them.
+    It runs from the trigger to one run-up before the target. An angle within 1 deg of
+    whole turns (one or more) is rounded to them. May be negative.
     """
     length = abs(trigger.trajectory.target - trigger.position) - trigger.run_up
     turns = round(length / FULL_TURN_DEG)
@@ -131,7 +146,11 @@ def _length(trigger: planned.Trigger) -> float:
 def _averages(
     trigger: planned.Trigger, exposure_s: float, frames: int | None, length: float
 ) -> tuple[int, str] | None:
-    """Infer averages, and how; None if they are not a whole number within 2 %.
+    """Infer the number of averages, and how.
+
+    From the period of an image: the length over the steps, if there are two frames or
+    more and a positive length, else from the run-up less the way to full speed, which
+    covers `MARGIN_IMAGES` images.
 
     Args:
         trigger: of the sequence, with its motion.
@@ -140,7 +159,8 @@ def _averages(
         length: of the motion [mm, deg].
 
     Returns:
-        The number of averages, and the figures that it follows from.
+        The number of averages, and the figures that it follows from; None if that is
+        below 1, or not a whole number within 2 %.
     """
     speed = trigger.speed
     acceleration = trigger.acceleration
@@ -206,7 +226,11 @@ class ImageCollector:
     # commands ------------------------------------------------------------------------------
 
     def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
-        """Simulate `take image`: add one image; the number of frames is for sequences.
+        """Simulate `take image`: add one image, not saved yet; the number of frames is
+        for sequences.
+
+        The camera is busy for the exposure times the averages, and the command's
+        overhead.
 
         Args:
             command: without arguments.
@@ -225,8 +249,9 @@ class ImageCollector:
         """Simulate `save image`: name the last image, which determines its kind; report
         problems.
 
-        No file name, and no image taken before, are errors; a moving axis is a warning.
-        Saved again under another name it is a copy.
+        No file name, and no image taken before, are errors, and nothing is saved; an axis
+        that moved while the image was taken is a warning. Saved again it is added as a
+        copy.
 
         Args:
             command: with the file's name.
@@ -234,7 +259,7 @@ class ImageCollector:
             _step: not used.
 
         Returns:
-            The time that the command takes.
+            The time that the command takes; the camera is busy until its end.
         """
         name = image_name(command.path)
         if name is None:
@@ -264,15 +289,17 @@ class ImageCollector:
         """Simulate `take and save image sequence`: back to back, during any motion.
 
         The images are added, with positions of a fly scan where a trigger is armed, which
-        is used up. Inferred settings and unsafe motion are reported.
+        is used up. Inferred settings, motion without a trigger, and projections during
+        which nothing moves are warnings.
 
         Args:
-            command: with number of images and file names.
+            command: with prefix and first number of the file names.
             start: moment of the first exposure [s].
             step: index of the command's step.
 
         Returns:
-            The time that the command takes, with a note of the number of images.
+            The time that the command takes, with a note of the number of images; the
+            camera is busy until its end.
         """
         trigger = self._active(start)
         moving = self.motors.moving(start)
@@ -329,6 +356,9 @@ class ImageCollector:
         """Add images taken from `start` on with the settings in force, and remember them
         as the last.
 
+        X-rays and motion are those of `start`, for all of the images; the motors under
+        way then are remembered in `moved`.
+
         Args:
             starts: of the exposures, (n,) [s].
             start: of the command [s].
@@ -381,9 +411,12 @@ class ImageCollector:
         """Infer frames and averages that the script leaves out, set them in the camera,
         and warn of both.
 
+        Averages that do not follow are those in force. Frames that do not follow, or
+        without a trigger, are 1. Inferred averages are remembered for the images before.
+
         Args:
             trigger: of the sequence, or None.
-            start: moment of the first exposure [s].
+            start: not used.
 
         Returns:
             Frames and averages that fit the motion; None where none fit, or without a
@@ -424,8 +457,11 @@ class ImageCollector:
         """Compute the nominal moments of a fly scan's images, and positions by the rule;
         report deviations.
 
-        A late start, angles that are not whole turns, a short run-up and an overrun are
-        warnings.
+        Warnings: a sequence that starts more than `_TIME_TOLERANCE_S` after the trigger
+        (the first image is then where the motor is); stated frames that miss whole turns
+        by more than `_MISMATCH_STEPS` increments; a motor that is off the rule by more
+        than `_POSITION_TOLERANCE`, by a short run-up or an overrun (then all images are
+        where the motor is, one period apart).
 
         Args:
             trigger: the motion during the scan.
@@ -491,7 +527,8 @@ class ImageCollector:
         """Note the names of saved images; warn of repeated names, missing settings and
         X-rays that do not fit the kind.
 
-        All are warnings; a dark with X-rays on, any other without.
+        A dark does not fit X-rays on, any other kind X-rays off. Of repeated names the
+        first is named.
         """
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
@@ -512,7 +549,9 @@ class ImageCollector:
         """Warn, once each, of the settings that a saved image takes from the machine's
         defaults.
 
-        Tube settings only if X-rays are on; averages not where a hint was given.
+        They are mode, exposure, ROI and averages; with X-rays on, voltage and power too.
+        Averages are left out where a hint was given, or a warning says that they are
+        inferred.
         """
         s = draft.camera
         self._default("mode", "the camera mode", s.mode)
@@ -530,7 +569,12 @@ class ImageCollector:
 
     def _default(self, name: str, what: str, value: str) -> None:
         """Warn, once, that the script states no value of setting `name`; `value` of the
-        machine file is assumed.
+        machine file is assumed. Do nothing if it is stated.
+
+        Args:
+            name: of the setting.
+            what: the setting in words, for the message.
+            value: with its unit, for the message.
         """
         if name not in self.camera.said | self.tube.said | self._reported:
             self._reported.add(name)

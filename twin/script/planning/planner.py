@@ -95,6 +95,15 @@ def simulated(
 
     If averages are inferred from a scan, the commands run a second time with them,
     because they apply to the images before the scan as well.
+
+    Args:
+        commands: of the script, in order.
+        machine: whose axes, limits, camera and timing these are.
+        start: the scanner before the script.
+
+    Returns:
+        The simulation at its end, with steps, images and findings; nothing is raised for
+        problems of the script.
     """
     simulation = Simulation(machine, start)
     simulation.run(commands)

@@ -49,10 +49,14 @@ def plan_poses(
     """Plan streamed poses (thesis 4.6.2): dark and flat, then one projection a pose.
 
     The axes of a pose start together and all arrive before its image. The flat is taken
-    at the first pose, but with the sample beside the beam; X-rays stay on from then on.
-    Dark and flat average as many images as those of a composed script. The settings file
-    is written at the first pose. Line i + 1 of problems and steps is pose i; line 0 is
-    everything before.
+    at the first pose, but with the sample beside the beam; X-rays stay on from then until
+    after the last pose. Dark and flat average as many images as those of a composed
+    script. The settings file is written at the first pose. Line i + 1 of problems and
+    steps is pose i; line 0 is everything before.
+
+    A plan without a flat has the warning `no_flat` (also without poses), and one whose
+    way to the flat is not free `flat_path`: it goes there all the same, all motors at
+    once.
 
     Args:
         poses: axis -> position [mm, deg]; axes left out stay where they are.
@@ -61,7 +65,8 @@ def plan_poses(
         exposure_ms: of every image; None keeps the camera's current exposure.
         start: the scanner before; the machine's homes if None.
         sample: its size, if known.
-        flat: where the sample is out of the beam; True finds it, False takes no flat.
+        flat: where the sample is out of the beam; True finds it, the first place with a
+            free path; False takes no flat.
         route: finds a free path to the flat and from there to the first pose; None: the
             direct one.
 
@@ -143,7 +148,15 @@ def _image(file: str, line: int = 0) -> list[c.Command]:
 
 
 def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
-    """Make the moves to a pose; several start together, then each is repeated to wait for it."""
+    """Make the commands that move all axes of a pose together and wait for each.
+
+    Of several axes each is first sent without waiting, then again with an
+    acknowledgement; a single one is sent once, and no axis gives [].
+
+    Args:
+        pose: axis -> position [mm, deg].
+        line: of the commands.
+    """
     moves = [
         c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()
     ]
@@ -167,12 +180,14 @@ def _arrival(
 def _legs(start: Pose, end: Pose, route: Route | None = None) -> Sequence[Pose] | None:
     """List the moves between two poses: those of `route`, or all motors at once.
 
+    Only motors whose position changes move.
+
     Args:
         start, end: motor -> position [mm, deg].
-        route: finds a free path; None: the direct one.
+        route: finds a free path; None: the direct one, whether free or not.
 
     Returns:
-        Moves in order; None if the route finds none.
+        Moves in order, [] where nothing changes; None if the route finds none.
     """
     goal = {axis: value for axis, value in end.items() if value != start[axis]}
     if route is None:

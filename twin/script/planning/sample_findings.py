@@ -85,8 +85,9 @@ def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
         plan: with the saved images, their settings and positions.
 
     Returns:
-        A probe for each of the first `PROBE_SETTINGS` settings: `PROBE_VIEWS` views on a
-        coarse grid of rays.
+        A probe for each of the first `PROBE_SETTINGS` settings with X-rays on: at most
+        `PROBE_VIEWS` views, evenly spread, on a grid of rays with about `PROBE_RAYS`
+        along the longer side. Empty without projections.
     """
     settings = lit_settings(plan, kinds=("projection",))
     probes: list[SampleProbe] = []
@@ -104,7 +105,8 @@ def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
 def shares_behind(
     chain: Chain, probe: SampleProbe, paths_mm: Float32Array, rows: FloatArray
 ) -> CountShares:
-    """Count the saturated and the starved pixels of a probe's views.
+    """Count the saturated and the starved pixels of a probe's views, as shares of all
+    pixels.
 
     Args:
         chain: tube, materials of the sample, panel.
@@ -131,6 +133,10 @@ def predicted_exposures(
         plan: that the forecast is of.
         forecast: of the pixels behind the sample.
         physics: how counts are made.
+
+    Returns:
+        One for each probe of the forecast, in its order. Where pixels behind the sample
+        are not predicted it has the forecast's reason.
     """
     made = [
         _predicted(plan, probe, seen, physics)
@@ -148,11 +154,17 @@ def _predicted(
     """Predict the exposure of one setting: open beam, pixels behind the sample, and
     doubts about both.
 
+    Pixels that are saturated (or starved) as the open beam already is are no further
+    doubt.
+
     Args:
         plan: of the scan.
         probe: the setting, and its images.
         seen: predicted pixels behind the sample; None if unknown.
         physics: how counts are predicted.
+
+    Returns:
+        The prediction; without the open beam's fill if the physics cannot predict it.
     """
     lit = probe.exposure
     made = PredictedExposure(lit.kV, lit.power_W, lit.exposure_ms, shares=seen)
@@ -177,11 +189,13 @@ def sample_problems(
 
     Args:
         forecast: of the pixels behind the sample.
-        known: warnings of the open beam, which explain pixels of the same kind.
+        known: warnings of the open beam, which explain pixels of the same kind at the
+            same line.
 
     Returns:
-        Warnings `saturated_pixels` and `starved_pixels`; one `unpredicted_pixels` with
-        the reason, if pixels are not predicted.
+        Warnings `saturated_pixels` and `starved_pixels`, from a share of `WARNING_SHARE`
+        on; one `unpredicted_pixels` with the reason, at the first probe's line, if pixels
+        are not predicted.
     """
     explained = {(p.code, p.line) for p in known}
     found = [

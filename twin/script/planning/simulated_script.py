@@ -49,8 +49,15 @@ _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 
 
 def sample_size(data: bytes) -> SampleSize | None:
-    """Decode the sample's diameter from the argument of `set sample info`; None if
-    it has none."""
+    """Decode the sample's diameter from the argument of `set sample info`.
+
+    Args:
+        data: a big-endian double [mm] at its beginning.
+
+    Returns:
+        The size, without a height. None for less than 12 bytes, or a diameter that is not
+        above 0 and at most `_MAX_DIAMETER_MM`.
+    """
     if len(data) < 12:
         return None
     (diameter,) = struct.unpack_from(">d", data)
@@ -100,7 +107,8 @@ class Simulation:
         """Simulate all commands in order: advance the clock, and add a step for each.
 
         A camera command waits until the camera is free (assumed). Names are matched to
-        the machine's whatever their case.
+        the machine's whatever their case. A problem of a command does not end the
+        simulation.
 
         Args:
             commands: of the script, in order; problems go to `findings`.
@@ -139,6 +147,9 @@ class Simulation:
     def _release(self, command: c.Command, span: planned.Span) -> float:
         """Compute the moment [s] at which the script goes on after a command, by its
         wait.
+
+        With ACK it is the end of the command; with POS the passing of its trigger, if it
+        has one; else at once. It is never before now.
         """
         if command.wait is c.Wait.ACK:
             return max(self.now, span.end)
@@ -165,7 +176,9 @@ class Simulation:
     # scanner -------------------------------------------------------------------------------
 
     def _custom(self, command: c.Custom) -> planned.Span:
-        """Count the time of an unknown command, which has no effect; warn if it is to an axis."""
+        """Count the time of an unknown command, which has no effect; warn if it is to a
+        motor of the machine.
+        """
         if command.component in self.machine.axes:
             self.findings.warn(
                 "custom_component",
@@ -209,8 +222,13 @@ class Simulation:
     # tube ----------------------------------------------------------------------------------
 
     def _xray_on(self, _command: c.XrayOn) -> planned.Span:
-        """Switch X-rays on, unless they are, and set when they are ready; return the time
-        that it takes.
+        """Switch X-rays on at the end of the command, and set when they are ready.
+
+        If they are on already nothing changes, and the command takes the time of any
+        other.
+
+        Returns:
+            The time that the command takes; X-rays are ready later.
         """
         if self.tube.on:
             return self.timed("command", note=" (already on)")
@@ -220,7 +238,12 @@ class Simulation:
         return span
 
     def _xray_off(self, _command: c.XrayOff) -> planned.Span:
-        """Switch X-rays off; if they are known to be off, only the time of asking counts."""
+        """Switch X-rays off at once; if they are known to be off, only the time of asking
+        counts.
+
+        Returns:
+            The time that the command takes.
+        """
         if not self.tube.on and self.tube.known:
             return self.timed("xrayoff_again", note=" (already off)")
         self.tube.switch(False, self.now)
@@ -231,6 +254,9 @@ class Simulation:
 
         With X-rays off it would wait for ever: an error is reported, and the script goes
         on.
+
+        Returns:
+            The time that the command takes; a wait counts as assumed.
         """
         if not self.tube.on:
             what = "waits until the X-rays are ready, but they are off: the script would hang here"
@@ -290,10 +316,10 @@ class Simulation:
     # motors --------------------------------------------------------------------------------
 
     def _axis(self, command: c.MotorCommand) -> bool:
-        """Return whether the machine has the command's axis; report it if not (a custom
-        one as a warning).
+        """Return whether the machine has the command's axis; report it if not.
 
-        A name that scanners reserve is an error.
+        A name that scanners reserve is an error, another one a warning: a custom
+        component without effect.
         """
         name = command.component
         if self.machine.has(name):
@@ -312,6 +338,9 @@ class Simulation:
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
         """Set an axis's speed or acceleration, limited to those of its motors; report
         what lies beyond.
+
+        The motors of a virtual axis get their share. An axis that the machine lacks is
+        reported and changes nothing.
 
         Args:
             command: with axis and value [mm/s, deg/s, per s].
@@ -350,12 +379,16 @@ class Simulation:
         """Start a move of an axis within its travel; register its trigger, and report
         what lies beyond.
 
+        A target beyond travel is replaced by the limit. An axis that the machine lacks is
+        reported and nothing moves.
+
         Args:
             command: with axis, target [mm, deg] and wait.
 
         Returns:
-            The time span of the motion, the moment at which the script goes on, and a
-            note of limited motors.
+            The time span of the motion, the moment at which the script goes on (with
+            POS), and a note of limited motors. With ACK the machine's overhead is in the
+            span.
         """
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
@@ -396,7 +429,10 @@ class Simulation:
         begin: Mapping[str, float],
         end: float,
     ) -> float:
-        """Find the moment at which the motor passes the trigger, and register the trigger.
+        """Find the moment at which the motor passes the trigger, and register the
+        trigger.
+
+        Of a virtual axis the motor is the one it is defined by.
 
         Args:
             command: the move.
@@ -406,8 +442,8 @@ class Simulation:
             end: of the motion [s].
 
         Returns:
-            Moment [s]; `end`, with an error reported, if the motor never passes the
-            trigger.
+            Moment [s]; `end`, with an error reported and no trigger registered, if the
+            motor never passes it.
         """
         virtual = self.machine.virtual_axes.get(command.component)
         if virtual is None:
