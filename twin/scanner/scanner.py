@@ -629,7 +629,8 @@ class ScannerTwin:
             was halted.
 
         Raises:
-            CollisionError: not even halting is free of the new stage; nothing changes.
+            CollisionError: a pair is too near, a move of the change would collide, or not
+                even halting is free of the new stage; nothing changes.
             SafetyError: the stage was changed meanwhile; motion was stopped meanwhile and
                 the change has targets; motors coast; or a long programme has begun.
                 Nothing changes.

@@ -330,7 +330,7 @@ def switched(
 
     Args:
         machine: has these times.
-        tube: before; switching to its present state changes nothing.
+        tube: before; its present state again changes nothing, unless `now` is None.
         on: on or off.
         now: time of the command [s]; None: the X-rays are ready already, and the time of
             the last switch stays.

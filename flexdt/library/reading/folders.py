@@ -93,10 +93,11 @@ def load_dataset(
             Nikon's .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a
             folder with one of these.
         machine: the scanner, for texts that do not name one that ships with the package.
-            Ignored, like `profile`, for files of other programs.
+            Ignored, like `profile`, unless flexdt.json or texts are read.
         profile: zero offsets to use; default: those of the file, or the profile that
             reproduces the printed figures.
-        ignore_document: use the texts alone even if flexdt.json is there.
+        ignore_document: use the texts alone even if flexdt.json or a saved geometry is
+            there.
         geometry: one view for each projection, in place of a file's, or where an NXtomo
             or .txrm file has none. Ignored for folders of flexdt's or a scanner's own.
         distances: source to axis and source to panel [mm], of an NXtomo file that has
