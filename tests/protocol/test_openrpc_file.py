@@ -45,7 +45,7 @@ def test_the_table_of_parameters_is_current() -> None:
 
 
 def test_states_of_jobs_and_kinds_of_images_are_named() -> None:
-    [states] = re.findall(r"A job is (.*?):", SPEC)
+    [states] = re.findall(r"A job is (.*?)\.", SPEC)
     assert re.findall(r"`(\w+)`", states) == list(get_args(JobPhase))
     [kinds] = re.findall(r"`kind` of an image: (.*?)\.\n", SPEC, re.DOTALL)
     choices = get_args(ProjectionGet.model_fields["kind"].annotation)
