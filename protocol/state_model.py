@@ -144,6 +144,8 @@ class Correction(Result):
     comment: str = ""
     source: str | None = None
     """data sets or method it came from"""
+    sides_known: bool = False
+    """found from beads of known places, which tell the direction of rotation"""
 
 
 class ClockState(Result):

@@ -955,8 +955,12 @@ def apply_calibration(
     *,
     comment: str | None = None,
     source: str | None = None,
+    sides_known: bool = False,
 ) -> Flow[corrections.CorrectionResult]:
     """Put a correction (mm, deg; true minus nominal) in force; it replaces the last.
+
+    `sides_known` says that it was found from beads of known places, which tell the direction
+    of rotation and mirrored images.
 
     Example:
         >>> twin.apply_calibration({"det_roll": 0.1}, "rolled").correction.name
@@ -970,6 +974,8 @@ def apply_calibration(
         name=name,
         comment=comment,
         source=source,
+        # A server before this field refuses it.
+        sides_known=sides_known or None,
     )
 
 

@@ -349,7 +349,9 @@ def _correction(state: State) -> NamedCorrection | None:
     c = state.correction
     if c is None:
         return None
-    return NamedCorrection.from_edge(c.name, c.date, c.parameters, c.comment)
+    return NamedCorrection.from_edge(
+        c.name, c.date, c.parameters, c.comment, sides_known=c.sides_known
+    )
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:

@@ -590,7 +590,7 @@ async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
     if correction is None:
         now = None
     else:
-        now = correction.model_dump(include={"name", "parameters"})
+        now = correction.model_dump(include={"name", "parameters", "sides_known"})
     return (await _of_volume(viewer, params, "compare", json.dumps(now)))[0]
 
 

@@ -170,6 +170,8 @@ class CalibrationApply(f.Params):
     name: f.Name | None = None
     comment: f.Comment = ""
     source: f.ShortText | None = None
+    sides_known: bool = False
+    """found from beads of known places, which tell the direction of rotation"""
 
 
 class CalibrationDelete(f.Params):

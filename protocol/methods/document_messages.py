@@ -67,6 +67,8 @@ class CorrectionPart(f.Params):
     date: f.ShortText
     parameters: Annotated[dict[f.AxisName, Kept], MaxLen(64), few(64)]
     comment: f.Comment = ""
+    sides_known: bool = False
+    """found from beads of known places, which tell the direction of rotation"""
 
 
 class Scene(f.Params):

@@ -142,16 +142,20 @@ class Corrections:
         name: str | None,
         note: str,
         when: datetime | None = None,
+        *,
+        sides_known: bool = False,
     ) -> NamedCorrection:
         """Make a correction from edge values [mm, deg]; nothing is stored yet.
 
-        Values that are left out are nominal; the note of a known one stays.
+        Values that are left out are nominal; the note of a known one stays, and whether
+        its sides are known.
 
         Args:
             values: parameter -> value [mm, deg].
             name: of the correction; None: one that follows from its date.
             note: for people.
             when: its date; None: now.
+            sides_known: see `NamedCorrection`.
 
         Returns:
             The new correction, or the known one of this name with the same values.
@@ -179,7 +183,9 @@ class Corrections:
                 "calibration.delete makes room",
                 {"asked": len(self._all) + 1, "allowed": self._most},
             )
-        return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
+        return self._all.get(chosen) or NamedCorrection(
+            chosen, date, parameters, note, sides_known=sides_known
+        )
 
     def after(self, correction: NamedCorrection | None) -> History:
         """Return the history once `correction` (None: none) is in force instead of the last.

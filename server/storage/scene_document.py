@@ -62,12 +62,14 @@ def save_scene(
 
 
 def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
-    """Convert a correction to the names of the wire: name, date, parameters (mm, deg), comment."""
+    """Convert a correction to the names of the wire: name, date, parameters (mm, deg), comment
+    and whether its sides are known."""
     return {
         "name": correction.name,
         "date": correction.date,
         "parameters": correction.parameters.to_edge(),
         "comment": correction.note,
+        "sides_known": correction.sides_known,
     }
 
 
@@ -77,7 +79,13 @@ def correction_of(part: p.CorrectionPart) -> NamedCorrection:
     Raises:
         UnknownNameError: a name that is not a parameter.
     """
-    return NamedCorrection.from_edge(part.name, part.date, part.parameters, part.comment)
+    return NamedCorrection.from_edge(
+        part.name,
+        part.date,
+        part.parameters,
+        part.comment,
+        sides_known=part.sides_known,
+    )
 
 
 def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:

@@ -433,6 +433,7 @@ class CorrectionEntry(_Model):
     date: str
     note: str = ""
     parameters: dict[str, float]
+    sides_known: bool = False
 
     @classmethod
     def of(cls, correction: NamedCorrection | None) -> CorrectionEntry | None:
@@ -441,7 +442,11 @@ class CorrectionEntry(_Model):
         if c is None:
             return None
         return cls(
-            name=c.name, date=c.date, note=c.note, parameters=c.parameters.to_edge()
+            name=c.name,
+            date=c.date,
+            note=c.note,
+            parameters=c.parameters.to_edge(),
+            sides_known=c.sides_known,
         )
 
 
@@ -657,7 +662,9 @@ class DatasetDocument(_Model):
         c = self.correction
         if c is None:
             return None
-        return NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
+        return NamedCorrection.from_edge(
+            c.name, c.date, c.parameters, c.note, sides_known=c.sides_known
+        )
 
     def machine_of(self, file: str = DOCUMENT) -> Machine:
         """Read the scanner's description.

@@ -169,14 +169,21 @@ class NamedCorrection:
 
     @classmethod
     def from_edge(
-        cls, name: str, date: str, values: Mapping[str, float], note: str
+        cls,
+        name: str,
+        date: str,
+        values: Mapping[str, float],
+        note: str,
+        *,
+        sides_known: bool = False,
     ) -> NamedCorrection:
-        """Make the correction with these values [mm, deg].
+        """Make the correction with these values [mm, deg], without a panel's distortion.
 
         Raises:
             UnknownNameError: a name that is not a parameter.
         """
-        return cls(name, date, Offsets.from_edge(values), note)
+        parameters = Offsets.from_edge(values)
+        return cls(name, date, parameters, note, sides_known=sides_known)
 
 
 @dataclass(frozen=True)

@@ -382,7 +382,11 @@ def push_correction(client: TwinClient, correction: NamedCorrection, source: str
         n: v for n, v in correction.parameters.to_edge().items() if v != nominal[n]
     }
     client.apply_calibration(
-        parameters, correction.name, comment=correction.note, source=source
+        parameters,
+        correction.name,
+        comment=correction.note,
+        source=source,
+        sides_known=correction.sides_known,
     )
 
 

@@ -24,6 +24,11 @@ export function parametersOf(report) {
         throw new Error(`no number: ${bad.slice(0, 5).join(", ")}`);
     return found;
 }
+// Whether a report is of a phantom whose beads are known.
+const ofBeads = (report) => {
+    const { phantom } = report;
+    return typeof phantom === "string" && phantom !== "unknown";
+};
 const unit = (name) => name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm";
 // Outliers that a report names.
 const LISTED = 3;
@@ -60,8 +65,8 @@ function table(parameters, sigmas = {}, units = {}) {
     }));
 }
 // Says whether the correction is in force.
-export async function apply(parameters, source, comment = "") {
-    const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
+export async function apply(parameters, source, comment = "", sides_known = false) {
+    const answer = await command("calibration.apply", { parameters, source, comment, sides_known }, "Not applied");
     if (!answer)
         return false;
     // warnings come by the log
@@ -94,7 +99,7 @@ export async function refresh() {
     if (!answer.corrections.length)
         box.append(el("div", { class: "muted" }, "none yet"));
     for (const c of [...answer.corrections].reverse()) {
-        const again = () => void apply(c.parameters, c.source, `again: ${c.name}`);
+        const again = () => void apply(c.parameters, c.source, `again: ${c.name}`, c.sides_known);
         box.append(el("div", {}, el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)), ...(c.name === answer.current
             ? [el("b", {}, "in force")]
             : [
@@ -106,7 +111,8 @@ export async function refresh() {
 const dated = (correction) => correction.date.slice(0, 16).replace("T", " ");
 chosen($input("#correction-file"), async (file) => {
     try {
-        await apply(parametersOf(JSON.parse(await file.text())), file.name);
+        const report = JSON.parse(await file.text());
+        await apply(parametersOf(report), file.name, "", ofBeads(report));
     }
     catch (error) {
         emit("note", "error", "Not applied", `${file.name}: ${words(error)}`);
@@ -145,6 +151,7 @@ function fit() {
     void estimate("calibration.fit", { datasets: names, ...wanted() }, names, "No calibration");
 }
 async function estimate(method, params, names, title) {
+    const beads = "phantom" in params && params.phantom !== "unknown";
     $button("#fit").disabled = true;
     $("#fit-note").textContent = `${names.join(", ")}: running…`;
     $("#fit-report").textContent = "";
@@ -169,7 +176,7 @@ async function estimate(method, params, names, title) {
         disabled: !r.identifiable || !correction,
         onclick: () => {
             if (correction)
-                void apply(correction, names.join(", "));
+                void apply(correction, names.join(", "), "", beads);
         },
     };
     const compared = {

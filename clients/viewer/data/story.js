@@ -151,7 +151,7 @@ function tell(parameters) {
 async function use() {
     if (!found)
         return;
-    if (await apply(found.correction, found.source, "after a story"))
+    if (await apply(found.correction, found.source, "after a story", true))
         next();
 }
 on("job", (told) => {

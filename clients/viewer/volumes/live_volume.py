@@ -456,7 +456,10 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
             served.answer({})
             parameters = json.loads(now)
             given = parameters and NamedCorrection(
-                parameters["name"], "", Offsets.from_edge(parameters["parameters"])
+                parameters["name"],
+                "",
+                Offsets.from_edge(parameters["parameters"]),
+                sides_known=parameters["sides_known"],
             )
             _told(held, lambda: compare(held, given), "not_compared")
         case _:

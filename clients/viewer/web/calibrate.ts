@@ -37,6 +37,11 @@ export function parametersOf(report: unknown): Record<string, number> {
   if (bad.length) throw new Error(`no number: ${bad.slice(0, 5).join(", ")}`);
   return found as Record<string, number>;
 }
+// Whether a report is of a phantom whose beads are known.
+const ofBeads = (report: unknown) => {
+  const { phantom } = report as { phantom?: unknown };
+  return typeof phantom === "string" && phantom !== "unknown";
+};
 const unit = (name: string) =>
   name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm";
 // Outliers that a report names.
@@ -102,10 +107,11 @@ export async function apply(
   parameters: Record<string, number>,
   source: string | null,
   comment = "",
+  sides_known = false, // found from beads of known places
 ): Promise<boolean> {
   const answer = await command(
     "calibration.apply",
-    { parameters, source, comment },
+    { parameters, source, comment, sides_known },
     "Not applied",
   );
   if (!answer) return false;
@@ -136,7 +142,7 @@ export async function refresh(): Promise<void> {
   box.textContent = "";
   if (!answer.corrections.length) box.append(el("div", { class: "muted" }, "none yet"));
   for (const c of [...answer.corrections].reverse()) {
-    const again = () => void apply(c.parameters, c.source, `again: ${c.name}`);
+    const again = () => void apply(c.parameters, c.source, `again: ${c.name}`, c.sides_known);
     box.append(
       el(
         "div",
@@ -156,7 +162,8 @@ export async function refresh(): Promise<void> {
 const dated = (correction: Correction) => correction.date.slice(0, 16).replace("T", " ");
 chosen($input("#correction-file"), async (file) => {
   try {
-    await apply(parametersOf(JSON.parse(await file.text())), file.name);
+    const report: unknown = JSON.parse(await file.text());
+    await apply(parametersOf(report), file.name, "", ofBeads(report));
   } catch (error) {
     emit("note", "error", "Not applied", `${file.name}: ${words(error)}`);
   }
@@ -206,6 +213,7 @@ async function estimate<M extends "calibration.fit" | "calibration.align">(
   names: string[],
   title: string,
 ) {
+  const beads = "phantom" in params && params.phantom !== "unknown";
   $button("#fit").disabled = true;
   $("#fit-note").textContent = `${names.join(", ")}: running…`;
   $("#fit-report").textContent = "";
@@ -236,7 +244,7 @@ async function estimate<M extends "calibration.fit" | "calibration.align">(
     class: "small primary",
     disabled: !r.identifiable || !correction,
     onclick: () => {
-      if (correction) void apply(correction, names.join(", "));
+      if (correction) void apply(correction, names.join(", "), "", beads);
     },
   };
   const compared = {

@@ -177,7 +177,7 @@ function tell(parameters: Record<string, unknown>): void {
 }
 async function use(): Promise<void> {
   if (!found) return;
-  if (await apply(found.correction, found.source, "after a story")) next();
+  if (await apply(found.correction, found.source, "after a story", true)) next();
 }
 on("job", (told: JobStatus) => {
   if (!waiting || (told.job !== job && told.job !== phantomJob)) return;

@@ -60,16 +60,18 @@ export type Compose = {
 export type Control = { action: "acquire" | "release" | "force" };
 export type ControlResult = { controller: string | null; yours: boolean };
 export type Correct = {
-  parameters: Record<string, number>; name?: string | null; comment?: string; source?: string | null
+  parameters: Record<string, number>; name?: string | null; comment?: string;
+  source?: string | null; sides_known?: boolean
 };
 export type Correction = {
   name: string; date: string; parameters: Record<string, number>; comment: string;
-  source: string | null
+  source: string | null; sides_known: boolean
 };
 export type CorrectionDeleted = { name: string };
 export type CorrectionListResult = { corrections: Array<Correction>; current: string | null };
 export type CorrectionPart = {
-  name: string; date: string; parameters: Record<string, number>; comment?: string
+  name: string; date: string; parameters: Record<string, number>; comment?: string;
+  sides_known?: boolean
 };
 export type CorrectionResult = { correction: Correction | null; warnings: Array<string> };
 export type DatasetGet = {

@@ -80,7 +80,8 @@ class Aligned(Generic[Images_co]):
     @property
     def correction(self) -> NamedCorrection:
         """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that
-        was in force, with dO_x, det_roll, det_yaw and dD_y replaced.
+        was in force, with dO_x, det_roll, det_yaw and dD_y replaced. It knows the sides
+        if that one did.
 
         Raises:
             NotIdentifiableError: there is no correction; the message gives the reason.
@@ -91,8 +92,14 @@ class Aligned(Generic[Images_co]):
         now = datetime.now(UTC)
         name = f"alignment {now:%Y-%m-%d %H:%M:%S}"
         note = f"without a phantom, {self.alignment.frames} frames of {self.dataset.name}"
+        before = self.dataset.correction
         return NamedCorrection(
-            name, now.isoformat(timespec="seconds"), offsets, note, self.alignment.panel
+            name,
+            now.isoformat(timespec="seconds"),
+            offsets,
+            note,
+            self.alignment.panel,
+            sides_known=before is not None and before.sides_known,
         )
 
 

@@ -34,7 +34,12 @@ async def apply(
         CollisionError: bodies would be too close; nothing changes.
     """
     async with twin.stage_turn:
-        correction = twin.corrections.make(params.parameters, params.name, params.comment)
+        correction = twin.corrections.make(
+            params.parameters,
+            params.name,
+            params.comment,
+            sides_known=params.sides_known,
+        )
         history = twin.corrections.after(correction)
         ready = h.ensure_allowed(twin, client, "calibration.apply")
         warnings = await h.change_stage(

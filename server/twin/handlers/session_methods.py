@@ -173,7 +173,9 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
         in_force = twin.corrections.in_force
         if scene.correction is not None:
             c = scene.correction
-            correction = twin.corrections.make(c.parameters, c.name, c.comment)
+            correction = twin.corrections.make(
+                c.parameters, c.name, c.comment, sides_known=c.sides_known
+            )
         history = None
         if correction != in_force:
             history = twin.corrections.after(correction)
