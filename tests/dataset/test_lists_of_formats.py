@@ -155,7 +155,7 @@ def mesh_wire() -> object:
 def mesh_pages() -> object:
     texts = (
         page("phantoms.md", "\n\nSTL, ", "files become"),
-        page("tutorials/own-sample.md", "\nSTL, ", ", closed"),
+        page("tutorials/own-sample.md", "surfaces in STL, ", ". GLB"),
         argument(fx.phantoms.mesh_phantom, "source").split(" file,")[0],
         argument(phantom_commands.make, "mesh").rstrip("."),
     )
