@@ -131,7 +131,7 @@ class AcquilaEvent:
     def answer(
         self, reply_type: ReplyType, reply: str = "", comp_type: str = ""
     ) -> AcquilaEvent:
-        """Make the event that replies to this one: same UUID, same tick count.
+        """Make the event that replies to this one: all fields the same but those given.
 
         Args:
             reply_type: RCV, FDB, ACK or ERR.
@@ -149,13 +149,14 @@ class AcquilaEvent:
 def parse_event(data: bytes | str) -> AcquilaEvent:
     """Parse one event from JSON.
 
-    Missing and null texts become "", numbers in arguments their text. The component is
-    stripped, runs of blanks in the command become one, and the reply type is mapped to
-    the scanner's spelling.
+    Missing and null texts become "", numbers and truth values their text; a missing or
+    unusable tick count becomes 0, a missing UUID 0. The component is stripped, and runs
+    of blanks in the command become one. The reply type is read in either case; empty,
+    SEND and SENT are a command. Unknown members are ignored.
 
     Args:
-        data: one JSON object, at most `MAX_BYTES`; control characters inside texts are
-            allowed.
+        data: one JSON object, at most `MAX_BYTES`; control characters inside the JSON's
+            texts are allowed.
 
     Returns:
         The event, with every field checked.
@@ -277,11 +278,10 @@ def _text(content: Mapping[str, object], name: str) -> str:
 def _plain(name: str, text: str) -> str:
     """Check a field's length and characters, and return the text unchanged.
 
-    Binary fields may hold anything but surrogates.
-
     Args:
-        name: of the field, which has its own limit in `MAX_CHARS`; binary fields may hold
-            control characters.
+        name: of the field, which has its own limit in `MAX_CHARS`; those of
+            `BINARY_FIELDS` may hold anything but surrogates, others no control characters
+            either.
         text: the field's value.
 
     Raises:
@@ -313,12 +313,11 @@ def _whole(value: object) -> int:
 
 
 def _uuid(value: object) -> int | float | str:
-    """Return a UUID (a number below `MAX_UUID` or a text) unchanged, or 0 for null.
-
-    Truth values are refused; so is a number that is not finite.
+    """Check a UUID, and return it unchanged; 0 for null.
 
     Raises:
-        AcquilaError: another type, a greater number, or a text that no event can carry.
+        AcquilaError: another type (truth values too), a number not finite or not below
+            `MAX_UUID` in absolute value, or a text that no event can carry.
     """
     if isinstance(value, str):
         return _plain("UUID", value)

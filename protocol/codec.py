@@ -77,15 +77,18 @@ def write_json(document: object) -> bytes:
 
 
 def json_pieces(document: object) -> list[bytes]:
-    """Encode like `write_json`, in pieces; large binary values bypass the encoder.
+    """Encode a document as one line of ASCII JSON, in pieces; large binary values bypass
+    the encoder.
 
-    Below `MIN_PIECEWISE_BYTES` a binary value is base64 in the text.
+    Binary values become base64: below `MIN_PIECEWISE_BYTES` within the text, larger ones
+    in pieces of their own. Models, arrays, NumPy numbers, sets and mappings are converted
+    by `_plain`.
 
     The encoder writes an unguessable mark in place of each large value; the marks are
     then replaced by the value's base64, so that the document is never copied as a whole.
 
     Args:
-        document: plain data, with bytes where the wire has binary values.
+        document: plain data, with bytes where the wire has binary values; not changed.
 
     Returns:
         The document's parts in order, as bytes: ASCII text, and base64 of at most
@@ -166,7 +169,8 @@ def read_msgpack(data: bytes | bytearray | memoryview) -> object:
 
 
 def write_msgpack(document: object) -> bytes:
-    """Encode a document as one MessagePack object; bytes stay raw.
+    """Encode a document as one MessagePack object; bytes stay raw, and models, arrays,
+    NumPy numbers, sets and mappings are converted by `_plain`.
 
     Raises:
         ValueError, TypeError, OverflowError: a value that MessagePack cannot hold.
@@ -208,8 +212,8 @@ def _plain(value: object) -> object:
     """Convert a value that an encoder does not know to plain Python: models, arrays,
     NumPy numbers, sets (sorted lists) and mappings.
 
-    Of models, a dict of their fields; mappings become dicts; what is inside is left to
-    the encoder.
+    A model becomes a dict of its fields, an array nested lists, a NumPy number Python's,
+    a mapping a dict; members are left to the encoder.
 
     Raises:
         TypeError: anything else.

@@ -83,8 +83,8 @@ class Prepared:
         self._pieces: dict[Codec, list[bytes]] = {}
 
     def encoded(self, codec: Codec) -> list[bytes]:
-        """Return the message's bytes, framing included; encoded at the first call for each
-        codec.
+        """Return the message's bytes, framing included; encoded at the first call for
+        each codec and kept.
 
         One piece up to `MAX_OVERTAKING_BYTES`, several for a larger message.
         """
@@ -174,7 +174,8 @@ class Connection:
     def receive_end(self) -> None:
         """End reception: the peer has ended the stream.
 
-        The connection is closed in any case, and messages not taken out are discarded.
+        The connection is closed in any case, and messages not taken out are discarded. If
+        it was closed before, nothing happens.
 
         Raises:
             ProtocolError: it ended inside a message, so that message is lost.
@@ -191,8 +192,9 @@ class Connection:
         """Divide received bytes into complete messages, which wait undecoded for
         `next_raw`.
 
-        The first byte decides the codec if none was given: 0 begins a MessagePack frame.
-        After a fatal error, and once closed, bytes are ignored.
+        The first byte decides the codec if none was given: 0 begins a MessagePack frame,
+        any other JSON lines. Lines and frames above `max_message` become `Malformed` in
+        the queue. After a fatal error, and once closed, bytes are ignored.
 
         Args:
             data: any part of the stream, also an empty one.
@@ -214,8 +216,9 @@ class Connection:
         """Divide received bytes into JSON lines; a chunk of many short lines is split at
         once.
 
-        A chunk that is too long, has one line end or none, or may hold HTTP is divided
-        line by line; blank lines are dropped.
+        A chunk that is longer than `max_message`, has one line end or none, or may hold
+        HTTP is divided by `_feed_each_line`. Blank lines are dropped; the rest after the
+        last line end waits.
 
         Args:
             data: received bytes, any part of the stream.
@@ -237,8 +240,9 @@ class Connection:
         """Divide JSON lines one by one; queue an error for HTTP (fatal) and for lines
         that are too long.
 
-        Blank lines are dropped; the rest of a refused line is skipped up to its end; an
-        incomplete line is kept, refused as soon as it is too long.
+        Blank lines are dropped; an incomplete line is kept. A line is refused as soon as
+        it is longer than `max_message`, and the rest of it is skipped up to its end.
+        After HTTP the rest of `data` is dropped.
 
         Args:
             data: received bytes, any part of the stream.
@@ -269,10 +273,9 @@ class Connection:
         """Divide MessagePack frames; queue an error for one that is too long, and skip
         its rest.
 
-        An incomplete frame waits for more bytes.
-
-        A length above `MAX_FRAME` is a fatal error, as the stream has no known next frame
-        then.
+        An incomplete frame waits for more bytes. A frame above `max_message` is refused
+        and skipped; a length above `MAX_FRAME` is a fatal error, as the stream has no
+        known next frame then, and the rest of `data` is dropped.
 
         Args:
             data: received bytes, any part of the stream.
@@ -312,9 +315,8 @@ class Connection:
         """Take the next message's bytes, or an error, out of the queue; None if none
         waits.
 
-        Errors that are not fatal are returned in their place, and reception goes on.
-
-        A fatal error closes the connection: nothing follows it.
+        Errors come in their place among the messages. One that is not fatal ends nothing;
+        a fatal one closes the connection, and nothing follows it.
         """
         if not self.whole:
             return None
@@ -352,11 +354,10 @@ class Connection:
     ) -> list[bytes]:
         """Take urgent messages out of the queue before their turn.
 
-        Errors in the queue, and larger messages, keep their place.
-
         Every message up to `MAX_OVERTAKING_BYTES` is examined once: first its bytes are
         searched for `names`, which is fast, and only a message with a match is passed to
-        `wanted`, which may decode it.
+        `wanted`, which may decode it. Errors, larger messages and those that `wanted`
+        declines keep their place.
 
         Args:
             names: names of urgent methods, as bytes.
@@ -424,10 +425,13 @@ class Connection:
     def batch(self, bodies: Sequence[Sequence[bytes]]) -> list[bytes]:
         """Join encoded messages into one batch document, without framing.
 
-        Without a codec it is JSON.
+        Without a codec it is JSON. No body gives an empty array.
 
         Args:
             bodies: bodies of the messages, from `body`; at most 65 535.
+
+        Returns:
+            The document in pieces, in order.
         """
         if self.codec is Codec.MSGPACK:
             return [_array_head(len(bodies)), *chain.from_iterable(bodies)]
@@ -437,7 +441,8 @@ class Connection:
         return [*out, b"]"]
 
     def framed(self, body: Sequence[bytes]) -> list[bytes]:
-        """Add framing to an encoded body.
+        """Add framing to an encoded body: a newline for JSON (also without a codec), a
+        length for MessagePack.
 
         Raises:
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
@@ -537,7 +542,8 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
     """Encode a message as a frame: its length and head, and the payload that follows
     without a copy.
 
-    Large is above `MAX_COPIED_BYTES`; the message is not changed.
+    Large is above `MAX_COPIED_BYTES`. Only `data` as the last member at each level
+    counts. The message is the same afterwards.
 
     Args:
         message: its innermost `data` may be bytes of any size.
@@ -569,7 +575,10 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
 
 
 def unpack(body: memoryview) -> Message:
-    """Decode a frame's body; `Malformed` with a parse error if that fails with ValueError.
+    """Decode a frame's body, without its length, to a message.
+
+    Bytes that are not MessagePack give `Malformed` with a parse error, other documents
+    that are no message `Malformed` as `from_plain`.
 
     In a body above `MAX_COPIED_BYTES` whose last member is a large `data`, the data
     becomes a view into `body`, without a copy.
@@ -601,15 +610,16 @@ def _split(body: memoryview) -> object | None:
 
     The head of the frame is searched for `data` with a 32-bit length that reaches exactly
     to the end of the frame. The same bytes may occur inside another value, so each
-    candidate is decoded without its payload first; the number of attempts is bounded,
-    which limits the work that a hostile frame can cause.
+    candidate is decoded without its payload first; only the first `_HEAD_WINDOWS_BYTES`
+    are searched, and at most `_MAX_SPLIT_ATTEMPTS` candidates decoded, which limits the
+    work that a hostile frame can cause.
 
     Args:
         body: a frame without its length.
 
     Returns:
-        The document; None where `data` is not at the end, or the frame is not
-        MessagePack.
+        The document; None where no candidate in these windows decodes: the caller then
+        decodes the whole frame.
     """
     attempts = 0
     for window in _HEAD_WINDOWS_BYTES:
@@ -636,7 +646,8 @@ def _with_payload(head: bytes, payload: memoryview) -> object | None:
         payload: the bytes of `data`.
 
     Returns:
-        The document; None if `head` is no MessagePack with an innermost `data`.
+        The document; None if `head` with an empty `data` is no MessagePack, or `data` is
+        not its last member.
     """
     try:
         document = codecs.read_msgpack(head + _EMPTY_BIN)
@@ -650,9 +661,8 @@ def _with_payload(head: bytes, payload: memoryview) -> object | None:
 
 
 def _innermost(document: object) -> dict[str, Any] | None:
-    """Follow the last members of nested maps; return the map whose last member is `data`, or
-    None.
-    """
+    """Follow the last members of nested maps; return the first map whose last member is
+    `data`. None where an empty map or another value comes first."""
     while isinstance(document, dict) and document:
         key = next(reversed(document))
         if key == "data":

@@ -41,9 +41,8 @@ def few(most: int) -> BeforeValidator:
 
 
 def payload(value: object) -> object:
-    """Decode binary data: base64 text, or bytes.
-
-    The result is bytes, a copy.
+    """Convert binary data to bytes: base64 text is decoded, bytes, bytearray and
+    memoryview are copied.
 
     Raises:
         ValueError: anything else.
@@ -89,7 +88,7 @@ def lines(value: str) -> str:
 def plain_name(value: str) -> str:
     """Check that a name can become a file's name, and return it.
 
-    An empty name passes here.
+    An empty name passes.
 
     Raises:
         ValueError: a slash, backslash or control character, or more than `MAX_STEM` bytes

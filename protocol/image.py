@@ -24,12 +24,14 @@ DTYPES: tuple[str, ...] = get_args(Dtype)
 
 
 def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
-    """Convert an array to an image value; `data` is a read-only view where the layout allows.
+    """Convert an array to an image value.
 
-    A copy is made of an array in another order or byte order.
+    `data` is a view of the array; a copy only where it is not little-endian and
+    C-contiguous.
 
     Returns:
-        {"dtype": name, "shape": sizes, "data": little-endian bytes in C order}.
+        {"dtype": name, "shape": sizes, "data": read-only memoryview of the little-endian
+        bytes in C order}.
 
     Raises:
         ValueError: a dtype that is not in `DTYPES`.
@@ -50,10 +52,11 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
 
     Args:
         value: a mapping with dtype (one of `DTYPES`), shape (up to four sizes) and data
-            (bytes, or base64 text).
+            (bytes, or base64 text); other members are ignored.
 
     Raises:
-        RpcError: -32602, naming what does not fit.
+        RpcError: -32602: a member is missing, an unknown dtype, an invalid shape, or data
+            of another size or type; the message names the member.
     """
     try:
         dtype = value["dtype"]
@@ -73,11 +76,10 @@ def from_bytes(
 ) -> npt.NDArray[np.generic]:
     """View raw bytes as a read-only array of `shape`, without a copy.
 
-    An unknown type is -32602, too.
-
     Args:
         data: little-endian values in C order.
-        dtype: name of `DTYPES`.
+        dtype: name of `DTYPES`; unchecked, so a name that NumPy does not know is a
+            TypeError.
         shape: sizes; their product gives the number of values.
 
     Raises:
@@ -104,7 +106,8 @@ def payload(data: object) -> bytes | memoryview:
     A bytearray is copied to bytes, a memoryview not.
 
     Raises:
-        RpcError: -32602, neither bytes nor base64.
+        RpcError: -32602, base64 with any other character or wrong padding, or another
+            type.
     """
     match data:
         case bytes() | memoryview():

@@ -138,8 +138,8 @@ def event(topic: str, seq: int, time: float, data: object) -> Notification:
 def to_plain(message: Message) -> object:
     """Convert a message to the dict (or the list, for a batch) that a codec encodes.
 
-    Parameters that are None are left out; error data only if there is any, with values
-    that are not finite replaced as `finite` does.
+    Parameters that are None are left out, and so is error data that is None; numbers in
+    error data that are not finite become text. Parameters and results are not copied.
 
     Args:
         message: a call, an answer, a malformed message (its error) or a batch.
@@ -163,11 +163,11 @@ def to_plain(message: Message) -> object:
 
 
 def finite(data: object) -> object:
-    """Replace NaN and infinities in the `data` of an error by text; JSON has no such numbers.
+    """Replace NaN and infinities in the `data` of an error by text; JSON has no such
+    numbers.
 
-    Dicts and lists are copied, tuples become lists; names stay.
-
-    An error repeats the value that it is about, and that may have overflowed.
+    An error repeats the value that it is about, and that may have overflowed. Dicts and
+    lists are copied, at all levels, and tuples become lists; names and other values stay.
     """
     match data:
         case float():
@@ -187,8 +187,8 @@ def from_plain(document: object, max_batch: int = 1000) -> Message:
         max_batch: largest number of messages in a batch.
 
     Returns:
-        A message or a batch; `Malformed` for an empty or too large batch, or as
-        `_single`.
+        A message; a `Batch` for a list, whose items may be `Malformed`; `Malformed` for
+        an empty or too long list, or for a document that is no message.
     """
     if not isinstance(document, list):
         return _single(document)
@@ -209,7 +209,9 @@ def _call(plain: dict[str, object], params: Params) -> dict[str, object]:
 def _single(document: object) -> Single:
     """Convert one document of a codec to a message; raises nothing.
 
-    The checks, in this order: object, version "2.0", id, then method, result or error.
+    The checks, in this order: object, version "2.0", id, then method, result or error. An
+    answer needs an id, which may be null, and has either a result or an error; members
+    beyond these are ignored in answers.
 
     Args:
         document: plain data; not a batch.
@@ -243,7 +245,8 @@ def _single(document: object) -> Single:
 def _request(document: dict[object, object], id: Id) -> Single:
     """Read a request, or a notification if the document has no id.
 
-    The checks, in this order: unknown members, method, params, names in params.
+    The checks, in this order: unknown members (at most five are named), method is text,
+    params is an object or a list, names in params are text.
 
     Args:
         document: with the member `method`.
@@ -278,7 +281,8 @@ def _request(document: dict[object, object], id: Id) -> Single:
 def _failure(id: Id, error: object) -> Single:
     """Convert the answer to a failed request to `Failure`; `data` may be missing.
 
-    Returns `Malformed` unless `error` has a whole `code` and a text `message`.
+    Returns `Malformed` with the id unless `error` is an object with a whole `code` and a
+    text `message`.
     """
     if isinstance(error, dict):
         code = error.get("code")
@@ -371,7 +375,8 @@ class Correlation(Generic[_W]):
     def request(
         self, method: str, params: Mapping[str, object], waiter: _W, trace: str = ""
     ) -> Request:
-        """Make a request with a new id and register who waits for its answer.
+        """Make a request with a new id and register who waits for its answer. Ids are 1,
+        2, ..., or "trace/number" with a trace.
 
         Args:
             method: name of the method.
@@ -391,11 +396,13 @@ class Correlation(Generic[_W]):
         return Request(id, method, dict(params))
 
     def abandon(self, request: Request, *, sent: bool = True) -> None:
-        """Stop waiting for an answer; one that still comes is dropped.
+        """Stop waiting for an answer; one that still comes is dropped. A request that is
+        not open is ignored.
 
         Args:
             request: made by `request`.
-            sent: False if no byte of it was sent, so that no answer can come.
+            sent: False if no byte of it was sent: it is forgotten, and an answer to it
+                would be a violation.
         """
         if not sent:
             self._open_requests.pop(request.id, None)
@@ -403,7 +410,8 @@ class Correlation(Generic[_W]):
             self._open_requests[request.id] = None
 
     def waiter(self, id: object) -> _W | None:
-        """Return the waiter for the answer with this id, or None."""
+        """Return the waiter for the answer with this id; None for an abandoned or unknown
+        request, or an id that is neither text nor a whole number."""
         if isinstance(id, (int, str)):
             return self._open_requests.get(id)
         return None
@@ -419,11 +427,11 @@ class Correlation(Generic[_W]):
         return self._owed_answers[id] > 0
 
     def answer(self, answer: Response | Failure) -> Response | Failure:
-        """Check that an answer belongs to an open request, and close that request.
+        """Check that an answer belongs to an open request of the client, and close that
+        request.
 
-        Of two requests with one id, one is closed.
-
-        An error without id is about the connection and always allowed.
+        Of two requests with one id, one is closed. An error without id is about the
+        connection and always allowed; it closes none.
 
         Returns:
             The answer, unchanged.
@@ -451,20 +459,24 @@ class Correlation(Generic[_W]):
     def receive(self, message: Message) -> list[Answered[_W] | Request | Notification]:
         """Match a message from the peer to the open requests, item by item for a batch.
 
-        Once a violation has happened it is raised at every call. An answer without an id
-        sets `reason`; a parse error without one fails all open requests.
+        On a server, calls are returned, and a request is open from then on; malformed
+        messages give nothing, and the caller must answer them with `reply`.
 
-        Answers to abandoned requests are dropped. A malformed message with an id counts
-        as the answer to that request; on a server the caller must answer it with `reply`.
+        On a client, notifications are returned, and an answer with its waiter; an answer
+        to an abandoned request gives nothing. A malformed message with an id counts as
+        the answer to that request. A parse error without id fails all open requests; any
+        other error without id is kept as `reason` and gives nothing.
 
         Args:
             message: what the peer sent.
 
         Returns:
-            Calls, and answers with their waiters.
+            Calls, and answers with their waiters, in order.
 
         Raises:
-            ProtocolError: the peer may not send this.
+            ProtocolError: the peer may not send this (a request to a client, an answer to
+                a server or to no open request, a fatal error), or a violation happened
+                before. `violation` keeps it.
         """
         if self.violation is not None:
             raise self.violation
@@ -503,10 +515,11 @@ class Correlation(Generic[_W]):
     ) -> list[Answered[_W] | Request | Notification]:
         """Match an answer to its request and close the request.
 
-        [] if the request was abandoned.
+        Returns:
+            The answer with its waiter, in a list; [] if the request was abandoned.
 
         Raises:
-            ProtocolError: no such request is open.
+            ProtocolError: no such request is open; recorded as the violation.
         """
         if answer.id not in self._open_requests:
             raise self._violated(
@@ -530,7 +543,7 @@ class Correlation(Generic[_W]):
             is owed an answer all the same.
 
         Raises:
-            ProtocolError: an answer instead of a call.
+            ProtocolError: an answer instead of a call; recorded as the violation.
         """
         match message:
             case Request(id):
@@ -568,17 +581,17 @@ def hello_params(client: str, token: str | None) -> dict[str, object]:
 
 
 def _require_text_names(value: object, where: str) -> None:
-    """Check that all names in nested data are text, which JSON would silently make of
-    numbers.
+    """Check that all names in nested data are text: JSON would silently turn numbers into
+    text.
 
-    Lists are looked into; other values pass.
+    Mappings, lists and tuples are searched at all levels; other values pass.
 
     Args:
         value: parameters of a call.
         where: path of `value`, for the message.
 
     Raises:
-        TypeError: a name of another type; names the place.
+        TypeError: a name of another type; names the first, with its place.
     """
     if isinstance(value, Mapping):
         for name, inner in value.items():

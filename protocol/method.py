@@ -90,7 +90,8 @@ def parse_params(
 ) -> _P:
     """Validate the parameters of a call, given by name, by position, or not at all.
 
-    Names that the model does not have are a problem, too, if it forbids them.
+    Missing parameters take their defaults. A name that the model does not have is a
+    problem if the model forbids it.
 
     Args:
         method: the called method.
@@ -121,7 +122,7 @@ def parse_result(model: type[_M], given: object) -> _M:
     """Validate a result against its model (for clients) and return it as that model.
 
     Raises:
-        RpcError: the answer does not fit the model.
+        RpcError: -32603, the answer does not fit the model.
     """
     try:
         return model.model_validate(given)

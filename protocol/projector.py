@@ -43,14 +43,15 @@ Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 def _rows(value: object) -> object:
     """Convert rows of cone_vec to a float64 array (n, 12), contiguous.
 
-    An array that is float64 and contiguous is not copied.
+    Values that are float64 and contiguous are not copied; integers and other floats are
+    converted.
 
     Args:
         value: an image value {dtype, shape, data}, or a list of rows of numbers.
 
     Raises:
         ValueError: another shape, truth values, no row or more than `MAX_VIEWS`, or a
-            number that is not finite or beyond `MAX_MM`.
+            number that is not finite or beyond `MAX_MM`; names the first such row.
     """
     try:
         array = np.asarray(image.decode(value) if isinstance(value, Mapping) else value)
@@ -183,11 +184,13 @@ class VolumePut(f.Params):
 
     @model_validator(mode="after")
     def _one(self) -> VolumePut:
-        """Check that exactly one of scene, grid and mesh is given, and data
-        where it belongs.
+        """Check that exactly one of scene, grid and mesh is given, and data where it
+        belongs.
 
-        Returns the value unchanged; raises ValueError otherwise. A scene has no data, the
-        others need it.
+        A scene has no data, a grid and a mesh need it. Returns the value unchanged.
+
+        Raises:
+            ValueError: none or several of the three, or data missing or out of place.
         """
         if sum(one is not None for one in (self.scene, self.grid, self.mesh)) != 1:
             raise ValueError("give one of scene, grid, mesh")

@@ -82,7 +82,8 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
     """Make the error -32601 for an unknown method, with all methods in its data;
     returned, not raised.
 
-    The asked name is clipped.
+    The name that was sent is cut after 200 characters; the data has the keys asked and
+    allowed (sorted).
     """
     names = sorted(allowed)
     return RpcError(
@@ -100,7 +101,10 @@ def invalid_params(
     Args:
         message: for people.
         problems: made by `problem`, for the data.
-        allowed: values, for the data; None for none.
+        allowed: the values that would fit; None leaves it out.
+
+    Returns:
+        The error; its data has the keys problems (a list) and, if given, allowed.
     """
     data: dict[str, object] = {"problems": [dict(p) for p in problems]}
     if allowed is not None:
@@ -127,7 +131,8 @@ def busy(message: str, data: object = None) -> RpcError:
 
 
 def not_authorised() -> RpcError:
-    """Make the error -32004 for a missing or wrong token; returned, not raised."""
+    """Make the error -32004 for a missing or wrong token; returned, not raised. Its data
+    names the call that is allowed."""
     message = "a valid token is needed: session.hello {token}"
     data = {"allowed": "session.hello with the server's token"}
     return RpcError(Code.NOT_AUTHORISED, message, data)
@@ -136,13 +141,15 @@ def not_authorised() -> RpcError:
 def too_large(
     what: str, asked: float | str, allowed: float, unit: str = "bytes"
 ) -> RpcError:
-    """Make the error for something above its allowed size.
+    """Make the error -32008 for something above its allowed size; returned, not raised.
 
     Args:
         what: the thing, with its article.
         asked: its size, in `unit`.
         allowed: largest size, in `unit`.
         unit: unit of both.
+
+    Its data repeats the four arguments by name.
     """
     return RpcError(
         Code.TOO_LARGE,

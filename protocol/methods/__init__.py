@@ -46,11 +46,12 @@ def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
 def openrpc_document(
     methods: Mapping[str, AnyMethod] = METHODS, *, title: str = "flexdt twin server"
 ) -> dict[str, Any]:
-    """Make the OpenRPC document of a server as plain data
-    (https://spec.open-rpc.org, version 1.3).
+    """Make the OpenRPC document of a server as plain data (https://spec.open-rpc.org,
+    version 1.3).
 
-    Schemas of parameters and results are in components, once each, with the errors by
-    name (code and message). Line breaks in descriptions of fields become spaces.
+    Schemas of parameters and results are in components, once each, with all errors of
+    `Code` by name (code and message). Line breaks in descriptions of fields become
+    spaces.
 
     Args:
         methods: method table of the server.
