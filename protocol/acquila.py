@@ -292,13 +292,13 @@ def _plain(name: str, text: str) -> str:
             f"{name} of {len(text)} characters; allowed: {MAX_CHARS[name]}"
         )
     if (
-        found := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)
+        character := (_SURROGATE if name in BINARY_FIELDS else _UNPRINTABLE).search(text)
     ) is not None:
         but = "surrogates and control characters"
         if name in BINARY_FIELDS:
             but = "surrogates"
         raise AcquilaError(
-            f"{name} holds U+{ord(found[0]):04X} at {found.start()}; allowed: anything "
+            f"{name} holds U+{ord(character[0]):04X} at {character.start()}; allowed: anything "
             f"but {but}"
         )
     return text

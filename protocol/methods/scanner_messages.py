@@ -222,9 +222,9 @@ class SampleUpload(f.Params):
             raise ValueError(
                 f"chunk ends at {self.start + len(self.data)}, total is {self.total}"
             )
-        own = KINDS[self.format]
-        if self.kind != own:
-            raise ValueError(f"format {self.format} is for kind {own}, not {self.kind}")
+        kind = KINDS[self.format]
+        if self.kind != kind:
+            raise ValueError(f"format {self.format} is for kind {kind}, not {self.kind}")
         if self.kind == "scene" and self.material is not None:
             raise ValueError("a scene has its own materials")
         if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
