@@ -44,7 +44,7 @@ def spiral_positions(
 ) -> FloatArray:
     """Compute bead centres on the elliptic spiral that fits a cuboid.
 
-    At most `MAX_BEADS`; beads may overlap.
+    Beads may overlap.
 
     Unity's y_k = (k/(K-1) - 1/2)(H - 2r) at angle 2 pi k / K on semi-axes W/2 - r (x) and
     B/2 - r (z); a single bead sits at mid-height, angle 0 (the thesis describes the
@@ -52,14 +52,15 @@ def spiral_positions(
 
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
-        beads: K >= 1.
+        beads: K, 1 to `MAX_BEADS`.
         radius_mm: bead radius [mm].
 
     Returns:
         (K, 3) [mm], object frame.
 
     Raises:
-        LimitError: no beads, or the cuboid is smaller than a bead.
+        LimitError: another number of beads, a side that is not above 0 and finite, or a
+            radius that is not above 0 and at most half the smallest side.
 
     Example:
         >>> spiral_positions((20.0, 40.0, 60.0), beads=5, radius_mm=2.0).shape
@@ -102,8 +103,9 @@ def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> Flo
     spaced in height.
 
     The layout of the thesis's public code: from (x max, y min) along y min, x min, y max
-    and x max, the last bead above the first. If the height is too small, all are at
-    mid-height.
+    and x max, the last bead above the first. A single bead is at the lower end. A side
+    shorter than twice the inset counts as 0: then all are in the middle along it. Nothing
+    is checked.
 
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
@@ -141,20 +143,23 @@ def bead_phantom(
 ) -> Phantom:
     """Make a cuboid with `beads` beads on the spiral, or beads in air at given positions.
 
-    Overlapping beads of the spiral are allowed, and stated in `assumed`; of beads at
-    positions the size is that of a box about the origin.
+    Overlapping beads of the spiral are allowed; the pair that overlaps most is stated in
+    `assumed`. With positions there is no body, and the size is that of the box about the
+    origin that holds the beads.
 
     Args:
         name_or_dims: a name of Table 6.2, (width, breadth, height) [mm], or the beads'
             centres (k, 3) [mm], in the object's frame.
         beads: K; not used with positions.
         bead_radius_mm: 2 mm in the thesis's simulations.
-        body_material: of the cuboid (assumed: the thesis does not say).
+        body_material: of the cuboid (assumed: the thesis does not say); not used with
+            positions.
         bead_material: of the beads (assumed: the thesis says "metallic").
 
     Raises:
         UnknownNameError: a name that Table 6.2 does not have, or an unknown material.
-        LimitError: the beads do not fit.
+        LimitError: the beads do not fit, see `spiral_positions`, or an array of another
+            shape.
 
     >>> bead_phantom("tall", beads=3).name
     'tall-3'
@@ -163,16 +168,16 @@ def bead_phantom(
     """
     if isinstance(name_or_dims, str):
         if name_or_dims not in CUBOIDS_MM:
-            what = f"unknown bead cuboid {name_or_dims!r}; Table 6.2 has"
-            raise UnknownNameError.among(what, name_or_dims, CUBOIDS_MM)
+            message = f"unknown bead cuboid {name_or_dims!r}; Table 6.2 has"
+            raise UnknownNameError.among(message, name_or_dims, CUBOIDS_MM)
         name = f"{name_or_dims}-{beads}"
         size = CUBOIDS_MM[name_or_dims]
     else:
         numbers = np.asarray(name_or_dims, dtype=np.float64)
         if numbers.shape[-1:] != (3,) or numbers.ndim > 2 or not numbers.size:
-            what = "a cuboid or beads"
+            message = "a cuboid or beads"
             more = ", or (k, 3) [mm]"
-            raise LimitError.of_shape(what, numbers.shape, (3,), more)
+            raise LimitError.of_shape(message, numbers.shape, (3,), more)
         if numbers.ndim == 2:
             many = len(numbers)
             x, y, z = (2.0 * (np.abs(numbers).max(axis=0) + bead_radius_mm)).tolist()
@@ -234,14 +239,15 @@ def cuboid_with_beads(
         name: the phantom's name.
         size_mm: width, breadth, height [mm].
         beads: (k, 3) centres [mm].
-        radii_mm: (k,) [mm].
+        radii_mm: (k,) or one for all [mm].
         body_material: None leaves the beads in air.
         bead_materials: one for each bead.
         description: one line for people.
         assumed: facts without a source.
 
     Raises:
-        LimitError: a bead sticks out of the body; names it.
+        LimitError: a bead sticks out of the body; names the first. Beads in air are not
+            checked.
         UnknownNameError: an unknown material.
     """
     centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)

@@ -87,7 +87,8 @@ def brick_shapes(
 ) -> list[tuple[analytic.Shape, float]]:
     """List the shapes of one brick with +1 (filled) or -1 (hole), turned about the axis.
 
-    Holes are in the list after what they cut; the roof stays closed.
+    Holes are in the list after the shapes that they cut; the roof stays closed. Tubes are
+    between each four studs, none with one row.
 
     Args:
         v: the brick's measures [mm].

@@ -235,15 +235,16 @@ def _find(name: str) -> Material | None:
 def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]]:
     """List (material, amount) that a solid adds, 1 for the material's own density.
 
-    A material without composition is counted as so much of the stand-in; an amount within
-    `ATTENUATION_TOLERANCE` of 1 or -1 is exactly that.
+    A material without composition counts as water of the same attenuation; an amount
+    within `ATTENUATION_TOLERANCE` of 1 or -1 is exactly that.
 
     Args:
         solid: with its attenuation.
         known: material's name -> material with composition.
 
     Returns:
-        One entry, or two where the solid replaces one material by another.
+        One entry; two, 1 and -1, where the solid's attenuation is the difference of its
+        material's and another known one's.
     """
     made_of = known.get(solid.material)
     if made_of is None:
@@ -270,8 +271,8 @@ def _scaled(volume: Volume, made_of: Material) -> Volume:
 def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Object:
     """Sample the materials of a phantom on one grid about the origin.
 
-    Negative amounts count as 0; a box side is at least 1e-3 of the longest. Without parts
-    there are no materials.
+    Negative amounts count as 0. A side of the box is taken as at least 1e-3 of the
+    longest. Without parts the last axis of the data is empty.
 
     Args:
         parts: from `channels`.
@@ -340,9 +341,11 @@ def _fractions_filled(body: Body, grid: Volume, box: Vector) -> Float32Array:
 
 
 def _overlaps(fine: Volume, coarse: Volume, axis: int) -> FloatArray:
-    """Compute which part of a coarse voxel's edge each fine one covers along `axis` (x, y, z).
+    """Compute which part of a coarse voxel's edge each fine one covers along `axis` (x,
+    y, z).
 
-    (coarse, fine), shares of the coarse voxel's edge, 0 to 1.
+    Returns:
+        float64 (coarse voxels, fine voxels): shares of the coarse edge, 0 to 1.
     """
 
     def planes(volume: Volume) -> FloatArray:

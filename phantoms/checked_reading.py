@@ -136,15 +136,12 @@ def number(value: object, where: str) -> float:
 
 
 def positive(value: object, where: str) -> float:
-    """Return `value` if it is a length from `MIN_LENGTH_MM` on; raise PhantomError
-    otherwise.
-
-    At most `MAX_NUMBER`, and never 0.
-    """
-    found = number(value, where)
-    if found < MIN_LENGTH_MM:
+    """Return `value` as a float if it is a number from `MIN_LENGTH_MM` to `MAX_NUMBER`;
+    raise PhantomError otherwise."""
+    length = number(value, where)
+    if length < MIN_LENGTH_MM:
         raise wrong(value, where, f"a number from {MIN_LENGTH_MM:g} to {MAX_NUMBER:g}")
-    return found
+    return length
 
 
 def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[_T, ...]:
@@ -166,10 +163,10 @@ def lengths(value: object, where: str) -> analytic.Vector:
 
 def unit(value: object, where: str) -> analytic.Vector:
     """Return `value` as a vector (3,); raise PhantomError unless its length is 1 within 1e-6."""
-    found = vector(value, where)
-    if abs(math.hypot(*found) - 1.0) > 1e-6:
+    direction = vector(value, where)
+    if abs(math.hypot(*direction) - 1.0) > 1e-6:
         raise wrong(value, where, "a unit vector")
-    return found
+    return direction
 
 
 def axes(value: object, where: str) -> analytic.Matrix:
@@ -204,13 +201,14 @@ def packed(dtype: str) -> PlainValidator:
     """
 
     def read(value: object) -> npt.NDArray[np.generic]:
-        """Decode {dtype, shape, data}; check type, size and base64.
-
-        Arrays above `MAX_ARRAY_BYTES` and data of another length than the shape's are
-        PhantomErrors, too.
+        """Decode {dtype, shape, data} to a read-only array; `data` is base64.
 
         Args:
             value: the document of an array.
+
+        Raises:
+            PhantomError: another type than `dtype`, more than `MAX_ARRAY_BYTES`, no
+                base64, or data of another length than the shape's.
         """
         if get(value, "dtype", NAMED_ALREADY) != dtype:
             raise wrong(get(value, "dtype", NAMED_ALREADY), "dtype", dtype)
@@ -305,7 +303,8 @@ def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
     """Make a scene from a document of `scene_to_dict`.
 
     Raises:
-        PhantomError: names the key path, the value and the allowed ones.
+        PhantomError: more than `MAX_SOLIDS` solids, or a missing or wrong value; names
+            the key path, the value and the allowed ones.
 
     Example:
         >>> from flexdt.phantoms import load_phantom

@@ -198,8 +198,11 @@ def expose(
 ) -> Forecast:
     """Predict transmission, contrast to noise, dose, time and size of a circular scan.
 
-    Of the settings tried, only those within the panel's exposure times are in `best`, by
-    falling contrast to noise; each with the exposure that does not saturate.
+    Transmission and the shares of saturated and starved pixels are of `SIMULATED_VIEWS`
+    views over a circle, without noise. For `best`, each of `FILTERS` is tried with each
+    voltage, and its exposure is divided into read-outs that the open beam does not
+    saturate; those outside the panel's exposure times are left out. They are sorted by
+    falling contrast to noise.
 
     Args:
         sample: as for `flexdt.simulate`.
@@ -228,7 +231,7 @@ def expose(
         knows no scattered radiation.
 
     Raises:
-        TwinError: names the argument, what was asked and what is allowed.
+        TwinError: names the argument, its value and what is allowed.
 
     Example:
         >>> import flexdt as fx
@@ -318,13 +321,15 @@ def expose(
         kVs = tried
     else:
         kVs = np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
-    found = [
+    settings = [
         seen.setting(layer, seen.unsaturated(layer, replace(lit, kV=float(one))))
         for layer in FILTERS
         for one in kVs
     ]
     best = [
-        s for s in found if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms
+        s
+        for s in settings
+        if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms
     ]
     return Forecast(
         Transmission.of(through),
@@ -356,8 +361,9 @@ def _check_settings(
 ) -> None:
     """Check that the machine has these settings.
 
-    The first that fails is raised. Averages and images must be whole; at least one
-    voltage.
+    In the order of the arguments: at least one voltage, each in the tube's range; power
+    up to the tube's; the panel's exposure times; averages whole, 1 to 1e6; images whole,
+    1 to 1e7.
 
     Args:
         machine: with the ranges.
@@ -368,7 +374,7 @@ def _check_settings(
         images: of the scan.
 
     Raises:
-        LimitError: names the setting, what was asked and what is allowed.
+        LimitError: the first setting that is outside; names it, its value and the range.
     """
     low, high = _voltages(machine)
     spec = machine.detector
@@ -378,7 +384,7 @@ def _check_settings(
             f"{high:g}, or None",
             {"asked": [], "allowed": [low, high]},
         )
-    for what, values, low_end, high_end in (
+    for name, values, low_end, high_end in (
         ("kV", kVs, low, high),
         ("power_W", [power_W], 1e-9, machine.tube.max_W),
         ("exposure_ms", [exposure_ms], spec.min_exposure_ms, spec.max_exposure_ms),
@@ -386,11 +392,11 @@ def _check_settings(
         ("images", [images], 1, 10**7),
     ):
         for value in values:
-            counted = what in ("averages", "images")
+            counted = name in ("averages", "images")
             if not low_end <= value <= high_end or (counted and value != int(value)):
                 integers = "whole numbers from " if counted else ""
                 raise LimitError(
-                    f"{what} is {value:g}; allowed with {machine.name}: "
+                    f"{name} is {value:g}; allowed with {machine.name}: "
                     f"{integers}{low_end:g} to "
                     f"{high_end:g}",
                     {"asked": value, "allowed": [low_end, high_end]},
@@ -473,7 +479,8 @@ class _SeenDetail:
     images: int
 
     def setting(self, layer: str, at: ExposureSettings) -> Setting:
-        """Compute contrast to noise and dose of a setting.
+        """Compute contrast to noise of the detail on the darkest ray, and dose, of a
+        setting.
 
         The dose is the air kerma [mGy] at the object's distance, over all images of the
         scan.
@@ -524,8 +531,8 @@ class _SeenDetail:
 def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
     """Warn of a plan's projections whose pixels will be saturated or starved.
 
-    Without scatter, by the machine's detector and tube; those that the open beam has
-    already are left out.
+    Without scatter, by the machine's detector and tube. Problems that the open beam has
+    already are left out; () without problems.
 
     Args:
         plan: of the scan.
@@ -559,7 +566,8 @@ def _views(
     """Simulate views: paths (k, n, rows, cols), transmission (n, rows, cols), saturated
     and starved parts.
 
-    The parts are shares of all pixels, 0 to 1; without noise. Paths are by material [mm].
+    Without noise. Paths are by material [mm]. Both parts are shares of all pixels, 0 to
+    1; starved pixels have less than `FEW_COUNTS` above dark.
     """
     paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
     images = radiographs(chain, paths, cone.rows, [lit] * len(cone))

@@ -31,13 +31,18 @@ MAX_COMPARED_BODIES: Final = 2000
 
 
 def united(mesh: TriangleMesh) -> TriangleMesh | None:
-    """Unite the overlapping bodies of a mesh; return it unchanged where the boxes around
-    them are apart.
+    """Unite the overlapping bodies of a mesh; return the mesh itself where the boxes
+    around its bodies are apart.
 
-    One unchanged body may meet itself: then it is not looked at.
+    Shells turned inwards are cavities of the body around them. A mesh of one body is
+    returned unchecked.
 
-    Shells turned inwards are cavities of the body around them. None where the surface of
-    a body meets itself, so that it has no inside.
+    Args:
+        mesh: closed; not changed.
+
+    Returns:
+        The united mesh; None where the surface of a body meets itself, so that it has no
+        inside.
     """
     bodies = _bodies(mesh)
     if not _boxes_meet([mesh.vertices[np.unique(mesh.faces[body])] for body in bodies]):
@@ -54,8 +59,8 @@ def cut(
 ) -> tuple[analytic.Scene, tuple[Surface, ...]]:
     """Cut solids and surfaces so that those of a higher priority take precedence.
 
-    Pieces whose boxes do not overlap something of a higher priority stay as they are,
-    also round ones; what is cut becomes a mesh.
+    A piece whose box overlaps none of a higher priority stays as it is, also a round one;
+    a piece that is cut becomes a mesh, and is left out if nothing remains.
 
     Args:
         parts: solids, surfaces and the priority of both.
@@ -64,8 +69,8 @@ def cut(
         The remaining parts of the solids, and of the surfaces.
 
     Raises:
-        PhantomError: something round, a hole, or a mesh that meets itself would have to
-            be cut.
+        PhantomError: a round solid, a hole, or a mesh that meets itself would have to be
+            cut or to cut.
 
     Example:
         >>> import trimesh
@@ -108,8 +113,6 @@ def _box(one: analytic.Solid | Surface) -> tuple[FloatArray, FloatArray]:
 def _filled(one: analytic.Solid | Surface) -> Surface:
     """Convert a piece to a filled mesh of exactly its form.
 
-    The solid's negative attenuation makes it a hole.
-
     Args:
         one: mesh, box or convex solid.
 
@@ -117,7 +120,7 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
         The mesh; a surface itself.
 
     Raises:
-        PhantomError: a round solid or a hole.
+        PhantomError: a round solid, or a hole (of negative attenuation).
     """
     if isinstance(one, Surface):
         return one
@@ -125,30 +128,28 @@ def _filled(one: analytic.Solid | Surface) -> Surface:
         not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron)
         or one.mu_per_mm < 0.0
     ):
-        what = "hole"
+        kind = "hole"
         if one.mu_per_mm > 0.0:
-            what = type(one.shape).__name__.lower()
+            kind = type(one.shape).__name__.lower()
         raise PhantomError(
-            f"a {what} of {one.material} overlaps something of another priority; "
+            f"a {kind} of {one.material} overlaps something of another priority; "
             "allowed: meshes, "
             "boxes and convex solids. A round solid names what it replaces instead",
-            {"asked": what, "allowed": ["mesh", "box", "convex"]},
+            {"asked": kind, "allowed": ["mesh", "box", "convex"]},
         )
     mesh = solid_mesh(one)
     return Surface(mesh.vertices, mesh.faces, one.material, one.mu_per_mm)
 
 
 def _outside(surface: Surface, others: Sequence[Surface]) -> Surface | None:
-    """Subtract the others from a filled mesh.
-
-    Attenuation is kept.
+    """Subtract the others from a filled mesh; material and attenuation stay.
 
     Args:
         surface: filled.
         others: filled, that are taken away.
 
     Returns:
-        What is left, in the surface's material; None if nothing is left.
+        The rest; None if nothing is left.
 
     Raises:
         PhantomError: the surface of one meets itself.
@@ -191,9 +192,10 @@ def _bodies(mesh: TriangleMesh) -> list[npt.NDArray[np.int64]]:
 
 
 def _boxes_meet(bodies: Sequence[npt.NDArray[np.float64]]) -> bool:
-    """Return whether the bounding boxes of any two bodies overlap (touching does not count).
+    """Return whether the bounding boxes of any two bodies overlap (touching does not
+    count).
 
-    True without a look for more than `MAX_COMPARED_BODIES`.
+    More than `MAX_COMPARED_BODIES` are not compared: True.
     """
     if len(bodies) > MAX_COMPARED_BODIES:
         return True

@@ -146,14 +146,13 @@ class Phantom(ArrayValue):
         return joined(parts_of(*pieces, self.beads, around=around))
 
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
-        """Convert to voxels for X-rays, at every call.
+        """Convert to voxels for X-rays.
 
-        `voxel_mm` and `oversample` are not used for a phantom that came as voxels.
-        Nothing is cached.
+        Nothing is cached. A phantom that came as voxels is returned on its own grid,
+        without use of the arguments.
 
         Args:
-            voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side. A
-                phantom that came as voxels is returned as it came.
+            voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side.
             oversample: samples per voxel along each side.
 
         Returns:
@@ -192,7 +191,8 @@ class Phantom(ArrayValue):
     def from_dict(cls, document: object) -> Phantom:
         """Make a phantom from a document of `to_dict`.
 
-        A document of version 0.2.0, with one `surface`, is read as well.
+        A document of version 0.2.0, with one `surface`, is read as well; a missing
+        description is empty.
 
         Raises:
             PhantomError: names the key path, the value and the allowed ones.
@@ -217,8 +217,8 @@ def assemble(
 ) -> Phantom:
     """Join several phantoms; attenuation adds up where they overlap.
 
-    The size is the largest of the parts' along each axis; beads and assumptions are
-    joined.
+    The size is the largest of the parts' along each axis; beads are joined in order, and
+    each assumption is kept once.
 
     Args:
         name: of the whole.
@@ -232,7 +232,8 @@ def assemble(
         The phantom; one part alone is renamed.
 
     Raises:
-        PhantomError: there are none, one of several is voxels, or one cannot be cut.
+        PhantomError: there are no parts, another number of priorities, one of several
+            parts is voxels, or one cannot be cut.
     """
     if priority and len(priority) != len(parts):
         raise PhantomError(

@@ -119,14 +119,14 @@ def boxes(
 
     In order: solids, surfaces, then the voxels (whole grid, empty ones included).
     """
-    found = [bounds(solid.shape) for solid in scene.solids]
-    found += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]
+    corners = [bounds(solid.shape) for solid in scene.solids]
+    corners += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]
     if voxels is not None:
         half = np.array(voxels.voxel_mm) * voxels.data.shape[::-1] / 2.0
-        found.append(
+        corners.append(
             (np.array(voxels.center_mm) - half, np.array(voxels.center_mm) + half)
         )
-    return found
+    return corners
 
 
 def size_about_origin(
@@ -140,10 +140,10 @@ def size_about_origin(
     Raises:
         PhantomError: there is nothing.
     """
-    found = boxes(scene, surfaces)
-    if not found:
+    corners = boxes(scene, surfaces)
+    if not corners:
         raise PhantomError("a phantom needs at least one solid or mesh")
-    x, y, z = (2.0 * np.abs(np.array(found)).max(axis=(0, 1))).tolist()
+    x, y, z = (2.0 * np.abs(np.array(corners)).max(axis=(0, 1))).tolist()
     return (x, y, z)
 
 

@@ -219,7 +219,7 @@ def _one(
 
     Args:
         sample, material, voxel_mm, priority: as for `as_phantom`.
-        keep: leave meshes at their own places.
+        keep: leave meshes at their own places. Parts of a sequence always are.
 
     Raises:
         PhantomError: another kind of value.
@@ -312,7 +312,8 @@ def _array(
         voxel_mm: spacing, one number or (x, y, z).
 
     Raises:
-        PhantomError: no spacing, no numbers, or parts outside 0 to 1.
+        PhantomError: no spacing, a dtype that is no real number or truth value, or parts
+            outside 0 to 1.
     """
     if voxel_mm is None:
         raise PhantomError(
@@ -342,7 +343,8 @@ def _array(
 def _labelled(
     sample: object, names: Mapping[int, str], voxel_mm: float | Vector | None
 ) -> Phantom:
-    """Make voxels of several materials from an array of labels or a Volume that holds them.
+    """Make voxels of several materials from an array of labels or a Volume that holds
+    them.
 
     Attenuation is that of the label's material; a label that is named need not occur.
 
@@ -352,7 +354,8 @@ def _labelled(
         voxel_mm: spacing of an array; a Volume has its own.
 
     Raises:
-        PhantomError: neither array nor Volume, or a label without a material.
+        PhantomError: neither array nor Volume, an array without `voxel_mm`, a label
+            without a material, a material for 0, or more than 255 labels.
     """
     if isinstance(sample, Volume):
         labels: Any = sample.data

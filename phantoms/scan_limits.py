@@ -89,11 +89,11 @@ def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int])
         TwinError: the first finding, with its remedy.
     """
     half = np.array(phantom.size_mm) / 2.0
-    found = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
+    findings = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
     settled(
         [
             replace(one, severity=Severity.REFUSAL)
-            for one in found
+            for one in findings
             if one.kind in USELESS_PLACEMENTS
         ]
     )
@@ -116,7 +116,8 @@ def open_beam_doubts(
         physics: how counts are made.
 
     Returns:
-        At most one sentence, with an exposure that would do.
+        One sentence, with an exposure that would do; [] where the beam is in range, or
+        `physics` makes no counts of it.
     """
     beam = open_beam_of(machine, camera, exposure, view, physics)
     doubt = None

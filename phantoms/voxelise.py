@@ -37,20 +37,22 @@ def voxelise(
 ) -> Volume:
     """Sample the attenuation [1/mm] of a scene and of meshes on a grid about the origin.
 
-    The grid is rounded up to whole voxels. Overlaps add up; negative solids take away.
+    The grid is rounded up to whole voxels, at least one along each axis. Overlaps add up;
+    negative solids take away.
 
     Args:
         scene: analytic solids, added up.
         surfaces: triangle meshes to add.
         size_mm: content of the grid, along x, y, z [mm].
         voxel_mm: voxel edge [mm].
-        oversample: sub-columns per voxel along x and along y.
+        oversample: sub-columns per voxel along x and along y, 1 to 16.
 
     Returns:
         Volume, data float32 [z, y, x].
 
     Raises:
-        PhantomError: grid too large, or the mesh is not closed.
+        PhantomError: another oversample, an edge that is not above 0 and finite, a grid
+            of more than `MAX_VOXELS`, or a mesh that is not closed.
     """
     if not (math.isfinite(voxel_mm) and voxel_mm > 0.0):
         raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: above 0")

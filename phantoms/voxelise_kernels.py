@@ -174,7 +174,7 @@ def cross(triangles, starts, counts, heights, signs):
 def add_surface(data, starts, counts, heights, signs, oversample, value):
     """Fill between crossings of `data` wherever the winding number is not zero.
 
-    A column that does not close is filled as far as it closes.
+    A column that does not close is filled between its crossings only.
 
     Overlapping bodies fill once, inward shells are cavities.
 

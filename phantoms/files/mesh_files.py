@@ -98,7 +98,8 @@ def mesh_phantom(
         unit: length unit of the file's numbers: um, mm, cm, m, inch; default: that of the
             format, m for GLB, and mm where it has none.
         material: the material.
-        file_type: one of `FORMATS`; default: by the path's suffix (bytes need it).
+        file_type: one of `FORMATS`, in either case; default: by the path's suffix (bytes
+            need it).
         name: default: the path's stem, or "mesh".
         place: "center" puts the middle of its box on the axis at the reference height;
             "keep" takes the file's origin for that point.
@@ -180,7 +181,9 @@ def filled_mesh(
     high = high - shift
     x, y, z = (2.0 * np.maximum(np.abs(low), np.abs(high))).tolist()
     solid = _convex(mesh, vertices)
-    what = f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
+    description = (
+        f"{len(mesh.faces)} triangles of {label} in {unit}, filled with {material}"
+    )
     if twice := filled_twice(vertices, mesh.faces):
         inner = "1 shell lies"
         if twice != 1:
@@ -192,7 +195,7 @@ def filled_mesh(
         )
     return Phantom(
         name,
-        what,
+        description,
         Scene(() if solid is None else (Solid(solid, material, mu),)),
         (x, y, z),
         surfaces=()
@@ -336,8 +339,8 @@ def _read(
             ) from None
         _check_size(size, label)
     if kind.lower() not in FORMATS:
-        what = f"{label}: {kind or 'no format'!r} is not a mesh format we read"
-        raise PhantomError.instead(what, kind, FORMATS)
+        message = f"{label}: {kind or 'no format'!r} is not a mesh format we read"
+        raise PhantomError.instead(message, kind, FORMATS)
     _check_size(len(raw), label)
     return raw, kind.lower(), label
 
@@ -453,10 +456,10 @@ def _check_glb(raw: bytes) -> None:
         raise ValueError("it does not begin as a GLB file (glTF 2.0) does")
     (size,) = struct.unpack_from("<I", raw, 12)
     if size > min(MAX_GLB_DOCUMENT, len(raw) - 20):
-        what = (
+        message = (
             f"its document has {size} bytes; allowed: {MAX_GLB_DOCUMENT}, all in the file"
         )
-        raise ValueError(what)
+        raise ValueError(message)
     try:
         _check_gltf(json.loads(raw[20 : 20 + size]), len(raw))
     except (AttributeError, LookupError, TypeError, RecursionError) as error:
@@ -522,8 +525,8 @@ def _check_gltf(document: Any, total: int) -> None:
 
 
 def _check_stl(raw: bytes) -> None:
-    """Compare the length of a binary STL file with the one that its head announces; text
-    files pass.
+    """Check that a binary STL file has the length that its head announces; text files
+    pass.
 
     Files shorter than a head, and heads that announce 0 triangles, pass, too.
 

@@ -97,8 +97,8 @@ def load_phantom_file(
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
     """Make the phantom of a document in any of the three forms.
 
-    With the key `scene` it is a saved phantom, with `solid` or `mesh` a scene file, else a
-    bead file.
+    With the key `scene` it is a phantom that `Phantom.to_dict` wrote, else with `solid`
+    or `mesh` a scene file, else a bead file.
 
     Args:
         document: parsed TOML or JSON.
@@ -418,12 +418,12 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
     phantom = load_phantom_file(document, name)
     solids = phantom.scene.solids
     faces = sum(len(one.faces) for one in phantom.surfaces)
-    for what, count, allowed in (
+    for kind, count, allowed in (
         ("solids", len(solids), MAX_SENT_SOLIDS),
         ("triangles", faces, MAX_FACES),
     ):
         if count > allowed:
-            raise PhantomError.instead(f"{name} has {count} {what}", count, allowed)
+            raise PhantomError.instead(f"{name} has {count} {kind}", count, allowed)
     if phantom.voxels is not None and not phantom.is_voxels:
         raise PhantomError(f"{name}: voxels cannot be put together with other parts")
     for surface in phantom.surfaces:
@@ -433,8 +433,8 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
             raise PhantomError(f"{name}: {error.message}", error.data) from None
     size = phantom.size_mm
     if not phantom.is_voxels:
-        own = size_about_origin(phantom.scene, phantom.surfaces)
-        size = (max(size[0], own[0]), max(size[1], own[1]), max(size[2], own[2]))
+        extent = size_about_origin(phantom.scene, phantom.surfaces)
+        size = (max(size[0], extent[0]), max(size[1], extent[1]), max(size[2], extent[2]))
     if max(size) > MAX_EXTENT_MM:
         message = f"{name} measures {max(size):g} mm about its axis"
         raise PhantomError.instead(message, max(size), f"{MAX_EXTENT_MM:g} mm")
