@@ -148,7 +148,7 @@ def _project(
 ) -> None:
     """Fill out (channels, n, rows, cols) with the solids' chords times their weights.
 
-    Zero without solids.
+    Out is zero without solids. Work is divided into portions over all threads.
 
     Args:
         solids: the k solids, object frame.
@@ -198,9 +198,8 @@ def warm_up() -> None:
 
 
 def warm_up_forward() -> None:
-    """Run `project_scene` and `forward` on tiny problems, so that their kernels are
-    compiled; with rays in fans and alone.
-    """
+    """Run `project_scene` and `forward` on tiny problems, with rays in fans and alone, so
+    that their kernels are compiled."""
     shapes = (
         Sphere((0, 0, 0), 1.0),
         Box((0, 0, 0), (1, 1, 1)),
@@ -215,9 +214,8 @@ def warm_up_forward() -> None:
 
 
 def warm_up_back() -> None:
-    """Run `back` on tiny problems, so that its kernels are compiled; into new memory,
-    with rays in fans and alone.
-    """
+    """Run `back` on tiny problems, into new memory, with rays in fans and alone, so that
+    its kernels are compiled; the same for adding a volume of another order."""
     images = np.ones((1, 5, 6), np.float32)
     for volume in _tiny_volumes():
         back(images, END_ON, volume)
@@ -260,13 +258,12 @@ class TriangleMesh:
     faces: IntArray
 
     def __post_init__(self) -> None:
-        """Check the mesh and store its vertices and faces as read-only arrays.
-
-        The arrays are copies.
+        """Check the mesh and store copies of its vertices, float64, and faces, int64,
+        read-only.
 
         Raises:
-            GeometryError: wrong shapes, a face with an unknown vertex, or a mesh that is not
-                closed.
+            GeometryError: wrong shapes, a face with an unknown vertex, or a mesh that is
+                not closed.
         """
         vertices = np.array(self.vertices, dtype=np.float64)
         faces = np.array(self.faces, dtype=np.int64)
@@ -306,6 +303,8 @@ def project_mesh(
     out: Float32Array | None = None,
 ) -> Float32Array:
     """Compute the path length [mm] through a mesh along every ray.
+
+    Rays are moved aside by a ten-millionth of a pixel, so that none runs along an edge.
 
     Args:
         mesh: the solid.
@@ -353,14 +352,14 @@ def project_mesh(
 def _check_closed(faces: IntArray, vertices: int) -> None:
     """Check that every edge is passed as often in one direction as in the other.
 
-    So a closed mesh may touch itself.
+    A closed mesh may touch itself: an edge may have more than two faces.
 
     Args:
         faces: (m, 3) numbers of vertices.
         vertices: number of vertices.
 
     Raises:
-        GeometryError: an edge has no partner; the message names one.
+        GeometryError: an edge has no partner; the message names one and counts them.
     """
     start = faces.ravel()
     end = faces[:, [1, 2, 0]].ravel()

@@ -121,12 +121,13 @@ class Convex:
 def as_convex(shape: Shape) -> Convex:
     """Convert one shape to its quadric and slabs, with its corners or semi-axes [mm].
 
-    Corners hold solids without semi-axes; boxes and polyhedra have no quadric (zeros),
-    spheres no slabs.
+    Spheres and ellipsoids have semi-axes and no slabs; boxes, cylinders and polyhedra
+    have corners, whose convex hull holds them. Boxes and polyhedra have no quadric
+    (zeros). A slab is a normal (3), low and high end along it.
 
     Raises:
-        GeometryError: a size is not positive, axes are not orthonormal, or a polyhedron is not
-            bounded.
+        GeometryError: a size is not positive, axes are not orthonormal, or a polyhedron
+            is not bounded.
     """
     none = np.zeros((0, 5))
     match shape:
@@ -191,7 +192,8 @@ def shadows(
 ) -> IntArray:
     """Find the pixels that each solid can darken.
 
-    A solid that is not wholly before the source can darken all.
+    The box around a solid's shadow, cut to the panel. A solid that is not wholly before
+    the source can darken all pixels.
 
     Args:
         shapes: the k solids.
@@ -199,7 +201,8 @@ def shadows(
         shape: detector (rows, cols).
 
     Returns:
-        (n, k, 4) first row, last row + 1, first column, last column + 1.
+        int64 (n, k, 4) first row, last row + 1, first column, last column + 1; without a
+        pixel the first is not below the last.
     """
     result = np.empty((len(rays), len(shapes), 4), np.int64)
     inverse = _inverses(rays)
@@ -293,11 +296,9 @@ def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArr
 def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
     """Compute the corner points of an intersection of half-spaces, (m, 3) [mm].
 
-    Also raised for fewer than four half-spaces, or if numbers of normals and offsets
-    differ.
-
     Raises:
-        GeometryError: a normal is not of unit length, or the half-spaces enclose no
+        GeometryError: a normal is not of unit length, fewer than four half-spaces,
+            another number of offsets than of normals, or the half-spaces enclose no
             bounded solid.
     """
     from scipy.optimize import linprog
@@ -317,10 +318,10 @@ def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
     try:
         if ball.status == 0 and ball.x[3] > 0.0:
             with np.errstate(all="ignore"):  # an unbounded one has corners at infinity
-                found = HalfspaceIntersection(np.column_stack([n, -d]), ball.x[:3])
+                solid = HalfspaceIntersection(np.column_stack([n, -d]), ball.x[:3])
             # Bounded exactly when the hull of the dual points holds the origin.
-            if (found.dual_equations[:, 3] < -1e-12).all():
-                return np.asarray(found.intersections)
+            if (solid.dual_equations[:, 3] < -1e-12).all():
+                return np.asarray(solid.intersections)
     except QhullError:  # the dual points lie in a plane
         pass
     raise GeometryError("the half-spaces of a polyhedron enclose no bounded solid")
@@ -335,7 +336,7 @@ def _unit(shape: Shape, direction: Vector) -> FloatArray:
     """Check that a direction of a shape is a unit vector, and return it normalised, (3,).
 
     Raises:
-        GeometryError: it is not.
+        GeometryError: its length differs from 1 by more than `UNIT_TOLERANCE`.
     """
     k = np.array(direction, dtype=np.float64)
     if k.shape != (3,) or abs(np.linalg.norm(k) - 1) > UNIT_TOLERANCE:
@@ -344,10 +345,11 @@ def _unit(shape: Shape, direction: Vector) -> FloatArray:
 
 
 def _orthonormal(shape: Shape, axes: Matrix) -> FloatArray:
-    """Check that the axes of a shape are orthonormal rows, and return them as an array (3, 3).
+    """Check that the axes of a shape are orthonormal rows, and return them as an array
+    (3, 3).
 
     Raises:
-        GeometryError: they are not.
+        GeometryError: a dot product differs by more than `UNIT_TOLERANCE`.
     """
     a = np.array(axes, dtype=np.float64)
     if a.shape != (3, 3) or np.abs(a @ a.T - np.eye(3)).max() > UNIT_TOLERANCE:

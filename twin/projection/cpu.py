@@ -44,8 +44,13 @@ TILE = 8
 def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, bool]]:
     """Yield ranges of neighbouring views of one orientation, each with its transposition.
 
-    A range holds at most as many views as fit into ROOM. The second value is True when
-    rows and columns of these views are exchanged.
+    The second value is True when rows and columns of these views are exchanged; such a
+    range holds at most as many views as fit into ROOM (at least one), as their images are
+    copied.
+
+    Args:
+        views: (n, 12) rays in voxel units.
+        shape: detector (rows, cols).
     """
     on_side = lying(views, shape)
     most = max(1, ROOM // (4 * shape[0] * shape[1]))
@@ -106,6 +111,12 @@ def _project_alone(
 ) -> None:
     """Fill the chosen views of `out` with line integrals of rays that are walked one by
     one, on all threads.
+
+    Args:
+        box: the volume.
+        views: (n, 12) rays in voxel units.
+        chosen: indices of views.
+        out: (n, rows, cols), changed.
     """
     from flexdt.twin.projection.kernels import siddon_kernels
 
@@ -133,7 +144,8 @@ def spread(
         box: the volume; its spans are not used.
         views: as in `project`.
         values: C-ordered float32.
-        clean: True if box.flat holds zeros; otherwise its content is overwritten.
+        clean: True if box.flat holds zeros; otherwise its content is overwritten (if
+            there is a view).
         fans: False to walk every ray on its own.
     """
     shape = (values.shape[1], values.shape[2])
@@ -209,7 +221,7 @@ def _spread(
 def z_slices(nz: int, count: int) -> IntArray:
     """Cut nz levels into at most `count` ranges (s, 2) of about equal height.
 
-    Cuts are at whole cache lines.
+    Cuts are at multiples of `LANES` voxels; fewer ranges where there are fewer of these.
     """
     lines = -(-nz // LANES)
     edges = np.unique(np.arange(count + 1) * lines // count) * LANES

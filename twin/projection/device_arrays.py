@@ -47,8 +47,11 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
-        """Copy images (n, rows, cols) from the host, or share their memory if they are on
-        the device; raises if the device fails.
+        """Make an array of images (n, rows, cols): a copy of those on the host, or the
+        shared memory of those on the device.
+
+        Raises:
+            DeviceError: the device failed.
         """
         if gpu.is_there(images):
             there = images
@@ -63,7 +66,11 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_voxels(cls, volume: Volume) -> DeviceArray:
-        """Copy a volume's voxels, on its grid, to the device; raises if the device fails."""
+        """Copy a volume's voxels, on its full grid, to the device.
+
+        Raises:
+            DeviceError: the device failed.
+        """
         layout = blank_layout(volume)
         layout_data(layout)[...] = volume.data
         layout = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
@@ -84,8 +91,12 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     def __getitem__(self, views: slice | npt.NDArray[np.intp]) -> DeviceArray:
         """Copy the images of some views, by their indices, into a new array on the
-        device; any slice returns this array itself (only slices over all views are
-        used).
+        device; return this array itself for any slice.
+
+        Only slices over all views are used.
+
+        Raises:
+            DeviceError: the device failed.
         """
         if isinstance(views, slice):
             return self
@@ -103,8 +114,8 @@ class DeviceArray(NDArrayOperatorsMixin):
                 )
             return DeviceArray(some, (len(views), *self.shape[1:]))
 
-        found: DeviceArray = gpu.demand(gather)
-        return found
+        images: DeviceArray = gpu.demand(gather)
+        return images
 
     @property
     def size(self) -> int:
@@ -117,8 +128,9 @@ class DeviceArray(NDArrayOperatorsMixin):
         """Apply a function of UFUNCS to device arrays, or to one and a number, on the
         device; see `_combine`.
 
-        Returns NotImplemented for any other function, method, option or operand, and for
-        a number minus an array.
+        The result goes into `out` if given, else into a new array. Returns NotImplemented
+        for any other function, method, option or operand, and for a number minus an
+        array.
         """
         a, b = inputs if len(inputs) == 2 else (self, None)
         if not isinstance(a, DeviceArray) and ufunc is not np.subtract:
@@ -164,13 +176,18 @@ def _combine(
 ) -> DeviceArray:
     """Apply a function of the kernel elementwise to `a` and an array or a number `b`.
 
-    Raises GeometryError for arrays of different shapes, and if the device fails.
-
     Args:
         name: name of the function in the kernel.
         a, b: operands; b is an array or a number.
         out: array for the result, `a` for example; None for new memory.
         least: smallest denominator of a ratio; see `DeviceArray.over`.
+
+    Returns:
+        `out`, or a new array with the shape and grid of `a`.
+
+    Raises:
+        GeometryError: arrays of different shapes.
+        DeviceError: the device failed.
     """
     if isinstance(b, DeviceArray) and b.shape != a.shape:
         raise GeometryError.of_shape(
@@ -198,8 +215,8 @@ def _combine(
         )
         return made
 
-    found: DeviceArray = gpu.demand(launch)
-    return found
+    combined: DeviceArray = gpu.demand(launch)
+    return combined
 
 
 def _fold(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
@@ -226,5 +243,5 @@ def _fold(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
         kernels.fold[kernels.FOLDING](getattr(kernels, name), a.flat, b.flat, parts)
         return np.asarray(parts.copy_to_host())
 
-    found: FloatArray = gpu.demand(launch)
-    return found
+    folded: FloatArray = gpu.demand(launch)
+    return folded

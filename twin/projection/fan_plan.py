@@ -108,11 +108,14 @@ def plan_fans(
 ) -> FanPlan:
     """Cut views into fans.
 
-    Views whose panel faces the source badly are not planned: `alone` lists them; level
-    views need no cut along rows.
+    Of level views, whose columns are parallel to z, each column is a fan; the others are
+    cut as `_plan_tilted`. A view that has a corner whose ray is more than `FACING` (a
+    cosine, seen along z) off the panel's middle, or that tilts too much, gets no fans:
+    `alone` lists it.
 
     Args:
-        views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the box.
+        views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the
+            box.
         counts: (nx, ny, nz) voxels of the box.
         shape: detector (rows, cols).
     """
@@ -175,8 +178,9 @@ def _plan_tilted(
     """Plan fans between images of vertical planes for the `chosen` views that can have
     them.
 
-    `alone` lists those that cannot: steep planes, a pole near the panel, or more fans
-    than are worth it.
+    `alone` lists those that cannot: planes seen more than 45 degrees off the columns, a
+    pole closer than `MIN_GAP_SHARE` to the panel, or more fans than
+    `MAX_FANS_A_PIXEL_LINE` times rows and columns.
 
     Args:
         chosen: indices of views.
@@ -307,7 +311,9 @@ def plan_turns(
 ) -> Turns:
     """Order the jobs of a plan so that threads never add to the same voxel at a time.
 
-    Views with little to share are added by one thread; fans of others in two halves.
+    The jobs of a view are gathered to units at least `MIN_UNIT_WIDTH` voxels wide; every
+    second unit is of one turn, the rest of the next. Neighbouring views with fewer than
+    four units, and all with one worker, are one unit for one thread.
 
     Args:
         plan: of these views.
@@ -315,6 +321,10 @@ def plan_turns(
         counts: (nx, ny, nz) voxels of the box.
         shape: detector (rows, cols).
         workers: threads.
+
+    Returns:
+        Turns (ranges of units), units (ranges of jobs), and into how many slices of z the
+        box must be cut to occupy all threads; empty ranges without jobs.
     """
     jobs = plan.jobs
     none = np.zeros((0, 2), np.int64)
@@ -349,7 +359,7 @@ def plan_turns(
 
 def _cuts(width: FloatArray) -> list[int]:
     """List bounds of runs of jobs that are at least MIN_UNIT_WIDTH wide together,
-    beginning with 0; a remainder joins the last run.
+    beginning with 0 and ending with the number of jobs; a remainder joins the last run.
     """
     cuts = [0]
     gathered = 0.0

@@ -73,7 +73,8 @@ def cil_operator(
     """Make a `LinearOperator` from `ImageData` (vertical, horizontal_y, horizontal_x) to
     `AcquisitionData` (angle, vertical, horizontal).
 
-    `out` is filled if given, else a new container is returned.
+    `out` is filled if given, else a new container is returned. Angles of CIL's geometry
+    are the views' numbers, as a cone_vec has none.
 
     Args:
         project, spread: projector and transpose.

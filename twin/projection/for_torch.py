@@ -188,11 +188,12 @@ class _ByRows(torch.autograd.Function):
 
 
 def _tensor(values: Any) -> Any:
-    """Convert an array of any library to a tensor that shares its memory; a read-only array is
-    copied.
+    """Convert an array of any library to a tensor that shares its memory; a read-only
+    array is copied.
 
     Raises:
-        NotBuiltError: it is on a device that the kernels cannot use.
+        NotBuiltError: it is on another device than the processor and a CUDA device that
+            works.
     """
     if isinstance(values, np.ndarray):
         values = (
@@ -255,16 +256,18 @@ def _each(
 ) -> Any:
     """Apply a function to each member of a batch, on its device.
 
-    Before and after, it waits for PyTorch's streams and for the kernels' own, which do not know
-    each other.
+    Before and after, it waits for PyTorch's streams and for the kernels' own, which do
+    not know each other.
 
     Args:
-        function: of a three-dimensional float32 tensor; returns an array.
+        function: of a three-dimensional float32 tensor (without a gradient); returns an
+            array.
         values: tensor (..., a, b, c).
         shape: of the function's results.
 
     Returns:
-        A tensor (..., *shape) on the device of `values`.
+        A float32 tensor (..., *shape) on the device of `values`; empty for an empty
+        batch.
     """
     batch = values.shape[:-3]
     device = values.device

@@ -82,11 +82,14 @@ def availability() -> Availability:
 
 @cache
 def _probe() -> Availability:
-    """Look for the driver, import numba's CUDA and project one ray on the device.
+    """Look for the driver, import numba's CUDA and project one ray on the device; the
+    result is cached for the process.
+
+    The simulator needs no driver.
 
     Returns:
-        Whether a device can be used, with its name or the reason; nothing is raised. A failed
-        first ray is logged.
+        Whether a device can be used, with its name or the reason; nothing is raised. A
+        failed first ray is logged.
     """
     from numba import config
 
@@ -153,8 +156,9 @@ def switched_off() -> Iterator[None]:
 def attempt(work: Callable[[], object]) -> bool:
     """Run some work on the device and return whether it succeeded.
 
-    If it failed, the caller computes on the processor. A device that lacks memory is
-    tried again later; after any other failure it is not used again.
+    If it failed, the caller computes on the processor, and a warning is logged. A device
+    that lacks memory is tried again later; after the first other failure it is not used
+    again in this process, and later failures are not logged.
     """
     try:
         work()
@@ -180,9 +184,8 @@ def upload(flat: Float32Array) -> Any:
 
 
 def free_bytes() -> int | None:
-    """Return the free memory of the device [bytes]: 0 if the query fails, None in the
-    simulator.
-    """
+    """Return the free memory of the device [bytes]: 0 if the query fails (which `attempt`
+    logs), None in the simulator."""
     from numba import config, cuda
 
     if config.ENABLE_CUDASIM:
@@ -203,15 +206,18 @@ def has_room(needed: int) -> bool:
 
 
 def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0) -> bool:
-    """Return whether a device has room for voxels and one portion of images, and pays.
+    """Return whether a device has room for voxels and one portion of images, and is
+    likely faster.
+
+    Voxels that are to be moved pay from `VIEWS_A_THREAD` views a thread on; the views
+    before count for voxels of at least `WORTH_BYTES`.
 
     Args:
         voxel_bytes: size of the voxels to be moved there; 0 for voxels on the device.
         images: (n, rows, cols).
         threads: number of threads of the processor.
         before: number of views of the same voxels that the processor has projected. More
-            are then likely: the volume is moved once these would have paid for it, so
-            that it takes at most twice the least time.
+            are then likely: the volume is moved once these would have paid for it.
     """
     views = len(images) + (before if voxel_bytes >= WORTH_BYTES else 0)
     if not availability().present or (voxel_bytes and views < VIEWS_A_THREAD * threads):
@@ -272,7 +278,8 @@ def check_host(there: bool, what: str) -> None:
 
 
 def taken(x: Any) -> Any:
-    """Convert an array on the device to numba's array that shares its memory.
+    """Convert an array on the device to numba's array that shares its memory; numba's own
+    is returned unchanged.
 
     Raises:
         GeometryError: it is not float32 in C order.
@@ -284,8 +291,8 @@ def taken(x: Any) -> Any:
     else:
         array = cuda.as_cuda_array(x)
     if array.dtype != np.float32 or not array.is_c_contiguous():
-        said = f"an array of {array.dtype} on the device"
-        raise GeometryError.instead(said, str(array.dtype), "float32 in C order")
+        message = f"an array of {array.dtype} on the device"
+        raise GeometryError.instead(message, str(array.dtype), "float32 in C order")
     return array
 
 
@@ -295,18 +302,19 @@ def demand(work: Callable[[], Any]) -> Any:
     Raises:
         DeviceError: the device failed; the failure is logged as well.
     """
-    found: list[Any] = []
-    if not attempt(lambda: found.append(work())):
+    results: list[Any] = []
+    if not attempt(lambda: results.append(work())):
         raise DeviceError(
             "the CUDA device failed at arrays that are on it; the log says of what"
         )
-    return found[0]
+    return results[0]
 
 
 def project_there(
     box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]
 ) -> Any:
-    """Project a volume on the device to images that stay there.
+    """Project a volume on the device to images that stay there; does not wait for the
+    kernels.
 
     Args:
         box: the layout's voxels.
@@ -383,7 +391,8 @@ def spread(
     clean: bool = False,
     deterministic: bool = False,
 ) -> None:
-    """Apply `spread_there` to box.flat on the host.
+    """Apply `spread_there` to box.flat on the host: the voxels are moved to the device
+    and the sums back.
 
     Args:
         box: the volume.
@@ -404,7 +413,11 @@ def whole_factor(box: Box, values: Any) -> float:
     """Compute the power of 2 that scales values for a sum of 64-bit integers.
 
     A ray adds at most its value times a voxel's diagonal; the sum of all rays stays below
-    2^62.
+    2^62. 1 for values that are all zero or not finite.
+
+    Args:
+        box: sizes of the voxels.
+        values: images, on the host or the device (copied to the host).
     """
     diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
     if is_there(values):
@@ -429,10 +442,11 @@ def by_slabs(
 
 
 def rises(views: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Compute a bound of the voxels that rays rise for each along the faster one of x and y,
-    (n,).
+    """Compute a bound of the voxels that rays rise for each along the faster one of x and
+    y, (n,).
 
-    Infinity where rays of a view may go along different ways of these axes.
+    Of x, y and the diagonal that the panel's middle is on, the way with the least bound
+    counts. Infinity where some corner's ray goes backwards along each of them.
     """
     corners = _corners(views, shape)
     middle = corners[:, :, :2].mean(axis=1)
@@ -450,7 +464,8 @@ def clear_of(
 ) -> npt.NDArray[np.bool_]:
     """Find the views whose source is before a box and whose detector plane is behind it.
 
-    Boxes too long for the slab walk have no such views.
+    By a share `MIN_CLEARANCE` of the distance. A box with a side of `SIDE` voxels or
+    more, or 2^31 values, is too large for the slab walk: all are False.
 
     Args:
         box: the layout's voxels.
@@ -505,11 +520,15 @@ def launcher(
     transposed: bool,
     factor: float = 1.0,
 ) -> Callable[[], None]:
-    """Prepare the kernels for these views, and copy the views to the device.
+    """Choose the kernel of each view, and copy the views to the device.
+
+    A view takes the slab walk if it is clear of the box and rises at most one voxel a
+    step; the column walk if its v is also parallel to z, within `RISE`, on a device whose
+    lanes meet; else ray by ray.
 
     One array goes there: views by kernel, each with the number of its image. Views of a
-    detector on its side take its columns for rows, so that lanes are neighbours along z there,
-    too.
+    detector on its side take its columns for rows, so that lanes are neighbours along z
+    there, too.
 
     Args:
         box: the layout's voxels.

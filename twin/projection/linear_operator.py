@@ -49,8 +49,9 @@ SMALLEST_TOLERANCE = 1e-5
 def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[Any], Any]:
     """Wrap a function of a numpy array for arrays of any library.
 
-    An array that numpy can read gives a numpy array. The memory of any other array is
-    shared by DLPack, and the result goes to `from_dlpack` of the array's own library.
+    NumPy's arrays, and values without DLPack, give a NumPy array. The memory of any other
+    array is shared by DLPack, and the result goes to `from_dlpack` of the array's own
+    library.
 
     Raises:
         NotBuiltError: the array is in the memory of a device.
@@ -153,19 +154,23 @@ class Operator:
         """Compute line integrals (n, rows, cols) of voxels (nz, ny, nx) [1/mm] or of a
         volume.
 
-        Tensors are projected with gradients, and arrays in batches. Raises GeometryError
-        for a volume on another grid.
+        Tensors are projected with gradients, and may be batches. Of other arrays the
+        result is in their own library; of a `DeviceVolume` it stays on the device.
 
-        Those of a `DeviceVolume` stay on the device.
+        Raises:
+            GeometryError: a volume on another grid, or another shape.
+            NotBuiltError: an array on a device that is neither tensor nor `DeviceVolume`.
         """
         if isinstance(x, (Volume, DeviceVolume)):
             if not _same_grid(x, self.like):
-                said, wanted = (
+                given, wanted = (
                     f"{v.shape} voxels of {v.voxel_xyz} mm at {v.center_mm} mm"
                     for v in (x, self.like)
                 )
                 raise GeometryError.instead(
-                    f"a volume of {said}", list(x.shape), f"the operator's grid, {wanted}"
+                    f"a volume of {given}",
+                    list(x.shape),
+                    f"the operator's grid, {wanted}",
                 )
             return forward(x, self.geometry, self.detector_shape)
         if _is_tensor(x):
@@ -226,7 +231,7 @@ class Operator:
             tolerance: relative, at least 1e-5.
 
         Raises:
-            LimitError: the tolerance is below 1e-5.
+            LimitError: the tolerance is below 1e-5, or 1 or more.
 
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -235,8 +240,8 @@ class Operator:
             1.0
         """
         if not SMALLEST_TOLERANCE <= tolerance < 1.0:
-            said = f"the tolerance is {tolerance:g}"
-            raise LimitError.instead(said, tolerance, f"{SMALLEST_TOLERANCE:g} to 1")
+            message = f"the tolerance is {tolerance:g}"
+            raise LimitError.instead(message, tolerance, f"{SMALLEST_TOLERANCE:g} to 1")
         return norm_of(
             self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance
         )
@@ -371,7 +376,11 @@ class Adjoint:
         """Apply the transpose to projections (n, rows, cols); returns voxels (nz, ny,
         nx).
 
-        An array on a CUDA device (but no tensor) gives a `DeviceVolume`.
+        An array on a CUDA device (but no tensor) gives a `DeviceVolume`; a tensor a
+        tensor, with gradients; any other array one of its own library.
+
+        Raises:
+            GeometryError: another shape than the operator's images.
         """
         if not _is_tensor(y) and gpu.is_there(y):
             _check(tuple(y.shape), self.T.image_shape, "projections")
@@ -432,7 +441,7 @@ def norm_of(
         tolerance: relative.
 
     Returns:
-        The largest singular value.
+        The largest singular value [mm]; 0 where no ray meets the grid.
     """
     x = ones
     while True:

@@ -82,7 +82,11 @@ Shape2 = tuple[int, int]
 
 def in_order(geometry: ConeVec, order: Order) -> ConeVec:
     """Return the geometry with its axes permuted as `Volume.in_order` does; the images
-    are the same.
+    are the same. (x, y, z) gives the geometry itself.
+
+    Args:
+        geometry: n views.
+        order: the old axis in the place of x, y and z.
     """
     if order == ORDERS[0]:
         return geometry
@@ -93,7 +97,8 @@ def in_order(geometry: ConeVec, order: Order) -> ConeVec:
 def by_level_axis(
     volume: Volume, geometry: ConeVec, shape: tuple[int, int]
 ) -> Iterator[tuple[slice, Order, bool]]:
-    """Yield ranges of neighbouring views with the best axis to stack levels along.
+    """Yield ranges of neighbouring views with the best axis to stack levels along, by
+    estimated time; nothing without views.
 
     Returns:
         Tuples of the range, the volume's order for projecting it, and whether rays travel
@@ -113,8 +118,8 @@ def level_axes(
 ) -> npt.NDArray[np.intp]:
     """Choose an index into ORDERS for each view, or NO_FANS, by estimated time.
 
-    Orders other than the first must be clearly faster to be chosen, and the panel
-    must face the planes of fans.
+    Orders other than the first must take less than `MAX_TIME_SHARE` of the time of the
+    others. An order is not chosen if some ray is within acos(`FACING`) of its level axis.
 
     Args:
         rays: (n, 12) source relative to the volume's centre, first pixel minus source, u,
@@ -192,8 +197,10 @@ def forward(
         float32 (n, rows, cols), dimensionless; numpy's, or on the device numba's array.
 
     Raises:
-        GeometryError: volume, cone_vec, shape or out do not fit, or a row gives its
-            pixels no rays of their own.
+        GeometryError: volume, cone_vec, shape or out do not fit, a row gives its pixels
+            no rays of their own, or `out` is given for a `DeviceVolume`.
+        DeviceError: the device failed at a `DeviceVolume`; for other volumes the
+            processor computes instead.
 
     Examples:
         A ray along y through 4 voxels of 0.5 mm and 0.02 / mm:
@@ -245,7 +252,9 @@ def _single_view(
         volume, cone_vec, shape, out: as those of `forward`.
 
     Returns:
-        The image, (1, rows, cols); None where the view has to be projected as others.
+        The image, (1, rows, cols), `out` if given; None for several views, a volume
+        without a copy on the device or without voxels, a geometry that is no ConeVec, or
+        a view that `single_view` refuses.
 
     Raises:
         GeometryError: shape or out does not fit.
@@ -331,7 +340,10 @@ def back(
 
     Raises:
         GeometryError: the number of projections is not that of the views, out does not
-            fit, or a row gives its pixels no rays of their own.
+            fit or is given for images on a device, or a row gives its pixels no rays of
+            their own.
+        DeviceError: the device failed at images that are on it; for those of the host the
+            processor computes instead.
 
     Examples:
         >>> volume = Volume(np.full((3, 4, 3), 0.02, np.float32), 0.5)
@@ -443,7 +455,8 @@ def box_of(layout: Layout) -> Box:
 
 
 def layout_data(layout: Layout) -> Float32Array:
-    """View the voxels of a layout's box as (nz, ny, nx), without a copy."""
+    """View the voxels of a layout's box as (nz, ny, nx), without a copy; writes go to the
+    layout."""
     nx, ny, nz = layout.counts
     size = layout.flat.itemsize
     return np.lib.stride_tricks.as_strided(
@@ -480,10 +493,10 @@ def require_line_integrals(projections: Any) -> None:
     """
     kind = getattr(projections, "dtype", None)
     if kind is not None and kind.kind == "u":
-        said = f"projections are {kind}, as a detector's counts are"
+        message = f"projections are {kind}, as a detector's counts are"
         wanted = "line integrals, as `line_integrals()` of a data set gives them"
         raise GeometryError.instead(
-            said, str(kind), f"{wanted}, or floating-point numbers"
+            message, str(kind), f"{wanted}, or floating-point numbers"
         )
 
 
@@ -506,9 +519,9 @@ def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
 
 
 def _are_finite(values: npt.NDArray[Any]) -> bool:
-    """Return whether all numbers are finite; many contiguous float32 numbers are checked
-    on all cores, others by their sum (which must not overflow).
-    """
+    """Return whether all numbers are finite; C-ordered float32 numbers of at least
+    `MIN_PARALLEL_BYTES` are checked on all cores, others by their sum (which must not
+    overflow)."""
     if (
         values.nbytes < MIN_PARALLEL_BYTES
         or values.dtype != np.float32
@@ -521,8 +534,8 @@ def _are_finite(values: npt.NDArray[Any]) -> bool:
 
 
 def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
-    """Check that each pixel of cone_vec, (n, 12) [mm], has its own ray, and return a
-    ConeVec.
+    """Check that each pixel of cone_vec, a ConeVec or (n, 12) [mm], has its own ray, and
+    return a ConeVec.
 
     Raises:
         GeometryError: a row does not; it is named.

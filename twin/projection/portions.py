@@ -43,8 +43,12 @@ def layer_portions(volume: Float32Array) -> Iterator[tuple[int, int]]:
 
 
 def portions(job_ns: FloatArray, threads: int) -> Iterator[tuple[int, int]]:
-    """Yield consecutive ranges (first, last) of jobs whose times are `job_ns` (n,) [ns],
-    each about `PORTION_NS` for each thread, at least one job.
+    """Yield consecutive ranges (first, last) of jobs, each of about `PORTION_NS` for each
+    thread, but of at least one job.
+
+    Args:
+        job_ns: (n,) times of the jobs on one thread [ns].
+        threads: that work at once.
     """
     ends = np.cumsum(job_ns)
     first = 0
@@ -83,7 +87,9 @@ def fan_job_ns(
     counts: tuple[int, int, int],
     pixels: tuple[int, int],
 ) -> FloatArray:
-    """Estimate the times of the jobs of a plan [ns], (k,).
+    """Estimate the times of the jobs of a plan on one thread [ns], (k,).
+
+    Rays of a source inside the box are counted as walked one by one.
 
     Args:
         lines: (m, 2) fan boundaries c = a + b r.

@@ -68,6 +68,12 @@ class SingleViews:
     """
 
     def __init__(self, volume: Volume, box: Box) -> None:
+        """Take a volume and its box, and copy the voxels to the device unless they are
+        there.
+
+        A box too large for the slab walk gets an infinite clearance, so that no view is
+        clear of it.
+        """
         layout = volume.layout
         half = 0.5 * np.array(volume.shape[::-1]) * volume.voxel_xyz
         sides = (layout.low_mm, layout.voxel_mm, volume.center_mm, half, layout.counts)
@@ -87,7 +93,8 @@ class SingleViews:
             image: (rows, cols) filled.
 
         Returns:
-            Whether it is filled; False where `gpu` has to project the view.
+            Whether it is filled; False where `gpu` has to project the view. Without the
+            driver's package or a part of it, `usable` becomes False.
 
         Raises:
             RuntimeError: the driver failed.
@@ -130,6 +137,16 @@ class ViewMemory:
     """
 
     def __init__(self, device: int, shape: tuple[int, int]) -> None:
+        """Allocate image and table on the device and, page-locked, on the host, with a
+        stream; nothing is launched.
+
+        Args:
+            device: number of the device.
+            shape: image (rows, cols).
+
+        Raises:
+            ImportError: the driver's package is missing.
+        """
         from numba import cuda
 
         self.driver = importlib.import_module(DRIVER)
@@ -149,9 +166,13 @@ class ViewMemory:
     def project(self, views: SingleViews, row: FloatArray, image: Float32Array) -> bool:
         """Fill an image; see `SingleViews.project`.
 
+        The first image of each kind of view is compared with that of numba's launch; if
+        it differs, `views.usable` becomes False.
+
         Returns:
-            False for a view that needs a look, a kernel that is not compiled yet, and one that
-            gives another image than by numba's launch.
+            Whether it is filled; False for a view that `prepare` calls UNFIT, a kernel
+            that is not compiled yet, and one that gives another image than by numba's
+            launch.
         """
         from flexdt.twin.projection.kernels import gpu_kernels, view_kernels
 
@@ -289,6 +310,8 @@ def _array(array: Any) -> list[ctypes.c_int64]:
 def project(volume: Volume, box: Box, row: FloatArray, image: Float32Array) -> bool:
     """Fill an image with line integrals of a volume that is on the device.
 
+    What is prepared for single views is kept with the volume's copy.
+
     Args:
         volume: whose layout has a copy on the device.
         box: of its layout.
@@ -296,7 +319,8 @@ def project(volume: Volume, box: Box, row: FloatArray, image: Float32Array) -> b
         image: (rows, cols) filled.
 
     Returns:
-        Whether it is filled; False where `gpu` has to project the view, or the device failed.
+        Whether it is filled; False where `gpu` has to project the view, or the device
+        failed.
     """
     copy = volume.layout.device_copy
     if copy.single_views is None:

@@ -148,7 +148,7 @@ class DeviceCopy:
     single_views: Any = None
 
     def uploaded(self) -> Any:
-        """Return the storage on the device, moved there at the first call."""
+        """Return the storage on the device, moved there at the first call and kept."""
         from flexdt.twin.projection import gpu
 
         if self.there is None:
@@ -192,9 +192,9 @@ def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
         or steps[2] < nz
         or steps[1] < nx * steps[2]
     ):
-        said = f"out is {data.dtype} {data.shape} with strides {data.strides}"
+        message = f"out is {data.dtype} {data.shape} with strides {data.strides}"
         wanted = f"writeable float32 {volume.shape} with z contiguous in memory, as room_like makes"
-        raise GeometryError.instead(said, list(data.shape), f"{wanted} it")
+        raise GeometryError.instead(message, list(data.shape), f"{wanted} it")
     low = [c - size / 2 for c, size in zip(volume.center_mm, volume.size_mm, strict=True)]
     return Layout(
         flat=_flat_alias(data, (ny - 1) * steps[1] + (nx - 1) * steps[2] + nz),
@@ -258,9 +258,9 @@ class Volume:
             object.__setattr__(self, "voxel_mm", _vector((size,) * 3, "voxel_mm")[0])
         object.__setattr__(self, "center_mm", _vector(self.center_mm, "center_mm"))
         if any(size <= 0 for size in self.voxel_xyz):
-            said = f"voxel_mm is {self.voxel_mm}"
+            message = f"voxel_mm is {self.voxel_mm}"
             sizes = list(self.voxel_xyz)
-            raise GeometryError.instead(said, sizes, "positive sizes (x, y, z) in mm")
+            raise GeometryError.instead(message, sizes, "positive sizes (x, y, z) in mm")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """Return the values, (nz, ny, nx)."""
@@ -320,10 +320,10 @@ class Volume:
             return self
         from flexdt.twin.projection import gpu
 
-        found = gpu.availability()
-        if device != "cuda" or not found.present:
+        device_state = gpu.availability()
+        if device != "cuda" or not device_state.present:
             if device == "cuda":
-                why = f": {found.reason}"
+                why = f": {device_state.reason}"
             else:
                 why = ""
             raise NotBuiltError(
@@ -434,12 +434,12 @@ class Volume:
         access.
         """
         noise: Any = getattr(self, "_noise", None)  # of `volume_errors.with_errors`
-        found: Float32Array | None
+        values: Float32Array | None
         if noise is None:
-            found = None
+            values = None
         else:
-            found = noise.sigma(self)
-        return found
+            values = noise.sigma(self)
+        return values
 
     @property
     def bias_bound(self) -> Float32Array | None:
@@ -450,12 +450,12 @@ class Volume:
         access. Where `accuracy.cut_off` it is an estimate.
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
-        found: Float32Array | None
+        bound: Float32Array | None
         if bias is None:
-            found = None
+            bound = None
         else:
-            found = bias.bound(self)
-        return found
+            bound = bias.bound(self)
+        return bound
 
     @property
     def accuracy(self) -> Accuracy | None:
@@ -470,12 +470,12 @@ class Volume:
             Accuracy(half=0.006, most=0.021, cause='cone', cut_off=False)
         """
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
-        found: Accuracy | None
+        summary: Accuracy | None
         if bias is None:
-            found = None
+            summary = None
         else:
-            found = bias.accuracy(self)
-        return found
+            summary = bias.accuracy(self)
+        return summary
 
     @property
     def voxel_xyz(self) -> Vector3:
@@ -520,7 +520,10 @@ class Volume:
         return x, y, z
 
     def like(self, data: npt.NDArray[np.floating]) -> Volume:
-        """Make a volume of other values (nz, ny, nx) on the same grid.
+        """Make a volume of other values (nz, ny, nx) on the same grid, as float32.
+
+        Raises:
+            GeometryError: another shape.
 
         Example:
             >>> volume = Volume(np.zeros((6, 4, 4)), voxel_mm=0.5)
@@ -715,14 +718,17 @@ class Grid:
         """Check that the grid has voxels of a positive size.
 
         Raises:
-            GeometryError: it has not.
+            GeometryError: a number of voxels below 1, or an edge that is not above 0 and
+                finite.
         """
         if min(self.shape) < 1 or not (
             math.isfinite(self.voxel_mm) and self.voxel_mm > 0
         ):
-            said = f"grid of {self.shape} voxels of {self.voxel_mm} mm"
+            message = f"grid of {self.shape} voxels of {self.voxel_mm} mm"
             wanted = "three whole numbers above 0, and one edge above 0"
-            raise GeometryError.instead(said, repr((self.shape, self.voxel_mm)), wanted)
+            raise GeometryError.instead(
+                message, repr((self.shape, self.voxel_mm)), wanted
+            )
 
     @property
     def bytes(self) -> int:
@@ -796,7 +802,8 @@ def bring_over(
     *,
     adding: bool = False,
 ) -> None:
-    """Copy or add data to a layout's memory, in portions of the kernel.
+    """Copy or add data to a layout's memory, in portions of the kernel; elements between
+    columns stay.
 
     Args:
         data: (nz, ny, nx), in any order of its axes.
