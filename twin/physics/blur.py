@@ -34,9 +34,9 @@ FOLDS = 20
 
 
 def kernel(sigma_px: float) -> Float32Array:
-    """Compute the weights of a Gaussian blur by `sigma_px`, (2 r + 1,), adding up to 1;
-    of narrow ones the discrete Gaussian (Bessel functions).
-    """
+    """Compute the weights of a Gaussian blur by `sigma_px` > 0, float32 (2 r + 1,),
+    adding up to 1: samples of the Gaussian, below `MIN_SAMPLED_SIGMA_PX` the discrete
+    Gaussian (Bessel functions). r is 4 sigma + 1, rounded up."""
     from scipy.special import ive
 
     t = sigma_px * sigma_px
@@ -52,7 +52,8 @@ def kernel(sigma_px: float) -> Float32Array:
 @lru_cache(maxsize=16)
 def noise_kernel(sigma_px: float) -> Float32Array:
     """Compute the weights (2 r + 1,) that shape white noise as light does that spreads
-    with `sigma_px` before pixels collect it; see `noise_spectrum`."""
+    with `sigma_px` before pixels collect it; see `noise_spectrum`. r is 4 sigma + 3,
+    rounded up; the last 16 are kept."""
     reach = int(np.ceil(4.0 * sigma_px + 3.0))
     frequency = np.fft.fftfreq(max(FREQUENCIES, 4 * reach)).astype(np.float64)
     modulation = np.sqrt(noise_spectrum(frequency, sigma_px))
@@ -62,7 +63,8 @@ def noise_kernel(sigma_px: float) -> Float32Array:
 
 def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
     """Compute the noise power of a flat image by frequency [cycles a pixel], 1 at none:
-    light's and aperture's modulation squared, with all that is folded back."""
+    light's (a Gaussian of `sigma_px`) and aperture's modulation squared, with the `FOLDS`
+    next frequencies on either side folded back."""
     f = frequency[..., None] + np.arange(-FOLDS, FOLDS + 1)
     return np.asarray(
         (np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1)
@@ -79,11 +81,16 @@ def blurred(
     """Blur an image (rows, cols) along its rows and, by default alike, across them; edges
     continue as their last pixel.
 
+    Below `MIN_SIGMA_PX` both ways the image itself is returned.
+
     Args:
         image: float32 (rows, cols).
         sigma_px: standard deviation along the rows [pixels].
         across_px: across them [pixels]; None: the same.
-        weights: makes the kernel of a standard deviation.
+        weights: makes the kernel of a standard deviation; default: a Gaussian.
+
+    Returns:
+        float32 (rows, cols).
 
     Raises:
         LimitError: a blur wider than `MAX_SIGMA_PX`.
@@ -107,8 +114,11 @@ def blurred(
 
 
 def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> float:
-    """Compute the standard deviation of the focal spot's image at the rotation axis, or
-    `towards_mm` nearer to the source [pixels].
+    """Compute the standard deviation of the focal spot's image for a point at the
+    rotation axis, or `towards_mm` nearer to the source [pixels along u].
+
+    Not negative; points at the source or behind it count as at 1e-3 of the axis's
+    distance.
 
     Args:
         view: cone_vec row (12,) [mm].

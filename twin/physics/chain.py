@@ -51,9 +51,12 @@ class Chain:
 
 @lru_cache(maxsize=32)
 def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
-    """Compute the effective energies of the chain at a voltage [kV]; the last 32 are kept.
+    """Compute the effective energies of the chain at a voltage [kV]; the last 32 are
+    kept.
 
-    Weights are electrons and their variance per cm2 of pixel and mAs at 1 m.
+    Weights are electrons and their variance per cm2 of pixel and mAs at 1 m. With
+    `mono_keV` the weights are those of the full spectrum, and all attenuation is that of
+    this one energy.
     """
     signal, noise = weights_of(chain, kV)
     beam = effective_beam(signal, noise, chain.substances, chain.thickest_mm)
@@ -64,10 +67,12 @@ def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
 
 
 def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
-    """Compute the contribution of each energy to an open pixel's electrons and their variance.
+    """Compute the contribution of each energy to an open pixel's electrons and their
+    variance.
 
     The variance is that of a compound Poisson process: photons are counted, each gives a
-    spread amount of charge.
+    spread amount of charge. With `mono_keV` all photons have this energy, as many as give
+    the full spectrum's signal.
 
     Args:
         chain: tube and panel.
@@ -97,7 +102,8 @@ def expected_signal(
     view: npt.ArrayLike,
     exposure: ExposureSettings,
 ) -> Expected:
-    """Compute the noise-free charge of one image.
+    """Compute the noise-free charge of one image: attenuation averaged over the moments,
+    focal-spot blur of the rotation axis, then flux.
 
     Args:
         chain: tube, materials, panel.
@@ -105,10 +111,10 @@ def expected_signal(
             the exposure; one channel a substance [mm].
         view: the cone_vec row (12,) of the image [mm]; distances give flux and focal-spot
             blur.
-        exposure: tube and time.
+        exposure: tube and time; with X-rays off all is 0.
 
     Returns:
-        Electrons of one read-out.
+        Electrons of one read-out and their variance, float32 (rows, cols) each.
     """
     shape = (int(paths_mm.shape[-2]), int(paths_mm.shape[-1]))
     if not exposure.xrays_on:
@@ -142,7 +148,7 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     """Compute the open pixels' share of the charge at 1 m, per cm2; see `flux_map`, which
     caches it.
 
-    The view is rounded, so that nearly equal ones share a cached map.
+    Distances are rounded to 1e-6 mm, so that nearly equal views share a cached map.
 
     Args:
         view: cone_vec row (12,) [mm].
@@ -216,7 +222,8 @@ class Scattered:
         view: FloatArray,
         exposure: ExposureSettings,
     ) -> Expected:
-        """Add the scatter to the expected electrons of primary radiation.
+        """Add the scatter to the expected electrons of primary radiation; `expected` is
+        not changed.
 
         Args:
             expected: electrons without scatter.
@@ -259,7 +266,8 @@ def radiographs(
     moments: int = 1,
     scatter: Sequence[Scattered] = (),
 ) -> list[Radiograph]:
-    """Compute the images of several exposures, as if X-rays were on.
+    """Compute the images of several exposures, as if X-rays were on. Distances, flux and
+    blur of an exposure are those of its middle view.
 
     Args:
         chain: tube, materials, panel.
@@ -268,6 +276,9 @@ def radiographs(
         exposures: tube and time of each of the n images.
         moments: views spread over each exposure.
         scatter: of each image; none if left out.
+
+    Returns:
+        Line integrals and expected electrons of each image, in order.
     """
     images = []
     for i, given in enumerate(exposures):
@@ -286,7 +297,8 @@ def radiographs(
 def _as_line_integrals(
     chain: Chain, expected: Expected, view: FloatArray, exposure: ExposureSettings
 ) -> Float32Array:
-    """Compute -log of the expected signal over the open beam's.
+    """Compute -log of the expected signal over the open beam's, both taken as at least
+    1e-6 electrons.
 
     Args:
         chain: tube and detector.

@@ -165,8 +165,11 @@ class Detector:
     """Assumed: computed for the scintillator."""
 
     def __post_init__(self) -> None:
-        """Check the figures' ranges, and convert the response to pairs of floats and counts to
+        """Check the figures' ranges (`_BOUNDS`), and convert a mapping of pixels to
+        `PixelGrid`, the response to pairs of floats, and bits, averages and serial to
         whole numbers.
+
+        Figures of `_OPTIONAL_FIGURES` may be None.
 
         Raises:
             LimitError: a figure out of its range, or an unknown scintillator.
@@ -209,13 +212,17 @@ class Detector:
         return cls(**{"swank": 1.0, "response": all_of_it, **nothing, **figures})
 
     def of_pixels(self, pixels: PixelGrid) -> Detector:
-        """Give this detector the pixels of a geometry, each with the charge that its area has.
+        """Return this detector with the pixels of a geometry.
+
+        Where it states none, electrons per count and dark charge become those of the
+        pixel's area.
 
         Args:
             pixels: number of columns and rows, and pitch [mm].
 
         Raises:
-            LimitError: the detector states another pitch.
+            LimitError: the detector's `pixel_mm` differs from the pitch by more than 1e-6
+                of it.
 
         Example:
             >>> Detector(electrons_per_count=20).of_pixels(PixelGrid(200, 100, 0.1)).pixels.size_mm
@@ -240,7 +247,8 @@ class Detector:
         return replace(self, pixels=pixels, electrons_per_count=gain, dark_e_per_s=dark)
 
     def camera(self, shape: tuple[int, int]) -> CameraSettings:
-        """Make camera settings that read out all of (rows, cols) pixels.
+        """Make camera settings that read out all of (rows, cols) pixels, unbinned; the
+        exposure is the detector's, or `USUAL_MS` where it states none.
 
         Example:
             >>> Detector(exposure_ms=50).camera((100, 200)).roi
@@ -274,8 +282,9 @@ class Detector:
     def gain(self, camera: CameraSettings) -> float:
         """Compute the electrons in each count.
 
-        By default the unbinned pixel's full well fills the converter's depth, and a full
-        well is in proportion to the pixel's area: larger pixels hold more charge.
+        That of the detector where it states one. Else the unbinned pixel's full well of
+        the camera's mode (high or low) fills the converter's depth, and is in proportion
+        to the pixel's area.
 
         Example:
             >>> panel = Detector(electrons_per_count=20)
@@ -317,7 +326,9 @@ class Detector:
     def figures(self) -> dict[str, float]:
         """List its figures by name, for data sets; without the camera's settings.
 
-        Lag is left out if it is zero. The scintillator is named by a figure of 1.
+        Full well, read noise and dark charge are those in force. Long lag is left out if
+        it is zero; text and None are left out. The scintillator is named by a figure of
+        1.
 
         Example:
             >>> Detector(bits=12).figures()["bits"]
@@ -354,7 +365,8 @@ class Detector:
         contribution to the variance of a signal of many [electrons^2], (e,) both.
 
         The number of photons is Poisson's, each leaves a spread energy and that a spread
-        charge.
+        charge. The mean energy is the stated response, interpolated from (0, 0) on, or
+        else the scintillator's computed one.
 
         Example:
             >>> charge, variance = Detector().charge_of_photons()
@@ -415,6 +427,10 @@ def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pa
         panel: the detector.
         binning: unbinned pixels per image pixel along each side.
         roi: left, top, right, bottom, inclusive, unbinned.
+
+    Returns:
+        Gain, offset [counts] and dead pixels, (rows, cols) each, read-only; the last 8
+        are kept. The seed is the panel's serial number.
     """
     rng = np.random.default_rng([panel.serial])
     shape = (panel.pixels.rows, panel.pixels.columns)

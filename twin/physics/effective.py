@@ -65,7 +65,7 @@ class EffectiveBeam:
     def transmit(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Compute the signal and its variance behind path lengths.
 
-        Exponentials are summed over the effective energies.
+        Exponentials are summed over the effective energies, in single precision.
 
         Args:
             paths_mm: float32 (m, ...) [mm].
@@ -92,9 +92,10 @@ def effective_beam(
     thickest_mm: Sequence[float],
     tolerance: float = SIGNAL_TOLERANCE,
 ) -> EffectiveBeam:
-    """Choose effective energies.
+    """Choose effective energies, and fit their weights to signal and variance behind
+    sampled paths.
 
-    The variance has the same energies, less exactly.
+    The variance has the same energies, less exactly: its error is not checked.
 
     Args:
         signal: (e,) contribution of each bin to the open beam's signal.
@@ -105,10 +106,12 @@ def effective_beam(
 
     Raises:
         LimitError: no energy has a signal.
-        TwinError: not reached with `MAX_ENERGIES` energies.
+        TwinError: the tolerance is not reached within `MAX_ROUNDS` rounds of at most
+            `MAX_ENERGIES` energies.
 
     Returns:
-        Energies whose signal is within the tolerance on thicknesses that were not fitted.
+        The beam: at most `MAX_ENERGIES` energies whose signal is within the tolerance on
+        thicknesses that were not fitted, with the largest error there.
     """
     if not signal.max() > 0.0:
         message = "no photon leaves anything in the detector"
@@ -159,8 +162,8 @@ def sample_paths(
     more: int = 1,
     seed: int = 0,
 ) -> FloatArray:
-    """Draw path lengths (j, m) [mm] that represent all that occur: alone, together,
-    thin and thick.
+    """Draw path lengths (j, m) [mm] that represent all that occur: alone, together, thin
+    and thick; the first row is the open beam.
 
     They end at the thickness at which a material alone lets nearly nothing through, and
     begin at `MIN_OPTICAL_DEPTH`, apart from the open beam.
@@ -202,7 +205,8 @@ def _relative(
     paths: FloatArray, mu: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Compute each energy's contribution behind `paths`, (j, e), and their sum, (j,),
-    over that sum."""
+    relative to that sum, so that the latter is 1; a sum below `MIN_TRANSMISSION` of the
+    open beam's counts as that."""
     columns = np.exp(-paths @ mu) * weights
     total = columns.sum(axis=1)
     scale = 1.0 / np.maximum(total, MIN_TRANSMISSION * weights.sum())
@@ -243,7 +247,8 @@ def _pursue(
 
 
 def _non_negative(columns: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Solve a least squares problem with weights that are not negative.
+    """Solve a least squares problem with weights that are not negative; by a slower
+    method (BVLS) where NNLS does not converge.
 
     Args:
         columns: (m, p) what each weight adds.

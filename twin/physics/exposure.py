@@ -74,8 +74,8 @@ class ExposureSettings:
 
 def ideal_response(machine: Machine) -> IdealResponse:
     """Make the ideal response of `machine`: at the machine's own voltage, power and
-    exposure an open beam fills 3/4 of the detector's depth of bits.
-    """
+    exposure an open beam fills 3/4 of the detector's depth of bits. Dark level and noise
+    are scaled to that depth."""
     model = IdealResponse()
     tube = machine.tube
     scale = 2.0 ** (machine.detector.bits - model.bits)
@@ -127,7 +127,8 @@ def expose(
     settings: ExposureSettings,
     rng: np.random.Generator | None = None,
 ) -> Counts:
-    """Compute the counts of one image.
+    """Compute the counts of one image: open beam times exp(-line integrals), dark level,
+    noise, clipped to 0 and full scale.
 
     Args:
         model: of tube and detector.
@@ -167,8 +168,8 @@ def _noisy(
 ) -> Float32Array:
     """Add the noise of a saved image to `signal` in place, and return it.
 
-    Photons are drawn from Poisson's distribution where they are few, else from a normal
-    one, together with the read noise.
+    Photons are drawn from Poisson's distribution where fewer than `MIN_GAUSSIAN_PHOTONS`
+    are expected, else from a normal one. Read noise is normal; averaging reduces both.
 
     Args:
         model: photons in a count, and read noise.

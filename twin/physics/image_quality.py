@@ -56,7 +56,8 @@ def pixel_reading(
     paths_mm: Sequence[float] = (),
     detail: tuple[Substance, float] | None = None,
 ) -> PixelValue:
-    """Forecast the count of a pixel behind materials, in surroundings that are like it.
+    """Forecast the count of a pixel behind materials, and its noise in a saved image, in
+    surroundings that are like it; without scatter and focal-spot blur.
 
     Args:
         chain: tube, materials, panel.
@@ -65,6 +66,12 @@ def pixel_reading(
         flux: the pixel's share of the charge at 1 m, see `chain.flux_map` [cm2].
         paths_mm: path through each of the chain's substances [mm]; nothing if left out.
         detail: one more substance and the path through it [mm].
+
+    Returns:
+        Counts above dark and their standard deviation.
+
+    Raises:
+        LimitError: the tables have no spectrum for the voltage.
 
     Example:
         >>> from flexdt.twin.machine.camera import Roi
@@ -131,7 +138,9 @@ def air_kerma_mGy(chain: Chain, exposure: ExposureSettings, distance_mm: float) 
 def mass_energy_transfer(substance: Substance) -> FloatArray:
     """Compute the mass energy-transfer coefficient at the tables' energies, (e,) [cm2/g].
 
-    Without fluorescence that escapes, so for light elements only.
+    Photoelectric absorption in full, and the electron's mean share of incoherent
+    scattering. Without fluorescence that escapes, so for light elements only. Kept for
+    each substance.
     """
     parts = cross_sections((substance,))
     scattered = parts.coherent[0] + parts.incoherent[0]
@@ -141,8 +150,8 @@ def mass_energy_transfer(substance: Substance) -> FloatArray:
 
 
 def compton_share(energy_keV: npt.ArrayLike) -> FloatArray:
-    """Compute the mean part of a photon's energy that a free electron takes in
-    Compton scattering, (e,)."""
+    """Compute the mean part of a photon's energy, 0 to 1, that a free electron takes in
+    Compton scattering (Klein and Nishina), (e,)."""
     cosine, weight = np.polynomial.legendre.leggauss(64)
     alpha = (
         np.atleast_1d(np.asarray(energy_keV, dtype=np.float64))[:, None] / ELECTRON_KEV

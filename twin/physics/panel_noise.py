@@ -69,7 +69,8 @@ class NoiseTerm:
 def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
     """Draw the deviation of the charge from its mean [electrons], of variance / averages.
 
-    Gaussian for many quanta; for few, whole quanta of the size that gives the variance.
+    Gaussian; below `MIN_GAUSSIAN_PHOTONS` quanta whole ones (Poisson), of the size that
+    gives the variance.
     """
     mean = exposed.mean_e
     variance = exposed.variance_e
@@ -86,7 +87,8 @@ def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
 
 
 def draw_electronics(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
-    """Draw the read noise of an exposed panel, less by averaging, (rows, cols) [electrons]."""
+    """Draw the read noise of an exposed panel, divided by the root of the averages,
+    (rows, cols) [electrons]."""
     sigma = exposed.panel.read_noise(exposed.camera)
     shape = exposed.mean_e.shape
     return np.float32(sigma / np.sqrt(exposed.averages)) * rng.standard_normal(
@@ -117,7 +119,13 @@ that spread first."""
 def drawn(
     exposed: Exposed, rng: np.random.Generator, *, spreads: bool
 ) -> Iterator[Float32Array]:
-    """Draw the noise of each term that spreads, spread as it is, or of each that does not.
+    """Draw the noise of each term of `NOISE` that spreads with light, blurred by the
+    panel, or of each that does not.
+
+    Args:
+        exposed: electrons, panel and camera.
+        rng: source of random numbers.
+        spreads: True: the terms that spread; False: the others.
 
     Yields:
         Electrons of a saved image, float32 (rows, cols), one array a term.
@@ -135,8 +143,8 @@ def drawn(
 def pixel_variance(
     panel: Detector, camera: CameraSettings, averages: int, xrays_e2: float
 ) -> float:
-    """Add up the variance of a pixel of a saved image in surroundings that are
-    like it [counts^2].
+    """Add up the variance of a pixel of a saved image in surroundings that are like it
+    [counts^2], the rounding to whole counts included.
 
     Args:
         panel: the detector.
@@ -145,11 +153,11 @@ def pixel_variance(
         xrays_e2: variance that X-rays have in one read-out before light spreads
             [electrons^2].
     """
-    kept = _kept_by_blur(panel.blur_px(camera))
+    kept_share = _kept_by_blur(panel.blur_px(camera))
     electrons = 0.0
     for term in NOISE:
         term_e2 = term.variance_e2(panel, camera, xrays_e2)
-        electrons += term_e2 * kept if term.spreads else term_e2
+        electrons += term_e2 * kept_share if term.spreads else term_e2
     return electrons / averages / panel.gain(camera) ** 2 + ROUNDING_COUNTS2
 
 

@@ -135,7 +135,8 @@ def open_beam_of(
     view: npt.ArrayLike,
     physics: Physics = "poly",
 ) -> OpenBeam | None:
-    """Predict the open beam of one image.
+    """Predict the open beam of one image: the counts of its brightest pixel above dark,
+    and those at which it saturates.
 
     Args:
         machine: its tube and detector.
@@ -145,7 +146,7 @@ def open_beam_of(
         physics: how the counts are made; mono has the counts of poly.
 
     Returns:
-        None where `physics` has no spectrum for the voltage.
+        The open beam; None where mono or poly have no spectrum for the voltage.
     """
     if physics == "ideal":
         model = ideal.ideal_response(machine)
@@ -165,8 +166,8 @@ def open_beam_of(
 def open_beam_doubt(
     machine: Machine, exposure: ExposureSettings, beam: OpenBeam
 ) -> str | None:
-    """Describe an open beam that saturates or starves the panel, and a better exposure;
-    None if neither.
+    """Describe an open beam that saturates or starves the panel, and the exposure that
+    `proposed_setting` names; None if neither.
 
     Args:
         machine: whose limits hold for the proposal.
@@ -175,19 +176,21 @@ def open_beam_doubt(
     """
     if not (beam.saturated or beam.starved):
         return None
-    what = f"the open beam has {beam.counts:.3g} counts above dark"
+    doubt = f"the open beam has {beam.counts:.3g} counts above dark"
     if beam.saturated:
         fill = f"{beam.fill:.3g} times the largest count"
-        what = f"the open beam saturates the panel: {fill}"
+        doubt = f"the open beam saturates the panel: {fill}"
     proposal = proposed_setting(machine, exposure, beam)
-    return f"{what}; {proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"
+    return f"{doubt}; {proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"
 
 
 def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str:
-    """Name an exposure that fills the panel, or a power where no exposure does, or a voltage.
+    """Name the exposure, and the power if it changes, that fill `BRIGHTEST_FILL` of the
+    panel's range.
 
-    Power is raised before time; beyond the longest exposure the text begins with "not
-    even".
+    Power is raised before time, up to the tube's, and lowered only below the shortest
+    exposure. Beyond the longest exposure the text begins with "not even"; without any
+    counts it is "a higher voltage".
 
     Args:
         machine: whose limits hold.

@@ -56,7 +56,8 @@ def read_out(
     before: Sequence[tuple[Float32Array, float]] = (),
     trapped: Float32Array | None = None,
 ) -> Counts:
-    """Read an image out: add lag, noise, blur, fixed pattern, dark charge, and clip to counts.
+    """Read an image out: add lag, noise, blur, fixed pattern, dark charge, and clip to
+    counts from 0 to full scale; dead pixels are 0.
 
     Args:
         panel: the detector.
@@ -79,8 +80,8 @@ def read_out(
     """
     shape = (int(expected.mean_e.shape[0]), int(expected.mean_e.shape[1]))
     if shape != camera.shape:
-        what = "signal and camera of different panels or modes: pixels (rows, columns)"
-        raise LimitError.of_shape(what, shape, camera.shape)
+        message = "signal and camera of different panels or modes: pixels (rows, columns)"
+        raise LimitError.of_shape(message, shape, camera.shape)
     charge = expected.mean_e.copy()
     for earlier, gap_s in before:
         left = panel.lag_fraction * np.exp(-max(gap_s, 0.0) / panel.lag_s)
@@ -120,14 +121,15 @@ def trapped_after(
     exposure: ExposureSettings,
     gap_s: float,
 ) -> Float32Array:
-    """Compute the electrons in traps when the next frame starts, (rows, cols).
+    """Compute the electrons in traps when the next frame starts, (rows, cols): earlier
+    ones decay, and the frame adds the panel's long-lag part of its charge.
 
     Args:
         panel: the detector.
         trapped: at the frame's start, (rows, cols).
         expected: expected electrons of the frame; None in the dark.
         exposure: of the frame.
-        gap_s: from its end to the next frame's start.
+        gap_s: from its end to the next frame's start [s].
     """
     left = trapped * np.float32(np.exp(-(exposure.duration_s + gap_s) / panel.long_lag_s))
     if expected is not None:

@@ -13,13 +13,13 @@ MAX_RAYS = 16
 
 
 def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
-    """Sample a Gaussian focal spot: views (n, 12) become (n * points, 12), whose
-    mean has the spot's blur at every depth. A spiral, so that no two points are
-    behind one another.
+    """Sample a Gaussian focal spot: views (n, 12) become (n * points, 12), those of one
+    view in a row, whose mean has the spot's blur at every depth. Only the source is
+    moved, along u and v. A spiral, so that no two points are behind one another.
 
     Args:
         rows: cone_vec rows.
-        spot_mm: full width at half maximum.
+        spot_mm: full width at half maximum [mm].
         points: from each view, at least 3.
     """
     k = (np.arange(points) + points // 2) % points  # the innermost in the middle
@@ -48,8 +48,8 @@ def check_rays(rays: int) -> None:
 
 def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
     """Sample the pixels: views through a point in each of rays x rays parts of each
-    pixel, (n * rays^2, 12): no two in one row or column, so that edges along them come
-    out in rays^2 steps."""
+    pixel, (n * rays^2, 12), those of one view in a row: no two in one row or column, so
+    that edges along them come out in rays^2 steps."""
     j, i = np.divmod(np.arange(rays**2)[:, None], rays)
     across = (i + (j + 0.5) / rays) / rays - 0.5
     down = (j + (rays - i - 0.5) / rays) / rays - 0.5

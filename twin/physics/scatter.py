@@ -158,9 +158,9 @@ class ScatterImage:
 
 
 def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
-    """Interpolate values at nodes, (v, u), at every pixel: cubic splines (lower ones for
-    fewer than 4 nodes), float32 (rows, cols).
-    """
+    """Interpolate values at nodes, (v, u), at every pixel: cubic splines (of lower order
+    for fewer than 4 nodes), float32 (rows, cols). Nodes reach from the first to the last
+    pixel, evenly."""
     from scipy.interpolate import RectBivariateSpline
 
     rows, cols = shape
@@ -180,7 +180,9 @@ def scatter_image(
     settings: ScatterSettings | None = None,
     stream: int = 0,
 ) -> ScatterImage:
-    """Simulate the scatter image of one view.
+    """Simulate the scatter image of one view by Monte Carlo: histories are doubled until
+    the mean error of the nodes is `settings.error` of the mean scatter, or until
+    `MAX_HISTORIES` in each of `BATCHES` batches.
 
     Args:
         thing: the object's voxels, in the frame of `view`.
@@ -189,6 +191,10 @@ def scatter_image(
         beam: spectrum and panel.
         settings: of the simulation.
         stream: number of the view: others draw other photons.
+
+    Returns:
+        Values at the nodes, in units of the open beam's signal, with their error; zeros
+        for an empty object or one beside the panel.
 
     Raises:
         GeometryError: the source is beside or inside the object's box.
@@ -349,17 +355,17 @@ def _node_counts(shape: tuple[int, int], aspect: float, nodes: int) -> tuple[int
 def _lit(
     thing: Object, row: FloatArray, shape: tuple[int, int], collimated: bool
 ) -> tuple[float, float, float, float]:
-    """Project the object's box on the panel's plane: least column and row,
-    greatest, from its centre.
+    """Project the object's box on the panel's plane: least and greatest column and row,
+    from its centre.
 
     Args:
         thing: the object with its box [mm].
         row: cone_vec row (12,).
         shape: (rows, cols) of the panel.
-        collimated: the beam is limited to the panel.
+        collimated: the beam is limited to the panel, so that the rectangle is cut to it.
 
     Returns:
-        (left, top, right, bottom) [pixels].
+        (left, top, right, bottom) [pixels]; of no area where nothing is lit.
 
     Raises:
         GeometryError: the source is in the box or beside it.
@@ -458,10 +464,11 @@ class ScanScatter:
         return np.maximum(values, np.float32(0.0))
 
     def _at(self, index: int, values: FloatArray, power: int = 1) -> FloatArray:
-        """Interpolate values of the simulated views (k, ...) at view `index` of the scan.
+        """Interpolate values of the simulated views (k, ...) at view `index` of the scan,
+        linearly along the way; at the ends the nearest view's.
 
         Args:
-            index: of the view.
+            index: of the view; negative ones count from the end.
             values: of the simulated views.
             power: of the weights: 2 for variances.
 
@@ -520,7 +527,8 @@ def scan_scatter(
     beam: Beam,
     settings: ScatterSettings | None = None,
 ) -> ScanScatter:
-    """Simulate the scatter of a scan.
+    """Simulate the scatter of a scan, at views at most `step_deg` apart along its way;
+    others are interpolated.
 
     Args:
         thing: the object's voxels, in the frame of `views`.
@@ -554,7 +562,9 @@ def way_of(rows: FloatArray) -> FloatArray:
     """Compute the path length of source and panel up to each view, relative to their
     distances, (n,) [rad].
 
-    The largest of source's, panel's and pixel vectors' relative steps counts.
+    0 for the first. Of each step the largest of three counts: source's, over its least
+    distance from the axis; panel's, over its least distance from the source; and that of
+    u and v, over the least length of u.
 
     Args:
         rows: cone_vec of the views, (n, 12).
@@ -576,7 +586,8 @@ def way_of(rows: FloatArray) -> FloatArray:
 
 def _views_to_simulate(way: FloatArray, step: float) -> Sequence[int]:
     """Choose the views to simulate: first, last, and so many that no path between two is
-    longer than `step`, unless it is a single step from one view to the next."""
+    longer than `step`, unless it is a single step from one view to the next; their
+    indices, ascending."""
     chosen = [0]
     for i in range(1, len(way)):
         if i == len(way) - 1 or way[i + 1] - way[chosen[-1]] > step:

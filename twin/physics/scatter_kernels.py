@@ -77,7 +77,8 @@ def between(row: Any, at: Any) -> Any:
 
 @kernel
 def travel(amounts, lower, edge, p, d, mu, stop, paths):
-    """Walk from p along d through the grid (Amanatides and Woo, Eurographics 1987).
+    """Walk from p along d through the grid (Amanatides and Woo, Eurographics 1987), to an
+    optical depth or, with an infinite one, to the far side, adding up path lengths.
 
     Args:
         amounts: (nz, ny, nx, m) float32, parts of each material's own density.
@@ -85,10 +86,11 @@ def travel(amounts, lower, edge, p, d, mu, stop, paths):
         p, d: (3,) start, also outside the grid, and unit direction.
         mu: (m,) attenuation at one energy [1/mm]; used for `stop` alone.
         stop: optical depth at which to end; infinite: at the grid's far side.
-        paths: (m,) replaced by amount times length of each material [mm].
+        paths: (m,) replaced by amount times length of each material [mm]; zeros with a
+            finite `stop`.
 
     Returns:
-        Distance from p at which `stop` was reached; -1 if it was not.
+        Distance from p at which `stop` was reached [mm]; -1 if it was not.
     """
     materials = amounts.shape[3]
     for m in range(materials):
@@ -180,6 +182,13 @@ def depth_drawn(number, depth):
     """Draw the optical depth of a forced interaction on a path of optical depth `depth`,
     and its weight.
 
+    Args:
+        number: random, in [0, 1).
+        depth: above 0.
+
+    Returns:
+        The depth, 0 to `depth`, and the weight.
+
     Half of the chance is the exponential's, cut off at the far side; half is even, since
     a photon that goes on to the panel is weakened as much wherever on the way it
     interacts. Without it thick objects would be sampled at their entrance alone. Newton's
@@ -199,7 +208,8 @@ def depth_drawn(number, depth):
 
 @kernel
 def chosen_material(amounts, lower, edge, p, mu, number):
-    """Choose the material that a photon meets at p, by a number in [0, 1).
+    """Choose the material that a photon interacts with at p, in proportion to
+    attenuation, by a number in [0, 1); returns its index.
 
     Args:
         amounts: density of each material relative to its own, (z, y, x, m).
@@ -226,14 +236,15 @@ def chosen_material(amounts, lower, edge, p, mu, number):
 
 @kernel
 def coherent_cosine(state, energy, cumulated, root_step):
-    """Draw the angle of a coherent interaction: x^2 from the running integral of
-    F^2, then Thomson's (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs
-    Biomed. 17 (1983) 115).
+    """Draw the angle of a coherent interaction: x^2 from the running integral of F^2,
+    then Thomson's (1 + cos^2) / 2 by rejection (Persliden, Comput. Programs Biomed. 17
+    (1983) 115).
 
     Args:
         state: of the random numbers.
         energy: of the photon [keV].
-        cumulated: running integral of F^2.
+        cumulated: running integral of F^2 over x^2, at points evenly spaced in the root
+            of x.
         root_step: spacing of its table.
 
     Returns:
@@ -351,9 +362,11 @@ def detect(
     image,
     channel,
 ):
-    """Send the expected signal of an interaction at p to `fan` of the nodes.
+    """Send the expected signal of an interaction at p to `fan` of the nodes, coherent and
+    incoherent; nodes that see p from behind the panel get nothing.
 
-    Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any other.
+    Every len(nodes) / fan-th node is taken from `start` on, so each is as likely as any
+    other.
 
     Args:
         amounts, lower, edge: as for `travel`.
@@ -458,6 +471,10 @@ def histories(
     tallies,
 ):
     """Follow histories in each batch and add their signals to the images.
+
+    The first interaction is forced, as is each later one; absorption lowers the weight,
+    and below `ROULETTE` histories are ended by chance. A ray that misses the object
+    counts nothing.
 
     Args:
         points: (b, n, DIMENSIONS) numbers of the first interactions of each batch's n

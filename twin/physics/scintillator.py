@@ -51,14 +51,15 @@ class Deposited(NamedTuple):
 def deposited(screen: Filter) -> Deposited:
     """Compute the part of a photon's energy that a layer keeps.
 
-    Fluorescence and scattered photons that leave the layer take their energy along. Zero
-    for no thickness.
+    K fluorescence and Compton-scattered photons that leave the layer take their energy
+    along. Zero for no thickness. The last 64 are kept, read-only.
 
     Args:
         screen: the layer.
 
     Returns:
-        Mean and mean square of the kept part, (e,) each, for the energies of the tables.
+        Mean and mean square of the kept part of the energy, (e,) each, 0 to 1, for the
+        energies of the tables.
 
     Example:
         >>> csi = Filter(Substance.of("CsI", "CsI", 4.51), 0.2)
@@ -94,8 +95,8 @@ def deposited(screen: Filter) -> Deposited:
             / 2.0
         )
 
-    kept = photo * energy * here.sum(axis=1)
-    square = kept * energy
+    mean = photo * energy * here.sum(axis=1)
+    square = mean * energy
     for symbol, part in substance.fractions:
         edge, jump, fluorescence, lines = K_SHELL.get(
             symbol, (np.inf, 0.0, 0.0, (0.0, 0.0))
@@ -107,7 +108,7 @@ def deposited(screen: Filter) -> Deposited:
         for line, often in zip(lines, (K_ALPHA_SHARE, 1.0 - K_ALPHA_SHARE), strict=True):
             lost = escaping(np.interp([line], energy, stopping))
             escapes = amount * often * (here * lost).sum(axis=1)
-            kept -= escapes * line
+            mean -= escapes * line
             square -= escapes * line * (2.0 * energy - line)
     cosine, weight = np.polynomial.legendre.leggauss(12)
     k = 1.0 / (1.0 + energy[:, None] / ELECTRON_KEV * (1.0 - cosine))
@@ -116,9 +117,9 @@ def deposited(screen: Filter) -> Deposited:
     for j in range(len(cosine)):
         lost = (here * escaping(np.interp(energy * k[:, j], energy, photo))).sum(axis=1)
         met = compton * energy * ring[:, j]
-        kept += met * (here.sum(axis=1) - k[:, j] * lost)
+        mean += met * (here.sum(axis=1) - k[:, j] * lost)
         square += met * energy * (here.sum(axis=1) - k[:, j] * (2.0 - k[:, j]) * lost)
-    result = Deposited(kept / energy, square / energy**2)
+    result = Deposited(mean / energy, square / energy**2)
     for array in result:
         array.flags.writeable = False
     return result

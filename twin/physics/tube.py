@@ -61,9 +61,8 @@ class TubeModel:
 
     def figures(self) -> dict[str, float]:
         """List spot size [mm, mm/W], the number of spot points if above 1, and each
-        filter's thickness [mm], by name, for data sets; layers of one substance are
-        added up.
-        """
+        filter's thickness [mm], by name, for data sets; layers of one substance are added
+        up, and their order is lost."""
         layers: dict[str, float] = {}
         for one in self.filters:
             name = f"{_FILTER}{one.substance.name}_mm"
@@ -78,12 +77,17 @@ class TubeModel:
 
     @classmethod
     def of_figures(cls, figures: Mapping[str, float]) -> TubeModel:
-        """Make the tube that `figures` describe; the default tube if they do not.
+        """Make the tube that `figures` describe; the default tube if they lack the
+        smallest spot.
 
-        "Do not": they lack the smallest spot. Without a number of spot points it is 1.
+        Without a number of spot points it is 1.
 
         Args:
-            figures: name -> number, as `figures` of a data set has them.
+            figures: name -> number, as `figures` of a data set has them; others are
+                ignored.
+
+        Raises:
+            UnknownNameError: a filter of an unknown substance.
         """
         if "tube_smallest_spot_mm" not in figures:
             return cls()
@@ -156,14 +160,16 @@ def voltages() -> tuple[float, float]:
 def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     """Compute the spectrum that leaves the tube at `kV`, behind its filters.
 
-    Interpolated linearly between the tables' voltages.
+    Photons a bin, per mAs and cm2 at 1 m, interpolated linearly between the tables'
+    voltages.
 
     Args:
         kV: voltage.
         tube: with its filters; None: the default one.
 
     Raises:
-        LimitError: the tables do not reach, or nothing comes through the filters.
+        LimitError: a voltage outside the tables, or fewer than `MIN_PHOTONS` photons come
+            through the filters.
     """
     stored = tables()
     low, high = voltages()
@@ -233,7 +239,8 @@ class Tube:
     mono_keV: float | None = None
 
     def __post_init__(self) -> None:
-        """Check voltage, power, spot and energy, and convert the filters' names to `Filter`s.
+        """Check voltage (the tables'), power (up to 1e6 W), spot (0 to 10 mm) and energy,
+        and convert the filters' names to `Filter`s.
 
         Raises:
             LimitError: a value out of its range, or an unknown filter.
@@ -249,7 +256,8 @@ class Tube:
             object.__setattr__(self, "filters", tuple(map(_filter, self.filters)))
 
     def model(self, design: TubeModel | None = None) -> TubeModel:
-        """Return filters and focal spot; those of `design` where this tube states none.
+        """Return filters and focal spot; those of `design`, or of the default tube, where
+        this tube states none. A stated spot has this size at all powers.
 
         Example:
             >>> Tube(filters=(), spot_mm=0.02).model().smallest_spot_mm
