@@ -28,7 +28,8 @@ BAND = 16
 
 @kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
-    """Cut the pieces [t0, t1] of the rays to a run of columns down to a slab, in place.
+    """Cut the pieces [t0, t1] of the rays to a run of columns down to a slab, in place;
+    t1 < t0 where nothing is left. A ray along the slab keeps all or loses all.
 
     Args:
         t0: (k,) beginnings, in lengths of the rays.
@@ -56,8 +57,10 @@ def cut_by_slab(t0, t1, at, low, high, rate, step, first):
 
 @kernel
 def cut_by_quadric(t0, t1, q, d, e, first):
-    """Cut the pieces [t0, t1] of the rays to a run of columns down to |q + t (d + column * e)|
-    <= 1, in place.
+    """Cut the pieces [t0, t1] of the rays to a run of columns down to |q + t (d + column
+    * e)| <= 1, in place; t1 <= t0 where nothing is left.
+
+    A ray along a cylinder's axis keeps all inside it and loses all outside.
 
     Args:
         t0: (k,) beginnings, in lengths of the rays.
@@ -96,7 +99,7 @@ def cut_by_quadric(t0, t1, q, d, e, first):
 
 @kernel
 def add_chords(row, t0, t1, weight, d, e, first):
-    """Add weight * chord length to a row of pixels.
+    """Add weight * chord length [mm] to a row of pixels.
 
     Args:
         row: (k,) changed in place.
@@ -127,8 +130,11 @@ def mapped(m, p, out):
 def project_convex(
     quadric, slabs, slab_range, shadow, rays, weight, channel, out, first_job, last_job
 ):
-    """Fill `out` with weighted chord lengths of convex solids, job by job: BAND rows of a view
-    each.
+    """Fill `out` with weighted chord lengths of convex solids, job by job: BAND rows of a
+    view each.
+
+    The rows of these jobs are set to zero in every channel first. Chords end at the
+    source and at the pixel.
 
     Args:
         quadric: (k, 13) whether a solid is curved, its matrix and centre.
@@ -218,7 +224,9 @@ def edge_form(p, i, j, g, form):
 
 @kernel
 def draw_row(line, forms, flips, plane, r, c0, c1):
-    """Add the signed distances of one triangle to a row of pixels, in lengths of their rays.
+    """Add the signed distances of one triangle to a row of pixels, in lengths of their
+    rays: + where the ray leaves the solid, - where it enters; distances are cut to 0
+    (source) and 1 (pixel).
 
     Args:
         line: (cols,) sums of the row, changed in place.
@@ -254,6 +262,9 @@ def draw_row(line, forms, flips, plane, r, c0, c1):
 @kernel
 def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plane):
     """Draw one triangle onto rows row0 to row1 - 1: add its signed distances to `sums`.
+
+    Nothing for a triangle behind the source or beside the rows; of one that reaches
+    behind the source every pixel is tried.
 
     Args:
         sums: (row1 - row0, cols) changed in place.
@@ -340,9 +351,8 @@ def locate(vertices, g, inverse, p, pixels):
 
 @maker
 def make_band(vertices, cols):
-    """Create a worker's arrays, not initialised: sums, vertices (twice), edge forms,
-    flips, plane.
-    """
+    """Create a worker's arrays, not initialised: sums (MESH_BAND, cols), positions and
+    pixels of the vertices (k, 3) each, edge forms (3, 3), flips (3,), plane (4,)."""
     return (
         np.empty((MESH_BAND, cols)),
         np.empty((vertices, 3)),

@@ -56,10 +56,8 @@ binding.add_symbol(ALONE, ctypes.addressof(kernel_threads.ALONE))
 
 
 def _choose(module: ir.Module) -> None:
-    """Change a module so that its parallel loops call the threading layer only where `ALONE` is
-    0; otherwise they run in the calling thread.
-
-    The module is changed in place.
+    """Change a module in place so that its parallel loops call the threading layer only
+    where the global `ALONE` is 0; otherwise they run in the calling thread.
 
     A module without parallel loops stays as it is.
     """
@@ -128,8 +126,10 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 @contextmanager
 def _linking(codegen: Any) -> Iterator[None]:
-    """Link all libraries made within the context to one another, except existing ones,
-    under numba's compiler lock; nothing within another such context.
+    """Link all libraries made within the context to one another; within another such
+    context this one changes nothing.
+
+    A global of an environment that exists already is not set again.
     """
     if "_library_class" in vars(codegen):
         yield
@@ -158,9 +158,8 @@ class _EntryPoint(_Linked):
 
     def _compile_core(self) -> Any:
         """Compile the function into a cacheable library of its own, with a progress line;
-        returns its compiled result. The first time in this process a warning logs that
-        it takes long.
-        """
+        returns its compiled result. Before the first one of this process a warning is
+        logged that it takes long."""
         name = self.state.func_id.func_name
         if not _EntryPoint.silent:
             LOG.warning(SLOW, name)
@@ -185,6 +184,8 @@ ENTRY_POINT = {"cache": True, "nogil": True, "pipeline_class": _EntryPoint}
 def _entry_point(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function that Python calls, and keep its code on disk; without a function
     returns the decorator with these options.
+
+    The options are `ENTRY_POINT`'s, replaced by those given.
     """
     if function is None:
         return partial(_entry_point, **options)
@@ -262,9 +263,8 @@ def fetch_next(typingctx: Any, counter: Any) -> Any:
 
 @intrinsic
 def count_one(typingctx: Any, counters: Any, index: Any) -> Any:
-    """Add one to counters[index], an int64, atomically, after all earlier writes of this
-    thread.
-    """
+    """Compile to: add one to counters[index], an int64, atomically, after all earlier
+    writes of this thread."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         address = _address(context, builder, signature.args[0], *args)
@@ -302,9 +302,8 @@ LOOKS = 2000
 
 @kernel
 def wait_until(counters, index, count):
-    """Return when counters[index] has reached count, asleep if that takes long: on a busy
-    machine the thread that is waited for may need this thread's core.
-    """
+    """Wait until counters[index] has reached count; after `LOOKS` looks the thread sleeps
+    between them, as the thread that is waited for may need its core."""
     looks = 0
     while _look(counters, index) < count:
         looks += 1

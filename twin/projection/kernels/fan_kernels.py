@@ -32,7 +32,7 @@ from flexdt.twin.projection.kernels.fan_rays_kernels import (
     collect,
     columns_of,
     describe,
-    make_found,
+    make_collected,
     make_rays,
     make_work,
     oriented,
@@ -47,34 +47,41 @@ SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
 
 
 @inline
-def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
-    """Sum the integrals of a fan of collected rays into the job's buffer; transposed, add the
-    buffer's values to the voxels.
+def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
+    """Sum the integrals of a fan of collected rays into the job's buffer; transposed, add
+    the buffer's values to the voxels.
+
+    A fan that cannot be walked together is walked ray by ray; rays that miss the box
+    change nothing.
 
     Args:
         box: voxels; transposed, changed in place.
         g: (12,) source, first pixel minus source, u, v [voxels].
         grid: the box as seen along the fan, from `oriented`.
-        found: n collected rays.
+        collected: n collected rays.
         rays: room for them, sorted.
         work: room for the walk.
         n: number of rays.
         buffer: values of the job's pixels; changed in place unless transposed.
         transposed: see above.
     """
-    fan = describe(grid, found, n)
+    fan = describe(grid, collected, n)
     if not fan.together:
         # Source or pixels inside the box, or rays along a voxel plane: each ray on its own.
         for q in range(n):
             # As integers: single rays come with such, and one form of `walk_ray` serves both.
-            at, r, c = found.slot[q], np.int64(found.row[q]), np.int64(found.column[q])
+            at, r, c = (
+                collected.slot[q],
+                np.int64(collected.row[q]),
+                np.int64(collected.column[q]),
+            )
             if not transposed:
                 buffer[at] = walk_ray(box, g, r, c, ZERO, False)
             elif buffer[at] != ZERO:
                 walk_ray(box, g, r, c, buffer[at], True)
         return
     # By slope, rays that cross a plane one after the other lie side by side in memory.
-    count = sort_by_slope(grid, fan, found, rays, work.bins, n)
+    count = sort_by_slope(grid, fan, collected, rays, work.bins, n)
     if count == 0 or fan.j1 <= fan.j0:
         return
     start(grid, fan, rays, work, count)
@@ -115,9 +122,8 @@ def put(image, buffer, starts, ends, width, top, bottom):
 
 @kernel
 def take(image, buffer, starts, ends, width, top, bottom):
-    """Apply the transpose of `put`, with its arguments: copy the image's pixels into the
-    buffer.
-    """
+    """Copy the job's columns of an image, rows top to bottom - 1, into its buffer;
+    arguments as those of `put`."""
     for r in range(top, bottom):
         row = image[r, starts[r] : ends[r]]
         at = (r - top) * width
@@ -136,14 +142,16 @@ def work_on(
     image,
     starts,
     ends,
-    found,
+    collected,
     rays,
     work,
     buffer,
     transposed,
 ):
-    """Do one job: fill the columns of an image between two lines; transposed, add them to the
-    voxels.
+    """Do one job: fill the columns of an image between two lines; transposed, add them to
+    the voxels.
+
+    Pixels beyond the shadow's rows get zero, or are not read.
 
     Args:
         box: voxels; transposed, changed in place.
@@ -155,7 +163,7 @@ def work_on(
         image: (rows, cols); changed in place unless transposed.
         starts: (rows,) room.
         ends: (rows,) room.
-        found: room for collected rays.
+        collected: room for collected rays.
         rays: room for sorted rays.
         work: room for the walk.
         buffer: room for the job's pixels.
@@ -173,9 +181,9 @@ def work_on(
             buffer[i] = ZERO
     for line in range(first, last):
         grid = oriented(box, g, lines, line, rows)
-        n = collect(found, grid, g, lines, line, starts, width, shadow)
+        n = collect(collected, grid, g, lines, line, starts, width, shadow)
         if n > 0:
-            carry_fan(box, g, grid, found, rays, work, n, buffer, transposed)
+            carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed)
     if not transposed:
         put(image, buffer, starts, ends, width, top, bottom)
 
@@ -205,7 +213,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         # Each worker keeps its memory and takes the next job when it is free: jobs differ in
         # cost.
         for _ in prange(workers):
-            found, rays = make_found(room), make_rays(room)
+            collected, rays = make_collected(room), make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
             starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
             buffer = np.empty(rows * widest, np.float32)
@@ -222,7 +230,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                     out[view],
                     starts,
                     ends,
-                    found,
+                    collected,
                     rays,
                     work,
                     buffer,
@@ -250,7 +258,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         counter = np.zeros(1, np.int64)
         done = np.zeros(len(turns), np.int64)
         for _ in prange(workers):
-            found, rays = make_found(room), make_rays(room)
+            collected, rays = make_collected(room), make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
             starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
             buffer = np.empty(rows * widest, np.float32)
@@ -295,7 +303,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         values[view],
                         starts,
                         ends,
-                        found,
+                        collected,
                         rays,
                         work,
                         buffer,
@@ -309,7 +317,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
 
 @parallel
 def open_rest(box, slices, marks):
-    """Set the voxel columns to zero to which nothing was added, and which hold anything.
+    """Set to zero the voxel columns that no ray has opened: they may hold old values.
 
     Args:
         box: voxels, changed in place.

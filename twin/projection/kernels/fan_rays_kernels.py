@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from flexdt.twin.projection.kernels.compiling import kernel, maker
-from flexdt.twin.projection.kernels.fan_types import Fan, Found, Grid, Rays, Work
+from flexdt.twin.projection.kernels.fan_types import Collected, Fan, Grid, Rays, Work
 from flexdt.twin.projection.kernels.fan_walk_kernels import BINS, NONE, ZERO
 
 SPREAD = 1e-7
@@ -26,8 +26,11 @@ bound."""
 
 @kernel
 def oriented(box, g, lines, line, rows):
-    """Compute the box as seen along the central ray of the fan between `line` and the next: a
-    `Grid`.
+    """Compute the box as seen along the central ray of the fan between `line` and the
+    next: a `Grid`.
+
+    Axis t is the one of x and y along which that ray goes faster (y if alike), l the
+    other; both are mirrored where the ray goes backwards.
 
     Args:
         box: voxels.
@@ -120,8 +123,8 @@ def columns_of(lines, first, last, cols, starts, ends):
         first: number of the first line.
         last: number of the last line.
         cols: of the image.
-        starts: (rows,) filled with the first column.
-        ends: (rows,) filled with the column after the last.
+        starts: (rows,) filled with the first column, 0 to cols.
+        ends: (rows,) filled with the column after the last, 0 to cols.
 
     Returns:
         The largest number of columns in a row, 1 at least.
@@ -137,14 +140,14 @@ def columns_of(lines, first, last, cols, starts, ends):
 
 
 @kernel
-def collect(found, grid, g, lines, line, starts, width, shadow):
+def collect(collected, grid, g, lines, line, starts, width, shadow):
     """Collect the pixels of a fan, with slope, rise and span of their rays; returns their
     number.
 
     Pixels that the box cannot reach are left out.
 
     Args:
-        found: filled.
+        collected: filled.
         grid: the box as seen along the fan.
         g: (12,) source, first pixel minus source, u, v [voxels].
         lines: (m, 2) column of each line in row 0, and its slope.
@@ -153,9 +156,9 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
         width: its columns.
         shadow: rows and columns that the box can reach, the first of them the buffer's first.
     """
-    row = found.row
-    column = found.column
-    slot = found.slot
+    row = collected.row
+    column = collected.column
+    slot = collected.slot
     low = lines[line]
     high = lines[line + 1]
     top = shadow[0]
@@ -193,9 +196,9 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
     z0 = g[5]
     zc = g[8]
     zr = g[11]
-    slope = found.slope
-    rise = found.rise
-    span = found.span
+    slope = collected.slope
+    rise = collected.rise
+    span = collected.span
     for q in range(n):
         r = row[q]
         c = column[q]
@@ -208,17 +211,17 @@ def collect(found, grid, g, lines, line, starts, width, shadow):
 
 
 @kernel
-def describe(grid, found, n):
+def describe(grid, collected, n):
     """Compute the `Fan` of n (at least one) collected rays: slope of its reference line,
     range of slopes and rises, slabs, whether it spreads, and whether its rays can be
     walked together.
 
-    They cannot with the source in the box, rays that end within it, nearly along an axis,
-    or drifting far apart.
+    They cannot with the source in the box, rays that end within it, spreading rays nearly
+    along an axis (`ON_AXIS`), or rays that drift more than `DRIFT` voxels off the line.
     """
-    slope = found.slope[:n]
-    rise = found.rise[:n]
-    span = found.span[:n]
+    slope = collected.slope[:n]
+    rise = collected.rise[:n]
+    span = collected.span[:n]
     m_low = slope[0]
     m_high = slope[0]
     rise_low = rise[0]
@@ -256,7 +259,7 @@ def describe(grid, found, n):
 
 
 @kernel
-def sort_by_slope(grid, fan, found, rays, bins, n):
+def sort_by_slope(grid, fan, collected, rays, bins, n):
     """Sort the rays that meet the box by slope (in bins) into `rays`, and fill `bins`; returns
     their number.
 
@@ -265,15 +268,15 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
     Args:
         grid: the box as seen along the fan.
         fan: of the rays.
-        found: n collected rays; their bins are filled in.
+        collected: n collected rays; their bins are filled in.
         rays: filled with slope, rise and slot in the new order.
         bins: (BINS + 1,) filled with the first place of each bin.
         n: number of collected rays.
     """
-    slope = found.slope
-    rise = found.rise
-    slot = found.slot
-    part = found.bin
+    slope = collected.slope
+    rise = collected.rise
+    slot = collected.slot
+    part = collected.bin
     reach0 = fan.begin - grid.st
     reach1 = fan.j1 - grid.st
     # A counting sort: count the rays of each bin, turn counts into first places, deal out.
@@ -314,7 +317,8 @@ def sort_by_slope(grid, fan, found, rays, bins, n):
 def start(grid, fan, rays, work, n):
     """Initialise n sorted rays for their walk, and list their first z crossings by slab.
 
-    Only crossings before the last slab are listed.
+    Crossings behind the last slab are not listed; nor do rays without a z crossing in the
+    box have one.
 
     Args:
         grid: the box as seen along the fan.
@@ -379,9 +383,9 @@ def start(grid, fan, rays, work, n):
 
 
 @maker
-def make_found(room):
+def make_collected(room):
     """Create arrays, not initialised, for fans of up to `room` pixels."""
-    return Found(
+    return Collected(
         row=np.empty(room),
         column=np.empty(room),
         slope=np.empty(room),

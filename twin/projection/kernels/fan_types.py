@@ -81,7 +81,7 @@ class Fan(NamedTuple):
     together: bool
 
 
-class Found(NamedTuple):
+class Collected(NamedTuple):
     """Rays as collected from the detector: row, column, slope dl / dt, rise dz / dt, t of the
     pixel from the source, place in the job's buffer, and bin of slope (-1: misses the box).
     """
@@ -98,11 +98,10 @@ class Found(NamedTuple):
 class Rays(NamedTuple):
     """Rays of a fan in order of slope.
 
-    slope; rise; slot as in Found; cross: t of the next z crossing; pace: t between them, signed
-    by direction; acc: integral so far (transposed: the value to spread); weight: 1 / slope;
-    tilt: slope - m0; ratio: m0 / slope - 1; level; following: next ray with a crossing in the
-        same slab;
-    length: mm a unit of t; picked: spare.
+    slope; rise; slot as in Collected; cross: t of the next z crossing; pace: t between
+    them, signed by direction; acc: integral so far (transposed: the value to spread);
+    weight: 1 / slope; tilt: slope - m0; ratio: m0 / slope - 1; level; following: next ray
+    with a crossing in the same slab; length: mm a unit of t; picked: spare.
     """
 
     slope: Any

@@ -352,7 +352,7 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
 @inline
 def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
     """Correct the rays that pass a grid vertex of plane t = j on the other side than the
-    reference line.
+    reference line; only the two vertices next to the line are examined.
 
     Args:
         flat: voxels; transposed, changed in place.
@@ -503,10 +503,10 @@ def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
 
 @inline
 def prefetch_slab(flat, spans, grid, fan, j, transposed):
-    """Prefetch the voxel columns of slab j on the reference line and, transposed, those beside
-    it that are to be opened.
+    """Prefetch the voxel columns of slab j on the reference line and, transposed, those
+    beside it that are to be opened.
 
-    Columns (or parts of them) that hold nothing are left out.
+    Levels that the fan cannot touch, and forward those that hold nothing, are left out.
     """
     x = grid.sl + fan.m0 * (j - grid.st)
     w0, w1 = levels_between(grid, fan, j, j + 1)
@@ -530,9 +530,8 @@ def prefetch_slab(flat, spans, grid, fan, j, transposed):
 
 @inline
 def open_slab(flat, marks, grid, j, i0, i1):
-    """Open the voxel columns l = i0 to i1 of slab j, so that they may be added to; see
-    `siddon_kernels.open_column`.
-    """
+    """Open the voxel columns l = i0 to i1 (inclusive, those outside the grid left out) of
+    slab j, so that they may be added to; see `siddon_kernels.open_column`."""
     for i in range(max(i0, 0), min(i1, grid.nl - 1) + 1):
         mark = mark_of(grid, j, i)
         if marks[mark] == 0:
@@ -557,9 +556,8 @@ def settle(rays, work, n):
 
 @inline
 def share_out(rays, work, n):
-    """Sum the rays' values and their first moments in each level, in place in `work`, to
-    be added to the voxels of that level.
-    """
+    """Replace the sums in `work` by the rays' values and first moments, added up in each
+    level: these are what the voxels of that level receive."""
     acc, ratio, level = rays.acc, rays.ratio, rays.level
     total, moment = work.total, work.moment
     total[:] = ZERO
@@ -572,13 +570,15 @@ def share_out(rays, work, n):
 
 @kernel
 def walk(flat, spans, grid, fan, rays, work, n, transposed):
-    """Carry a sorted fan of n rays through its slabs: fill the rays' sums, or (transposed) add
-    them to the voxels.
+    """Carry a sorted fan of n rays through its slabs: fill the rays' sums, or
+    (transposed) add them to the voxels.
+
+    Every `SETTLED` slabs the sums of levels are settled and begin again.
 
     Args:
         flat: voxels; transposed, changed in place.
-        spans: occupied levels of each voxel column; transposed, marks of those that are open,
-            see `siddon_kernels.open_column`.
+        spans: occupied levels of each voxel column; transposed, marks of those that are
+            open, see `siddon_kernels.open_column`.
         grid: the box as seen along the fan.
         fan: of the rays.
         rays: sorted rays, initialised by `start`.

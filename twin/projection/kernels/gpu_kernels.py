@@ -175,11 +175,13 @@ def direction(views, view, r, c, axis):
 
 @cuda.jit(device=True, inline=True)
 def fixed_line(start, slope, n):
-    """Compute a line over the slabs in fixed point.
+    """Compute a line over the slabs, start + k slope, in fixed point of `BITS` bits;
+    start is cut to `REACH`.
 
     Returns:
         position and slope in fixed point, slope and its inverse in single precision, and
-        the slabs between which the line is within [0, n).
+        the places, in slabs, between which the line is within [0, n). A line without
+        slope is inside everywhere or from `STEEP` on, nowhere.
     """
     start = min(max(start, -REACH), REACH)
     position = np.int64(math.floor(start * FIXED))
@@ -395,8 +397,8 @@ def slab_kernel(transposed):
 
 
 def column_kernel(transposed):
-    """Compile the slab walk of views with detector columns parallel to z; forward or
-    transposed.
+    """Compile the slab walk of views with detector columns parallel to z; forward, or
+    transposed (adds to voxels).
 
     Rays of one column have their line in x and y in common, and a warp has rays of one
     column: each lane finds the crossing of one of the next 32 slabs with the planes of b,
@@ -612,8 +614,9 @@ def first_crossing(s, d, n, enter, unit):
         unit: factor on t.
 
     Returns:
-        voxel at entry, distance of the first crossing after it, distance between crossings, and
-        crossings until the box ends.
+        voxel at entry, distance of the first crossing after it, distance between
+        crossings, and crossings until the box ends. Along an axis that the ray does not
+        move on: infinity, 0 and 1.
     """
     at = plus(s, times(enter, d))
     # On the device, floor gives a float.
@@ -631,8 +634,8 @@ def first_crossing(s, d, n, enter, unit):
 
 
 def ray_kernel(transposed):
-    """Compile the walk of single rays from voxel to voxel; any geometry, forward or
-    transposed.
+    """Compile the walk of single rays from voxel to voxel; any geometry, forward, or
+    transposed (adds to voxels).
 
     Entry and exit are computed in double precision; the walk counts crossings from the
     entry in single precision (error below 1e-4 of a voxel, not growing with the distance
@@ -661,8 +664,8 @@ def ray_kernel(transposed):
         step_c,
         factor,
     ):
-        """Walk the ray to a thread's pixel voxel by voxel, in any direction; arguments as those
-        of `slab_kernel`'s walk.
+        """Walk the ray to a thread's pixel voxel by voxel, in any direction; arguments as
+        those of `slab_kernel`'s walk. A ray that misses the box gives 0 or adds nothing.
         """
         view = start + cuda.blockIdx.x % n
         r = cuda.blockIdx.y * BLOCK[0] + cuda.threadIdx.x
@@ -799,7 +802,8 @@ def combine(kind, a, b, number, alone, out):
 
 @cuda.jit
 def fold(kind, a, b, parts):
-    """Reduce every parts.size-th run of numbers into parts[i], one thread each.
+    """Reduce every parts.size-th run of `RUN` numbers into parts[i], one thread each:
+    single precision within a run, double over the runs.
 
     The bytes of the result are the same at every call. Kinds: DOT adds a b, SUM adds a,
     LARGEST takes the largest a.

@@ -16,15 +16,15 @@ BLOCK = 32
 
 @parallel
 def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
-    """Copy data to flat[y * stride_y + x * stride_x + z] for first_y <= y < last_y, in blocks
-    that fit the first cache.
+    """Copy data to flat[y * stride_y + x * stride_x + z] for first_y <= y < last_y, in
+    blocks that fit the first cache.
 
     Args:
         data: (nz, ny, nx) float32.
         flat: changed in place.
         stride_x: elements from x to x + 1.
         stride_y: elements from y to y + 1.
-        adding: data is added to what flat holds.
+        adding: data is added to the values in flat; otherwise it replaces them.
         first_y: first y.
         last_y: y after the last.
     """
@@ -98,8 +98,11 @@ def unfit_parts(bits):
 
 @parallel
 def touch(flat):
-    """Write a zero into every page of fresh zeros: threads get pages of their own at the same
-    time, instead of several of them the same page.
+    """Write a zero into every page of fresh zeros, so that each thread brings in pages of
+    its own.
+
+    Args:
+        flat: (k,) float32 zeros; every 1024th number is written.
     """
     chunk = 1 << 19
     for part in prange((flat.size + chunk - 1) // chunk):

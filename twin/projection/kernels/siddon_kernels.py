@@ -31,9 +31,9 @@ from flexdt.twin.projection.kernels.fan_types import Box
 
 @inline
 def clip(s, d, n, enter, leave):
-    """Cut [enter, leave] down to the t where s + t d is in [0, n]; (1, 0) if there are
-    none. With d 0, s = n lies outside.
-    """
+    """Cut [enter, leave] down to the t where s + t d is in [0, n], and return it; leave
+    <= enter where there are none. With d = 0 it is unchanged for s in [0, n), else (1,
+    0)."""
     if d != 0.0:
         a, b = -s / d, (n - s) / d
         return max(enter, min(a, b)), min(leave, max(a, b))
@@ -106,13 +106,13 @@ def ray_of(box, g, r, c):
 
 @inline
 def walk_ray(box, g, r, c, value, transposed):
-    """Compute the line integral of the ray to pixel (r, c), voxel by voxel.
-
-    0 for a ray that misses the box.
+    """Compute the line integral of the ray to pixel (r, c), voxel by voxel; transposed,
+    add the pixel's value to the voxels, which are opened first. A ray that misses the box
+    gives 0 and adds nothing.
 
     Args:
-        box: voxels; transposed, changed in place, and its spans are the marks of `open_column`,
-            two for each voxel column.
+        box: voxels; transposed, changed in place, and its spans are the marks of
+            `open_column`, two for each voxel column.
         g: (12,) source, first pixel minus source, u, v [voxels].
         r: row.
         c: column.
@@ -195,9 +195,11 @@ def project_rays(box, views, chosen, out, tile, first_job, last_job):
 
 @parallel
 def spread_rays(box, views, chosen, values, slices, marks, first_column, last_column):
-    """Apply the transpose of `project_rays` to columns of the chosen views: add to box.flat.
+    """Apply the transpose of `project_rays` to columns of the chosen views: add to
+    box.flat.
 
-    Each job owns a range of z and meets every ray, so that no two jobs write the same voxel.
+    Each job owns a range of z and walks every ray whose pixel is not 0, so that no two
+    jobs write the same voxel. Voxel columns are opened at the first addition.
 
     Args:
         box: voxels, changed in place.
@@ -265,8 +267,10 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
         dz: along z.
 
     Returns:
-        sum of values times ray parameter; then sum of J and sum of J t over the planes across
-        x, y and z.
+        sum of values times lengths in the ray parameter t; then the sums of J and of J t
+        over the planes across x, of those across y, and z. J is the value before a plane
+        minus that behind it; faces of the box count, with 0 outside. All 0 for a ray that
+        misses the box.
     """
     jx = jy = jz = mx = my = mz = total = 0.0
     enter, leave = clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz)
@@ -351,6 +355,9 @@ def ends(total, length, d, jumps, moments):
     total: sum of values times ray parameter, so that the integral is total * length; d:
     the ray's extent along this axis [mm]; jumps, moments: sums of J and of J t over its
     planes.
+
+    Returns:
+        The derivative by the source's coordinate, and by the pixel's [1/mm].
     """
     stretch = total * d / length  # the ray grows longer
     if d == 0.0:
@@ -396,13 +403,13 @@ def ray_derivatives(box, g, r, c):
 
 @parallel
 def gather(box, views, weights, tile, parts, first_job, last_job):
-    """Sum over the pixels of weight times derivative, with respect to the twelve numbers of a
-    view.
+    """Sum weight times derivative over the pixels of a view, with respect to its twelve
+    numbers; pixels of weight 0 are skipped.
 
-    A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what it
-    gets goes to D, u and v with these factors. Each job, `tile` columns of one view, adds into
-    a row of its own of parts (n * tiles, 12): no two write to the same place, and the sums do
-    not depend on the number of threads.
+    A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what
+    it gets goes to D, u and v with these factors. Each job, `tile` columns of one view,
+    adds into a row of its own of parts (n * tiles, 12): no two write to the same place,
+    and the sums do not depend on the number of threads.
 
     Args:
         box: the volume.

@@ -114,9 +114,9 @@ def _spreads_behind(row, frame, least_sine):
 
 @kernel
 def _steepest(rays, rows, cols):
-    """Compute a bound of the voxels that rays rise for each along the faster one of x and y, as
-    `gpu.rises`; rays as `prepare` makes them.
-    """
+    """Compute a bound of the voxels that rays rise for each along the faster one of x and
+    y, as `gpu.rises`; rays as `prepare` makes them; infinite where rays go along
+    different ways."""
     mx = 2.0 * rays[3] + (cols - 1) * rays[6] + (rows - 1) * rays[9]
     my = 2.0 * rays[4] + (cols - 1) * rays[7] + (rows - 1) * rays[10]
     diagonal = np.sqrt(2.0 * (mx * mx + my * my))
