@@ -50,16 +50,27 @@ from flexdt.runtime import process_threads as _process_threads
 from flexdt.twin import long_work as _long_work
 
 
-def _told(
+def _show_work(
     what: str, progress: _long_work.Progress = None
 ) -> _typing.ContextManager[_long_work.Advance]:
+    """Show the work that goes on inside the context, from when it takes seconds, as a
+    line with a bar; see `shown_work`, which is imported at the first use.
+
+    Args:
+        what: name of the work.
+        progress: a function that takes the fraction done; None shows the line, False
+            nothing.
+
+    Returns:
+        The context; it gives the function that takes the fraction done, 0 to 1.
+    """
     # Here, because logging and threads take a third of the import of flexdt.
     from flexdt.runtime.progress_lines import shown_work
 
     return shown_work(what, progress)
 
 
-_long_work.during = _told
+_long_work.during = _show_work
 _process_threads.watch()
 
 _HOMES: _typing.Final = {
@@ -107,8 +118,17 @@ if (
     def __getattr__(name: str) -> _typing.Any:
         """Import a public name at its first use and keep it in the module.
 
-        `__version__` is read from the installed package each time. Raises AttributeError
-        on an unknown name, with the nearest known one, if any.
+        `__version__` is read from the installed package each time and not kept.
+
+        Args:
+            name: of `_HOMES`, or `__version__`.
+
+        Returns:
+            The module's attribute, or the module itself where the entry ends with a
+            colon.
+
+        Raises:
+            AttributeError: an unknown name; names the nearest known one, if any.
         """
         if name == "__version__":
             from importlib.metadata import version  # 10 ms that few imports need
@@ -124,10 +144,11 @@ if (
 
         module, colon, attribute = _HOMES[name].partition(":")
         home = import_module(module)
-        found = home if colon and not attribute else getattr(home, attribute or name)
-        globals()[name] = found
-        return found
+        value = home if colon and not attribute else getattr(home, attribute or name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
+    """List the public names, also those not imported yet."""
     return list(__all__)

@@ -82,11 +82,14 @@ def _calibrate(
 ) -> Outcome[DataSet]:
     """Open the data sets, and calibrate them.
 
-    A geometry in place of data needs `markers` as well, else TwinError. A geometry
-    replaces that of each data set.
+    Without data, geometry and `markers` make a data set without images. Otherwise a
+    geometry replaces that of each data set.
 
     Args:
         data, phantom, geometry, options: as for `calibrate`.
+
+    Raises:
+        TwinError: neither data, nor geometry and markers.
     """
     if isinstance(geometry, str | PathLike):
         geometry = ConeVec.load(geometry)

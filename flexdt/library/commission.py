@@ -85,7 +85,9 @@ class Commissioned(NamedTuple):
             out: the folder that the commands in them name.
 
         Returns:
-            Title -> head and rows.
+            Title -> head and rows: scans, axes, zero_offsets, disagreements, not_judged,
+            and next, the at most `MAX_NEXT_SCANS` scans that settle most questions, with
+            their commands.
         """
         votes = Counter(q.settled_by for q in self.questions if q.settled_by)
         sod = (
@@ -174,13 +176,17 @@ class Commissioned(NamedTuple):
 def commission(
     folders: Sequence[Path], traffic: Path | None, read_log: ReadLog
 ) -> Commissioned:
-    """Estimate a machine and its profile from past scans: rates and signs from their texts,
-    times from executed scripts, zero offsets from alignments.
+    """Estimate a machine and its profile from past scans: rates and signs from their
+    texts, times from executed scripts, zero offsets from alignments.
+
+    The machine to begin with is the shipped one that most texts name; else the one whose
+    motors have the limits of an executed script; else the FleX-ray, with a question.
+    Scans are sorted by date, those without one last; a folder given twice counts once.
 
     Args:
         folders: of scans, as the scanner or a twin writes them.
-        traffic: a recording of `flexdt follow`, or a log; lines that a folder has too count
-            once.
+        traffic: a recording of `flexdt follow`, or a log; lines that a folder has too
+            count once.
         read_log: reads an executed script or a recording.
 
     Returns:
@@ -220,8 +226,8 @@ def commission(
     )
     if traffic is not None:
         log = read_log(traffic, shipped)
-        told = [x.command for x in log]
-        if all([x.command for x in s.log] != told for s in scans):
+        commands = [x.command for x in log]
+        if all([x.command for x in s.log] != commands for s in scans):
             scans.append(PastScan(str(traffic), log=log))
     if words := tells.other_scanners(scans, known):
         raise CommandError(
@@ -244,7 +250,10 @@ def commission(
         f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < MIN_DURATIONS
     ]
     why = f"no executed script tells it, or fewer than {MIN_DURATIONS} commands of one"
-    rest = [*offsets.questions, *(Question(what, why, "recorded") for what in unseen)]
+    rest = [
+        *offsets.questions,
+        *(Question(subject, why, "recorded") for subject in unseen),
+    ]
     findings = [
         *_machine_errors(machine, offsets.profile),
         *tells.contradictions(scans, shipped, machine),
@@ -273,9 +282,11 @@ def _nothing(question: Question) -> None:
 
 
 def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
-    """Read a scan's settings texts, the names of its images, and the shape of the first one.
+    """Read a scan's settings texts, the names of its images, and the shape of the first
+    one.
 
-    What follows an unreadable text is not read.
+    In the order: second text, first text, first image; at the first of them that cannot
+    be read the rest is left out.
 
     Args:
         folder: of the scan.
@@ -314,11 +325,17 @@ def _script(
 ) -> PastScan:
     """Add the executed script to a scan, or else the script that was submitted.
 
+    The folder's .txt, .tsv and .log files but the settings texts are tried in the order
+    of their names; the first executed script ends the search.
+
     Args:
         scan: whose folder is searched.
         machine: for the names of motors.
         read_log: reads an executed script.
-        ask: takes the errors of files that are neither.
+        ask: takes the errors of files that are neither, as questions.
+
+    Returns:
+        The scan, with log and commands, commands alone, or unchanged.
     """
     content = list_folder(Path(scan.name))
     for name in sorted(content.names - {content.scan_settings, content.xre_settings}):
@@ -341,7 +358,8 @@ def _fit_machine(
 ) -> tuple[d.Machine, str, Fit | None]:
     """Fit a machine to the texts' signs and rates and to the executed scripts.
 
-    The file's text is the shipped one with the changed axes. Rotations keep their rates.
+    The file's text is the shipped one with the changed axes. Rotations keep their rates;
+    executed lines of other components count without a motor.
 
     Args:
         scans: past scans.
@@ -383,9 +401,12 @@ def _fit_machine(
 def _with_rates(
     axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine
 ) -> d.Axis:
-    """Return an axis with the rates of the last settings text, and the sign of most of them.
+    """Return an axis with the rates of the last settings text, and the sign of most of
+    them.
 
-    Maximum rates are raised to what was seen. Returned as it is if nothing differs.
+    Maximum rates are raised to those stated. The sign is compared only where the script
+    moved by more than 1 mm or deg, and the text agrees within `MATCH_MM`. Its source
+    names the texts; an axis without a difference is returned unchanged.
 
     Args:
         axis: of the shipped machine.
@@ -393,24 +414,26 @@ def _with_rates(
         scans: past scans.
         machine: of the axis.
     """
-    told = [(s, m) for s in scans if s.settings and (m := s.settings.motors.get(name))]
+    stated_motors = [
+        (s, m) for s in scans if s.settings and (m := s.settings.motors.get(name))
+    ]
     signs = Counter[int]()
-    for scan, motor in told:
-        asked = tells.scripted(scan, machine).get(name, 0.0)
-        if abs(asked) > 1.0 and abs(abs(asked) - abs(motor.value)) <= rebuild.MATCH_MM:
-            signs[1 if asked * motor.value > 0 else -1] += 1
+    for scan, motor in stated_motors:
+        target = tells.scripted(scan, machine).get(name, 0.0)
+        if abs(target) > 1.0 and abs(abs(target) - abs(motor.value)) <= rebuild.MATCH_MM:
+            signs[1 if target * motor.value > 0 else -1] += 1
     changes: dict[str, Any]
     if signs:
         changes = {"settings_sign": signs.most_common(1)[0][0]}
     else:
         changes = {}
     for rate in ("speed", "acceleration"):
-        values = [v for _, m in told if (v := getattr(m, rate))]
+        values = [v for _, m in stated_motors if (v := getattr(m, rate))]
         if values:
             most = max(values[-1], getattr(axis, f"max_{rate}"))
             changes |= {rate: values[-1], f"max_{rate}": most}
     stated = axis.model_copy(update=changes)
-    source = f"rates: settings texts, n = {len(told)}; limits as shipped"
+    source = f"rates: settings texts, n = {len(stated_motors)}; limits as shipped"
     if stated == axis:
         return axis
     return stated.model_copy(update={"source": source})
@@ -421,7 +444,8 @@ def _with_alignment(
 ) -> PastScan:
     """Add the poses of a past scan, and its alignment without a phantom.
 
-    A scan without radiographs, or whose alignment is refused, counts as failed.
+    A scan without radiographs, or whose alignment determines no axis, counts as failed.
+    The zero offsets are the scan's own profile.
 
     Args:
         scan: its texts and profile.
@@ -438,10 +462,10 @@ def _with_alignment(
         data = load_dataset(
             scan.name, machine=machine, profile=scan.profile, ignore_document=True
         )
-        found = align_dataset(data).alignment
-        if found.offsets is None:
-            raise TwinError(f"align: {found.refused['axis_column_px']}")
-        return replace(scan, aligned=found)
+        alignment = align_dataset(data).alignment
+        if alignment.offsets is None:
+            raise TwinError(f"align: {alignment.refused['axis_column_px']}")
+        return replace(scan, aligned=alignment)
     except TwinError as error:
         ask(Question(scan.name, error.message, "ordinary" if scan.profile else ""))
         return scan
@@ -450,7 +474,7 @@ def _with_alignment(
 def write_commission(found: Commissioned, out: Path) -> None:
     """Write `machine.toml`, `profile.toml`, `commission.json` and `report.html` into a
     new folder, which appears when all files are complete and both TOML files are read
-    back.
+    back; after an error nothing is left.
 
     Args:
         found: the result of `commission`.

@@ -77,23 +77,25 @@ def compare_folder(
     *,
     shown: int = SHOWN_FRAMES,
 ) -> Comparison:
-    """Compare a data set with the twin: calibrate it, and simulate some frames with and without
-    the correction.
+    """Compare a data set with the twin: calibrate it, and simulate some frames with and
+    without the correction.
 
     Args:
         folder: the data set; TIFFs and the two settings texts are enough.
         phantom: that was scanned, by value, name or file.
         tolerance_px: largest allowed rms residual of the beads after correction, per
             coordinate.
-        shown: frames of which difference images are made.
+        shown: number of frames, evenly spread, of which difference images are made.
 
     Returns:
-        Residuals before and after correction, and difference images.
+        Residuals before (nominal geometry) and after correction, and difference images;
+        the document has those of the correction in force, too, if there is one.
 
     Raises:
         DatasetError: no data set.
         NotIdentifiableError: the data do not determine a correction.
-        TwinError: they contradict the phantom or the angles; the message has the findings.
+        TwinError: they contradict the phantom or the angles; the message has the
+            findings.
     """
     begun = time.perf_counter()
     dataset = load_dataset(folder)
@@ -151,9 +153,8 @@ def _figures(
     residual: FloatArray, images: Float32Array | None
 ) -> dict[str, float | None]:
     """Compute rms and largest length of residuals (n, k, 2) [px], and the rms of the
-    images of differences (None without images), by the names of FIGURES; nan is
-    ignored in the lengths.
-    """
+    images of differences (None without images), by the names of FIGURES; nan is left out
+    of the largest length."""
     length = np.linalg.norm(residual, axis=2)
     if images is None:
         of_images = None
@@ -172,7 +173,8 @@ def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
     """List the rows of a comparison's table: correction, rms and largest [px], rms of the
     images.
 
-    Only corrections that the document has, of before, after and in_force.
+    Rows of before, after and in_force, those that the document has; None for a figure
+    that is unknown.
     """
     return [
         (name, *(document[name][figure] for figure in FIGURES))
@@ -184,12 +186,15 @@ def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
 def write_comparison(comparison: Comparison, out: Path) -> None:
     """Write report.html, compare.json and the difference images into a folder.
 
-    Also a verdict on the tolerance, residuals by frame, and pictures before and after
-    correction.
+    The report has a verdict on the tolerance, residuals by frame, and pictures of each
+    frame shown. Images are `difference_FRAME_before.tif` and `_after.tif`.
 
     Args:
         comparison: of a data set with the twin.
         out: the folder, made if needed; images are float32 TIFF.
+
+    Raises:
+        OSError: it cannot be written.
     """
     import tifffile
 

@@ -55,28 +55,36 @@ def html_report(report: CheckReport, name: str = "script") -> str:
     return page(title, body)
 
 
-def against_html(found: LogComparison, name: str = "script") -> str:
+def against_html(comparison: LogComparison, name: str = "script") -> str:
     """Make one self-contained HTML page that compares the prediction with the execution.
 
     Args:
-        found: the comparison.
+        comparison: of a plan and its log.
         name: of the script.
     """
     title = f"{name}: predicted and executed"
-    rows = table(found.HEADER, found.table(), text=("what",))
+    rows = table(comparison.HEADER, comparison.table(), text=("what",))
     return page(
         title,
-        [heading(title), facts(against_summary(found)), *_problems(found.problems), rows],
+        [
+            heading(title),
+            facts(against_summary(comparison)),
+            *_problems(comparison.problems),
+            rows,
+        ],
     )
 
 
-def clearance_plot(found: Clearance) -> str:
+def clearance_plot(clearance: Clearance) -> str:
     """Plot the smallest clearance over time, contacts marked, as an SVG element.
 
     Args:
-        found: with a trace; parts that overlap are 0 mm apart.
+        clearance: with a trace; parts that overlap are drawn as 0 mm apart.
+
+    Raises:
+        TwinError: matplotlib is not installed.
     """
-    times, distances = np.array(found.trace, dtype=np.float64).T
+    times, distances = np.array(clearance.trace, dtype=np.float64).T
     return plot(
         [Series("", times, np.maximum(distances, 0.0))],
         title="Smallest clearance",
@@ -84,7 +92,8 @@ def clearance_plot(found: Clearance) -> str:
         y_label="clearance (mm)",
         width=900,
         marks=[
-            (c.time_s, f"line {c.line}: {' and '.join(c.pair)}") for c in found.collisions
+            (c.time_s, f"line {c.line}: {' and '.join(c.pair)}")
+            for c in clearance.collisions
         ],
     )
 
@@ -97,8 +106,7 @@ def printable(text: str) -> str:
 
 def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
     """Make HTML parts on a script's problems: heading and table of line, severity, code
-    and message; empty without any.
-    """
+    and message; [] without any."""
     if not problems:
         return []
     head = ("line", "severity", "code", "what")
@@ -107,25 +115,23 @@ def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
     return [heading("Problems", level=2), table(head, rows, kinds=kinds, text=head[1:])]
 
 
-def _clearance(found: Clearance | None) -> list[str]:
-    """Make HTML parts with the plot of the clearance; empty without a trace, a sentence
-    in place of the plot without matplotlib.
-    """
-    if found is None or not found.trace:
+def _clearance(clearance: Clearance | None) -> list[str]:
+    """Make HTML parts with the plot of the clearance; [] without a trace; without
+    matplotlib a sentence takes the place of the plot."""
+    if clearance is None or not clearance.trace:
         return []
     try:
         require_plots()
     except TwinError as error:
         shown = paragraph(f"Not drawn: {error.message}")
     else:
-        shown = figure(clearance_plot(found))
+        shown = figure(clearance_plot(clearance))
     return [heading("Clearance", level=2), shown]
 
 
 def _steps(report: CheckReport) -> list[str]:
-    """Make the HTML table of steps: line, start and duration [s], its 90 % range, the
-    part of it that is assumed and from what, and effect.
-    """
+    """Make heading and HTML table of a plan's steps: line, start and duration [s], its 90
+    % range, the part of it that is assumed and from what, and effect."""
     timing = report.plan.machine.timing
     rows = [
         (

@@ -38,10 +38,16 @@ class Measured:
 def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
     """Measure transmission, saturated and starved pixels of a scan's radiographs.
 
-    Of `SIMULATED_VIEWS` views; saturation is None where the full scale is not known.
+    Of `SIMULATED_VIEWS` projections that are there, evenly spread. Pixels whose flat
+    image is not brighter than the dark one are left out of transmission and starved
+    pixels; starved ones have less than `FEW_COUNTS` above dark.
 
     Args:
         data: a data set or its folder.
+
+    Returns:
+        Transmission, saturated part (None where the full scale is not known), starved
+        part, and the number of projections.
 
     Raises:
         DatasetFormatError: no pixel of its flat image is brighter than the dark one.

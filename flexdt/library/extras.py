@@ -15,10 +15,11 @@ DISTRIBUTION: Final = "flexdt-extensions"
 def package(
     name: str, what: str = "this format", extra: str = "io", distribution: str = "flexdt"
 ) -> Any:
-    """Import the package or module `name` of a distribution's extra, which `what` needs.
+    """Import and return the package or module `name` of a distribution's extra, which
+    `what` needs.
 
     Raises:
-        TwinError: it is not installed.
+        TwinError: it cannot be imported; names the command that installs the extra.
     """
     try:
         return import_module(name)
@@ -63,12 +64,13 @@ def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
         The object, e.g. a function.
 
     Raises:
-        TwinError: the distribution is not installed.
+        TwinError: no such entry point, as where the distribution is not installed; names
+            the command that installs it.
     """
-    found = offered(name, group)
-    if found is None:
+    loaded = offered(name, group)
+    if loaded is None:
         raise TwinError(
             f"{what} needs {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}",
             {"missing": DISTRIBUTION},
         )
-    return found
+    return loaded

@@ -64,8 +64,13 @@ def require_plots() -> None:
 
 
 def blank(width: float, height: float) -> Figure:
-    """Make an empty figure [px] that belongs to no window; raises if matplotlib is
-    missing.
+    """Make an empty figure that belongs to no window.
+
+    Args:
+        width, height: [px], at `DPI`.
+
+    Raises:
+        TwinError: matplotlib is missing.
     """
     require_plots()
     from matplotlib.figure import Figure
@@ -146,11 +151,12 @@ def arrows(
     title: str,
     factor: float,
 ) -> str:
-    """Draw vectors over an image plane, row 0 at the top, each with a dot where it begins.
+    """Draw vectors over an image plane, row 0 at the top, each with a dot where it
+    begins.
 
     Args:
-        groups: name, places (m, 2) as (column, row) [px], and vectors (m, 2) alike; nan
-            is left out.
+        groups: name, places (m, 2) as (column, row) [px], and vectors (m, 2) alike; a
+            pair that is not finite is left out.
         size: of the plane, (rows, cols).
         title: of the figure.
         factor: by which vectors are enlarged.
@@ -173,7 +179,7 @@ def arrows(
 
 
 def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float) -> str:
-    """Draw the ellipse of a covariance about zero.
+    """Draw the ellipse of a covariance about zero; negative eigenvalues count as 0.
 
     Args:
         covariance: (2, 2).
@@ -205,10 +211,10 @@ def image_under(
 ) -> str:
     """Draw a grey image with points over it.
 
-    Dense is dark; without points there is no legend.
+    Large values are dark; without points there is no legend.
 
     Args:
-        values: (rows, cols); black and white are percentiles.
+        values: (rows, cols); black and white are the percentiles 99.7 and 0.5.
         points: their x and y are columns and rows.
         title: of the figure.
         width: of the figure [px].

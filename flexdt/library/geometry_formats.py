@@ -51,14 +51,16 @@ MAX_CUBE_DIFFERENCE: Final = 1e-6
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
     """Convert a geometry of ASTRA; see `ConeVec.from_astra`.
 
-    Angles and vectors are checked for a plausible spread. Angles of `cone` are [rad].
+    Rows are checked for pixels with rays of their own. Angles of `cone` are [rad]; those
+    that look like degrees give a warning.
 
     Args:
         geometry: ASTRA's dictionary (`cone` or `cone_vec`), or rows (n, 12).
         shape: detector (rows, cols), where ASTRA's is missing or to be checked.
 
     Raises:
-        GeometryError: another type, or an incomplete geometry.
+        GeometryError: another type, an incomplete geometry, or another shape than
+            `shape`.
     """
     if not isinstance(geometry, Mapping):
         return check_spread(ConeVec(as_numbers("cone_vec", geometry), shape))
@@ -84,9 +86,9 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
         raise GeometryError(
             f"ASTRA's geometry: {error}", {"asked": repr(error)}
         ) from None
-    own = check_spread(ConeVec(rows, counted))
-    own.of_shape(shape)
-    return own
+    cone_vec = check_spread(ConeVec(rows, counted))
+    cone_vec.of_shape(shape)
+    return cone_vec
 
 
 def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
@@ -106,7 +108,10 @@ def _circle_of_astra(geometry: Mapping[str, Any]) -> FloatArray:
 
 def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
     """Convert to ASTRA's dictionary of type cone_vec, with a copy of the vectors; see
-    `ConeVec.to_astra`. Raises without a panel shape.
+    `ConeVec.to_astra`.
+
+    Raises:
+        GeometryError: the geometry has no panel shape.
     """
     rows, cols = cone_vec.of_shape()
     return {
@@ -139,8 +144,8 @@ def from_tomosipo(geometry: Any) -> ConeVec:
                 "of tomosipo",
                 {"asked": type(geometry).__name__, "missing": lost},
             )
-        found = (np.asarray(getattr(vectors, name)) for name in names)
-        geometry = dict(zip(TOMOSIPO_NAMES, found, strict=True))
+        stored = (np.asarray(getattr(vectors, name)) for name in names)
+        geometry = dict(zip(TOMOSIPO_NAMES, stored, strict=True))
     arrays = {name: np.asarray(values) for name, values in geometry.items()}
     return _value(read_tomosipo(arrays, "tomosipo's geometry"))
 
@@ -166,14 +171,15 @@ def to_cil(cone_vec: ConeVec) -> Any:
 def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
     """Make TIGRE's geometry and angles; see `ConeVec.to_tigre`.
 
-    TIGRE must be installed.
-
     Args:
         cone_vec: the geometry.
         like: grid or volume whose voxels it gets; None for no volume.
 
     Returns:
         TIGRE's geometry, and angles [rad].
+
+    Raises:
+        ExchangeError: TIGRE is not installed, or cannot express the geometry.
     """
     arrays = tigre_arrays(_scan(cone_vec))
     angles = np.asarray(arrays.pop(ANGLES), dtype=np.float64)
@@ -194,15 +200,14 @@ def to_tigre(cone_vec: ConeVec, like: object) -> tuple[Any, FloatArray]:
 def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
     """Make a model of LEAP; see `ConeVec.to_leap`.
 
-    LEAP must be installed. Raises too for voxels that are no cubes.
-
     Args:
         cone_vec: the geometry.
         like: grid or volume whose voxels it gets; None for LEAP's default volume.
         rows_up: count rows upwards.
 
     Raises:
-        ExchangeError: LEAP refuses the geometry or the volume.
+        ExchangeError: LEAP is not installed, voxels are no cubes (within
+            `MAX_CUBE_DIFFERENCE`), or LEAP refuses the geometry or the volume.
     """
     scan = _scan(cone_vec)
     arrays = leap_arrays(scan.rows_up() if rows_up else scan)
@@ -217,8 +222,8 @@ def to_leap(cone_vec: ConeVec, like: object, rows_up: bool) -> Any:
     blank = _voxels(like)
     x, y, z = blank.voxel_xyz
     if max(x, y, z) - min(x, y, z) > MAX_CUBE_DIFFERENCE * x:
-        asked = f"LEAP: voxels of {x:g} x {y:g} x {z:g} mm"
-        raise ExchangeError.instead(asked, [x, y, z], "cubes, in a modular beam")
+        message = f"LEAP: voxels of {x:g} x {y:g} x {z:g} mm"
+        raise ExchangeError.instead(message, [x, y, z], "cubes, in a modular beam")
     if not model.set_volume(*blank.shape[::-1], x, z, *blank.center_mm):
         raise ExchangeError("LEAP refuses the volume; it has printed why")
     return model
@@ -242,7 +247,8 @@ def _peer(module: str, name: str, ending: str) -> Any:
     """Import another program's module.
 
     Raises:
-        ExchangeError: it cannot be imported; names a file that it reads.
+        ExchangeError: it cannot be imported; names a file ending in `ending` that it
+            reads.
     """
     try:
         return import_module(module)
@@ -260,8 +266,16 @@ def load(
 ) -> ConeVec:
     """Read a geometry from a file; see `ConeVec.load`.
 
-    Without `format`, by the file's ending; flexdt's own ending is JSON. `shape` and
-    `pixel` [mm] are for formats that lack them.
+    Args:
+        file: its path.
+        format: name of `FORMATS`; None: that of the file's ending, where .json is
+            flexdt's own document or a CTSimU scenario.
+        shape: detector (rows, cols), for formats that lack it; others must agree.
+        pixel: its edge, or edges along columns and rows [mm], likewise.
+
+    Raises:
+        ExchangeError: an unknown format or ending, an invalid file, or one that
+            contradicts shape or pixel.
     """
     path = Path(file)
     pitch = None if pixel is None else _pair(pixel)
@@ -286,18 +300,27 @@ def _json(path: Path, given: Given) -> ScanGeometry:
     """
     if "file" in read_json(text_of(path), str(path)):
         return import_geometry(path, "ctsimu", given)
-    own = load_geometry(path)
+    stored = load_geometry(path)
     if given.shape is not None:
-        own.cone_vec.with_shape(own.shape).of_shape(given.shape)
-    given.check_pitch(own, path)
-    if own.shape is not None:
-        return own
-    return ScanGeometry(own.cone_vec, given.shape)
+        stored.cone_vec.with_shape(stored.shape).of_shape(given.shape)
+    given.check_pitch(stored, path)
+    if stored.shape is not None:
+        return stored
+    return ScanGeometry(stored.cone_vec, given.shape)
 
 
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
-    """Write a geometry to a file, in `format` or, if None, in that of the file's ending
-    (flexdt's own for its own ending); see `ConeVec.save`.
+    """Write a geometry to a file; see `ConeVec.save`.
+
+    Args:
+        cone_vec: the geometry.
+        file: its path.
+        format: name of `FORMATS`; None: that of the file's ending, where .json is
+            flexdt's own document.
+
+    Raises:
+        ExchangeError: an unknown format or ending, or a format that cannot carry the
+            geometry.
     """
     path = Path(file)
     if format is None and path.suffix.lower() == OWN_ENDING:
@@ -325,23 +348,21 @@ def _format(path: Path, among: Iterable[Format]) -> str:
         for ending in form.endings
         if ending != OWN_ENDING
     }
-    found = by_ending.get(path.suffix.lower())
-    if found is None:
+    name = by_ending.get(path.suffix.lower())
+    if name is None:
         endings = [OWN_ENDING, *by_ending]
         raise ExchangeError(
             f"{path.name}: the ending of a geometry file is one of {', '.join(endings)}",
             {"asked": path.suffix, "allowed": endings},
         )
-    return found
+    return name
 
 
 def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
     """Convert one pixel edge, or two along columns and rows, to two floats [mm].
 
-    Also raised for anything but one or two numbers.
-
     Raises:
-        GeometryError: they are not above 0.
+        GeometryError: anything but one or two numbers above 0.
     """
     try:
         along_columns, along_rows = np.broadcast_to(

@@ -59,9 +59,11 @@ def parsed(text: str, file: str) -> Machine:
 def profile(
     word: Profile | str | PathLike[str] | None, of: Machine, file: str | None = None
 ) -> Profile:
-    """Return a calibration profile by shipped name or by file; None is the machine's default.
+    """Return a calibration profile by shipped name or by file; None is the machine's
+    default.
 
-    A file comes before a shipped name. A profile that is given is only checked.
+    A file comes before a shipped name. A profile that is given is returned, after the
+    check that it is for this machine.
 
     Args:
         word: the requested name or file, or the profile itself.
@@ -69,7 +71,7 @@ def profile(
         file: the requested machine, for the error.
 
     Raises:
-        MachineFileError: the file is invalid, or for another machine.
+        MachineFileError: the file is invalid, or the profile is for another machine.
         UnknownNameError: neither a file nor a shipped name.
     """
     from flexdt.twin.errors import MachineFileError
@@ -85,19 +87,19 @@ def profile(
     else:
         name = str(word)
     if isinstance(word, Profile):
-        found = word
+        chosen = word
     elif is_file(name):
-        found = parse_profile(Path(name).read_text(encoding="utf-8"), name)
+        chosen = parse_profile(Path(name).read_text(encoding="utf-8"), name)
     elif word is None:
-        found = default_profile(of, file or DEFAULT_MACHINE)
+        chosen = default_profile(of, file or DEFAULT_MACHINE)
     else:
-        found = builtin_profile(name)
-    if found.machine != of.name:
+        chosen = builtin_profile(name)
+    if chosen.machine != of.name:
         raise MachineFileError(
-            f"profile {found.name!r} is for machine {found.machine!r}, not {of.name!r}",
-            {"asked": found.name, "machine": of.name},
+            f"profile {chosen.name!r} is for machine {chosen.machine!r}, not {of.name!r}",
+            {"asked": chosen.name, "machine": of.name},
         )
-    return found
+    return chosen
 
 
 def is_file(word: str) -> bool:

@@ -67,8 +67,18 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
 
 
 def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
-    """Plot line integrals of one projection, as the source sees it, with a colour bar;
-    returns the axes (new ones if None).
+    """Plot line integrals of one projection, as the source sees it, with a colour bar.
+
+    Args:
+        data: the data set.
+        index: of the projection.
+        axes: matplotlib's, to draw into; None makes a figure.
+
+    Returns:
+        The axes.
+
+    Raises:
+        DatasetError: as `DataSet.line_integrals`.
     """
     if axes is None:
         axes = _pyplot().figure().add_subplot()
@@ -87,7 +97,7 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
 
     Args:
         volume: to plot.
-        axes: matplotlib's, to draw into; a new figure's without.
+        axes: matplotlib's, to draw into; None makes a figure.
         what: `data`, `sigma` or `bias_bound`.
 
     Returns:

@@ -113,7 +113,7 @@ def table(
     Args:
         head: names of the columns.
         rows: cells (see `cell_text`).
-        kinds: of the rows (see `paragraph`).
+        kinds: of the rows (see `paragraph`), in order; rows beyond them have none.
         text: names of the columns that hold text, which begins at the left.
     """
     texts = set(text)
@@ -128,8 +128,7 @@ def _row(
     tag: str, cells: Sequence[object], sides: Sequence[str], kind: str = ""
 ) -> Markup:
     """Make an HTML table row of cells with the tag `td` or `th`, each with the class of
-    its side; `kind` is the row's class.
-    """
+    its side; `kind` is the row's class, none if ""."""
     made = (
         _element(tag, cell_text(c), kind=side)
         for c, side in zip(cells, sides, strict=True)

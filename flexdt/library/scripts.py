@@ -43,15 +43,15 @@ def plan(
     """Plan a scan script on a clock that starts at 0, without a server.
 
     Args:
-        script: from `parse_script`, its text or bytes, or its path. A text of one line that
-            names a file is a path.
+        script: from `parse_script`, its text or bytes, or its path. A text of one line
+            that names a file is a path to it.
         machine: a machine, its shipped name or its file; the FleX-ray if None.
         profile: zero offsets, their shipped name or file; the machine's default if None.
         sample: on the stage, for truncation: anything that `flexdt.simulate` takes.
 
     Returns:
-        The plan: `.poses`, `.geometry`, `.duration_s`, `.problems`, `.check()`, `.plot()`,
-        `==`, `.to_dict()`.
+        The plan: `.poses`, `.geometry`, `.duration_s`, `.problems`, `.check()`,
+        `.plot()`, `==`, `.to_dict()`.
 
     Raises:
         ScriptError: the script does not parse; lists every error with its line.
@@ -75,6 +75,8 @@ def plan(
 def check(plan: ScanPlan, sample: object = None) -> CheckReport:
     """Check a plan, with the exposures of `sample` (None: no sample) and, if the machine
     has components, its collisions; see `ScanPlan.check`.
+
+    The start of the plan counts as known unless it is that of a machine just switched on.
     """
     if sample is None:
         phantom = None
@@ -89,10 +91,11 @@ def check(plan: ScanPlan, sample: object = None) -> CheckReport:
 
 
 def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
-    """Add warnings of projections in which the sample's pixels will be saturated or starved.
+    """Add warnings of projections in which the sample's pixels will be saturated or
+    starved.
 
     Args:
-        report: of a dry run; one with errors is returned as it is.
+        report: of a dry run; one with errors is returned unchanged.
         phantom: on the stage; None adds no warning.
     """
     if phantom is None or report.errors:
@@ -104,7 +107,8 @@ def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
 
 
 def size_of(phantom: Phantom | None) -> SampleSize | None:
-    """Return the size of a phantom on the stage; None leaves it to the script."""
+    """Return the size of a phantom on the stage, from the corners of its mesh, or its
+    stated box where it has no matter; None for no phantom leaves it to the script."""
     if phantom is None:
         return None
     corners = phantom.mesh(around=True).vertices

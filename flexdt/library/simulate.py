@@ -113,9 +113,8 @@ class Truth:
         )
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
-        """Select the geometry and, if there is any, scatter of some of the views, by
-        index.
-        """
+        """Return the truth of some of the views, by index: geometry and, if there is any,
+        scatter are selected, all else is the same."""
         if self.scatter is None:
             scatter = None
         else:
@@ -141,11 +140,12 @@ class Truth:
         return out
 
     def radiographs(self) -> Iterator[Radiograph]:
-        """Simulate the noise-free radiograph of each view, in batches that fit the memory.
+        """Simulate the noise-free radiograph of each view, in batches that fit the
+        memory.
 
-        With several spot points the focal spot is not blurred once more.
-
-        Rays per pixel and focal spot points are averaged, and scatter is added.
+        Rays per pixel and points of the focal spot are averaged, and scatter is added.
+        With several spot points the images are not blurred by the spot once more. A batch
+        takes about `BATCH_BYTES` of path lengths, at least one view.
 
         Yields:
             One radiograph a view, in order.
@@ -233,10 +233,10 @@ def project(
         body = sample
     else:
         body = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    found = examine(
+    findings = examine(
         Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes
     )
-    warn_of(found, GeometryError)
+    warn_of(findings, GeometryError)
     with long_work.during("projecting", progress):
         return (forward if plain else line_integrals)(body, cone, size)
 
@@ -334,14 +334,14 @@ def simulate(
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
     with long_work.during("simulating", progress) as advance:
         phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-        found = examine(
+        findings = examine(
             Operation.SIMULATE,
             cone,
             size,
             volume=_attenuation(phantom),
             boxes=phantom.boxes,
         )
-        placed = settled(found, GeometryError)
+        placed = settled(findings, GeometryError)
         parts = channels(phantom)
         chain = chain_through(parts, panel, design, settings.mono_keV)
         nothing = np.zeros(size, np.float32)
@@ -404,10 +404,10 @@ def simulate(
         counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth
     )
     made = replace(made, full_scale=panel.full_scale)
-    told = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
-    for doubt in told:
+    doubts = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
+    for doubt in doubts:
         warn_caller(doubt)
-    return replace(made, warnings=(*truth.assumed, *told))
+    return replace(made, warnings=(*truth.assumed, *doubts))
 
 
 def _check_sampling(noise: int | None, rays: int, spot_points: int) -> None:
@@ -440,11 +440,11 @@ def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
-    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the open beam
-    [ms].
+    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the open
+    beam, dark charge and offset included [ms]; within `EXPOSURES_MS`.
 
     Raises:
-        LimitError: the panel's offset leaves no range to fill.
+        LimitError: the panel's offset is more than half of its full scale.
     """
     # A panel that is half full in the dark has little range left: say so, not an odd exposure.
     require_within(
@@ -457,10 +457,12 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:
-    """Return the pixels' edges along u and v [mm]; equal ones exactly.
+    """Return the pixels' edges along u and v [mm]; those of the first view, and equal
+    numbers where they differ by less than `SAME_PITCH`.
 
     Raises:
-        GeometryError: no views, or edges that differ between views.
+        GeometryError: no views, or edges that differ between views by more than
+            `SAME_PITCH` of themselves.
     """
     lengths = np.linalg.norm([cone.u, cone.v], axis=2)
     if not lengths.size:
@@ -470,8 +472,8 @@ def _pitch(cone: ConeVec) -> tuple[float, float]:
         if np.abs(values - first).max() > SAME_PITCH * first:
             least = float(values.min())
             most = float(values.max())
-            said = f"pixels measure {least:.6g} to {most:.6g} mm along {name}"
-            raise GeometryError.instead(said, [least, most], "alike in all views")
+            message = f"pixels measure {least:.6g} to {most:.6g} mm along {name}"
+            raise GeometryError.instead(message, [least, most], "alike in all views")
     return u, u if abs(v - u) <= SAME_PITCH * u else v
 
 
@@ -484,8 +486,8 @@ def _panel(
 ) -> tuple[Detector, CameraSettings]:
     """Make detector and camera settings for a geometry's pixels.
 
-    Without a given one, the machine's: binned by a whole number, its region in the middle
-    if the panel is larger.
+    Without a given one, the machine's: binned by a whole number, with its usual region if
+    that has this shape, else one in the middle of the panel.
 
     Args:
         detector: as given, or None.
@@ -494,7 +496,8 @@ def _panel(
         pitch, row_pitch: pixel edges along columns and rows [mm].
 
     Raises:
-        LimitError: the machine's detector has no such pixels.
+        LimitError: the detector states another pitch, or the machine's has no such pixels
+            or too few.
     """
     if detector is not None:
         grid = PixelGrid(
@@ -541,7 +544,8 @@ def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
     """Yield a warning if the flat image, valid for views of one distance, differs between
     views.
 
-    Differences up to 0.1 % pass; at most one text.
+    Differences up to 0.1 % pass; at most one text. About 100 views of different distances
+    are compared.
 
     Args:
         shape: (rows, cols).
@@ -567,7 +571,8 @@ def _spot_doubt(truth: Truth) -> Iterator[str]:
     """Warn if one blur does not hold for the sample's depth: with one spot point, when
     the blur of its near and far side differ by more than `DOUBTED_PX`.
 
-    Yields at most one text; it proposes a number of spot points.
+    Yields at most one text, which proposes a number of spot points; nothing with several
+    points. The first view is examined.
     """
     spot_mm = truth.chain.tube.focal_spot_mm(truth.exposure.power_W)
     half = 0.5 * float(np.hypot(*truth.sample.size_mm[:2]))
@@ -583,9 +588,8 @@ def _spot_doubt(truth: Truth) -> Iterator[str]:
 
 
 def _different(cone: ConeVec) -> npt.NDArray[np.float64]:
-    """Return some of the views whose distances or foot points differ, about 100, the
-    extremes among them, (k, 12).
-    """
+    """Return rows of about 100 of the views whose distances or foot points differ
+    (rounded to 1e-6), those with the extremes among them, (k, 12)."""
     ray = cone.source - cone.detector
     feet = [np.einsum("ij,ij->i", ray, edge) for edge in (cone.u, cone.v)]
     keys = np.column_stack([cone.source_detector_distance, *feet]).round(6)

@@ -80,8 +80,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run the loop until a future is done, and return its result.
 
-        Meanwhile a wait without timers raises Deadlock; otherwise it waits for real, as
-        another thread may end it.
+        Meanwhile a wait that no timer ends raises Deadlock; a loop that runs in another
+        way waits for real, as another thread may end the wait.
 
         Raises:
             Deadlock: no event is left that could complete it.
@@ -95,7 +95,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def come_to_rest(self) -> None:
         """Stop the loop if another thread runs it, and wait for that thread's end.
 
-        If no thread runs it, nothing happens.
+        If no thread runs it, nothing happens. Not to be called by that thread.
         """
         for thread in threading.enumerate():
             if thread.ident == self._thread_id:  # type: ignore[attr-defined]
@@ -142,22 +142,26 @@ class _Jumps(selectors.DefaultSelector):
         self._loop = loop
 
     def select(self, timeout: float | None = None) -> list[Any]:
-        """Look for events without waiting; if there are none, let the clock jump by `timeout`.
+        """Look for events without waiting; if there are none, let the clock jump by
+        `timeout`.
 
-        Without a time-out (None: no timer is set) it waits for real unless the loop runs
-        until one future is done (`run_until_complete`), and raises Deadlock if it does.
+        Without a time-out (None: no timer is set) it waits for real, unless the loop runs
+        until one future is done (`run_until_complete`).
 
         Returns:
             Events as of the base class; [] after a jump.
+
+        Raises:
+            Deadlock: no event, no timer, and the loop runs until one future is done.
         """
         if timeout is None and not self._loop.alone:
             return super().select()
-        found = super().select(0.0)
-        if not found and timeout is None:
+        events = super().select(0.0)
+        if not events and timeout is None:
             raise Deadlock("nothing is left that could happen")
-        if not found and timeout is not None:
+        if not events and timeout is not None:
             self._loop.jump(timeout)
-        return found
+        return events
 
 
 __all__ = ["Deadlock", "InProcessTwin", "twin"]
@@ -240,8 +244,10 @@ class InProcessTransport(asyncio.Transport):
         self._server.data_received(self._wire.send(message))
 
     async def receive(self) -> list[Message]:
-        """Wait for data and return the messages that it completes, at least one; [] once the
-        connection has ended.
+        """Wait for data and return the messages that it completes, at least one; [] once
+        the connection has ended.
+
+        Data that complete no message are kept, and the wait goes on.
         """
         messages: list[Message] = []
         while not messages and (data := await self._inbox.get()):
@@ -326,7 +332,7 @@ class InProcessTwin:
         """Run a coroutine on the twin's loop, and return its result; virtual time passes
         meanwhile.
 
-        From another thread it waits while the loop runs there.
+        From a thread other than the running loop's, it waits for the result there.
 
         Raises:
             Deadlock: no event is left that could end the wait.
@@ -359,17 +365,18 @@ def twin(
     seed: int | None = 0,
     data: str | PathLike[str] | None = None,
 ) -> Iterator[InProcessTwin]:
-    """Start a twin in this process, for tests; it ends with the `with` block.
+    """Start a twin in this process, for tests, with a connected client; both end with the
+    `with` block.
 
-    Motion takes the machine's true time, by its speeds and accelerations, on a virtual clock
-    that passes while a call waits (`move(..., wait=True)`, `wait_job`) or in `advance`, and at
-    no other time. Nothing sleeps. Meshes and scenes that are sent, the calls about data sets,
-    `fit_calibration`, `align_dataset` and `predict_exposure` are worked on in a process with
-    limits, as always.
+    Motion takes the machine's true time, by its speeds and accelerations, on a virtual
+    clock that passes while a call waits (`move(..., wait=True)`, `wait_job`) or in
+    `advance`, and at no other time. Nothing sleeps. Meshes and scenes that are sent, the
+    calls about data sets, `fit_calibration`, `align_dataset` and `predict_exposure` are
+    worked on in a process with limits, as always.
 
     Args:
-        machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero offsets
-            are those of its default profile.
+        machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero
+            offsets are those of its default profile.
         sample: on the stage at start, a phantom's name; empty for no sample.
         physics: how images are made: ideal, mono or poly.
         speed_up: the twin's seconds for each of the loop; "max" ends each motion at once.
@@ -402,11 +409,11 @@ def twin(
             wall=loop.time,
         )
         server.submissions.checks = Checks(apart=False)
-        found = InProcessTwin(loop, server)
-        found.run(server.start(Sample(sample)))
+        scanner = InProcessTwin(loop, server)
+        scanner.run(server.start(Sample(sample)))
         try:
-            found.client = found.connect()
-            yield found
+            scanner.client = scanner.connect()
+            yield scanner
         finally:
-            found.run(found.close())
+            scanner.run(scanner.close())
             loop.come_to_rest()

@@ -34,7 +34,8 @@ def machines(draw: st.DrawFn) -> Machine:
     directions of their own, with other travel, speeds and accelerations; name and zero
     offsets are the shipped one's.
 
-    Travel shrinks towards home, speed and acceleration to 0.1 to 1 of the shipped ones.
+    Travel on either side of home, speed and acceleration are each multiplied by a number
+    drawn from 0.1 to 1.
 
     Example:
         >>> @given(machines())
@@ -58,6 +59,10 @@ def geometries(draw: st.DrawFn, *, max_views: int = 8, max_pixels: int = 64) -> 
     """Draw cone-beam geometries with a detector: circles and helices at any angles, even
     or not, with the panel moved aside and tilted by up to 10 deg about each axis, and
     pixels that may be oblong.
+
+    Lengths [mm]: 50 to 2000 from source to panel, the axis at 0.02 to 0.98 of it, pixels
+    of 0.005 to 1, the panel aside by up to half its side, heights up to 50 and rises up
+    to 50 a turn. Angles are -720 to 720 deg, at least one.
 
     Args:
         draw: of Hypothesis.
