@@ -28,7 +28,8 @@ MIN_TURN: Final = 0.2
 def without_bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> tuple[ImageSet, list[str]]:
-    """Interpolate the pixels of a data set that do not respond as their neighbours do.
+    """Find the pixels of a data set that do not respond as their neighbours do, and mark
+    them to be interpolated.
 
     Args:
         dataset: the scan.
@@ -36,12 +37,13 @@ def without_bad_pixels(
         counts: gives those of a frame by its index.
 
     Returns:
-        The data set, and warnings for the user.
+        The data set, and one warning that describes the pixels; without any, the data set
+        itself and [].
     """
-    found = _bad_pixels(dataset, cone_vec, counts)
-    if found is None:
+    pixels = _bad_pixels(dataset, cone_vec, counts)
+    if pixels is None:
         return dataset, []
-    return replace(dataset, interpolated=found.mask), [str(found)]
+    return replace(dataset, interpolated=pixels.mask), [str(pixels)]
 
 
 def _bad_pixels(
@@ -49,7 +51,9 @@ def _bad_pixels(
 ) -> BadPixels | None:
     """Find pixels that differ from their neighbours in all views.
 
-    For a panel on its side rows and columns are exchanged meanwhile.
+    At most `MAX_FROM_DISK` views are read, evenly spread; they are kept in memory for the
+    next pass if they need at most `MOST_KEPT_BYTES`. For a panel on its side rows and
+    columns are exchanged meanwhile.
 
     Args:
         dataset: with its flat image.
@@ -57,7 +61,8 @@ def _bad_pixels(
         counts: reads an image by its number.
 
     Returns:
-        None with few views, no open beam, hardly any turn, or no bad pixels.
+        The pixels; None with fewer than `MIN_VIEWS` views, no open beam, a source that
+        moves by less than `MIN_TURN` of its distance, or no bad pixels.
     """
     present = np.array(dataset.present)
     if len(present) < MIN_VIEWS or not (dataset.flat > dataset.dark).any():
@@ -88,7 +93,7 @@ def _bad_pixels(
                 kept.append(image)
             yield image
 
-    found = bad_pixels(images, axis_column)
-    if found is not None and lies:
-        return BadPixels(found.mask.T)
-    return found
+    pixels = bad_pixels(images, axis_column)
+    if pixels is not None and lies:
+        return BadPixels(pixels.mask.T)
+    return pixels

@@ -63,7 +63,8 @@ class ImagesOnDisk:
     def put(self, number: int, image: Float32Array) -> None:
         """Keep an image, as `ImagesInMemory.put`.
 
-        An image kept under this number before is overwritten.
+        An image kept under this number before is overwritten; other types are converted
+        to float32.
 
         Raises:
             OSError: it cannot be written; names the folder.
@@ -80,10 +81,9 @@ class ImagesOnDisk:
     def get(self, number: int, rows: slice = ALL_ROWS) -> Float32Array:
         """Return rows of a kept image, as `ImagesInMemory.get`.
 
-        Raises KeyError for a number that was not kept.
-
         Raises:
             OSError: it cannot be read; names the folder.
+            KeyError: no image was kept under this number.
         """
         height, width = self._shapes[number]
         first, last, _ = rows.indices(height)
@@ -103,7 +103,7 @@ class ImagesOnDisk:
         self._file.close()
 
     def _read_into(self, buffer: memoryview) -> int:
-        """Read some bytes into a buffer; returns how many.
+        """Read bytes into a buffer, at least one, up to its size; returns how many.
 
         Raises:
             OSError: the file ends too early.
@@ -139,8 +139,9 @@ class CountsOnce:
 
     def __getitem__(self, index: int) -> Counts:
         """Return counts of an image, and hold the newest two images, as a correction of
-        detector lag takes the frame before; images looked at earlier are not read
-        again.
+        detector lag takes the frame before.
+
+        An image that was looked at earlier is not read again, but then forgotten.
         """
         if index not in self._latest:
             counts = self._looked_at.pop(index, None)
@@ -192,11 +193,12 @@ class KeptImages:
     def image(self, number: int, *, again: bool) -> Float32Array:
         """Return an image as it was read.
 
-        An image that was kept is not read again.
+        An image that was kept is not read again; after a reading the function of progress
+        is called.
 
         Args:
             number: of the image.
-            again: keep it.
+            again: keep it for a further call; otherwise it is read again then.
 
         Raises:
             ValueError: its prepared image has replaced it.

@@ -185,9 +185,8 @@ class ScanFrames:
         return rows // self.binning, cols // self.binning
 
     def parts(self) -> Iterator[Float32Array]:
-        """Yield line integrals of all frames in order, `PART` at a time, (k, rows, cols);
-        not kept for another pass.
-        """
+        """Yield line integrals of all frames in order, corrected as in `view`, `PART` at
+        a time, (k, rows, cols); they are not kept for another pass."""
         count = len(self.indices)
         for first in range(0, count, PART):
             numbers = range(first, min(first + PART, count))
@@ -205,7 +204,10 @@ class ScanFrames:
 
         Args:
             number: of the frame among those that are reconstructed.
-            again: keep the image, where images are kept.
+            again: keep the image as measured, where images are kept.
+
+        Returns:
+            float32 (rows, cols).
         """
         if self.kept is None:
             image = self.measured(self.dataset, number)
@@ -243,7 +245,8 @@ def views_of(
         binning, every: see `VolumeRequest`.
 
     Raises:
-        LimitError: no frame or pixel would be left.
+        LimitError: no frame would be left, `every` is no whole number from 1, or binning
+            is no whole number from 1 to half of the shorter side.
     """
     rows, cols = dataset.shape
     most = max(1, min(rows, cols) // 2)
@@ -268,17 +271,17 @@ def views_of(
 
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
-    """Choose the grid of a requested volume; what is not requested is that of the field of
-    view.
+    """Choose the grid of a requested volume; what is not requested is that of the field
+    of view.
 
-    A requested shape without centre is centred at 0.
+    A requested shape without centre is centred at the origin.
 
     Args:
         views: to reconstruct.
         request: voxel size, shape and centre, each may be None.
 
     Raises:
-        GeometryError: voxels too large for the field of view.
+        GeometryError: voxels that are implausibly large for the field of view.
     """
     whole = field_of_view(views.cone_vec, views.shape, request.voxel_mm)
     if request.voxel_mm is not None and request.shape is None:
@@ -346,8 +349,9 @@ class ReconstructionTask:
     def plan(self, memory: int | None, *, slabs: bool = True) -> MemoryPlan:
         """Decide on the use of memory and disk.
 
-        Iterative methods make the volume as a whole. With a CUDA device all images may be
-        read again, as it may fail.
+        Iterative methods make the volume as a whole. With a CUDA device, which may fail,
+        all images may be read again and are kept as prepared. Without a stated memory at
+        least a layer at a time is planned.
 
         Args:
             memory: to use; None for half of the free memory [bytes].
@@ -485,6 +489,8 @@ def _untold(done: float, total: float) -> None:
 
 
 def _bias(views: ScanFrames) -> Bias | None:
+    """Estimate the bias of FDK from views and their truncation; None where it cannot be
+    estimated."""
     return bias_of(
         views.view,
         views.cone_vec,
@@ -503,8 +509,8 @@ def _reconstruct_in_process(
 ) -> tuple[ScanFrames, Bias | None, list[str]]:
     """Reconstruct into a file in this process.
 
-    Doubts are voxels that are not seen; of other algorithms none. The disk must have room
-    for kept images.
+    The disk must have room for kept images, else LimitError before any work. Doubts are
+    FDK's voxels that are not seen; other algorithms have none.
 
     Args:
         task: the reconstruction.
@@ -549,9 +555,10 @@ def _fdk_slabs(
     *,
     errors: bool = False,
 ) -> Iterator[Volume]:
-    """Reconstruct by FDK, slab after slab; images of a single slab enter as they are read.
+    """Reconstruct by FDK, slab after slab.
 
-    A single slab is yielded as one volume of the whole grid, without prepared images.
+    Where the plan keeps no prepared images, images enter as they are read, and one volume
+    of the whole grid is yielded; this is computed at the call.
 
     Args:
         task: the reconstruction.
@@ -618,15 +625,16 @@ def reconstruct_volume(
 ) -> Volume:
     """Reconstruct a data set in memory.
 
-    Doubts about the frames, the errors and lost voxels are warnings. The file is used
-    where three times the volume exceeds the memory; iterations never use it.
-
-    A volume by FDK that exceeds the memory is in a file without a name in the folder for
-    temporary files (TMPDIR); it has no `sigma`.
+    Doubts about the frames, the errors and lost voxels are warnings. A volume by FDK of
+    more than a third of the machine's memory is in a file without a name in the folder
+    for temporary files (TMPDIR), and has no `sigma`; iterations never use a file.
 
     Args:
         dataset, request, parameters, progress: as for `reconstruct_dataset`.
-        errors: as for `fdk`.
+        errors: estimate FDK's errors: `bias_bound`, `accuracy` and `sigma`.
+
+    Returns:
+        The volume, attenuation [1/mm].
 
     Raises:
         TwinError: as `reconstruct_dataset`.
@@ -666,7 +674,8 @@ def reconstruct_volume(
 
 
 def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
-    """Collect slabs in a volume whose values are in a file without a name, deleted with them.
+    """Collect slabs in a volume whose values are in a file without a name, which is
+    deleted when the values are.
 
     Args:
         slabs: from the lowest up.
@@ -686,11 +695,11 @@ def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
 def _task(
     dataset: ImageSet, request: VolumeRequest | None, parameters: Offsets | None
 ) -> ReconstructionTask:
-    """Check a request, and make its task: views without bad pixels, not yet corrected, and
-    grid.
+    """Check a request, and make its task: views without bad pixels, not yet corrected,
+    and grid.
 
-    Raises too for several materials with an algorithm that takes one; doubts are kept in
-    the views.
+    Bad pixels are marked to be interpolated; doubts about geometry, pixels and images are
+    kept in the views.
 
     Args:
         dataset: its images are read for bad pixels and doubts.
@@ -698,7 +707,9 @@ def _task(
         parameters: offsets instead of the correction's.
 
     Raises:
-        TwinError: the request cannot be met.
+        TwinError: an unknown algorithm, several materials with an algorithm that takes
+            one, a binning or selection that leaves nothing, an implausible geometry, or
+            images without line integrals.
     """
     if request is None:
         wanted = VolumeRequest()
@@ -711,10 +722,10 @@ def _task(
         )
     several = _names(wanted.material)
     if len(several) > 1 and "materials" not in ALGORITHMS[name].options:
-        said = f"materials {', '.join(several)} with {name}"
+        message = f"materials {', '.join(several)} with {name}"
         follow = " or ".join(having("materials"))
         allowed = f"one, or several with {follow}, which follow each through the volume"
-        raise LimitError.instead(said, [name, *several], allowed)
+        raise LimitError.instead(message, [name, *several], allowed)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     counts = CountsOnce(dataset.counts)
     grid = grid_of(views, wanted)
@@ -724,8 +735,8 @@ def _task(
         operation = Operation.ITERATE
     half = 0.5 * grid.voxel_mm * np.array(grid.shape[::-1])
     box = np.array([grid.center_mm - half, grid.center_mm + half])
-    found = examine(operation, views.cone_vec, views.shape, grid=box)
-    doubts = settled(found, GeometryError)
+    findings = examine(operation, views.cone_vec, views.shape, grid=box)
+    doubts = settled(findings, GeometryError)
     mended, bad = without_bad_pixels(
         dataset, dataset.corrected(parameters), counts.looked_at
     )
@@ -767,13 +778,15 @@ def preview(
 
 
 def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
-    """Prepare the requested corrections: scatter, rings and beam hardening.
+    """Prepare the requested corrections, in this order: scatter, rings (estimated after
+    scatter), and beam hardening.
 
     Several materials are corrected within an iterative algorithm; a single energy has no
     beam hardening.
 
     Args:
-        views: uncorrected frames; kept images are read once, in order, where the detector lags.
+        views: uncorrected frames; kept images are read once, in order, where the detector
+            lags.
         request: the volume.
 
     Returns:
@@ -817,15 +830,16 @@ def _without_scatter(
     """Simulate the scatter of an object of these materials in some views, and prepare its
     subtraction from all.
 
-    Images that state no model of noise are taken as a scanner's. Returns the frames with
-    the scatter to subtract and its doubts added.
-
-    A quick volume is reconstructed for the object.
+    A quick volume of about `SCATTER_VIEWS` views, binned to about `SCATTER_PIXELS`, gives
+    the object. Images that state no model of noise are taken as a scanner's.
 
     Args:
         views: the frames.
         names: of the materials.
         request: gives the tube.
+
+    Returns:
+        The frames, with the scatter to subtract and its doubts added.
 
     Raises:
         TwinError: the twin made the images without scatter.
@@ -852,10 +866,10 @@ def _without_scatter(
     geometry = views.cone_vec[::each].binned(factor, views.shape)
     chosen = range(0, len(views.indices), each)
     stack = np.stack([binned_mean(views.view(number), factor) for number in chosen])
-    found = scatterer_of(stack, geometry, chain, kV)
+    scatterer = scatterer_of(stack, geometry, chain, kV)
     beam = Beam.of(chain, kV)
-    scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)
-    return replace(views, scatter=scatter, doubts=(*views.doubts, *found.doubts))
+    scatter = scan_scatter(scatterer.thing, views.cone_vec.rows, views.shape, beam)
+    return replace(views, scatter=scatter, doubts=(*views.doubts, *scatterer.doubts))
 
 
 def _source(
@@ -863,7 +877,9 @@ def _source(
 ) -> tuple[float, TubeModel, float | None]:
     """Return voltage, tube and single energy, as requested or as the data set names them.
 
-    The request is taken first; single energy only from its tube.
+    The request's tube is taken first, then its voltage, then the data set's. A single
+    energy comes from the request's tube only; filters and focal spot otherwise from the
+    data set's figures, if it has any.
 
     Raises:
         LimitError: neither states the voltage.
@@ -874,10 +890,10 @@ def _source(
     if request.tube is not None:
         return request.tube.kV, request.tube.model(), request.tube.mono_keV
     if dataset.settings is None:
-        said = None
+        stated_kV = None
     else:
-        said = dataset.settings.kV
-    kV = said if request.kV is None else request.kV
+        stated_kV = dataset.settings.kV
+    kV = stated_kV if request.kV is None else request.kV
     if kV is None:
         raise LimitError(
             f"{dataset.where} does not say its tube voltage, which corrections of beam "
@@ -913,12 +929,16 @@ def _require_layer(grid: Grid) -> None:
 
 
 def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) -> None:
-    """Check, before any work, that the kept images and the volume fit the disk together.
+    """Check, before any work, that the kept images and the volume fit the disk together;
+    nothing is checked where images are kept in memory.
+
+    Args:
+        folder: of the images.
+        plan: of memory and disk.
+        volume_bytes: of the volume in the same folder.
 
     Raises:
         LimitError: names the needed and the free space.
-
-    Nothing is checked where the images are kept in memory.
     """
     if not plan.on_disk:
         return
@@ -961,7 +981,8 @@ def _iterative(
 ) -> Volume:
     """Reconstruct by an iterative algorithm, after checking that the memory suffices.
 
-    Options that are None are the algorithm's own.
+    Options that are None are the algorithm's own. Plausibility warnings are not shown, as
+    they are among the views' doubts.
 
     Args:
         views: to reconstruct.
@@ -970,7 +991,7 @@ def _iterative(
         tell: called with the iterations done, and all.
 
     Raises:
-        LimitError: the memory does not suffice.
+        LimitError: the algorithm's stacks and grids need more than 80 % of the memory.
     """
     algorithm = ALGORITHMS[request.algorithm]
     stacks = algorithm.stacks
@@ -980,7 +1001,7 @@ def _iterative(
         grids = grids + 3
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
     _require(f"of memory for {request.algorithm}", need, int(0.8 * memory_bytes()), grid)
-    asked = {
+    options = {
         "iterations": request.iterations,
         "weight": request.weight,
         "hardening": views.mixture,
@@ -994,7 +1015,7 @@ def _iterative(
             views.cone_vec,
             grid.blank(),
             watch=lambda step: tell(step.iteration, step.of),
-            **{name: value for name, value in asked.items() if value is not None},
+            **{name: value for name, value in options.items() if value is not None},
         )
     return made
 

@@ -39,8 +39,8 @@ def scan_rings(
     lies = on_its_side(cone_vec)
     numbers = range(len(cone_vec))
     views: Iterator[Float32Array] = (view(k).T if lies else view(k) for k in numbers)
-    found = ring_errors(views, _axis_column(cone_vec, shape, lies=lies))
-    return found.T if lies else found
+    offsets = ring_errors(views, _axis_column(cone_vec, shape, lies=lies))
+    return offsets.T if lies else offsets
 
 
 def _axis_column(
@@ -48,16 +48,15 @@ def _axis_column(
 ) -> float | None:
     """Return the column of the axis of a full turn.
 
-    Raises nothing: None too if the sources are on no circle.
-
     Args:
         cone_vec: of all views.
         shape: (rows, cols).
         lies: whether the panel is on its side.
 
     Returns:
-        None unless the turn is full and even, and the axis nearly parallel to the
-        columns.
+        The column (of the upright image); None if the sources are on no level circle, the
+        turn is not full and even, or the axis leans by more than `MOST_LEAN_PX` over the
+        image.
     """
     try:
         circle = circle_of(cone_vec)

@@ -68,8 +68,9 @@ class StandingImages:
     ) -> StandingImages:
         """Make the upright images of a scan.
 
-        For a leaning panel columns are resampled finer, unless that is done when FDK
-        stands them up.
+        A panel on its side is turned. The columns of a leaning panel are resampled
+        `FINER`, unless the overlap of an offset panel is narrow: then FDK stands the
+        images up itself.
 
         Args:
             cone_vec: of all views.
@@ -101,7 +102,8 @@ class StandingImages:
         return cls(cone_vec, turned, level, (rows, wide), rises, truncation)
 
     def stood(self, image: Float32Array, number: int) -> Float32Array:
-        """Return the image of a view as an upright panel would have recorded it.
+        """Return the image of a view as an upright panel would have recorded it;
+        unchanged, or only turned, where the panel is upright.
 
         Args:
             image: (rows, cols) as recorded.
@@ -117,8 +119,11 @@ class StandingImages:
         return stood
 
     def rows(self, like: Volume) -> slice:
-        """Return the rows with a slab's shadow in some view, with a margin; all rows if
-        the scan rises or the panel is not upright.
+        """Return the rows with a slab's shadow in some view, with a margin of `MARGIN` on
+        either side; all rows if the scan rises or the panel is not upright.
+
+        Args:
+            like: grid of the slab; its values are not used.
         """
         if self.rises or not is_upright(self.cone_vec):
             return slice(0, self.shape[0])
@@ -154,7 +159,7 @@ def fdk_slabs(
 ) -> Iterator[Volume]:
     """Reconstruct slab after slab.
 
-    Each image is corrected and kept once, at the first slab that needs it.
+    Each image is read, stood up and kept once, at the first slab.
 
     Args:
         view: gives the corrected image of a view as recorded.
@@ -232,9 +237,7 @@ class Work:
         slabs: Sequence[tuple[int, int]],
         tell: Callable[[float, float], None],
     ) -> Work:
-        """Estimate the work of slabs of a grid.
-
-        Of reading, filtering and backprojecting.
+        """Estimate the work of slabs of a grid: reading, filtering and backprojecting.
 
         Args:
             images: upright.

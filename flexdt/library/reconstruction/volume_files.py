@@ -38,8 +38,8 @@ NO_PLACE: Final = (
 
 @contextmanager
 def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
-    """Open `path` for a volume on `grid`, and yield the function that takes its slabs; the
-    ending chooses the format.
+    """Open `path` for a volume on `grid`, and yield the function that takes its slabs;
+    the ending chooses the format.
 
     The file gets its name when all slabs are written; after an error none is left.
 
@@ -48,7 +48,8 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
         grid: of the volume.
 
     Raises:
-        LimitError: another ending, a missing folder, or voxels that the format does not allow.
+        LimitError: another ending, a missing folder, voxels that the format does not
+            allow, or too little room on the disk for a format without compression.
         TwinError: the package that writes the format is not installed.
         OSError: the file cannot be written.
     """
@@ -61,11 +62,11 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
         allowed = [
             ending for one in VOLUME_FORMATS if one.oblong for ending in one.endings
         ]
-        said = (
+        message = (
             f"{path}: voxels of {' x '.join(f'{edge:g}' for edge in places.edges_mm)} mm"
         )
         raise LimitError.instead(
-            said, list(places.edges_mm), f"cubes, or {', '.join(allowed)}"
+            message, list(places.edges_mm), f"cubes, or {', '.join(allowed)}"
         )
     if not form.packed:
         require_bytes(path, 4 * math.prod(places.shape))
@@ -92,9 +93,11 @@ def ending(path: Path) -> str:
 
 
 def check_name(path: Path) -> VolumeFormat:
-    """Return the volume format of a file name, before any work.
+    """Return the volume format of a file name, by its ending, before any work.
 
-    Raises on an unknown ending, and LimitError if the folder does not exist.
+    Raises:
+        LimitError: an unknown ending, or the folder does not exist.
+        TwinError: the package that writes the format is not installed.
     """
     form = _format(path)
     if not path.absolute().parent.is_dir():
@@ -133,13 +136,15 @@ def save_volume(volume: Volume, file: File) -> None:
 
 
 def read_volume(file: File) -> Volume:
-    """Read a volume with its place, from a file that `volume_writer` made.
+    """Read a volume with its place, from a file that `volume_writer` made; the ending
+    chooses the format.
 
     Volumes with cubic voxels get one edge, others three.
 
     Raises:
         OSError: it cannot be read.
-        LimitError: it is not such a file.
+        LimitError: it is not such a file, or has another ending.
+        TwinError: the package that reads the format is not installed.
     """
     path = Path(file)
     form = _format(path)
@@ -193,9 +198,8 @@ class MiddleSlices:
 
     @property
     def images(self) -> dict[str, npt.NDArray[np.float32]]:
-        """Middle slices by name, first row at the top: xy (seen from above, +y
-        up), xz and yz (+z up).
-        """
+        """Middle slices by name, first row at the top: xy (seen from above, +y up), xz
+        and yz (+z up); layers not taken yet are zero."""
         return {
             "xy": self._across_z[::-1],
             "xz": self._across_y[::-1],

@@ -70,17 +70,15 @@ class VoxelPlaces:
 
     @property
     def grid(self) -> Grid:
-        """Grid of cubes.
-
-        Same shape and centre, with the one edge.
+        """Grid of cubes with this shape, centre and edge.
 
         Raises:
             GeometryError: they are no cubes.
         """
         if not self.cubes:
-            said = f"voxels of {' x '.join(f'{edge:g}' for edge in self.edges_mm)} mm"
+            message = f"voxels of {' x '.join(f'{edge:g}' for edge in self.edges_mm)} mm"
             raise GeometryError.instead(
-                said, list(self.edges_mm), "cubes, three equal edges"
+                message, list(self.edges_mm), "cubes, three equal edges"
             )
         return Grid(self.shape, self.edges_mm[0], self.center_mm)
 
@@ -129,8 +127,12 @@ class VolumeFormat:
 def _write_and_rename(
     write: Callable[[Path, VoxelPlaces], Iterator[Sink]],
 ) -> Callable[..., Iterator[Sink]]:
-    """Wrap the writer of one file: it writes to a temporary path, which then gets the
-    final one; not after an error.
+    """Wrap the writer of one file: it writes to a temporary path, which gets the final
+    name at the end; after an error it does not.
+
+    Returns:
+        A generator function of (temporary path, final path, places), which yields the
+        function that takes the slabs.
     """
 
     def write_whole_file(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
@@ -143,7 +145,7 @@ def _write_and_rename(
 def _write_headed(
     header: Callable[[VoxelPlaces], bytes], compress: bool = False
 ) -> Callable[..., Iterator[Sink]]:
-    """Return a writer of a header and the values after it.
+    """Return a writer of a header and the raw values after it, for `VolumeFormat.write`.
 
     The file gets its path only when complete.
 
@@ -301,7 +303,8 @@ def _nifti_header(places: VoxelPlaces) -> bytes:
 def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     """Write one data set, `volume`, with its place as attributes.
 
-    Yields the function that takes the slabs, lowest first. Raises if h5py is missing.
+    Yields the function that takes the slabs, lowest first. Raises TwinError if h5py is
+    missing.
 
     Args:
         part: the unfinished file.
@@ -326,12 +329,20 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 
 def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
-    """Read the fields of an ASCII header that ends with `end`, each divided by `between`,
-    and the offset [bytes] of the values; raises ValueError if no end is found.
+    """Read the fields of an ASCII header, name and value stripped, and the offset of the
+    values [bytes].
+
+    Args:
+        path: of the file.
+        between: separates name and value in a line.
+        end: ends the header, within the first `HEADER_BYTES`.
+
+    Raises:
+        ValueError: no such end, or a header that is not ASCII.
     """
     with path.open("rb") as file:
-        head, found, _ = file.read(HEADER_BYTES).partition(end)
-    if not found:
+        head, mark, _ = file.read(HEADER_BYTES).partition(end)
+    if not mark:
         raise ValueError("no values in the file")
     fields = (line.partition(between) for line in head.decode("ascii").splitlines())
     return {key.strip(): value.strip() for key, _, value in fields}, len(head) + len(end)
@@ -367,9 +378,9 @@ def _read_tiff(path: Path) -> Stored:
 
 
 def _read_mha(path: Path) -> Stored:
-    """Read voxels, edges and the first voxel's place from an .mha file; x and y of the file
-    point the other way.
-    """
+    """Read voxels (memory-mapped), edges [mm], the first voxel's place [mm] and True (it
+    is the first voxel's, not the centre) from an .mha file; x and y of the file point the
+    other way."""
     fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
     values = _map_values(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
