@@ -61,9 +61,9 @@ def __getattr__(name: str) -> Any:
     Raises AttributeError on any other name.
     """
     if name == "ENDINGS":
-        found: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}
+        value: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}
     elif name == "WRITERS":
-        found = {
+        value = {
             form.name: partial(_content, form=form, out=Path(form.name + form.endings[0]))
             for form in FORMATS.values()
             if form.write
@@ -71,11 +71,11 @@ def __getattr__(name: str) -> Any:
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     warnings.warn(f"{name}: use FORMATS[name]", DeprecationWarning, stacklevel=2)
-    return found
+    return value
 
 
 def geometry_of(dataset: ImageSet, parameters: Offsets | None = None) -> ScanGeometry:
-    """Return a data set's geometry.
+    """Return a data set's geometry, with its name and the files of its projections.
 
     Args:
         dataset: from `load_dataset`.
@@ -104,7 +104,8 @@ def export_dataset(
     real: Offsets | None = None,
     rows_up: bool = False,
 ) -> ScanGeometry:
-    """Write a data set's geometry in a peer's format.
+    """Write a data set's geometry in a peer's format; the file appears only when
+    complete.
 
     Args:
         dataset: from `load_dataset`.
@@ -119,7 +120,9 @@ def export_dataset(
         The geometry that was written.
 
     Raises:
-        ExchangeError: the format cannot carry it; nothing is written.
+        ExchangeError: an unknown format or another ending, `real` or `rows_up` with a
+            format that has no place for it, or a geometry that the format cannot carry;
+            nothing is written.
     """
     out = Path(out)
     form = _to_write(out, format, exported())
@@ -139,7 +142,8 @@ def export_dataset(
 
 
 def _content(geometry: ScanGeometry, form: Format, out: Path) -> Content:
-    """Return the content of a geometry's file in a format.
+    """Return the content of a geometry's file in a format, text or bytes; nothing is
+    written.
 
     Raises:
         ExchangeError: the format needs a data set, or cannot carry the geometry.
@@ -161,16 +165,20 @@ def import_geometry(
 ) -> ScanGeometry:
     """Read a geometry in a peer's format.
 
-    Shape, views and pitch must agree with the given ones.
+    Shape, views and pitch must agree with the given ones. Without a name it gets the
+    file's stem; doubts about the geometry become notes.
 
     Args:
         path: the file.
         format: one of `FORMATS` that is read (`Format.read`).
         given: values that the file does not state.
-        rows_up: its rows are counted upwards while the images have row 0 on top: v is negated.
+        rows_up: its rows are counted upwards while the images have row 0 on top: v is
+            negated.
 
     Raises:
-        ExchangeError: the file is invalid, or something is missing; names it.
+        ExchangeError: an unknown format, an invalid file, one that lacks something or
+            contradicts the given values, `rows_up` with a format that states its rows, or
+            a geometry that no scanner has.
         OSError: it cannot be read.
     """
     known = Given() if given is None else given
@@ -182,13 +190,13 @@ def import_geometry(
         if form.rows is not None:
             raise ExchangeError(f"{format} says by itself which way its rows grow")
         geometry = geometry.rows_up()
-    for what, asked, found in (
+    for quantity, stated, read in (
         ("rows and columns", known.shape, geometry.shape),
         ("views", known.views, len(geometry)),
     ):
-        if asked is not None and found not in (None, asked):
-            said = f"{path} says {found} {what}, not {asked}"
-            raise ExchangeError(said, {"asked": asked, "allowed": found})
+        if stated is not None and read not in (None, stated):
+            message = f"{path} says {read} {quantity}, not {stated}"
+            raise ExchangeError(message, {"asked": stated, "allowed": read})
     known.check_pitch(geometry, path)
     if geometry.shape is None:
         shape = known.shape
@@ -200,21 +208,24 @@ def import_geometry(
 
 
 def _with_doubts(geometry: ScanGeometry, path: Path) -> ScanGeometry:
-    """Add the doubts about a file's geometry to its notes.
+    """Return the geometry with the doubts about it added to its notes; itself without
+    doubts.
 
     Raises:
         ExchangeError: no scanner has such a geometry.
     """
-    found = examine(Operation.OPEN, geometry.cone_vec, geometry.shape)
-    doubts = settled(found, ExchangeError, str(path))
+    findings = examine(Operation.OPEN, geometry.cone_vec, geometry.shape)
+    doubts = settled(findings, ExchangeError, str(path))
     if doubts:
         return replace(geometry, notes=(*geometry.notes, *doubts))
     return geometry
 
 
 def _known(format: str, allowed: Iterable[str]) -> Format:
-    """Return the format of a name; raises ExchangeError that lists the allowed, unless
-    the name is one of them.
+    """Return the format of a name.
+
+    Raises:
+        ExchangeError: the name is not among the allowed ones; lists them.
     """
     names = [*allowed]
     if format not in names:
@@ -226,7 +237,7 @@ def _known(format: str, allowed: Iterable[str]) -> Format:
 
 
 def _to_write(out: Path, format: str, allowed: Iterable[str]) -> Format:
-    """Return the format of a name.
+    """Return the format of a name, for a file with this ending (in either case).
 
     Args:
         out: file to write.
@@ -260,7 +271,7 @@ def write_geometry(geometry: ScanGeometry, out: str | PathLike[str], format: str
 def save_geometry(geometry: ScanGeometry, out: str | PathLike[str]) -> None:
     """Write a geometry file: .json (everything) or .npy (cone_vec alone).
 
-    The file appears only when complete.
+    The file appears only when complete, in place of one of this name.
 
     Raises:
         ExchangeError: another ending.
@@ -295,7 +306,8 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
 def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> Images:
     """Return the data set with its nominal geometry replaced and no correction in force.
 
-    The geometry may lack a shape; then it is not compared.
+    The geometry may lack a shape; then only the number of views is compared. Motor
+    positions and images stay.
 
     Args:
         dataset: from `load_dataset`.
@@ -309,8 +321,11 @@ def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> I
     if isinstance(geometry, ConeVec):
         geometry = ScanGeometry(geometry, geometry.detector_shape)
     if len(geometry) != len(dataset):
-        said = f"{dataset.where} has {len(dataset)} projections, the geometry {len(geometry)} views"
-        raise ExchangeError(said, {"asked": len(geometry), "allowed": len(dataset)})
+        message = (
+            f"{dataset.where} has {len(dataset)} projections, the geometry "
+            f"{len(geometry)} views"
+        )
+        raise ExchangeError(message, {"asked": len(geometry), "allowed": len(dataset)})
     if geometry.shape not in (None, dataset.shape):
         raise ExchangeError(
             f"{dataset.where} has images of {dataset.shape}, the geometry is of "

@@ -103,20 +103,22 @@ def _read_rtk(path: Path, given: Given) -> ScanGeometry:
     The pitch [mm] is not in RTK's file.
 
     Raises:
-        ExchangeError: the file is invalid, or the pitch unknown.
+        ExchangeError: the file is invalid, or no pitch is given (checked after the file).
     """
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.twin.exchange.geometry import ExchangeError
     from flexdt.twin.exchange.rtk_xml import read_rtk
 
     # Whether it is RTK's file at all is said before what such a file lacks.
-    found = read_rtk(text_of(path), given.pitch_mm or (1.0, 1.0), given.shape, str(path))
+    geometry = read_rtk(
+        text_of(path), given.pitch_mm or (1.0, 1.0), given.shape, str(path)
+    )
     if given.pitch_mm is None:
         raise ExchangeError(
             f"{path}: RTK's file does not know the pixel size; give pixel= [mm] "
             "(--pixel or --like on the command line)"
         )
-    return found
+    return geometry
 
 
 def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
@@ -246,7 +248,10 @@ def _export_nxtomo(
     dataset: ImageSet, out: Path, parameters: Offsets | None, real: Offsets | None
 ) -> None:
     """Write a complete data set as NXtomo, with other offsets if `parameters` are given;
-    `real` is ignored. Raises if it is incomplete.
+    `real` is ignored.
+
+    Raises:
+        DatasetMissingError: the data set is incomplete.
     """
     from flexdt.library.datasets.nxtomo_writing import save_nxtomo
 

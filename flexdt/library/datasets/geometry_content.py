@@ -42,18 +42,19 @@ class Given:
         """
         pitch = geometry.pitch_mm
         if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
-            found, asked = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))
-            said = f"{path} says pixels of {found} mm, not {asked}"
+            read, stated = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))
+            message = f"{path} says pixels of {read} mm, not {stated}"
             raise ExchangeError(
-                said, {"asked": list(self.pitch_mm), "allowed": list(pitch)}
+                message, {"asked": list(self.pitch_mm), "allowed": list(pitch)}
             )
 
 
 def text_of(path: Path) -> str:
-    """Read a file's UTF-8 text.
+    """Read a file's UTF-8 text; a byte order mark is removed.
 
     Raises:
-        ExchangeError: it is too long, or no UTF-8.
+        ExchangeError: it has more than `MAX_BYTES`, or is no UTF-8.
+        OSError: it cannot be read.
     """
     if path.stat().st_size > MAX_BYTES:
         raise ExchangeError(f"{path}: {path.stat().st_size} bytes; allowed: {MAX_BYTES}")
@@ -69,7 +70,8 @@ def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
     Pickled objects are not read.
 
     Raises:
-        ExchangeError: it is no such file.
+        ExchangeError: it is no such file, or holds pickled objects.
+        OSError: it cannot be read.
     """
     try:
         loaded = np.load(path, allow_pickle=False)

@@ -54,9 +54,10 @@ def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
             checked.
 
     Returns:
-        At most one sentence, of the first kind that is saturated.
+        One sentence, of the first kind of which at least `WARNING_SHARE` of the pixels is
+        saturated; else [].
     """
-    for what, path in paths.items():
+    for kind, path in paths.items():
         if full_scale is None:
             break
         try:
@@ -64,29 +65,34 @@ def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
         except (OSError, DatasetError):
             continue
         if share >= WARNING_SHARE:
-            return [saturated_part(what, share)]
+            return [saturated_part(kind, share)]
     return []
 
 
 def image_doubts(
     scan: ImageSet, *, needed: bool = False, counts: Callable[[int], Counts] | None = None
 ) -> list[str]:
-    """Find saturated or starved pixels that make a scan's line integrals doubtful.
+    """Find saturated or starved pixels, and changes of the beam or between flat images,
+    that make a scan's line integrals doubtful.
 
     Saturated pixels are those with the panel's largest count. Where that is not known, it
     is the largest among the images if it is one at which converters end (2^bits - 1). All
     radiographs in memory are examined, `MAX_FROM_DISK` of those in files, and the flat
-    image.
+    image. A share of at least `WARNING_SHARE` is a doubt; starved pixels have fewer than
+    `FEW_COUNTS` above dark. Pixels without an open beam, and those that the data set
+    interpolates, are left out.
 
     Args:
         scan: the data set.
         needed: line integrals are.
-        counts: gives those of a frame in a file by its index; None reads them. Pixels
-            that the data set interpolates are skipped.
+        counts: gives those of a frame in a file by its index; None reads them.
+
+    Returns:
+        Sentences; [] where line integrals were given instead of counts.
 
     Raises:
-        DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of
-            the flat image is brighter than the dark one, or all are saturated.
+        DatasetFormatError: line integrals are `needed`, and the images hold none: no
+            pixel of the flat image is brighter than the dark one, or all are saturated.
     """
     if scan.arrays is not None and scan.arrays.integrals is not None:
         return []  # they were given, not exposed
@@ -125,8 +131,8 @@ def image_doubts(
         }
         held = min(shares.values()) <= 1.0 - WARNING_SHARE
         doubts = [
-            saturated_part(what, share)
-            for what, share in shares.items()
+            saturated_part(kind, share)
+            for kind, share in shares.items()
             if share >= WARNING_SHARE
         ]
         if starved >= WARNING_SHARE:

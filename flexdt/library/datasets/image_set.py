@@ -74,16 +74,16 @@ class Arrays:
     integrals: Float32Array | None = None
 
     def of_views(self, chosen: npt.NDArray[np.int64]) -> Arrays:
-        """Select the arrays of some of the images, by index; dark and flat images stay,
-        and arrays without counts are returned as they are.
+        """Return the counts and line integrals of some of the images, by index, with the
+        dark and flat images of all; the object itself where there are no counts.
         """
         if self.counts is None:
             return self
         if self.integrals is None:
-            kept = None
+            integrals = None
         else:
-            kept = self.integrals[chosen]
-        return replace(self, counts=self.counts[chosen], integrals=kept)
+            integrals = self.integrals[chosen]
+        return replace(self, counts=self.counts[chosen], integrals=integrals)
 
 
 @public
@@ -171,14 +171,16 @@ class ImageSet:
                 functions of counts; a warning gives the number beyond the range of
                 counts.
             geometry: one view for each image.
-            dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is
-                taken. Without a flat image, counts have no line integrals.
+            dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean
+                is taken. Without a flat image, counts have no line integrals.
             name: of the data set.
             warnings: doubts about it.
             truth: sample and settings of a simulation.
 
         Raises:
-            DatasetFormatError: shapes that do not fit, or values that are no counts.
+            DatasetFormatError: shapes that do not fit, values that are no counts, line
+                integrals that are not finite, or an implausible geometry. Images that are
+                zero everywhere make the data set incomplete.
 
         Example:
             >>> import numpy as np
@@ -237,11 +239,11 @@ class ImageSet:
         frames = tuple(
             Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(values))
         )
-        told: tuple[str, ...]
+        dark_doubt: tuple[str, ...]
         if dark is not None:
-            told = ()
+            dark_doubt = ()
         else:
-            told = ("no dark image: zero is taken",)
+            dark_doubt = ("no dark image: zero is taken",)
         return cls(
             name,
             frames,
@@ -250,7 +252,7 @@ class ImageSet:
             arrays=arrays,
             complete=not blank.any(),
             reason=reason if blank.any() else "",
-            warnings=(*told, *placed, *warnings),
+            warnings=(*dark_doubt, *placed, *warnings),
             truth=truth,
         )
 
@@ -293,13 +295,15 @@ class ImageSet:
         return facts_table(f"DataSet {self.name}", facts) + picture
 
     def _reference_counts(self) -> tuple[int, int]:
-        """Count the dark and the flat images, in memory if there, else in files."""
-        kept: tuple[npt.NDArray[Any] | None, npt.NDArray[Any] | None] = (None, None)
+        """Return the numbers of dark and of flat images, of those in memory if there are,
+        else in files.
+        """
+        in_memory: tuple[npt.NDArray[Any] | None, npt.NDArray[Any] | None] = (None, None)
         if self.arrays is not None:
-            kept = (self.arrays.darks, self.arrays.flats)
+            in_memory = (self.arrays.darks, self.arrays.flats)
         dark, flat = (
             len(files) if images is None else len(images)
-            for files, images in zip((self.darks, self.flats), kept, strict=True)
+            for files, images in zip((self.darks, self.flats), in_memory, strict=True)
         )
         return dark, flat
 
@@ -310,10 +314,12 @@ class ImageSet:
     def __getitem__(
         self, index: int | slice | Sequence[int] | npt.NDArray[Any]
     ) -> Float32Array | Self:
-        """Return line integrals (rows, cols) of one projection, or the data set of several.
+        """Return line integrals (rows, cols) of one projection, or the data set of
+        several.
 
-        Several keep dark and flat images, warnings and, where it can be selected, the
-        truth; an empty selection keeps the shape.
+        Several keep dark and flat images and warnings; the truth only where it can be
+        selected. Their shape is that of the first; an empty selection keeps the data
+        set's.
 
         Args:
             index: of a projection, or a slice or indices of several.
@@ -382,10 +388,11 @@ class ImageSet:
         return self.corrected().with_shape(self.shape if alike else None)
 
     def corrected(self, parameters: Offsets | None = None) -> ConeVec:
-        """Return the geometry of `frames` with a correction applied.
+        """Return the geometry of `frames` with a correction applied to the nominal one.
 
         Args:
-            parameters: offsets to add; default: the correction in force, or none.
+            parameters: offsets from the nominal geometry; default: the correction in
+                force, or none.
 
         Example:
             >>> import numpy as np
@@ -482,9 +489,7 @@ class ImageSet:
 
     @cached_property
     def dark(self) -> Float32Array:
-        """Mean of the dark images, (rows, cols) [counts]; zero, with a warning, without
-        any.
-        """
+        """Mean of the dark images, float32 (rows, cols) [counts]; zeros without any."""
         dark = self._mean(self.darks, None if self.arrays is None else self.arrays.darks)
         if dark is None:
             return np.zeros(self.shape, dtype=np.float32)
@@ -492,9 +497,7 @@ class ImageSet:
 
     @cached_property
     def flat(self) -> Float32Array:
-        """Mean of the flat images, (rows, cols).
-
-        Dark is not subtracted.
+        """Mean of the flat images, float32 (rows, cols) [counts]; dark is not subtracted.
 
         Raises:
             DatasetMissingError: there is no flat image.
@@ -532,9 +535,11 @@ class ImageSet:
         return plain.interpolating(self.interpolated)
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
-        """Compute projections as -log((p - d) / (f - d)), always finite; the panel's
-        distortion and lag are undone where the correction in force has some (lag where
-        the frame before is there).
+        """Compute projections as -log((p - d) / (f - d)), always finite.
+
+        Integrals that were given are copied instead. The panel's lag, where the frame
+        before is there, and its distortion are undone where the data set's panel has
+        some.
 
         Args:
             index: of one projection; None for all.
@@ -580,7 +585,8 @@ class ImageSet:
         return np.array(arrays.integrals[index])
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
-        """Return line integrals of several projections (default: all present), (n, rows, cols).
+        """Return line integrals of several projections, by index (default: all present),
+        float32 (n, rows, cols).
 
         Example:
             >>> import numpy as np
@@ -665,18 +671,19 @@ def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
 
 
 def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
-    """Convert line integrals to counts.
+    """Convert line integrals to counts of an open beam of `OPEN_COUNTS`, or of down to a
+    third of it where pixels are brighter; counts beyond uint16 are cut.
 
     Returns:
-        Counts (n, rows, cols), the open beam's count, and a warning if values exceed
-        their range.
+        Counts (n, rows, cols), the open beam's count, and [] or one warning with the
+        share of pixels that were cut or are below one count.
 
     Raises:
         DatasetFormatError: line integrals that are not finite.
     """
     if not np.isfinite(integrals).all():
-        said = "line integrals hold values that are not finite"
-        raise DatasetFormatError.instead(said, "NaN or infinity", "finite")
+        message = "line integrals hold values that are not finite"
+        raise DatasetFormatError.instead(message, "NaN or infinity", "finite")
     top = np.iinfo(np.uint16).max
     images = np.exp(-np.maximum(integrals.astype(np.float32), -80.0))
     # Brighter pixels than the open beam, as noise makes them, need room above it.
@@ -686,14 +693,14 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
     images *= opened
     lost = float(((images < 1.0) | (images > top)).mean())
     held = f"{np.log(opened / top):.3g} to {np.log(opened):.3g}"
-    told = (
+    warning = (
         f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut in "
         "counts, as files have them, and kept in line_integrals()"
     )
     return (
         np.rint(np.clip(images, 0, top)).astype(np.uint16),
         opened,
-        [told] if lost else [],
+        [warning] if lost else [],
     )
 
 
@@ -726,8 +733,8 @@ def _image_stack(
 
 
 def flats_of(data: ImageSet) -> npt.NDArray[Any]:
-    """Return the flat images, (k, rows, cols); none (k = 0) of files if there is a single
-    one, which is not read.
+    """Return the flat images, (k, rows, cols): those in memory, else those of files if
+    there are several. A single file is not read: an empty array then, as without any.
     """
     if data.arrays is not None and data.arrays.flats is not None:
         return data.arrays.flats
@@ -736,8 +743,8 @@ def flats_of(data: ImageSet) -> npt.NDArray[Any]:
 
 
 def references(data: ImageSet) -> list[tuple[str, Counts]]:
-    """List dark and flat images with their names; those in memory get names, and means
-    that are no integers are rounded.
+    """List dark, then flat images as (file name, counts). Those in memory get names
+    (di000000.tif, io000000.tif, ...) and are rounded to uint16.
     """
     if data.arrays is None:
         return [(path.name, read_image(path)) for path in (*data.darks, *data.flats)]

@@ -29,7 +29,8 @@ INK: Final = 0
 def labelled(
     grey: npt.NDArray[np.uint8], title: str, mm_per_pixel: float
 ) -> npt.NDArray[np.uint8]:
-    """Add a title above a picture and a scale bar below it.
+    """Add a title above a picture and a scale bar with its length below it; the bar is a
+    round length of at most `MOST_OF_WIDTH` of the width.
 
     Args:
         grey: (rows, cols).
@@ -37,7 +38,7 @@ def labelled(
         mm_per_pixel: length that a pixel of the picture stands for.
 
     Returns:
-        (HEAD_ROWS + rows + FOOT_ROWS, cols).
+        uint8 (HEAD_ROWS + rows + FOOT_ROWS, cols).
     """
     import cv2
 

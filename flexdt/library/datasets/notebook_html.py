@@ -15,7 +15,8 @@ THUMBNAIL_PX: Final = 240
 
 
 def facts_table(caption: str, facts: Mapping[str, object]) -> str:
-    """Write facts as a table of two columns; texts are escaped.
+    """Write facts as an HTML table of two columns, name and value, under a caption; texts
+    are escaped.
 
     Example:
         >>> facts_table("scan", {"frames": 3})

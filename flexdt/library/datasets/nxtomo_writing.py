@@ -35,8 +35,12 @@ BYTES_A_PIXEL: Final = 2
 def save_nxtomo(data: ImageSet, file: File) -> None:
     """Write a data set to an NXtomo file; see `DataSet.to_nxtomo`.
 
-    Raises DatasetFormatError if projections have several shapes, and an error without
-    h5py or room on the disk. A failure leaves no part of the file.
+    The file appears only when complete.
+
+    Raises:
+        DatasetFormatError: projections of several shapes.
+        TwinError: h5py is not installed, or the disk has too little room.
+        DatasetError: a projection cannot be read.
     """
     h5py = package("h5py", "to_nxtomo")
     if any(frame.shape != data.shape for frame in data.frames):
@@ -51,9 +55,11 @@ def save_nxtomo(data: ImageSet, file: File) -> None:
 
 
 def _write(data: ImageSet, out: Any) -> None:
-    """Write a data set into an open HDF5 file: counts, keys, angles, exposure and cone_vec.
+    """Write a data set into an open HDF5 file: counts, keys, angles, exposure and
+    cone_vec.
 
-    Dark and flat images come first; their angles are that of the first view.
+    Dark and flat images come first; their angles are that of the first view. Pixel sizes,
+    distances and the axis's place are those of the first view, too.
 
     Args:
         data: with all its images.
@@ -111,13 +117,13 @@ def _write(data: ImageSet, out: Any) -> None:
     shown["image_key"] = detector["image_key"]
     shown["rotation_angle"] = sample["rotation_angle"]
 
-    own = _group(entry, "flexdt", "NXcollection")
-    _write_quantity(own, "cone_vec", geometry.rows, "mm")
+    collection = _group(entry, "flexdt", "NXcollection")
+    _write_quantity(collection, "cone_vec", geometry.rows, "mm")
 
 
 def _field_of_view(axis_column: float, columns: int) -> str:
-    """Return NXtomo's `Full`, or `Half` where the rotation axis is near a side of the
-    panel.
+    """Return NXtomo's `Full`, or `Half` where the smaller side of the rotation axis has
+    less than `HALF_SEEN` times the columns of the larger.
     """
     left = axis_column + 0.5
     right = columns - 0.5 - axis_column
@@ -127,11 +133,12 @@ def _field_of_view(axis_column: float, columns: int) -> str:
 
 
 def _write_exposure(data: ImageSet, keys: list[int], entry: Any, instrument: Any) -> None:
-    """Write tube and exposure, as far as they are known: count_time, energies, and the current
-    of each image as its monitor (`control`).
+    """Write tube and exposure, as far as they are known: count_time, energies, and the
+    current of each image as its monitor (`control`).
 
-    A tube has a spectrum: `incident_energy` is the mean of flexdt's own spectrum, and the
-    source's energy is its end.
+    Without a voltage only count_time is written. The source's energy is the voltage;
+    `incident_energy` is the mean of flexdt's own spectrum, where its tables have the
+    voltage. The current of dark images is 0.
 
     Args:
         data: the data set.

@@ -50,8 +50,15 @@ def round_length(most: float) -> float:
 def windowed(
     image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """Convert an image to 8 bits: the percentiles of the finite values, of `like` if
-    given, become black and white; NaN is black. All black if they are equal.
+    """Convert an image to 8 bits, with the `PERCENTILES` of its finite values black and
+    white.
+
+    Args:
+        image: any shape; NaN becomes black.
+        like: image whose percentiles are taken instead.
+
+    Returns:
+        uint8; all 0 where the percentiles are equal or no value is finite.
     """
     seen = image if like is None else like
     seen = seen[np.isfinite(seen)]
@@ -68,7 +75,11 @@ def coloured(
     grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]
 ) -> npt.NDArray[np.uint8]:
     """Draw the marked pixels of a grey picture (rows, cols) in colour, (rows, cols, 3)
-    red first; later marks over earlier ones, those of outermost pixels as a band.
+    red first; later marks over earlier ones; those of outermost pixels (bit 4) as a band.
+
+    Args:
+        grey: the picture.
+        marks: (rows, cols) of bits, see `MARKS`.
     """
     picture = np.repeat(grey[:, :, None], 3, axis=2)
     values = np.asarray(marks, dtype=np.uint8)
@@ -81,8 +92,8 @@ def coloured(
 
 
 def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Widen marks of the outermost pixels into the picture, to a band of at least 2
-    pixels; returns a copy.
+    """Widen marks of the outermost pixels into the picture, to a band of 1 / `BAND` of
+    the longer side, at least 2 pixels; returns a copy.
     """
     wide = max(2, max(edge.shape) // BAND)
     out = edge.copy()
@@ -94,16 +105,17 @@ def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def legend(marks: npt.NDArray[np.generic]) -> list[str]:
-    """List the meanings of the colours that occur in a picture of marks, most with their
-    share of the pixels.
+    """List the meanings of the colours that occur in a picture of marks, with their share
+    of the pixels (but for the band at the edges); [] without marks.
     """
     values = np.asarray(marks, dtype=np.uint8)
     lines = []
-    for bit, _, name, what in MARKS:
+    for bit, _, name, meaning in MARKS:
         part = float(np.mean((values & bit) > 0))
         if part > 0:
             lines.append(
-                f"{name}: {what}" + ("" if bit == 4 else f" ({part:.2%} of the pixels)")
+                f"{name}: {meaning}"
+                + ("" if bit == 4 else f" ({part:.2%} of the pixels)")
             )
     return lines
 

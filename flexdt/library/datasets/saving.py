@@ -41,8 +41,10 @@ REFERENCES: Final = ("di", "io")
 def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
     """Write a data set into a folder; see `DataSet.save`.
 
-    Projections that are there are not written again; missing ones are left out. The note
-    of unfinished saving is removed last.
+    A note of unfinished saving (`UNFINISHED`) is written first and removed last.
+    Projections that are in the folder already are not written again; missing ones are
+    left out. The scanner's texts and the script are copied; a data set in memory gets
+    texts where `stated_settings` has some.
 
     Args:
         data: the data set.
@@ -50,7 +52,8 @@ def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
         resume: continue an interrupted saving.
 
     Raises:
-        DatasetExistsError: the folder has other files.
+        DatasetExistsError: the folder has other files, or an unfinished saving of another
+            data set or without `resume`.
     """
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
@@ -79,8 +82,9 @@ def save_data_set(data: ImageSet, folder: File, resume: bool = False) -> None:
 
 
 def _content_of(data: ImageSet) -> dict[str, object]:
-    """Return the content that a folder will hold: name, number of projections, shape, and
-    a digest of the geometry and of the first projection, which identifies the data set.
+    """Return the content that a folder will hold, to identify the data set: the keys
+    name, projections (present), shape and digest (SHA-256 of the geometry and the first
+    present projection).
     """
     digest = hashlib.sha256(np.ascontiguousarray(data.geometry.rows).tobytes())
     if data.present:
@@ -110,14 +114,18 @@ def _require_room_for(
     if not there:
         return
     if UNFINISHED not in there:
-        said = f"{path} is not empty; allowed: a new or an empty folder"
-        raise DatasetExistsError(said, {"path": str(path)})
+        message = f"{path} is not empty; allowed: a new or an empty folder"
+        raise DatasetExistsError(message, {"path": str(path)})
     if not resume:
-        said = f"{unfinished(path)}; allowed: resume=True, or an empty folder"
-        raise DatasetExistsError(said, {"path": str(path)})
+        message = f"{unfinished(path)}; allowed: resume=True, or an empty folder"
+        raise DatasetExistsError(message, {"path": str(path)})
     if _read_note(path) != content:
-        said = f"{unfinished(path)}, which is another data set than {content['name']!r}"
-        raise DatasetExistsError(f"{said}; allowed: an empty folder", {"path": str(path)})
+        message = (
+            f"{unfinished(path)}, which is another data set than {content['name']!r}"
+        )
+        raise DatasetExistsError(
+            f"{message}; allowed: an empty folder", {"path": str(path)}
+        )
 
 
 def unfinished(path: Path) -> str:
@@ -147,14 +155,14 @@ def _read_note(path: Path) -> Mapping[str, object]:
 
 
 def stated_settings(data: ImageSet) -> ScanSettings | None:
-    """Return the settings in the scanner's texts of a data set in memory.
+    """Return the settings that the scanner's texts of a data set in memory would state.
 
     Tube and camera figures are None where the data set does not know them.
 
     Returns:
-        None where they cannot express its geometry: they have one circle in the plane of
-        the sample's reference point, with equal steps and an upright panel of square
-        pixels.
+        None where they cannot express its geometry within `MATCH_MM`: they have one
+        circle in the plane of the sample's reference point, with equal steps and an
+        upright panel of square pixels.
     """
     geometry = data.geometry
     shape = data.shape
@@ -164,10 +172,10 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
         return None
     even = np.linspace(poses.angle[0], poses.angle[-1], len(poses.angle))
     figures = figures_of(poses[:1], shape)
-    said = poses_of(figures, shape, even).cone_vec().rows
+    stated_rows = poses_of(figures, shape, even).cone_vec().rows
     # The pitches are small: at the panel's edge they count by half its pixels.
     weights = np.repeat([1.0, 1.0, shape[1] / 2.0, shape[0] / 2.0], 3)
-    if np.abs((said - geometry.rows) * weights).max() > MATCH_MM:
+    if np.abs((stated_rows - geometry.rows) * weights).max() > MATCH_MM:
         return None
     exposure, camera = (
         getattr(data.truth, name, None) for name in ("exposure", "camera")
@@ -195,7 +203,8 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
 
 def _geometry(data: ImageSet) -> tuple[str, bytes]:
     """Return name and bytes of the geometry's file: the document, with the present
-    correction, if it still describes frames and poses, or else the geometry.
+    correction, if it still describes frames and poses (within 1e-6 mm), or else the
+    geometry with the warnings as notes.
     """
     files = tuple(frame.file for frame in data.frames)
     document = data.document
