@@ -90,7 +90,7 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
 
     Returns:
         A page; each slider chooses among at most `MOST_PICTURES` layers and starts at the
-        middle one. The line below tells the window.
+        middle one. The line below states the window.
 
     Raises:
         TwinError: the window is not two growing numbers.
@@ -140,7 +140,7 @@ def data_page(data: ImageSet) -> NotebookPage:
     if not images:
         raise TwinError(f"{data.where}: no projections to show", {"path": data.where})
     low, high = window_of(np.stack([_small(image) for image in images]), None)
-    what = "line integrals" if has_flat else "counts"
+    quantity = "line integrals" if has_flat else "counts"
     pictures = [
         (f"{i}: {data.frames[i].file}", _grey(image, low, high))
         for i, image in zip(chosen, images, strict=True)
@@ -149,7 +149,7 @@ def data_page(data: ImageSet) -> NotebookPage:
     sinogram = np.stack([image[middle] for image in images])
     tall = np.repeat(sinogram, max(1, SIDE_PX // (2 * len(sinogram))), axis=0)
     parts = [
-        _sliding(pictures, what),
+        _sliding(pictures, quantity),
         _sliding(
             [(f"row {middle}, views downwards", _grey(tall, low, high))], "sinogram"
         ),
@@ -161,11 +161,12 @@ def data_page(data: ImageSet) -> NotebookPage:
 def geometry_page(cone_vec: ConeVec) -> NotebookPage:
     """Draw source, panel and sample of each view, with one scale along all axes.
 
-    A slider chooses among at most `MOST_PICTURES` views, from the first one on. The
-    line below tells the drawing's width [mm].
+    A slider chooses among at most `MOST_PICTURES` views, from the first one on. The line
+    below states the drawing's width [mm].
 
     Args:
-        cone_vec: views in the object's frame; without a detector's shape the panel is a point.
+        cone_vec: views in the object's frame; without a detector's shape the panel is a
+            point.
     """
     drawing = _Drawing.of(cone_vec)
     shown = _slider_indices(len(cone_vec))
@@ -244,8 +245,8 @@ class _Drawing:
         return DRAWING_PX / 2 + scale * float(x), DRAWING_PX / 2 - scale * float(up)
 
     def still(self, cone_vec: ConeVec) -> str:
-        """Draw (SVG) what all views share: axes, places of the source, and the sample as a
-        circle at the origin, with a radius of at least 2 px.
+        """Draw the parts that all views share, as SVG: axes, places of the source, and
+        the sample as a circle at the origin, with a radius of at least 2 px.
 
         The source is a dot in each of at most `MOST_PICTURES` views.
         """
@@ -335,15 +336,13 @@ def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.ui
 
 
 def _slider(count: int, what: str, handler: str, start: int) -> str:
-    """Write a slider as HTML; hidden for a single picture.
+    """Write a slider with the values 0 to count - 1 as HTML; hidden for a single picture.
 
     Args:
         count: positions.
         what: its label.
         handler: JavaScript to run when it moves.
         start: first position.
-
-    Its values are 0 to count - 1.
     """
     hidden = " hidden" if count < 2 else ""
     return (
@@ -360,8 +359,8 @@ def _sliding(
 ) -> str:
     """Write pictures, of which a slider shows one.
 
-    Returns HTML with the pictures as PNG; the longer side of each
-    is scaled to `SIDE_PX`.
+    Returns HTML with the name of the pictures, each as PNG with its longer side scaled to
+    `SIDE_PX`, the slider, and below it the name of the one shown.
 
     Args:
         pictures: name and grey pixels (rows, columns) of each, at least one.

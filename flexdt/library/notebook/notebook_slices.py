@@ -38,14 +38,14 @@ def grey_of(values: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np
 def window_of(
     values: npt.NDArray[Any], window: Sequence[float] | None
 ) -> tuple[float, float]:
-    """Return the values of black and white.
+    """Return the values of black and white: those given, else percentiles.
 
     At most about MOST_VALUES values are looked at, in even steps along each axis. Equal
     percentiles give white = black + 1.
 
     Args:
-        values: whose percentiles are taken where no window is given; NaN and infinite ones
-            are left out.
+        values: whose percentiles are taken where no window is given; NaN and infinite
+            ones are left out.
         window: (black, white), or None for the PERCENTILES.
 
     Returns:

@@ -23,9 +23,11 @@ REACH: Final = 0.5
 def volume_widgets(
     widgets: Any, volume: Volume, window: Sequence[float] | None = None
 ) -> Any:
-    """Make three linked slices of a volume: a slider for each axis, and one for the window.
+    """Make three linked slices of a volume: a slider for each axis, and one for the
+    window.
 
-    They begin at the middle of each axis, and are drawn again when a slider has moved.
+    They begin at the middle of each axis, and are drawn again when a slider has moved
+    (that of the window when it is released). White lines mark the two other slices.
 
     Args:
         widgets: the package ipywidgets.
