@@ -48,15 +48,15 @@ class Aligned(Generic[Images_co]):
 
     @property
     def verdict(self) -> str:
-        """Parameters that were found with value, standard deviation and unit, as text;
-        else why the axis column is not identifiable.
+        """Parameters that were estimated, each with value, standard deviation and unit,
+        as one line; without any, why the axis column is not identifiable.
         """
-        told = [
+        estimates = [
             f"{name} {e.value:.6g} +- {e.sigma:.2g} {e.unit}"
             for name, e in self.alignment.parameters.items()
         ]
-        if told:
-            return ", ".join(told)
+        if estimates:
+            return ", ".join(estimates)
         return f"not identifiable: {self.alignment.refused['axis_column_px']}"
 
     @property
@@ -74,14 +74,15 @@ class Aligned(Generic[Images_co]):
         """Name -> {value, sigma, unit}: axis_column_px [px] and, if the images determine
         them, det_roll and det_yaw [deg] and source_row_px [px].
         """
-        found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
-        return found
+        estimates: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
+        return estimates
 
     @property
     def correction(self) -> NamedCorrection:
-        """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that
-        was in force, with dO_x, det_roll, det_yaw and dD_y replaced. It knows the sides
-        if that one did.
+        """The correction, for `DataSet.with_correction` and `calibration.apply`: the one
+        that was in force, with dO_x, det_roll, det_yaw and dD_y replaced. It is named by
+        the present time (UTC), and has the panel's distortion and lag that were found. It
+        knows the sides if that one did.
 
         Raises:
             NotIdentifiableError: there is no correction; the message gives the reason.
@@ -106,16 +107,17 @@ class Aligned(Generic[Images_co]):
 def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     """Estimate the geometry of a scan without a phantom, with warnings about the images.
 
-    An earlier correction is the start. Found panel and motion are in the document and the
-    data set.
+    An earlier correction is the start. Small steps of the panel are undone first. Doubts
+    about the images are added to the data set's warnings; a motion that was found, to its
+    document and geometry; the panel, to the document.
 
     Args:
         data: a data set with a flat image; frames may be missing.
         per_frame: whether shifts of single frames are looked for too.
 
     Returns:
-        The data set with the correction, the alignment and the report's document; without a
-        correction where the images do not determine the axis.
+        The data set with the correction, the alignment and the report's document; without
+        a correction where the images do not determine the axis.
 
     Raises:
         DatasetError: a frame cannot be read, or there is no flat image.
@@ -131,7 +133,7 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     frames, poses = _at_rest(data)
     passes = long_work.Passes(len(data))
     with long_work.during("aligning") as passes.advance:
-        found = align_turn(
+        alignment = align_turn(
             passes.counting(frames),
             poses,
             data.present,
@@ -143,30 +145,32 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
             data.panel,
         )
     document: dict[str, object] = {
-        "identifiable": found.identifiable,
-        "parameters": {name: told._asdict() for name, told in found.parameters.items()},
-        "refused": dict(found.refused),
-        "warnings": [*data.warnings, *found.warnings],
-        "frames": found.frames,
+        "identifiable": alignment.identifiable,
+        "parameters": {
+            name: estimate._asdict() for name, estimate in alignment.parameters.items()
+        },
+        "refused": dict(alignment.refused),
+        "warnings": [*data.warnings, *alignment.warnings],
+        "frames": alignment.frames,
         "seconds": round(time.perf_counter() - begun, 4),
         "dataset": data.where,
     }
-    if found.offsets is not None:
-        document["correction"] = found.offsets.to_edge()
-    if found.panel is not None:
-        document["panel"] = found.panel.to_json()
-    if found.motion is not None:
-        document["motion"] = [found.motion.to_dict()]
+    if alignment.offsets is not None:
+        document["correction"] = alignment.offsets.to_edge()
+    if alignment.panel is not None:
+        document["panel"] = alignment.panel.to_json()
+    if alignment.motion is not None:
+        document["motion"] = [alignment.motion.to_dict()]
         document["datasets"] = [data.where]
-        data = data.with_motion(found.motion)
-    return Aligned(found, document, data)
+        data = data.with_motion(alignment.motion)
+    return Aligned(alignment, document, data)
 
 
 def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
     """Return line integrals and poses, with small steps of the panel undone.
 
-    Unchanged if the largest step is below STANDS [px], or at least MAX_STEP_SHARE of the
-    shorter side.
+    Both are the data set's own if the largest step is at most `STANDS` [px], or at least
+    `MAX_STEP_SHARE` of the shorter side.
 
     Args:
         data: the scan.

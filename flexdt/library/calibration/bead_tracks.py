@@ -24,7 +24,8 @@ DIGITS: Final = 3
 
 
 def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
-    """Predict bead positions (n, k, 2) [px] in every frame, also of beads that were not seen.
+    """Predict bead positions (n, k, 2) [px] in every frame, also of beads that were not
+    seen, with the fitted bead places and panel's distortion.
 
     Args:
         fit: gives the frames and the beads.
@@ -40,17 +41,19 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
 
 
 def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
-    """Return measured and predicted bead positions of every frame, (column, row) in pixels.
+    """Return measured and predicted bead positions of every frame, (column, row) in
+    pixels.
 
-    `before` is the correction in force during the scan, or the nominal geometry; `after` the
-    fitted one, null where it must not be used. Unseen beads are null.
+    `before` is the correction in force during the scan, or the nominal geometry; `after`
+    the fitted one, null where it must not be used. Unseen beads are null.
 
     Args:
         outcome: of a calibration.
 
     Returns:
-        phantom, and datasets: for each its name and folder, the rms before and after, and its
-        frames; no datasets without a fit.
+        phantom, and datasets: for each dataset (name), folder, rms_before_px,
+        rms_after_px and frames; of each frame file, measured, before and after. No
+        datasets without a fit.
     """
     result = outcome.calibration
     fit = result.fit

@@ -83,9 +83,9 @@ class Outcome(Generic[Images_co]):
         d = self.document
         if not self.calibration.identifiable:
             return f"<Calibration with {self.phantom.name!r}: not identifiable>"
-        asked = sum(bool(p["asked"]) for p in self.parameters.values())
+        requested = sum(bool(p["asked"]) for p in self.parameters.values())
         return (
-            f"<Calibration with {self.phantom.name!r}: {asked} parameters from "
+            f"<Calibration with {self.phantom.name!r}: {requested} parameters from "
             f"{d['frames']} frames, rms {d['rms_px']:.4f} px. {self.verdict}>"
         )
 
@@ -95,9 +95,9 @@ class Outcome(Generic[Images_co]):
         """
         heads = ("parameter", "value", "sigma", "unit")
         rows = (
-            (name, *_digits(found["value"], found["sigma"]), found["unit"])
-            for name, found in self.parameters.items()
-            if found["asked"]
+            (name, *_digits(estimate["value"], estimate["sigma"]), estimate["unit"])
+            for name, estimate in self.parameters.items()
+            if estimate["asked"]
         )
         return emphasised(self.verdict) + values_table(heads, rows)
 
@@ -112,12 +112,12 @@ class Outcome(Generic[Images_co]):
         deg], as `Estimate` describes them; parameters with a prior that were not
         requested come last.
         """
-        found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
-        return found
+        estimates: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
+        return estimates
 
     @property
     def parts(self) -> Iterator[tuple[Images_co, slice]]:
-        """Each data set, with the slice of its frames among those of all."""
+        """Each data set, in order, with the slice of its frames among those of all."""
         first = 0
         for dataset in self.datasets:
             yield dataset, slice(first, first + len(dataset))
@@ -136,7 +136,7 @@ class Outcome(Generic[Images_co]):
         and lag, if any.
 
         Raises:
-            TwinError: the calibration is not to be used.
+            TwinError: the calibration is not identifiable, or has no fit.
         """
         result = self.calibration
         if not result.identifiable or result.fit is None:
@@ -156,7 +156,8 @@ class Outcome(Generic[Images_co]):
 
 
 def _digits(value: object, sigma: object) -> tuple[str, str]:
-    """Format value and sigma, both to sigma's second digit; "-" for what is no number.
+    """Format value and sigma, both to sigma's second digit; "-" for a value that is no
+    number.
 
     Where sigma is no number, 0, negative or infinite, the value has five digits.
     """
@@ -191,20 +192,29 @@ def calibrate_datasets(
 ) -> Outcome[Images]:
     """Calibrate from data sets; TIFFs and the two settings texts are enough for one.
 
+    Pixels that are not square are resampled, unless markers are given. With markers only
+    the frames in which one was marked are used. A motion that was found is added to the
+    data sets.
+
     Args:
         datasets: of the same phantom.
-        phantom: a phantom, its name, the path of a phantom file, or UNKNOWN: markers of unknown
-            positions, in one data set.
+        phantom: a phantom, its name, the path of a phantom file, or UNKNOWN: markers of
+            unknown positions, in one data set.
         request: the parameters to estimate; None is the thesis's six parameters, or dO_x
             for unknown markers.
         markers: their pixels in one data set, or a file of them (see `read_markers`);
             None: they are detected in the images.
         scale: a known distance of two unknown markers, or its text (see `Scale.of`).
-        radius_px: of their spots; None: any from 1.5 px up.
+        radius_px: of their spots; None: any that `SpotFinder` accepts.
+
+    Returns:
+        Calibration, the document of `flexdt calibrate` with the commands to run next, the
+        data sets as used, and the phantom.
 
     Raises:
-        TwinError: the phantom has no beads, the request names what does not exist, or the
-            file of markers is invalid.
+        TwinError: no data sets, several with markers or an unknown phantom, a scale with
+            a known one, a radius out of range, a phantom without beads, a request of
+            unknown parameters, or invalid markers.
     """
     start = time.perf_counter()
     if isinstance(scale, str):
@@ -217,7 +227,7 @@ def calibrate_datasets(
         datasets = [squared(d) for d in datasets]
     passes = long_work.Passes(sum(map(len, datasets)))
     frames = [DatasetFrames(d, passes.step) for d in datasets]
-    saturated = [found for d in datasets if (found := saturation(d)) is not None]
+    saturated = [finding for d in datasets if (finding := saturation(d)) is not None]
     low, high = SpotFinder().radius_px
     sought = None
     if radius_px is not None:
@@ -234,13 +244,13 @@ def calibrate_datasets(
         raise TwinError(
             "a scale is for phantom unknown: this phantom states its own size"
         )
-    told: dict[str, object] = {}
+    marker_document: dict[str, object] = {}
     marked = None
     if markers is not None:
         marked = read_markers(markers, len(datasets[0]))
         datasets, marked = seen_alone(datasets[0], marked)
     if unknown:
-        result, told = calibrate_unknown(
+        result, marker_document = calibrate_unknown(
             datasets[0],
             frames[0] if marked is None else None,
             marked,
@@ -277,7 +287,7 @@ def calibrate_datasets(
     result = replace(result, findings=explained_by(saturated, result.findings))
     result = with_undetermined(result)
     seconds = time.perf_counter() - start
-    document = calibration_document(result, seconds) | told
+    document = calibration_document(result, seconds) | marker_document
     if isinstance(phantom, str):
         given = phantom
     else:
@@ -296,7 +306,8 @@ def calibrate_datasets(
 
 @contextmanager
 def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
-    """Prefix an error with the saturated images that explain it.
+    """Run the body of a `with`, and prefix its TwinError with the findings on saturated
+    images that explain it; without such findings the error passes.
 
     Raises:
         TwinError: the error that was raised, preceded by the saturated images.
@@ -314,7 +325,7 @@ def explained_by(
     saturated: Sequence[Finding], findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
     """List findings on saturated images first, and leave out those that saturation
-    falsifies (`OF_SATURATION`); unchanged if none is saturated.
+    falsifies (`OF_SATURATION`); unchanged, as a tuple, if none is saturated.
     """
     if not saturated:
         return tuple(findings)
@@ -333,7 +344,9 @@ def with_undetermined(result: Calibration) -> Calibration:
 
 
 def saturation(dataset: ImageSet) -> Finding | None:
-    """Return a finding if the open beam saturates the detector, else None.
+    """Return a warning if the open beam saturates the detector: at least 1 % of every
+    fourth row and column of the flat image reaches 99.9 % of full scale. None otherwise,
+    without a machine, or without flat images in files.
 
     Thin objects are invisible then. Calibration survives it (beads are dark), but the
     body that is subtracted differs from the one in the images.
@@ -356,26 +369,27 @@ def saturation(dataset: ImageSet) -> Finding | None:
 def find_phantom(phantom: str | Phantom) -> Phantom:
     """Return a phantom that has beads, by value, name or file.
 
-    A name that does not ship is read as a file if there is one.
+    A name that does not ship is read as a file if there is one. A phantom itself is only
+    checked.
 
     Raises:
         TwinError: there is no such phantom, or it has no beads.
     """
     if isinstance(phantom, Phantom):
-        found = phantom
+        target = phantom
     else:
         try:
-            found = load_phantom(phantom)
+            target = load_phantom(phantom)
         except UnknownNameError:
             if not Path(phantom).is_file():
                 raise
-            found = read_phantom_file(Path(phantom))
-    if len(found.beads) == 0:
+            target = read_phantom_file(Path(phantom))
+    if len(target.beads) == 0:
         raise TwinError(
-            f"phantom {found.name!r} has no beads to calibrate with",
-            {"asked": found.name},
+            f"phantom {target.name!r} has no beads to calibrate with",
+            {"asked": target.name},
         )
-    return found
+    return target
 
 
 UNDETERMINED: Final = "undetermined"
@@ -484,7 +498,8 @@ def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
     Args:
         outcome: of a calibration.
         truth: offset -> value in edge units [mm, deg]; offsets that it leaves out are
-            nominal. alpha is compared modulo a turn.
+            nominal. alpha is compared modulo a turn. A parameter of several scans is
+            compared in each.
 
     Returns:
         False also where nothing is identifiable, or where a parameter that was neither
@@ -538,23 +553,25 @@ def settling_commands(finding: Finding) -> Sequence[str]:
     """
     if finding.code in NEXT:
         return NEXT[finding.code]
-    found = []
+    commands = []
     if finding.per_frame:
-        found.append(f"{_CALIBRATE} --per-frame {','.join(finding.per_frame)}")
+        commands.append(f"{_CALIBRATE} --per-frame {','.join(finding.per_frame)}")
     if finding.free:
-        found.append(f"{_CALIBRATE} --free {{free}},{','.join(finding.free)}")
-    return found or [_REPORT]
+        commands.append(f"{_CALIBRATE} --free {{free}},{','.join(finding.free)}")
+    return commands or [_REPORT]
 
 
 def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> str:
     """Return one sentence on use, and one on the limit of the calibration.
 
-    Not to be used: with the first error, weak direction or lack of a fit. The second
-    sentence is left out if no length was asked for.
+    If it is not to be used, one sentence with the first error, weak direction or lack of
+    a fit. Sharp is an axis known to `SHARP_PX`. The second sentence is about the least
+    certain length that was asked for, and is left out if none was.
 
     Args:
         result: of a calibration.
-        seen: its `image_quantities`, of each group of frames; empty where it must not be used.
+        seen: its `image_quantities`, of each group of frames; empty where it must not be
+            used.
     """
     if not result.identifiable or result.fit is None:
         weak = () if result.fit is None else result.fit.certificate.weak
@@ -597,8 +614,9 @@ def _is_sharp(fit: FitResult) -> bool:
 def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> list[str]:
     """List commands that would determine more, or settle an error; most useful first.
 
-    With an error, those that settle the first one. Else "reconstruct" if the geometry is
-    sharp, and two scans at different SOD unless it is sharp and not limited by priors.
+    With an error other than UNDETERMINED, those that settle the first one. Else
+    "reconstruct" if the geometry is sharp, and two scans at different SOD unless it is
+    sharp and not limited by priors.
 
     Args:
         result: of the calibration.
@@ -610,7 +628,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         estimates = {}
     else:
         estimates = result.fit.certificate.estimates
-    asked = [e for e in estimates.values() if e.asked]
+    requested = [e for e in estimates.values() if e.asked]
     if result.errors and result.errors[0].code != UNDETERMINED:
         free = ",".join(name for name, e in estimates.items() if e.asked)
         lines = settling_commands(result.errors[0])
@@ -623,7 +641,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         "flexdt reconstruct SAMPLE --correction REPORT.json --out volume.tif"
         "  # REPORT.json: of this command with --report"
     ]
-    limited = any(_by_priors(e) for e in asked)
+    limited = any(_by_priors(e) for e in requested)
     sharp = result.fit is not None and result.identifiable and _is_sharp(result.fit)
     if sharp and not limited:
         return use
@@ -664,7 +682,9 @@ def rounded_up(sigma: float) -> str:
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Format numbers in growing order as ranges of successive ones: 2, 5-9, 12."""
+    """Format numbers in growing order as ranges of successive ones: "2, 5-9, 12"; "" for
+    none.
+    """
     runs = [
         [n for _, n in run]
         for _, run in groupby(enumerate(sorted(numbers)), lambda pair: pair[1] - pair[0])

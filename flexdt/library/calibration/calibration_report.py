@@ -47,7 +47,7 @@ second, third... is drawn."""
 
 def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
     """Write the outcome's report as HTML, or its document as JSON if the name ends in
-    .json.
+    .json (in either case); the file appears only when complete.
     """
     if path.suffix.lower() == ".json":
         text = json.dumps(outcome.document, indent=1) + "\n"
@@ -60,7 +60,7 @@ def report(outcome: Outcome[ImageSet]) -> str:
     """Make the HTML report of a calibration.
 
     Without a fit only verdict, next commands and findings; ellipses only where the
-    geometry is determined in full.
+    geometry is determined in full. The first present image of each data set is read.
 
     Args:
         outcome: of the calibration.
@@ -186,7 +186,8 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
         fit: of the geometry.
 
     Returns:
-        HTML parts.
+        HTML parts. A parameter that moves during the scan is plotted, too; a data set
+        without images has no picture.
     """
     c = fit.certificate
     beads = range(c.used.shape[1])
@@ -237,15 +238,15 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
     for dataset, motion in zip(
         outcome.datasets, outcome.calibration.motions, strict=False
     ):
-        for name, told in motion.to_dict().items():
-            if told["moves"]:
-                values = np.array(told["values"])
+        for name, move in motion.to_dict().items():
+            if move["moves"]:
+                values = np.array(move["values"])
                 body.append(
                     plot(
                         [Series(name, np.arange(len(values)), values)],
                         title=f"{dataset.name}: {name} during the scan",
                         x_label="frame",
-                        y_label=str(told["unit"]),
+                        y_label=str(move["unit"]),
                         height=180,
                     )
                 )

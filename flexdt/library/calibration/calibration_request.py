@@ -36,8 +36,9 @@ OF_DETECTION: Final[Mapping[str, str]] = {
 def request_of(phantom: object, options: CalibrationOptions) -> CalibrationRequest:
     """Make the request of a calibration, the defaults filled in.
 
-    Options that are None are left out. An unknown phantom frees dO_x alone; priors "none"
-    makes offsets exact.
+    Options that are None are left out, and those of `OF_DETECTION` ignored. By default an
+    unknown phantom frees dO_x alone, others the thesis's six; priors "none" makes the
+    other offsets exact.
 
     Args:
         phantom: as of `flexdt.calibrate`.

@@ -37,8 +37,8 @@ class DatasetFrames:
     def __init__(
         self, dataset: ImageSet, seen: Callable[[], object] = lambda: None
     ) -> None:
-        """Take a data set, whose counts are kept if they are few bytes, and a function that is
-        called after each frame.
+        """Take a data set, whose counts are kept after the first reading if all need at
+        most `KEEP_BYTES`, and a function that is called after each frame of each pass.
         """
         self._dataset = dataset
         self._seen = seen
@@ -56,8 +56,11 @@ class DatasetFrames:
         return len(self._dataset)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame in its normalised image; unreadable or missing
-        frames are marked MISSING, with the reason.
+        """Detect the beads of every frame in its normalised image, in threads.
+
+        Returns:
+            The spots of each frame, in order; a frame that is missing or unreadable has
+            none, the state MISSING and the reason ("" if it is missing).
         """
         normalise = self._dataset.normalisation
 
@@ -74,15 +77,14 @@ class DatasetFrames:
         return self._each(one)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows of every frame; only their pixels are normalised.
-
-        Also NaN in frames that cannot be read.
+        """Cut the windows of every frame, in threads; only their pixels are normalised.
 
         Args:
             plan: corners and side of the windows.
 
         Returns:
-            float32 (n, k, side, side), NaN outside images and in dead pixels.
+            float32 (n, k, side, side), line integrals; NaN outside images, in dead pixels
+            and in frames that are missing or cannot be read.
         """
         normalise = self._dataset.normalisation
         log_open = np.where(normalise.dead, np.float32(np.nan), normalise.log_open)
@@ -109,7 +111,7 @@ class DatasetFrames:
     def _counts(self, index: int) -> Counts | None:
         """Return the counts of one frame; None if its file is missing or unreadable.
 
-        Keeps the counts if asked to, and the reason of an unreadable frame.
+        Keeps the counts where all fit, and the reason of an unreadable frame.
         """
         if index in self._kept:
             return self._kept[index]
@@ -125,12 +127,12 @@ class DatasetFrames:
         return counts
 
     def _each(self, work: Callable[[int], _T]) -> list[_T]:
-        """Do work on every frame in threads, in order, and report each frame; returns the
-        results.
+        """Do work on every frame in `THREADS` threads, and report each frame in order;
+        returns the results in order.
         """
-        found = []
+        results = []
         with ThreadPoolExecutor(THREADS) as pool:
             for one in pool.map(work, range(len(self))):
-                found.append(one)
+                results.append(one)
                 self._seen()
-        return found
+        return results

@@ -15,14 +15,16 @@ STEP_SCAN: Final = "step scan"
 def exposure_share(data: ImageSet) -> float | None:
     """Return the part of a step that the object turns while a frame is exposed.
 
-    A smooth scan turns on, so the part is that of the time between two frames. A scan that
-    stops for every image turns by nothing.
+    A smooth scan turns on, so the part is exposure times averages over the median time
+    between two projections, at most 1. A scan that stops for every image turns by
+    nothing: 0.
 
     Args:
         data: a scan with `flexdt.json` or the scanner's settings text.
 
     Returns:
-        From 0 to 1; None where neither states it.
+        From 0 to 1; None where neither states it, or a smooth scan has fewer than two
+        projections or no time between them.
     """
     document = data.document
     if document is None or "smooth" not in document.model_fields_set:

@@ -117,26 +117,27 @@ class Scale:
     def of(cls, text: str) -> Scale:
         """Parse A-B=MM, or A-B=MM+-SIGMA.
 
-        Sizes must be above 0 and at most `LONGEST_MM`; sigma is the class's if not given.
+        Spaces around the names are removed; without +-SIGMA sigma is the class's default.
 
         Raises:
-            TwinError: the text has another form.
+            TwinError: the text has another form, a name is empty, or a size is not above
+                0 and at most `LONGEST_MM`.
         """
         pair, _, size = text.rpartition("=")
         a, dash, b = pair.partition("-")
         mm, _, sigma = size.partition("+-")
         try:
-            found = cls(
+            scale = cls(
                 a.strip(), b.strip(), float(mm), float(sigma) if sigma else cls.sigma_mm
             )
         except ValueError:
-            found = cls(a, b, math.nan)
-        sizes = (found.mm, found.sigma_mm)
+            scale = cls(a, b, math.nan)
+        sizes = (scale.mm, scale.sigma_mm)
         if not (
-            dash and found.a and found.b and all(0 < size <= LONGEST_MM for size in sizes)
+            dash and scale.a and scale.b and all(0 < size <= LONGEST_MM for size in sizes)
         ):
             raise TwinError.instead(f"scale {text!r}", text, SCALE_FORM)
-        return found
+        return scale
 
 
 def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Markers:
@@ -189,15 +190,16 @@ def _of_array(path: Path, views: int) -> Markers:
 def _of_table(path: Path, views: int) -> Markers:
     """Read markers of a CSV file whose first line names its columns.
 
-    Empty lines are skipped; an empty column or row is nan; without a sigma column sigma
-    is None.
+    The head's words are those of `NAMES`, in either case and any order. Empty lines are
+    skipped; an empty column or row is nan; without a sigma column sigma is None.
 
     Args:
         path: of the file.
         views: that the scan has.
 
     Raises:
-        TwinError: unreadable, or a line that is invalid; names the line.
+        TwinError: unreadable, a column that the head lacks, or an invalid line; names the
+            line.
     """
     try:
         rows = list(csv.reader(io.StringIO(read_text(path))))
@@ -212,9 +214,9 @@ def _of_table(path: Path, views: int) -> Markers:
         for n, words in NAMES.items()
     }
     if -1 in at.values():
-        said = f"{path}, line 1: columns {', '.join(head) or 'none'}"
+        message = f"{path}, line 1: columns {', '.join(head) or 'none'}"
         raise TwinError.instead(
-            said, head, "frame, marker, column, row and, optionally, sigma"
+            message, head, "frame, marker, column, row and, optionally, sigma"
         )
     if "sigma" in head:
         width = head.index("sigma")
@@ -241,7 +243,7 @@ def _of_table(path: Path, views: int) -> Markers:
 
 
 def _mark(where: str, row: Mark) -> tuple[str, Mark]:
-    """Check and convert the types of a mark; a number becomes the marker's name.
+    """Check and convert the types of a mark; a name that is a number becomes its text.
 
     Args:
         where: place in its file, for messages.
@@ -274,14 +276,16 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
 def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     """Collect marks into a table, markers in the order of their names.
 
-    Without a sigma `ASSUMED_PX` is taken; decimal names come first, by number.
+    Without a sigma `ASSUMED_PX` is taken; decimal names come first, by number. Marks that
+    are missing are nan.
 
     Args:
         marks: each with its place in the source, for messages.
         views: that the scan has.
 
     Raises:
-        TwinError: a frame or sigma out of range, or a marker twice in one frame.
+        TwinError: a frame that the scan has not, a sigma that is not above 0 and at most
+            `WIDEST_PX`, a pixel beyond `FAR_PX`, or a marker twice in one frame.
     """
     seen: dict[tuple[int, str], tuple[float, float, float]] = {}
     for where, (frame, name, x, y, stated) in marks:
@@ -297,8 +301,8 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
                 f"sigma above 0 to {WIDEST_PX:g}",
             )
         if any(abs(v) > FAR_PX for v in (x, y)):
-            said = f"{where}: pixel ({x:g}, {y:g})"
-            raise TwinError.instead(said, [x, y], f"up to {FAR_PX:g}")
+            message = f"{where}: pixel ({x:g}, {y:g})"
+            raise TwinError.instead(message, [x, y], f"up to {FAR_PX:g}")
         seen[frame, name] = x, y, sigma
     labels = {name for _, name in seen}
     names = tuple(sorted(labels, key=lambda n: (not n.isdecimal(), n.zfill(9))))
@@ -311,12 +315,13 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
 
 
 def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
-    """Return data set and markers of the frames in which a marker was marked.
+    """Select the frames in which a marker was marked.
+
+    Returns:
+        The data set of these frames, in a list of one, and their markers.
 
     Raises:
         TwinError: no marker was marked.
-
-    The data set is the only one in a list.
     """
     some = np.flatnonzero(markers.seen.any(axis=1))
     if not len(some):
@@ -406,10 +411,12 @@ def calibrate_unknown(
         detector: finds spots in the images.
 
     Returns:
-        The calibration, and the document of the markers: names, positions and scale.
+        The calibration, and the document: markers (of `_described`) and scale, a text:
+        the stated one, "estimated", "free" or "from the prior on dO_z".
 
     Raises:
-        TwinError: too few markers, or one that is seen from too few directions.
+        TwinError: fewer than three markers, one that is seen from too few directions,
+            neither images nor markers, or a scale with dO_z free or with one marker.
     """
     poses = data.poses
     if markers is None:
@@ -449,14 +456,17 @@ def calibrate_unknown(
     model = BeadModel(places, radii, 0.0, "unknown")
     if scale is None:
         if "dO_z" in request.free:
-            told = "estimated"
+            scale_origin = "estimated"
         else:
-            told = "free"
+            scale_origin = "free"
         if "dO_z" in request.priors:
-            told = "from the prior on dO_z"
-        found = _calibrated(data, looks, index, model, want, images)
-        found = _turning_back(found, data, markers)
-        return found, {"markers": _described(found, names, index), "scale": told}
+            scale_origin = "from the prior on dO_z"
+        calibration = _calibrated(data, looks, index, model, want, images)
+        calibration = _turning_back(calibration, data, markers)
+        return calibration, {
+            "markers": _described(calibration, names, index),
+            "scale": scale_origin,
+        }
     pair = [_numbered(names, n) for n in (scale.a, scale.b)]
     if pair[0] == pair[1] or "dO_z" in request.free:
         raise TwinError.instead(
@@ -475,42 +485,45 @@ def calibrate_unknown(
         )
         model = replace(model, beads=model.beads * ratio, bead_radius_mm=radii * ratio)
         scaled = replace(want, start=start, priors={**want.priors, "dO_z": width})
-        found = _calibrated(data, looks, index, model, scaled, images)
-        if found.fit is None:
+        calibration = _calibrated(data, looks, index, model, scaled, images)
+        if calibration.fit is None:
             break
-        beads = found.fit.beads
+        beads = calibration.fit.beads
         last = ratio
         ratio = scale.mm / float(np.linalg.norm(beads[pair[0]] - beads[pair[1]]))
         if abs(ratio - 1.0) < 0.1 * scale.sigma_mm / scale.mm:
             break
         radii = radii * last
         model = replace(model, beads=beads)
-    said = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
-    found = _turning_back(found, data, markers)
-    return found, {"markers": _described(found, names, index), "scale": said}
+    stated_scale = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
+    calibration = _turning_back(calibration, data, markers)
+    return calibration, {
+        "markers": _described(calibration, names, index),
+        "scale": stated_scale,
+    }
 
 
 def _turning_back(
-    found: Calibration, data: ImageSet, markers: Markers | None
+    calibration: Calibration, data: ImageSet, markers: Markers | None
 ) -> Calibration:
     """Add an error if markers do not move, or fit twice as well with the stage reversed.
 
     "not_turning": the largest move is below 6 median sigmas. "angle_reversed": the rms of
-    the reversed fit is below half of the found one. Unchanged also without a fit.
+    the reversed fit is below half of the calibration's. Unchanged also without a fit.
 
-    Without perspective both directions would fit, with each marker as far behind the axis as
-    before.
+    Without perspective both directions would fit, with each marker as far behind the axis
+    as before.
 
     Args:
-        found: the calibration.
+        calibration: with its fit.
         data: the scan.
         markers: their pixels; None checks nothing.
 
     Returns:
         The calibration, with the error as its first finding if there is one.
     """
-    if markers is None or found.fit is None:
-        return found
+    if markers is None or calibration.fit is None:
+        return calibration
     moved = float(
         np.nanmax(np.nanmax(markers.tracks, axis=0) - np.nanmin(markers.tracks, axis=0))
     )
@@ -520,7 +533,7 @@ def _turning_back(
             f"the markers move by {moved:.2g} px at most in all frames: the "
             "object does not turn although the angles say so",
         )
-        return replace(found, findings=(off, *found.findings))
+        return replace(calibration, findings=(off, *calibration.findings))
     poses = replace(data.poses, angle=-data.poses.angle)
     at = centred(markers.tracks, poses, data.shape, NOMINAL)
     places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
@@ -536,16 +549,16 @@ def _turning_back(
         priors={"det_roll": 1.0},
         bound=math.inf,
     )
-    if not fit.certificate.rms_px < 0.5 * found.fit.certificate.rms_px:
-        return found
+    if not fit.certificate.rms_px < 0.5 * calibration.fit.certificate.rms_px:
+        return calibration
     off = error(
         "angle_reversed",
         f"the markers fit to {fit.certificate.rms_px:.2g} px instead of "
-        f"{found.fit.certificate.rms_px:.2g} if the stage turns the other way than the "
+        f"{calibration.fit.certificate.rms_px:.2g} if the stage turns the other way than the "
         "angles say, "
         "or if the images are mirrored",
     )
-    return replace(found, findings=(off, *found.findings))
+    return replace(calibration, findings=(off, *calibration.findings))
 
 
 def _calibrated(
@@ -558,8 +571,8 @@ def _calibrated(
 ) -> Calibration:
     """Calibrate from spots whose beads are known.
 
-    Without images there is no second detection, bead sizes are not
-    known, and the misfit's limit is at least 3 median sigmas.
+    Without images there is no second detection, bead sizes are not known, and the
+    misfit's limit is at least 3 median sigmas of the spots.
 
     Args:
         data: the scan.
@@ -603,9 +616,7 @@ def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArra
         poses: geometry of the frames.
 
     Returns:
-        (k,) medians [mm].
-
-    NaN for a marker that no frame shows.
+        (k,) medians [mm]; NaN for a marker that no frame shows.
     """
     scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
     return np.array(
@@ -623,22 +634,22 @@ def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArra
 
 
 def _described(
-    found: Calibration, names: Sequence[str], index: Index
+    calibration: Calibration, names: Sequence[str], index: Index
 ) -> list[dict[str, object]]:
     """List the markers of a calibration.
 
     Args:
-        found: the calibration.
+        calibration: with its fit.
         names: of the k markers.
         index: (n, k) spot of each marker in each frame, -1 without.
 
     Returns:
-        name, position_mm (in the object's frame), frames and rms_px (None if unknown) of each;
-        empty without a fit.
+        name, position_mm (in the object's frame), frames and rms_px (None if unknown) of
+        each; empty without a fit.
     """
-    if found.fit is None:
+    if calibration.fit is None:
         return []
-    rms = found.fit.certificate.rms_per_bead
+    rms = calibration.fit.certificate.rms_per_bead
     return [
         {
             "name": name,
@@ -647,6 +658,6 @@ def _described(
             "rms_px": round(float(rms[k]), 4) if math.isfinite(rms[k]) else None,
         }
         for k, (name, place) in enumerate(
-            zip(names, found.fit.beads.tolist(), strict=True)
+            zip(names, calibration.fit.beads.tolist(), strict=True)
         )
     ]

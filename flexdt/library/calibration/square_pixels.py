@@ -23,10 +23,12 @@ MAX_SIDE_DIFFERENCE = 1e-3
 
 
 def squared(data: Images) -> Images:
-    """Resample rows to the columns' pitch where pixels are not square, with a warning in the
-    data set.
+    """Resample rows to the columns' pitch where pixels are not square, with a warning in
+    the data set.
 
-    A copy has resampled images, dark and flat, and the geometry of it.
+    Pixels whose sides differ by less than `MAX_SIDE_DIFFERENCE` count as square. The copy
+    has images that are resampled when they are read, resampled dark and flat images, and
+    the geometry of the new rows.
 
     Args:
         data: a data set; itself is returned if its pixels are square.
@@ -41,7 +43,7 @@ def squared(data: Images) -> Images:
     shape = max(1, int(rows * ratio)), cols
     table = np.array(data.cone_vec.rows)
     table[:, 9:] /= ratio
-    said = (
+    warning = (
         f"the pixels are {np.linalg.norm(poses.u[0]):.4g} x "
         f"{np.linalg.norm(poses.v[0]):.4g} mm; "
         f"calibration takes their {rows} rows as {shape[0]} of the columns' pitch"
@@ -53,7 +55,7 @@ def squared(data: Images) -> Images:
         cone_vec=ConeVec(table).with_shape(shape),
         nominal=replace(poses, v=poses.v / ratio),
         arrays=Arrays(images, images.of(data.dark)[None], images.flats()),
-        warnings=(*data.warnings, said),
+        warnings=(*data.warnings, warning),
     )
 
 
@@ -76,8 +78,8 @@ class ResampledRows:
     @overload
     def __getitem__(self, index: npt.NDArray[np.int64]) -> ResampledRows: ...
     def __getitem__(self, index: int | npt.NDArray[np.int64]) -> Counts | ResampledRows:
-        """Return the resampled counts of one image, rounded to uint16, or for an array of
-        indices these images, not yet resampled.
+        """Return the resampled counts of one image, rounded and cut to uint16; for an
+        array of indices these images as `ResampledRows`, not yet read.
         """
         if isinstance(index, np.ndarray) and index.ndim:
             return replace(self, original=self.original[index])
